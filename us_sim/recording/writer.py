@@ -51,8 +51,9 @@ class BagWriter:
     or with :meth:`flush`, and then survives the end of the process.
 
     Where the disk is full the file gets its index and is closed, :meth:`resume` goes on in another
-    one when there is room again, and :attr:`lost` tells what did not fit. Where somebody takes the
-    file or a part of it away, that is an error as well, and writing goes on in another one at once.
+    one when there is room again, and :attr:`lost` counts the messages that did not fit. Where
+    somebody takes the file or a part of it away, that is an error as well, and writing goes on in
+    another one at once.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -100,7 +101,7 @@ class BagWriter:
         self._attachments: dict[str, tuple[str, bytes, int]] = {}
         self._last_flush: int | None = None
         self._closed_because = ""
-        self._taken_away: list[str] = []  # what happened to files, as nobody has been told yet
+        self._taken_away: list[str] = []  # sentences that nobody has been told yet
         self._ended = False
         try:
             self._name_files(Path(path), sidecar, further)
@@ -160,13 +161,13 @@ class BagWriter:
         schema: str | None = None,
         defined: bool = True,
     ) -> None:
-        """Makes a topic known; adding it again with the same type adds what is offered anew.
+        """Makes a topic known; adding it again with the same type adds its quality of service.
 
         Args:
             topic: full name.
             type_name: ``package/msg/Type``.
-            qos: what its publishers offer, in any form that ``QosProfile.of`` takes. What is added
-                later is in ``metadata.yaml`` and in files begun after that.
+            qos: offered by its publishers, in any form that ``QosProfile.of`` takes. Later profiles
+                are in ``metadata.yaml`` and in files begun after that.
             type_hash: RIHS01 hash; computed from the definition by default.
             schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
             defined: False takes a type whose definition is not known, and writes none.
@@ -224,7 +225,7 @@ class BagWriter:
 
         Raises:
             BagError: the topic is unknown, a time is negative, the bag is closed, or the disk is
-                full; what was written before stays readable.
+                full; earlier messages stay readable.
         """
         if topic not in self._topics:
             raise BagError(f"topic {topic} was not added to {self.path}: call add_topic first")
@@ -317,7 +318,7 @@ class BagWriter:
         """Writes the index and ``metadata.yaml``; closing again does nothing.
 
         Raises:
-            BagError: the disk is full; what was written before stays readable.
+            BagError: the disk is full; earlier messages stay readable.
             FileTakenError: the file was removed or moved.
         """
         self._ended = True
@@ -363,7 +364,7 @@ class BagWriter:
         return bool(self._max_duration and late)
 
     def _opened(self, path: Path) -> McapOutput:
-        """A new file that knows all topics so far, with what is attached."""
+        """A new file with all topics so far and the attachments."""
         output = McapOutput(
             path, _library(), compression=self._compression, chunk_size=self._chunk_size
         )
@@ -383,7 +384,7 @@ class BagWriter:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turns a failure of the disk into an error that says what is kept, and stops there."""
+        """Stop at a failure of the disk, with an error that says how much is kept."""
         if self._closed_because:
             raise BagError(self._closed_because)
         try:
@@ -412,7 +413,7 @@ class BagWriter:
             self.on_split(str(closed.path), str(self._output.path))
 
     def _finish(self) -> None:
-        """Give the present file its index, close it and count what is in it."""
+        """Give the present file its index, close it and count its messages."""
         file = self._output
         if file.is_finished:
             return

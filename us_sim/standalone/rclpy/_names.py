@@ -156,7 +156,7 @@ class RemapSyntaxError(ValueError):
 
 @dataclass(frozen=True)
 class RemapRule:
-    """One rule: what kind of name it replaces, for which node (None: all), and by what."""
+    """One rule: the kinds of names it replaces, for which node (None: all), and the new name."""
 
     kinds: int  # bits of TOPIC, SERVICE, NODE_NAME, NAMESPACE
     node: str | None
