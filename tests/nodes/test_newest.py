@@ -4,7 +4,7 @@ from bench import pose_at
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import Health
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.scene_node import Newest
 

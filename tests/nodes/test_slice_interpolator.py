@@ -13,7 +13,7 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.errors import ProbeError
 from us_sim.nodes import slice_interpolator
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_from,
     cloud_message,
     pixels_from,

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_message,
     cloud_message,
     colour_image_message,

@@ -1,7 +1,4 @@
-"""What a recorded session shows: counts, latency, and the lumen areas over time.
-
-How far the path that a camera tracked is from the true one.
-"""
+"""A recorded session measured: counts, latency, lumen areas, and the error of a tracked path."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from scipy.ndimage import binary_erosion
 from us_sim.demo.camera_video import PathVideo
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
@@ -295,7 +292,6 @@ def write_summary(summary: dict[str, Any], file: Path) -> None:
 
 
 def _percentiles(ages: list[int]) -> tuple[float, float]:
-    """ms, median and 99th percentile of ages in ns."""
     p50, p99 = np.percentile([age / MILLISECOND for age in ages], [50, 99])
     return float(p50), float(p99)
 
@@ -328,7 +324,6 @@ class TrackedPath:
         return summary
 
     def __str__(self) -> str:
-        """One line for a person."""
         found = self.summary
         mm, degrees = found["error_mm"], found["error_deg"]
         return (

@@ -286,7 +286,7 @@ def _publish_images(side: str) -> None:
     from rclpy.node import Node
     from sensor_msgs.msg import Image
 
-    from us_sim.nodes.conversions import image_message
+    from us_sim.nodes.messages import image_message
     from us_sim.nodes.qos import STREAM
 
     rclpy.init()

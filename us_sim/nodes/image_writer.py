@@ -12,8 +12,8 @@ import numpy as np
 from sensor_msgs.msg import Image
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import field_from, nanoseconds_of, pixels_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import field_from, nanoseconds_of, pixels_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, overridable

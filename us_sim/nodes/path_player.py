@@ -15,9 +15,8 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
-from us_sim.nodes.conversions import nanoseconds_of, pose_message
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import nanoseconds_of, pose_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable

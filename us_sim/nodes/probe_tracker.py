@@ -19,7 +19,8 @@ from visualization_msgs.msg import MarkerArray
 from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import transducer_mesh
-from us_sim.nodes.conversions import (
+from us_sim.nodes.guarded_node import kind_of
+from us_sim.nodes.messages import (
     nanoseconds_of,
     pose_from,
     pose_message,
@@ -28,7 +29,6 @@ from us_sim.nodes.conversions import (
     transducer_markers,
     transform_message,
 )
-from us_sim.nodes.guarded_node import kind_of
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.process import run_node
@@ -36,8 +36,7 @@ from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import TrackerInput
-from us_sim.scene.building import collider_of, probe_of
-from us_sim.scene.tracker_building import source_settings, tracking_of
+from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
 from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter

@@ -9,8 +9,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from us_sim.nodes.guarded_node import GuardedNode, decoded
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
 from us_sim.nodes.settings import SceneNodeSettings

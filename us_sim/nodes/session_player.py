@@ -12,8 +12,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.task import Future
 
 from us_sim.errors import BagError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.sessions.playback import Playback

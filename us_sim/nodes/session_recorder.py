@@ -17,8 +17,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from us_sim.errors import BagError, UsSimError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.sessions.attachments import session_attachments

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from us_sim.errors import BagError
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml
 
 INFINITE = 2**63 - 1  # ns, what rmw calls RMW_DURATION_INFINITE
 

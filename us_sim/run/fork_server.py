@@ -289,7 +289,8 @@ def main() -> int:
     request = _serve(socket.socket(fileno=os.dup(0)))
     if request is None:
         return 0
-    runpy.run_module(f"us_sim.nodes.{request.node}", run_name="__main__", alter_sys=True)
+    module = request.command[request.command.index("-m") + 1]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
     return 0
 
 
@@ -354,7 +355,7 @@ def _forked(request: _Request) -> bool:
 
 def _become(request: _Request, between: int) -> None:
     """Make of this process what a program of its own would be."""
-    from us_sim.nodes.early_interrupt import end_at_once_when_interrupted
+    from us_sim.nodes import end_at_once_when_interrupted
 
     given, said, ready = request.files
     until = time.monotonic() + ADOPTED_S

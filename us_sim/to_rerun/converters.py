@@ -1,25 +1,4 @@
-"""What a kind of message becomes in a recording of rerun.
-
-Texts: a person's marks of moments.
-
-Frames: each transform of tf, between the frames that it names.
-
-Points of clouds, such as the tissue's nodes.
-
-The skin: a mesh at rest, whose vertices move.
-
-Vessels, nerves and bone of a session in which nobody recorded them.
-
-They follow from what is recorded: the scene names them, and the tissue's nodes carry them.
-
-Forces: an arrow where they act, and three curves.
-
-How the nodes are: their states as text, what they measure as curves.
-
-Images: in two dimensions as they are, and the ultrasound image in the plane that it shows.
-
-Markers: the shapes that nodes draw for RViz.
-"""
+"""Messages of a session as entities of a rerun recording, and the views that the viewer opens."""
 
 from __future__ import annotations
 
@@ -40,7 +19,7 @@ from rerun.encodings import AbsoluteTimeRange
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.triangles import vertex_normals
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_from,
     colour_pixels_from,
     field_from,
@@ -53,9 +32,8 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.recording.reader import Bag
 from us_sim.recording.repair import extract
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import structures_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import structures_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.to_rerun.conversion import STAMP, RerunFile
 

@@ -11,7 +11,7 @@ from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
-from us_sim.nodes.conversions import colour_image_message, field_message, image_message
+from us_sim.nodes.messages import colour_image_message, field_message, image_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.settings.setting import Settings
@@ -35,8 +35,6 @@ class FrameStream(ABC):
 
     topic: ClassVar[str]
     """Its name."""
-    overlay_name: ClassVar[str] = ""
-    """What chooses it as the colours over the annotated image; empty where it has none."""
 
     def __init__(self, node: SceneNode) -> None:
         self._node = node

@@ -12,7 +12,7 @@ from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
 from us_sim.geometry.pose import FrameTree
-from us_sim.nodes.conversions import transform_from
+from us_sim.nodes.messages import transform_from
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.settings.spelling import counted
 from us_sim.tracking.haptic import HapticDevice

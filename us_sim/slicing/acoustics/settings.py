@@ -1,24 +1,4 @@
-"""Acoustic constants of tissues by name, from textbooks.
-
-Attenuation is taken as proportional to the frequency. Where the source gives a power of it, what
-stands here is its coefficient at 1 MHz.
-
->>> from us_sim.slicing.acoustics.settings import table_constants
->>> table_constants("brachial vein")  # blood
-(0.14, 1679000.0)
->>> table_constants("lymph node") is None
-True
-
-The settings of what sound does on its way: per tissue, and of all.
-
->>> from us_sim.slicing.acoustics.settings import Acoustics
->>> Acoustics(artefacts="live", frequency="8 MHz").frequency
-8000000.0
->>> Acoustics(frequency="80 MHz")
-Traceback (most recent call last):
-...
-us_sim.errors.ProbeError: imaging.acoustics.frequency: 8e+07 Hz is outside 500000 to 5e+07 Hz
-"""
+"""Acoustic constants of tissues, and the settings of sound's artefacts."""
 
 from __future__ import annotations
 

@@ -1,44 +1,19 @@
-"""Noise that is a function of where and when: the same in every run, whatever came before.
+"""Colour and pulsed-wave Doppler: the velocity of blood as a scanner estimates it.
 
-Numbers are hashed with the finaliser of SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast
-splittable pseudorandom number generators, OOPSLA 2014).
+Colour Doppler (Kasai, Namekawa, Koyano, Omoto, IEEE Trans. Sonics Ultrason. 32, 1985): from pulse
+to pulse the echo's phase turns by π v / n, for a velocity v along the beam and the Nyquist velocity
+n. The turn is averaged over pulses and places as a complex number R, and arg R is shown, so faster
+blood aliases. Here R comes of known velocities:
 
->>> import numpy as np
->>> from us_sim.slicing.flow.doppler import normal_pair, uniform
->>> pairs = np.array([normal_pair(np.uint64(7), np.uint64(k)) for k in range(4000)])
->>> bool(abs(pairs.mean()) < 0.05), bool(abs(pairs.std() - 1.0) < 0.05)
-(True, True)
+    R = w(v) exp(i π v / n), averaged over the resolution, plus noise,
 
-Colour Doppler: the velocity of blood in a box of the image, as a scanner estimates it.
+with a wall filter w and complex normal noise. Part of the noise is proportional to R (spectral
+broadening), part is the receiver's; both fall with the square root of the number of pulses.
 
-A scanner sends a few pulses along each beam and looks how far the echo's phase turns from one to
-the next: by pi v / n for a velocity v along the beam and the Nyquist velocity n. It averages the
-turn over pulses and places as complex numbers R, and shows arg R (C. Kasai, K. Namekawa, A. Koyano,
-R. Omoto, Real-time two-dimensional blood flow imaging using an autocorrelation technique, IEEE
-Trans. Sonics Ultrason. 32, 1985). So a velocity beyond n shows as one of the other sign, and where
-blood of both is in one place they cancel. Here R is made from velocities that are known:
-
-    R = w(v) exp(i pi v / n), averaged over the resolution, plus noise,
-
-with a wall filter w, which takes what is as slow as tissue, and complex normal noise; beams whose
-part of the face is in air have no signal. Part of the
-noise is proportional to R, as blood moves through the beam and is not the same from pulse to pulse
-(spectral broadening), part is not (the receiver's); both fall with the square root of the number of
-pulses. Places where R stays below a level show no colour, and gain lowers that.
-
-Pulsed-wave Doppler: the spectrum of velocities at a gate, over time.
-
-Each column is the spectrum of one moment: how much blood in the gate has which velocity along the
-beam. The beam sees each velocity somewhat spread, the more the faster it is, since blood passes
-through the gate in a short time (transit time broadening); and as the echo of many cells is a sum
-of random phases, the power in each bin is exponentially distributed around its mean (J. A. Jensen,
-Estimation of Blood Velocities Using Ultrasound, 1996, chapters 5 and 6). Velocities beyond the
-Nyquist velocity come in at the other end. A person sets the angle between beam and vessel, which
-makes velocities along the vessel of those along the beam: divided by its cosine.
-
-The vessel nearest to a place of the image, for a gate or a colour box that follows it.
-
-Compiling what shows blood, or loading it from numba's cache, before it is needed.
+Pulsed-wave Doppler: each column is the spectrum of one moment in the gate. The faster a velocity,
+the more it is spread (transit time broadening), and the power in each bin is exponentially
+distributed around its mean (J. A. Jensen, Estimation of Blood Velocities Using Ultrasound, 1996,
+chapters 5 and 6).
 """
 
 from __future__ import annotations
@@ -223,7 +198,6 @@ class ColourDoppler:
         return np.clip(np.rint((start + 0.5) * probe.lines - 0.5), 0, probe.lines - 1).astype(int)
 
     def _lay_out(self) -> None:
-        """Find the pixels of the box."""
         fraction, depth = fractions_and_depths(self._probe)
         start = fraction - self._lean(depth)
         with np.errstate(invalid="ignore"):

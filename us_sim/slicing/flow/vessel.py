@@ -1,8 +1,8 @@
-"""A vessel with its flow: how fast blood flows along it as the tissue has it now.
+"""A vessel with its flow in tissue that is pressed: circulation and pulse.
 
 >>> import numpy as np
->>> from us_sim.slicing.settings import FlowSettings
 >>> from us_sim.slicing.flow.vessel import Vessel
+>>> from us_sim.slicing.settings import FlowSettings
 >>> from us_sim.volume.volume import Volume
 >>> x, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
 >>> tube = np.repeat((x**2 + z**2 < 36)[:, None], 60, axis=1).astype(np.uint8)
@@ -12,57 +12,6 @@
 >>> vein.advance(0.0, None)
 >>> np.round(vein.axis_velocity[10], 2) + 0.0  # m/s, twice the mean
 array([ 0. , -0.1,  0. ])
-
-What drives a vessel's flow, and how that changes while the vessel is pressed: a lumped model.
-
-Blood comes from a bed of capillaries at pressure P through a resistance into a reservoir, the veins
-on the way, at pressure p. From there it flows through the vessel and on to where the pressure is
-zero. The reservoir is elastic, which makes this a Windkessel (N. Westerhof, J.-W. Lankhaar, B. E.
-Westerhof, The arterial Windkessel, Med. Biol. Eng. Comput. 47, 2009):
-
-    q = p / (D + R),    T dp/dt = (P - p) - S q.
-
-The resistance S of the bed and D downstream are those with which flow and pressure at rest have
-their settings' values, and T is the time constant with which a closed vein fills up. R is
-Poiseuille's resistance of the vessel itself, whose open area a differs from place to place:
-
-    R = sum of 8 pi mu ds / a^2.
-
-An artery has no reservoir behind a bed but the heart's pressure, p = P. Inertia is left out, and so
-is what a stenosis loses by turbulence behind it.
-
-A vessel is closed where opposite walls touch. For an elastic tube that is at 0.27 of its area at
-rest (J. E. Flaherty, J. B. Keller, S. I. Rubinow, Post buckling behavior of elastic tubes and
-rings with opposite sides in contact, SIAM J. Appl. Math. 23, 1972). What is open of a lumen is
-taken to fall to nothing there, evenly with its area.
-
->>> import numpy as np
->>> from us_sim.slicing.flow.vessel import Circulation
->>> from us_sim.slicing.settings import FlowSettings
->>> vein = FlowSettings("venous", (0, -1, 0), peak_velocity=0.15, mean_velocity=0.05)
->>> flow = Circulation(vein, rest_areas=np.full(30, 3e-5), spacing=2e-3)
->>> at_rest, closed = np.full(30, 3e-5), np.full(30, 0.7e-5)
->>> steps = [(0.0, at_rest), (1.0, closed), (31.0, closed), (31.01, at_rest), (60.0, at_rest)]
->>> [round(flow.advance(time, areas) / flow.at_rest, 2) for time, areas in steps]
-[1.0, 0.0, 0.0, 3.27, 1.0]
-
-The pulse of a vessel: how fast blood flows at each moment, over its mean.
-
-At rest an artery of a limb has a triphasic pulse: fast forward flow in systole, a short reversal as
-the aortic valve closes, and a slow forward wave after it (W. N. McDicken and P. R. Hoskins, in P.
-Hoskins, K. Martin and A. Thrush, Diagnostic Ultrasound: Physics and Equipment, 2nd ed., 2010,
-chapter 9). Its shape here is a sum of three bells, moved and scaled so that peak and mean are the
-settings' own. Flow in a vein of the arm swings with breathing, and a little with the heart (N.
-Baekgaard and C. Strandberg, Duplex ultrasound in the upper limb venous system, Phlebolymphology,
-2016): inspiration draws blood into the chest.
-
->>> import numpy as np
->>> from us_sim.slicing.settings import FlowSettings
->>> from us_sim.slicing.flow.vessel import Waveform
->>> pulse = Waveform(FlowSettings("arterial", (0, 1, 0), peak_velocity=0.8, mean_velocity=0.08))
->>> beat = pulse(np.arange(1000) / 1100)  # one beat at 1.1 a second
->>> round(float(beat.mean()), 3), round(float(beat.max()), 3), round(float(beat.min()), 1)
-(1.0, 5.0, -0.7)
 """
 
 from __future__ import annotations

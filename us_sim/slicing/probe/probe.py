@@ -1,4 +1,4 @@
-"""Transducers: the part of the patient that they image, as pixels and as beams.
+"""Transducers: linear, convex and phased arrays, as planes of pixels and as beams.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.slicing.probe.probe import LinearProbe
@@ -10,29 +10,6 @@ array([[-15.,   0.],
        [ -5.,   0.],
        [  5.,   0.],
        [ 15.,   0.]])
-
-Transducers whose beams spread: curved arrays, and phased arrays that steer their beams.
-
->>> import math
->>> from us_sim.slicing.probe.probe import ConvexProbe, SectorProbe
->>> convex = ConvexProbe(radius=0.06, opening_angle=math.radians(60), depth=0.14,
-...                      columns=640, rows=480)
->>> round(convex.width, 6), round(convex.height, 6)  # the arc's ends are 8 mm behind its middle
-(0.2, 0.148038)
->>> sector = SectorProbe(aperture=0.02, opening_angle=math.radians(90), depth=0.16,
-...                      columns=640, rows=480)
->>> round(sector.width, 6), sector.height
-(0.226274, 0.16)
-
-The outline of what a probe's image shows, for the eye.
-
->>> from us_sim.slicing.probe.probe import image_outline
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> image_outline(LinearProbe(aperture=0.04, depth=0.05), points=2) * 1e3
-array([[-20.,   0.,   0.],
-       [ 20.,   0.,   0.],
-       [ 20.,   0.,  50.],
-       [-20.,   0.,  50.]])
 """
 
 from __future__ import annotations
