@@ -20,11 +20,11 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
 from us_sim.settings.spelling import unknown
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 from us_sim.slicing.settings import OVERLAYS, TISSUE_PARAMETERS, Imaging
-from us_sim.viewer.viewer_settings import ViewerSettings
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 _AGE = Quantity("time", 0.01, 3600.0)

@@ -12,7 +12,7 @@ from nicegui import ui
 
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.parameters import Kind
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
 MODES = {

@@ -19,7 +19,7 @@ from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.nodes.streams.stream import FrameStream
-from us_sim.scene.structures import colour_of
+from us_sim.scene.building import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
 from us_sim.slicing.drawing.label_outlines import onto_border
 from us_sim.slicing.drawing.overlay import Overlay
