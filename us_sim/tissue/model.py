@@ -24,6 +24,8 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import LabelFractions, TissueMaterials, uniform_material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
+# Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
+# that the skin is the face of smallest z.
 FACES = {
     "top": ((2, False),),
     "bottom": ((2, True),),
@@ -33,19 +35,15 @@ FACES = {
     "back": ((1, True),),
     "sides": ((0, False), (0, True), (1, False), (1, True)),
 }
-"""Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
-that the skin is the face of smallest z."""
 
 
+# Distance from a bounding box's face, over the box's size, up to which nodes count as on the
+# face; for meshes that are no box.
 _MARGIN = 0.05
-"""Distance from a bounding box's face, over the box's size, up to which nodes count as on the face;
-for meshes that are no box."""
-
+# Nodes, also as a part of all, below which what is held is remarked on as little.
 _FEW, _FEW_PART = 10, 0.01
-"""Nodes, also as a part of all, below which what is held is remarked on as little."""
-
+# The cosine to -z below which a probe that comes along +z would only graze the surface.
 _GRAZING = 0.1
-"""The cosine to -z below which a probe that comes along +z would only graze the surface."""
 
 
 def held_remark(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:

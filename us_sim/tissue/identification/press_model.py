@@ -40,11 +40,9 @@ from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 from us_sim.tissue.solvers.tuning import TUNING
 
-_TOLERANCE = 1e-6
-"""Unbalanced force of a sensitivity, over the force that a modulus changes."""
-
+_TOLERANCE = 1e-6  # Unbalanced force of a sensitivity, over the force that a modulus changes
+# Iterations, and the same fraction with which no answer counts as one.
 _MOST_ITERATIONS, _UNSOLVED = 3000, 1e-3
-"""Iterations, and the same fraction with which no answer counts as one."""
 
 
 class Slopes(NamedTuple):
@@ -182,15 +180,10 @@ def slopes(
     return Slopes(found, moved)
 
 
+# The constants of all tetrahedra, from Young's moduli (Pa) by structure.
 MaterialsFor = Callable[[Mapping[str, float]], TissueMaterials]
-"""The constants of all tetrahedra, from Young's moduli (Pa) by structure."""
-
-_STEP = 1e-5
-"""Change of a modulus' logarithm by which forces are compared."""
-
-_FRAMES, _BALANCED = 200, 1e-3
-"""Frames for a pose at most, and the residual with which it must end."""
-
+_STEP = 1e-5  # Change of a modulus' logarithm by which forces are compared
+_FRAMES, _BALANCED = 200, 1e-3  # Frames for a pose at most, and the residual with which it must end
 Progress = Callable[[float, str], None]
 
 

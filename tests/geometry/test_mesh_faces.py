@@ -1,4 +1,4 @@
-"""Parts that hang together are those that SciPy finds."""
+"""Connected parts of graphs are those that SciPy finds."""
 
 import numpy as np
 import pytest

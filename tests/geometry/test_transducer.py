@@ -44,10 +44,7 @@ def test_the_face_lies_on_what_presses(collider):
 @given(st.floats(0.005, 0.05), st.floats(0.002, 0.02), st.floats(0.001, 0.004))
 def test_the_faces_volume_is_that_of_a_rounded_box(length, width, rounding):
     collider = RoundedBox(
-        length=length + 2 * rounding,
-        width=width + 2 * rounding,
-        height=0.05,
-        rounding=rounding,
+        length=length + 2 * rounding, width=width + 2 * rounding, height=0.05, rounding=rounding
     )
     face = transducer_mesh(collider)[0]
     base = length * width
