@@ -81,10 +81,9 @@ def media_of(
         if is_used and tissue.fibres is not None and tissue.fibres not in directions:
             directions.append(tissue.fibres)
     count = 1 + len(constants)
-    loss, shadow, scattering = np.zeros(count), np.zeros(count), np.zeros(count)
-    crossing = np.zeros((count, count))
+    loss, shadow, scattering, anisotropy = np.zeros((4, count), np.float32)
+    crossing, half_sine = np.zeros((count, count), np.float32), np.ones(count, np.float32)
     fibres = np.full(count, -1, dtype=np.int32)
-    anisotropy, half_sine = np.zeros(count), np.ones(count)
     blocks = np.zeros(count, dtype=np.bool_)
     for number, tissue in enumerate(constants, 1):
         assert tissue.attenuation is not None
@@ -106,15 +105,7 @@ def media_of(
             anisotropy[number] = tissue.anisotropy
             half_sine[number] = np.sin(tissue.half_angle) ** 2
     media = Media(
-        of_label,
-        loss.astype(np.float32),
-        shadow.astype(np.float32),
-        crossing.astype(np.float32),
-        blocks,
-        scattering.astype(np.float32),
-        fibres,
-        anisotropy.astype(np.float32),
-        half_sine.astype(np.float32),
+        of_label, loss, shadow, crossing, blocks, scattering, fibres, anisotropy, half_sine
     )
     unit = np.array(directions).reshape(-1, 3)
     return media, constants, unit / np.linalg.norm(unit, axis=1, keepdims=True)

@@ -65,14 +65,10 @@ class Crossings(NamedTuple):
 def room_for_crossings(count: int) -> Crossings:
     """Room for so many."""
     return Crossings(
-        np.empty(count, np.int32),
-        np.empty(count, np.float32),
-        np.empty((count, 2), np.uint8),
-        np.empty(count, np.int32),
-        np.empty((count, 3), np.float32),
-        np.empty((count, 3), np.float32),
-        np.empty(count, np.float32),
-    )
+        np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 2), np.uint8),
+        np.empty(count, np.int32), np.empty((count, 3), np.float32),
+        np.empty((count, 3), np.float32), np.empty(count, np.float32),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
