@@ -23,8 +23,8 @@ def add_reconstruct(commands: Any) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.command.reconstruct_sweep import SweepSettings
     from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-    from us_sim.volume.reconstruction.sweep_command import SweepSettings
 
     for settings in (SweepSettings, Compounding, ImagePart):
         add_setting_options(parser, settings)
@@ -38,8 +38,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _reconstruct(args: argparse.Namespace) -> int:
+    from us_sim.command.reconstruct_sweep import SweepSettings, reconstruct_sweep
     from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-    from us_sim.volume.reconstruction.sweep_command import SweepSettings, reconstruct_sweep
 
     settings = read_settings(args, SweepSettings)
     compounding, part = read_settings(args, Compounding), read_settings(args, ImagePart)

@@ -28,7 +28,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _segment(args: argparse.Namespace) -> int:
-    from us_sim.volume.segmentation.case_segmentation import segment_as_asked
+    from us_sim.command.segment_case import segment_as_asked
     from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 

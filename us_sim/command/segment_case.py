@@ -319,7 +319,7 @@ def _write(
     remarks: list[str],
 ) -> None:
     """Surfaces, picture and report into a folder."""
-    from us_sim.volume.segmentation.picture import draw_segmentation
+    from us_sim.command.volume_pictures import draw_segmentation
 
     surfaces = folder / SURFACES
     surfaces.mkdir(exist_ok=True)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
@@ -21,7 +22,6 @@ from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
-from us_sim.volume.reconstruction.picture import draw_slices
 from us_sim.volume.reconstruction.reconstruction import (
     APART,
     Plan,
