@@ -47,7 +47,6 @@ def test_examples(name):
         "us_sim.recording.path",
         "us_sim.scene.reading",
         "us_sim.tracking.probe_tracking",
-        "us_sim.geometry.frame_tree",
         "us_sim.scene.tracker_building",
     ],
 )

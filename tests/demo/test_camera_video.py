@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from us_sim.demo.camera_video import CAMERA, RATE, path_video, video_poses
-from us_sim.demo.session import Session
-from us_sim.demo.tracked_path import IMAGES, tracked_path
+from us_sim.demo.session import IMAGES, Session, tracked_path
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.press_and_slide import press_and_slide

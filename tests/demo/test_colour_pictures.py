@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import yaml
 
-from us_sim.demo.colour_pictures import colour_pictures
+from us_sim.demo.contact_sheet import colour_pictures
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
+from us_sim.slicing.flow.doppler import ColourDoppler
 
 VEIN = {"kind": "venous", "direction": [0, -1, 0], "peak_velocity": 0.5, "mean_velocity": 0.2}
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from us_sim.demo.contact_sheet import strain_pictures
 from us_sim.demo.session import Session
-from us_sim.demo.strain_pictures import strain_pictures
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene

@@ -14,18 +14,18 @@ from us_sim.evaluation.independent_forces import (
     spring_forces,
     volume_forces,
 )
-from us_sim.evaluation.independent_residual import IndependentResidual
-from us_sim.evaluation.push_directions import flared_distance, push_directions
-from us_sim.evaluation.stability.cases import StabilityCase, model_of
-from us_sim.evaluation.stability.meshes import mesh_named
+from us_sim.evaluation.independent_residual import (
+    IndependentResidual,
+    flared_distance,
+    push_directions,
+)
+from us_sim.evaluation.stability.cases import StabilityCase, mesh_named, model_of
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
-from us_sim.tissue.contact.penetration import push_out
-from us_sim.tissue.deformation import Deformation
+from us_sim.tissue.contact.probe_gap import FlaredProbe, push_out
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
 RANDOM = np.random.default_rng(2)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from tests.fuzz.good_input import good_input
-from us_sim.evaluation.latency.usage import usage_of
+from us_sim.evaluation.processes import usage_of
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.settings import NODES
 from us_sim.progress import Progress

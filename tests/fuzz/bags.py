@@ -17,9 +17,8 @@ from tests.fuzz.target import target
 from us_sim.errors import UsSimError
 from us_sim.recording.metadata import read_metadata
 from us_sim.recording.path import ProbePath, read_path, write_path
-from us_sim.recording.qos import QosProfile, qos_to_yaml
-from us_sim.recording.reader import read_bag
-from us_sim.recording.report import describe
+from us_sim.recording.reader import describe, read_bag
+from us_sim.recording.topic import QosProfile, qos_to_yaml
 from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000

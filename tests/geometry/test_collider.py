@@ -10,7 +10,7 @@ from us_sim.errors import ProbeError
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import curved_box_distance, signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.probe.fan_probe import ConvexProbe
+from us_sim.slicing.probe.probe import ConvexProbe
 
 # A core of 50 mm radius, whose front reaches 30 mm to each side: its ends are 40 mm above the
 # centre of curvature, so that normals there are (0.6, 0, 0.8).

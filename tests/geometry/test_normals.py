@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from us_sim.geometry.normals import vertex_normals
+from us_sim.geometry.triangles import vertex_normals
 
 
 @pytest.fixture(params=[np.float32, np.float64])

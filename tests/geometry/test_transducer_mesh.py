@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.geometry.transducer import transducer_mesh
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 
 LINEAR = RoundedBox(length=0.046, width=0.014, height=0.040, rounding=0.004)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.geometry.triangle_parts import TriangleParts, part_size
+from us_sim.geometry.triangles import TriangleParts, part_size
 
 
 def test_parts_are_as_large_as_the_rounding_between_the_spacing_and_a_quarter_of_it():

@@ -12,8 +12,8 @@ UNUSED = [
     ("us_sim.nodes.path_player", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.tissue_deformer", {"scipy.ndimage", "scipy.spatial", "cv2"}),
     (
-        "us_sim.nodes.slice_interpolator, us_sim.slicing.acoustics.live_acoustics, "
-        "us_sim.nodes.frame_streams.doppler_streams, us_sim.slicing.flow.warm_up",
+        "us_sim.nodes.slice_interpolator, us_sim.slicing.acoustics.beam_acoustics, "
+        "us_sim.nodes.streams.doppler, us_sim.slicing.flow.doppler",
         {"scipy.ndimage", "scipy.spatial"},
     ),
 ]

@@ -20,13 +20,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from us_sim.errors import BagError
-from us_sim.nodes.message_types import message_type
-from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.session_recorder import SessionRecorder
-from us_sim.recording.attached import extract
+from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.recording.mcap_output import McapOutput
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
+from us_sim.recording.repair import extract
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
@@ -333,7 +332,7 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
 
 @standalone_only
 def test_foreign_types_are_said_once_and_nothing_is_imported_for_them(bench, tmp_path, monkeypatch):
-    from us_sim.standalone.endpoint_qos import EndpointQos
+    from us_sim.standalone.ddsc import EndpointQos
     from us_sim.standalone.transport import Participant
 
     package = tmp_path / "innocent"

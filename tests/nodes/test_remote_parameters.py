@@ -15,8 +15,7 @@ from us_sim.nodes.posted import Posted
 from us_sim.nodes.remote_parameters import RemoteParameters
 from us_sim.nodes.settings import TissueDeformerSettings
 from us_sim.settings.registry import SOLVERS
-from us_sim.slicing.flow.colour_settings import ColourSettings
-from us_sim.slicing.formation.imaging import Imaging
+from us_sim.slicing.settings import ColourSettings, Imaging
 from us_sim.viewer.parameters import Kind, State
 
 

@@ -6,8 +6,7 @@ from time import monotonic as now
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.status_listener import StatusListener
 from us_sim.viewer.status import Level

@@ -7,9 +7,8 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
-from us_sim.nodes.conversions import affine_message, colour_image_message, image_message
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import affine_message, colour_image_message, image_message
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.image_feed import image_feeds

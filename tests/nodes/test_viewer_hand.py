@@ -10,9 +10,8 @@ from geometry_msgs.msg import PoseStamped
 from shape_msgs.msg import Mesh
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import mesh_message, nanoseconds_of, pose_message
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import mesh_message, nanoseconds_of, pose_message
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.qos import LATCHED

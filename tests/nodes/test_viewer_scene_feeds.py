@@ -15,8 +15,9 @@ from std_msgs.msg import Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer_mesh import transducer_mesh
-from us_sim.nodes.conversions import (
+from us_sim.geometry.transducer import transducer_mesh
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import (
     cloud_message,
     mesh_message,
     structure_markers,
@@ -24,8 +25,6 @@ from us_sim.nodes.conversions import (
     transducer_markers,
     wrench_message,
 )
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh

@@ -7,9 +7,8 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Int32MultiArray
 
-from us_sim.nodes.conversions import cloud_message, mesh_message, tetrahedra_message
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import cloud_message, mesh_message, tetrahedra_message
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_surface import ViewerSurface

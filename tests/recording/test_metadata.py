@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata, FileEntry, TopicEntry, read_metadata
-from us_sim.recording.qos import QosProfile
+from us_sim.recording.topic import QosProfile
 
 
 @pytest.mark.parametrize("bag", ["chunkzstd", "mcap", "sqlite3", "zstd"])

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from us_sim.errors import BagError
-from us_sim.recording.path import POSE_STAMPED, ProbePath, read_path, write_path
+from us_sim.recording.path import POSE_STAMPED, ProbePath, bodies_in, read_path, write_path
 from us_sim.recording.reader import read_bag
-from us_sim.recording.recorded_poses import bodies_in
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.writer import BagWriter
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import BagError
-from us_sim.recording.qos import INFINITE, QosProfile, qos_from_yaml, qos_to_yaml
+from us_sim.recording.topic import INFINITE, QosProfile, qos_from_yaml, qos_to_yaml
 
 profiles = st.builds(
     QosProfile,

@@ -21,8 +21,7 @@ from rosbags.rosbag2 import Reader
 
 from us_sim.errors import BagError
 from us_sim.recording import unpacking
-from us_sim.recording.reader import read_bag
-from us_sim.recording.report import describe
+from us_sim.recording.reader import describe, read_bag
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"

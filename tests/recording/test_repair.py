@@ -9,9 +9,9 @@ from rosbags.rosbag2 import Reader
 
 from us_sim.command.main import main
 from us_sim.errors import BagError
-from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
+from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"
@@ -178,7 +178,7 @@ def test_an_attachment_goes_nowhere_but_into_the_folder(tmp_path, name, capsys):
 
 
 def test_nothing_to_extract(tmp_path):
-    from us_sim.recording.attached import extract
+    from us_sim.recording.repair import extract
 
     with BagWriter(tmp_path / "bag.mcap"):
         pass

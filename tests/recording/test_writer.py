@@ -19,9 +19,9 @@ from rosbags.rosbag2 import Reader
 from us_sim.errors import BagError
 from us_sim.recording import writer
 from us_sim.recording.metadata import read_metadata
-from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
+from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from us_sim.errors import SettingsError, UsSimError
-from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.nodes.settings import SessionControlSettings
 from us_sim.run.losses import Recordings
 from us_sim.run.plan import Request, plan_of
 from us_sim.run.simulation import Simulation

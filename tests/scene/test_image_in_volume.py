@@ -10,8 +10,7 @@ from us_sim.recording.path import write_path
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.scene.image_in_volume import check_path_in_volume, part_inside
 from us_sim.scene.reading import load_scene, parse_scene
-from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.volume import Volume
 

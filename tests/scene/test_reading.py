@@ -8,16 +8,15 @@ import pytest
 import yaml
 
 from us_sim.errors import SceneError, UsSimError
-from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP
+from us_sim.evaluation.slice.recorded import LIVER_SWEEP
 from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.reading import find_scene, load_scene, parse_scene
 from us_sim.scene.scene import ImagingSettings
 from us_sim.share import shared_path
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.slicing.strain.settings import Strain
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
+from us_sim.slicing.settings import Strain
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.volume.sequences.sweep import read_sweep
 
 COMPLETE = yaml.safe_load(

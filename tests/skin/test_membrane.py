@@ -11,7 +11,7 @@ from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.triangle_parts import TriangleParts, part_size
+from us_sim.geometry.triangles import TriangleParts, part_size
 from us_sim.skin.membrane import CONTACT_TOLERANCE, SkinMembrane
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from us_sim.skin.springs import SHORTEST, spring_energy, spring_forces
+from us_sim.skin.membrane import SHORTEST, spring_energy, spring_forces
 
 STIFFNESS, LENGTH = 40.0, 0.01  # N/m, m
 EDGE = np.array([[0, 1]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import MeshError
-from us_sim.geometry.normals import vertex_normals
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.skin.surface import (
     TriangleSurface,
     bent_surface,

@@ -10,10 +10,9 @@ from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.cutting.slicer import create_slicer
-from us_sim.slicing.displacement import displacement
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
+from us_sim.slicing.strain import displacement
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
@@ -78,7 +77,7 @@ def test_it_is_where_the_method_that_tries_every_tetrahedron_says(kind):
             create_slicer(method, volume, rest, tetrahedra)
             for method in ("scan_conversion", "per_pixel")
         )
-        frame = Frame(Pose(), nodes, PROBES[0], volume, slicer, lambda _: None)
+        frame = Frame(Pose(), nodes, PROBES[0], volume, slicer)
         frame.plane = plane
         found = displacement(frame)
         expected = plane.pixels() - oracle.rest_coordinates(nodes, plane)

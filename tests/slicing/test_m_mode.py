@@ -1,12 +1,16 @@
-"""M-mode shows what is along its line, when it was there."""
+"""M-mode shows what is along its line, when it was there.
+
+A moving picture has every moment once, however frames come.
+"""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from us_sim.slicing.m_mode import MMode
-from us_sim.slicing.m_mode_settings import MModeSettings
-from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.m_mode import MMode, SweepPicture
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
+from us_sim.slicing.settings import MModeSettings
 
 PROBE = LinearProbe(aperture=0.04, depth=0.03, columns=80, rows=60)
 COLUMNS, ROWS, SWEEP = 512, 384, 4.0
@@ -37,3 +41,34 @@ def test_its_line_is_a_beam_where_beams_spread():
         shown = MMode(probe, MModeSettings(lateral=lateral)).line(image)
         wanted = (lateral + 0.5) * probe.lines - 0.5
         assert shown[8:-8].astype(float) == pytest.approx(wanted, abs=2.0)
+
+
+def picture(rows=32, columns=100, sweep=2.0):
+    return SweepPicture(rows, columns, sweep, (1.0, -1.0, "m"))
+
+
+@given(st.lists(st.floats(0.0, 0.7), min_size=1, max_size=20), st.integers(0, 2 * 10**9))
+def test_moments_follow_each_other_evenly_and_none_is_there_twice(steps, start):
+    made = picture()
+    asked = start + np.concatenate([[0.0], np.cumsum(steps)])
+    moments = np.concatenate([made.moments(time) for time in asked])
+    assert np.diff(moments) == pytest.approx(0.02, abs=1e-6)
+    assert moments[-1] <= asked[-1] + 1e-6
+    assert moments[-1] > asked[-1] - 0.02 - 1e-6
+
+
+def test_it_begins_anew_when_time_goes_back_or_stops_for_long():
+    made = picture()
+    made.add(np.full((32, len(made.moments(10.0))), 255, np.uint8))
+    assert made.grey[:, -1].all()
+    assert len(made.moments(5.0)) == 1
+    assert not made.grey.any()
+    made.add(np.full((32, 1), 255, np.uint8))
+    assert len(made.moments(60.0)) == 1
+    assert not made.grey.any()
+
+
+def test_the_zero_of_its_scale_is_a_line_across():
+    drawn = picture(rows=64).drawn()
+    lit = np.flatnonzero((drawn[:64, :100] > 0).all(axis=(1, 2)))
+    assert lit.tolist() == [32]

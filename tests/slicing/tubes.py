@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from us_sim.slicing.flow.settings import FlowSettings
 from us_sim.slicing.flow.vessel import Vessel
+from us_sim.slicing.settings import FlowSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 

@@ -12,13 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
+from us_sim.standalone.cdr import CdrError, deserialize, serialize
 from us_sim.standalone.interfaces import message_names, packages
-from us_sim.standalone.messages import (
-    CdrError,
-    deserialize,
-    message_class,
-    serialize,
-)
+from us_sim.standalone.messages import message_class
 
 Image = message_class("sensor_msgs/msg/Image")
 PoseStamped = message_class("geometry_msgs/msg/PoseStamped")

@@ -22,15 +22,17 @@ from transport_bench import (
     take_one,
 )
 
-from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.cdr import deserialize, serialize
+from us_sim.standalone.ddsc import EndpointQos
 from us_sim.standalone.graph import Graph
-from us_sim.standalone.messages import deserialize, message_class, serialize
+from us_sim.standalone.messages import message_class
 from us_sim.standalone.transport import DdsError, Participant
 
 ECHO = """
 import sys, threading
-from us_sim.standalone.endpoint_qos import EndpointQos
-from us_sim.standalone.messages import deserialize, message_class, serialize
+from us_sim.standalone.ddsc import EndpointQos
+from us_sim.standalone.cdr import deserialize, serialize
+from us_sim.standalone.messages import message_class
 from us_sim.standalone.transport import Participant
 Image, dds_type = message_class("sensor_msgs/msg/Image"), "sensor_msgs::msg::dds_::Image_"
 participant = Participant(int(sys.argv[1]))
@@ -154,7 +156,7 @@ def test_matches_are_counted(participant, neighbour, bell):
 
 BUSY_UNTIL_THE_END = """
 import sys, threading
-from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.ddsc import EndpointQos
 from us_sim.standalone.transport import Participant
 first, second = Participant(int(sys.argv[1])), Participant(int(sys.argv[1]))
 topic = ("rt/busy", "std_msgs::msg::dds_::String_", EndpointQos())

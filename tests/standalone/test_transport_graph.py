@@ -6,12 +6,12 @@ pytest.importorskip("cyclonedds", reason="the transport needs pip install cyclon
 
 from transport_bench import IMAGE, LATCHED, LISTENER, RELIABLE, STRING, Child
 
-from us_sim.standalone.domain import DiscoveryRange
-from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.cdr import deserialize, serialize
+from us_sim.standalone.ddsc import EndpointQos
 from us_sim.standalone.graph import Graph, GraphNode
-from us_sim.standalone.messages import deserialize, serialize, service_class
+from us_sim.standalone.messages import service_class
 from us_sim.standalone.services import ServiceClient, ServiceServer
-from us_sim.standalone.transport import Participant
+from us_sim.standalone.transport import DiscoveryRange, Participant
 
 
 def test_the_graph_shows_nodes_and_endpoints_of_other_processes(participant, domain, bell):

@@ -8,9 +8,10 @@ import threading
 import time
 from collections.abc import Callable
 
-from us_sim.standalone.domain import DiscoveryRange
-from us_sim.standalone.endpoint_qos import EndpointQos
-from us_sim.standalone.messages import message_class, serialize
+from us_sim.standalone.cdr import serialize
+from us_sim.standalone.ddsc import EndpointQos
+from us_sim.standalone.messages import message_class
+from us_sim.standalone.transport import DiscoveryRange
 
 LOCALHOST = DiscoveryRange("LOCALHOST")
 IMAGE = "sensor_msgs::msg::dds_::Image_"
@@ -63,7 +64,7 @@ class Child:
 
 LISTENER = """
 import sys
-from us_sim.standalone.endpoint_qos import EndpointQos
+from us_sim.standalone.ddsc import EndpointQos
 from us_sim.standalone.graph import Graph, GraphNode
 from us_sim.standalone.transport import Participant
 participant = Participant(int(sys.argv[1]))

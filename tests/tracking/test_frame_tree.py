@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from us_sim.geometry.frame_tree import FrameTree
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import FrameTree, Pose
 
 
 def test_the_pose_along_a_way_is_the_product_of_its_matrices():

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from awaiting import until
 
-from us_sim.slicing.probe.beam_places import pixels_of
-from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.slicing.probe.outline import image_outline
-from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.probe.beams import pixels_of
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, image_outline
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.meshes.transducer import transducer_packet
 from us_sim.viewer.packet import Packet

@@ -12,10 +12,9 @@ import pytest
 from PIL import Image
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.geometry.transducer import transducer_mesh
 from us_sim.skin.surface import plane_surface
-from us_sim.slicing.probe.outline import image_outline
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import LinearProbe, image_outline
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces

@@ -8,11 +8,14 @@ import pytest
 from awaiting import until
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.viewer.cases import Case, cases
-from us_sim.evaluation.viewer.points import Point
-from us_sim.evaluation.viewer.run_case import run_case  # noqa: F401 - it must be importable
-from us_sim.evaluation.viewer.taker import Taker
-from us_sim.evaluation.viewer.targets import targets
+from us_sim.evaluation.viewer.measure import (
+    Case,
+    Point,
+    Taker,
+    cases,
+    run_case,  # noqa: F401 - it must be importable
+)
+from us_sim.evaluation.viewer.report import targets
 from us_sim.viewer.feed import Feed
 from us_sim.viewer.packet import Packet
 from us_sim.viewer.simulator import Simulator

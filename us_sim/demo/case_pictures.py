@@ -1,4 +1,4 @@
-"""One picture of several cases: what the probe sees in each where it starts."""
+"""One picture of several cases: the probe's first image of each."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.scene.structures import colour_of
-from us_sim.slicing.drawing.label_border import onto_border
-from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 
 _COLUMNS = 4
 _INCHES = 3.2  # of a picture's side
@@ -49,7 +48,6 @@ def picture_cases(folders: Sequence[Path], file: Path) -> None:
 
 
 def _draw(axes: Any, scene: Scene, name: str) -> None:
-    """What the probe sees at the start, with the outlines of structures."""
     touching = dataclasses.replace(scene.imaging, contact=False)
     scene = dataclasses.replace(scene, imaging=touching)
     volume = volume_of(scene)

@@ -4,12 +4,32 @@
 >>> mesh = block(MESHES[0])
 >>> len(mesh.nodes), len(mesh.tetrahedra)
 (2000, 7695)
+
+Planes that are near each other where a probe touches, and farther apart elsewhere.
+
+>>> from us_sim.evaluation.block import graded_planes
+>>> graded_planes(0.0, 0.05, 0.0, 0.02, 0.01, 1.2).round(4).tolist()
+[0.0, 0.01, 0.02, 0.0336, 0.05]
+
+SciPy's conjugate gradients for the references, whatever SciPy calls their tolerance.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.block import solved
+>>> solved(np.diag([2.0, 4.0]), np.array([2.0, 2.0]), 1e-12, np.eye(2), 10)
+array([1. , 0.5])
 """
 
 from __future__ import annotations
 
+import inspect
 from functools import cache
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import cg
+
+from us_sim.errors import SolverError
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
 EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, along x, y and z
@@ -26,3 +46,51 @@ def block(counts: tuple[int, int, int]) -> TetrahedralMesh:
     return box_mesh(
         *(uniform_planes(*side, count) for side, count in zip(EXTENT, counts, strict=True))
     )
+
+
+def graded_planes(
+    low: float, high: float, fine_low: float, fine_high: float, size: float, growth: float
+) -> NDArray[np.float64]:
+    """Planes (m) from ``low`` to ``high``: ``size`` apart where it is fine, growing outside.
+
+    Each distance outside is about ``growth`` (above 1) times the one before.
+    """
+    count = max(1, round((fine_high - fine_low) / size))
+    fine = np.linspace(fine_low, fine_high, count + 1)
+    parts = [fine]
+    for length, end, direction in (
+        (fine_low - low, fine_low, -1),
+        (high - fine_high, fine_high, 1),
+    ):
+        if length <= 0:
+            continue
+        number = max(1, round(np.log1p(length / size * (1 - 1 / growth)) / np.log(growth)))
+        steps = growth ** np.arange(1, number + 1)
+        parts.append(end + direction * length * np.cumsum(steps) / steps.sum())
+    planes = np.unique(np.concatenate(parts))
+    planes[[0, -1]] = low, high
+    return planes
+
+
+_TOLERANCE = "rtol" if "rtol" in inspect.signature(cg).parameters else "tol"  # before SciPy 1.12
+
+
+def solved(
+    matrix: Any, right: NDArray[np.float64], tolerance: float, inverse: Any, limit: int
+) -> NDArray[np.float64]:
+    """(N,) x of the symmetric positive definite system ``matrix @ x = right``.
+
+    Args:
+        matrix: (N, N), or a ``LinearOperator``, as ``inverse``.
+        right: (N,).
+        tolerance: of the residual, relative to ``right``.
+        inverse: roughly that of the matrix, the preconditioner.
+        limit: of iterations.
+
+    Raises:
+        SolverError: it did not converge.
+    """
+    found, failed = cg(matrix, right, maxiter=limit, M=inverse, **{_TOLERANCE: tolerance})
+    if failed:
+        raise SolverError(f"the independent reference did not converge in {limit} steps")
+    return np.asarray(found)

@@ -1,11 +1,4 @@
-"""The probe's shape where it touches the patient: one for tissue and skin.
-
-`us_sim.geometry.collider_distance` computes how far points are from it.
-
->>> from us_sim.geometry.collider import RoundedBox
->>> RoundedBox(length="46 mm", width="14 mm", height="40 mm", rounding="4 mm").offset_box
-array([0.019, 0.003, 0.016, 0.004])
-"""
+"""The probe's shape where it touches the patient, shared by tissue and skin."""
 
 from __future__ import annotations
 

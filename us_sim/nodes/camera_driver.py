@@ -14,13 +14,12 @@ from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError
-from us_sim.nodes.awaited import CHECK_S, Awaited
-from us_sim.nodes.conversions import bgr_image_message, image_message
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import bgr_image_message, image_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.sessions.playback import CHECK_S, Awaited
 from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.share import full_path
 from us_sim.tracking.camera.model import CameraModel, read_camera_info

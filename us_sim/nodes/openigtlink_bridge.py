@@ -12,7 +12,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import ProbeError
-from us_sim.nodes.conversions import affine_from, nanoseconds_of, pixels_from, pose_from
+from us_sim.nodes.messages import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED

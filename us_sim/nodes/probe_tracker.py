@@ -18,8 +18,9 @@ from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.transducer_mesh import transducer_mesh
-from us_sim.nodes.conversions import (
+from us_sim.geometry.transducer import transducer_mesh
+from us_sim.nodes.guarded_node import kind_of
+from us_sim.nodes.messages import (
     nanoseconds_of,
     pose_from,
     pose_message,
@@ -28,7 +29,6 @@ from us_sim.nodes.conversions import (
     transducer_markers,
     transform_message,
 )
-from us_sim.nodes.guarded_node import kind_of
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.process import run_node
@@ -39,7 +39,7 @@ from us_sim.nodes.tracker_inputs.device import TrackerInput
 from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.tracker_building import source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
-from us_sim.slicing.probe.outline import image_outline
+from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter
 from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 

@@ -8,8 +8,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pose_from, pose_from_text
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import pose_from, pose_from_text
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.tracking.measurement import TrackingState
 

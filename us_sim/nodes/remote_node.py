@@ -11,8 +11,8 @@ from typing import Any
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter_client import AsyncParameterClient
 
-from us_sim.nodes.conversions.parameters import parameter_from, parameter_message, raw_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.parameter_values import parameter_from, parameter_message, raw_from
 from us_sim.viewer.parameters import NodeParameters, Parameter, State
 
 ANSWER_S = 10.0

@@ -12,14 +12,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.task import Future
 
 from us_sim.errors import BagError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
-from us_sim.nodes.message_types import message_type
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.playback import Playback
-from us_sim.nodes.player_services import offer_player_services
 from us_sim.nodes.process import run_node
-from us_sim.nodes.session_settings import SessionPlayerSettings
+from us_sim.nodes.sessions.playback import Playback
+from us_sim.nodes.sessions.recorded_topic import message_type
+from us_sim.nodes.sessions.rosbag2_services import offer_player_services
+from us_sim.nodes.settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
 from us_sim.share import find_bag

@@ -17,19 +17,15 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from us_sim.errors import BagError, UsSimError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
-from us_sim.nodes.message_types import message_type
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.recorded_topic import RecordedTopic
-from us_sim.nodes.recorder_services import RecorderEvents, offer_services
-from us_sim.nodes.session_attachments import session_attachments
-from us_sim.nodes.session_settings import SessionRecorderSettings
-from us_sim.recording.losses import Loss, news
-from us_sim.recording.pre_roll import PreRoll
+from us_sim.nodes.sessions.attachments import session_attachments
+from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
+from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_services
+from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Message, WriteBehind
+from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, news
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 

@@ -11,7 +11,7 @@ from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     cloud_message,
     mesh_message,
     nanoseconds_of,

@@ -10,8 +10,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable

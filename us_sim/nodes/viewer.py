@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.process import run_node

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import pose_message
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import pose_message
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.probe_lead import LEAD_TOPIC, Lead, probe_lead
 from us_sim.nodes.probe_whereabouts import ProbeWhereabouts

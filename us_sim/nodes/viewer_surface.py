@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from shape_msgs.msg import Mesh
 
-from us_sim.nodes.conversions import mesh_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import mesh_from
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.tracking.virtual_hand import RestSurface

@@ -15,9 +15,8 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import affine_from, nanoseconds_of, pixels_from, pose_from
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, LATCHED, overridable

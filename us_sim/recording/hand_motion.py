@@ -27,7 +27,7 @@ from scipy.special import erf
 
 from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath
-from us_sim.recording.shipped_path import write_where_asked
+from us_sim.recording.press_and_slide import write_where_asked
 from us_sim.settings.spelling import unknown
 
 RATE = 60.0

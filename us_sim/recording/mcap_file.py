@@ -39,11 +39,17 @@ from us_sim.recording.mcap_records import (
     record_at,
     records_in,
 )
-from us_sim.recording.qos import qos_from_yaml
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault
+from us_sim.recording.topic import (
+    BagAttachment,
+    BagMessage,
+    BagNote,
+    BagTopic,
+    Fault,
+    qos_from_yaml,
+)
 
-MAGIC = b"\x89MCAP0\r\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _TIME = struct.Struct("<Q8x")  # log time, place in its chunk
@@ -94,7 +100,7 @@ class McapFile:
         self.start: int | None = None
         self.end: int | None = None
         with path.open("rb") as stream:
-            if stream.read(len(MAGIC)) != MAGIC:
+            if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
                 raise BagError(f"{self._label} is not an MCAP file: it does not start as one")
             summary = _summary(stream)
             if summary is not None:
@@ -227,7 +233,7 @@ class McapFile:
     def _scan(self, stream: BinaryIO) -> None:
         """Walks the records of a file that has no usable summary."""
         size = stream.seek(0, 2)
-        position = len(MAGIC)
+        position = len(MCAP_MAGIC)
         gaps: list[tuple[int, int]] = []
         tables: dict[int, tuple[int, int]] = {}  # of the last chunk: messages, lowest log time
         missing: Counter[int] = Counter()
@@ -259,8 +265,8 @@ class McapFile:
         self._runs.sort()
         for id in self._counts.keys() - self._channels.keys():
             missing[id] += self._counts.pop(id)  # of a topic whose name is lost
-        stream.seek(max(0, size - len(MAGIC)))
-        if not (ended and stream.read() == MAGIC):
+        stream.seek(max(0, size - len(MCAP_MAGIC)))
+        if not (ended and stream.read() == MCAP_MAGIC):
             count = sum(self._counts.values())
             seconds = (self.end - self.start) / 1e9 if self.start and self.end else 0.0
             text = (
@@ -360,9 +366,9 @@ class McapFile:
 def _summary(stream: BinaryIO) -> Summary | None:
     """The summary of a file that has a sound one, with statistics and an index of its messages."""
     size = stream.seek(0, 2)
-    stream.seek(max(0, size - _FOOTER.size - len(MAGIC)))
+    stream.seek(max(0, size - _FOOTER.size - len(MCAP_MAGIC)))
     tail = stream.read()
-    if len(tail) != _FOOTER.size + len(MAGIC) or not tail.endswith(MAGIC):
+    if len(tail) != _FOOTER.size + len(MCAP_MAGIC) or not tail.endswith(MCAP_MAGIC):
         return None
     _, _, start, _, crc = _FOOTER.unpack_from(tail)
     if not 0 < start < size:
@@ -370,7 +376,7 @@ def _summary(stream: BinaryIO) -> Summary | None:
     if crc:
         stream.seek(start)
         # The checksum covers the summary and the footer up to the checksum itself.
-        if zlib.crc32(stream.read(size - start - len(MAGIC) - 4)) != crc:
+        if zlib.crc32(stream.read(size - start - len(MCAP_MAGIC) - 4)) != crc:
             return None
     stream.seek(0)
     try:

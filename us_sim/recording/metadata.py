@@ -20,7 +20,7 @@ from pathlib import Path
 import yaml
 
 from us_sim.errors import BagError
-from us_sim.recording.qos import QosProfile, qos_from_yaml
+from us_sim.recording.topic import QosProfile, qos_from_yaml
 from us_sim.settings.text_file import read_text
 from us_sim.settings.yaml_text import YamlError, load_yaml
 

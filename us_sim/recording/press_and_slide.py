@@ -10,14 +10,42 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.cache import cache_folder
 from us_sim.errors import BagError
-from us_sim.recording.path import ProbePath
-from us_sim.recording.shipped_path import write_where_asked
+from us_sim.recording.path import ProbePath, write_path
+
+
+def write_where_asked(arguments: Sequence[str], module: str, make: Callable[[], ProbePath]) -> int:
+    """Write a path to the file that the one argument names.
+
+    Args:
+        arguments: of the command line.
+        module: its name, for the usage.
+        make: the path.
+
+    Returns:
+        The exit status: 0, 1 where the file cannot be written, 2 for other arguments than one.
+    """
+    if len(arguments) != 1:
+        print(f"usage: python -m {module} FILE.mcap", file=sys.stderr)
+        return 2
+    try:
+        # The folder of the project's paths holds one bag per file, so none may claim it.
+        write_path(arguments[0], make(), sidecar=False)
+    except BagError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
 
 _EPOCH = 1_700_000_000 * 10**9  # ns
 
@@ -96,3 +124,32 @@ def main(arguments: list[str]) -> int:
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))
+
+
+_MADE = 1
+"""Changes with what `press_and_slide` makes, so that no older file is taken for it."""
+
+
+def pressing_path(depth: float, slide: float = 0.008) -> Path:
+    """The file of `press_and_slide` with that depth and slide (m), to a tenth of a millimetre.
+
+    Raises:
+        BagError: the cache folder cannot be written.
+    """
+    name = f"press-{_MADE}-{depth * 1e3:.1f}-mm-slide-{slide * 1e3:.1f}-mm.mcap"
+    file = cache_folder() / name
+    if file.is_file():
+        return file
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as folder:
+            partial = Path(folder, file.name)
+            path = press_and_slide(depth=round(depth, 4), slide=round(slide, 4))
+            write_path(partial, path, sidecar=False)
+            os.replace(partial, file)
+    except OSError as error:
+        raise BagError(
+            f"{file}: the path of the press cannot be kept ({error.strerror}): set US_SIM_CACHE to "
+            f"a folder that can be written"
+        ) from error
+    return file

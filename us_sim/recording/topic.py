@@ -1,12 +1,182 @@
-"""A bag's topics and messages as every kind of storage hands them out."""
+"""A bag's topics, messages and quality of service, as every kind of storage hands them out.
+
+Quality of service is in the YAML of rosbag2: policies by name since Jazzy, by number before.
+
+>>> from us_sim.recording.topic import QosProfile, qos_from_yaml, qos_to_yaml
+>>> latched = QosProfile(depth=1, durability="transient_local")
+>>> for line in qos_to_yaml([latched]).splitlines()[:4]:
+...     print(line)
+- history: keep_last
+  depth: 1
+  reliability: reliable
+  durability: transient_local
+>>> qos_from_yaml(qos_to_yaml([latched])) == (latched,)
+True
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from us_sim.errors import BagError
-from us_sim.recording.qos import QosProfile
+from us_sim.settings.yaml_text import YamlError, load_yaml
+
+INFINITE = 2**63 - 1  # ns, what rmw calls RMW_DURATION_INFINITE
+
+_POLICIES = {
+    "history": ("system_default", "keep_last", "keep_all", "unknown"),
+    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
+    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
+    "liveliness": (
+        "system_default",
+        "automatic",
+        "manual_by_node",
+        "manual_by_topic",
+        "unknown",
+        "best_available",
+    ),
+}
+"""Policies in the order of their numbers in rmw/types.h, which rosbag2 before Jazzy wrote."""
+
+_DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
+
+
+@dataclass(frozen=True)
+class QosProfile:
+    """What a publisher offered on a topic; the defaults are rclpy's.
+
+    Policies are named as rmw names them in lower case.
+
+    Raises:
+        BagError: a policy has no such name, or a depth or duration is negative.
+    """
+
+    history: str = "keep_last"
+    depth: int = 10
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    deadline: int = INFINITE  # ns
+    lifespan: int = INFINITE  # ns
+    liveliness: str = "automatic"
+    liveliness_lease_duration: int = INFINITE  # ns
+    avoid_ros_namespace_conventions: bool = False
+
+    def __post_init__(self) -> None:
+        for policy, names in _POLICIES.items():
+            if getattr(self, policy) not in names:
+                raise BagError(
+                    f"QoS {policy} cannot be {getattr(self, policy)!r}: use one of "
+                    f"{', '.join(names)}"
+                )
+        for number in ("depth", *_DURATIONS):
+            if getattr(self, number) < 0:
+                raise BagError(f"QoS {number} cannot be negative, as {getattr(self, number)} is")
+
+    @classmethod
+    def of(cls, profile: object) -> QosProfile:
+        """The profile that ``profile`` describes.
+
+        Args:
+            profile: a QosProfile, a mapping as in a bag's YAML, or an object with the attributes
+                of ``rclpy.qos.QoSProfile``.
+
+        Raises:
+            BagError: it is none of these, or holds a policy that does not exist.
+        """
+        if isinstance(profile, QosProfile):
+            return profile
+        try:
+            if isinstance(profile, Mapping):
+                values = {name: profile[name] for name in cls.__dataclass_fields__}
+            else:
+                values = {name: getattr(profile, name) for name in cls.__dataclass_fields__}
+        except (KeyError, AttributeError) as error:
+            raise BagError(f"{repr(profile)[:200]} is no QoS profile: it lacks {error}") from None
+        for policy in _POLICIES:
+            values[policy] = _policy_name(policy, values[policy])
+        for duration in _DURATIONS:
+            values[duration] = _nanoseconds(duration, values[duration])
+        try:
+            values["depth"] = int(values["depth"])
+        except (TypeError, ValueError, OverflowError):
+            raise BagError(f"QoS depth is no whole number: {values['depth']!r}") from None
+        return cls(**values)
+
+    def lines(self) -> list[str]:
+        """The lines of this profile as a YAML mapping, as rosbag2 0.26 writes it."""
+        lines = [
+            f"history: {self.history}",
+            f"depth: {self.depth}",
+            f"reliability: {self.reliability}",
+            f"durability: {self.durability}",
+        ]
+        lines += _duration_lines("deadline", self.deadline)
+        lines += _duration_lines("lifespan", self.lifespan)
+        lines.append(f"liveliness: {self.liveliness}")
+        lines += _duration_lines("liveliness_lease_duration", self.liveliness_lease_duration)
+        avoid = str(self.avoid_ros_namespace_conventions).lower()
+        lines.append(f"avoid_ros_namespace_conventions: {avoid}")
+        return lines
+
+
+def qos_to_yaml(profiles: Sequence[QosProfile]) -> str:
+    """The YAML list that rosbag2 puts in a channel's ``offered_qos_profiles``."""
+    if not profiles:
+        return "[]"
+    items = ["- " + "\n  ".join(profile.lines()) for profile in profiles]
+    return "\n".join(items)
+
+
+def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tuple[QosProfile, ...]:
+    """The profiles of a bag of any version: YAML text, or the list that it parses to.
+
+    Args:
+        document: the text or the list; None or an empty text means no profiles.
+        where: the beginning of errors.
+
+    Raises:
+        BagError: the text is not YAML, or not a list of profiles.
+    """
+    try:
+        if isinstance(document, str):
+            document = load_yaml(document)
+        if document is None or document == "":
+            return ()
+        if not isinstance(document, list):
+            raise BagError("this is not a list of QoS profiles")
+        return tuple(QosProfile.of(item) for item in document)
+    except YamlError as error:
+        raise BagError(f"{where}: the QoS profiles are not YAML: {error}") from None
+    except BagError as error:
+        raise BagError(f"{where}: {error}") from None
+
+
+def _policy_name(policy: str, value: Any) -> str:
+    """Lower-case name of a policy that is a name, a number or an enum member."""
+    names = _POLICIES[policy]
+    name = getattr(value, "name", value)
+    if isinstance(name, str):
+        return name.lower()
+    if isinstance(name, int) and 0 <= name < len(names):
+        return names[name]
+    raise BagError(f"QoS {policy} cannot be {value!r}: use one of {', '.join(names)}")
+
+
+def _nanoseconds(duration: str, value: Any) -> int:
+    """Nanoseconds of an integer, of ``{sec, nsec}``, or of an rclpy Duration."""
+    try:
+        if isinstance(value, Mapping):
+            return int(value["sec"]) * 10**9 + int(value["nsec"])
+        return int(getattr(value, "nanoseconds", value))
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise BagError(f"QoS {duration} is not a duration: {value!r}") from None
+
+
+def _duration_lines(name: str, nanoseconds: int) -> list[str]:
+    return [f"{name}:", f"  sec: {nanoseconds // 10**9}", f"  nsec: {nanoseconds % 10**9}"]
+
 
 LOST = "messages_lost"
 """The note that says how many messages of each topic are missing since the note before."""

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError
-from us_sim.recording.qos import QosProfile
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"

@@ -23,10 +23,57 @@ from functools import partial
 from typing import NamedTuple
 
 from us_sim.errors import BagError, FileTakenError
-from us_sim.recording.losses import Loss, Losses, news
 from us_sim.recording.schemas import definitions, schema_text
 from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
+
+
+class Loss(NamedTuple):
+    """Messages of one topic that were lost."""
+
+    in_transport: int  # before they reached this process
+    in_recorder: int  # since the queue or the disk was full
+
+
+class Losses:
+    """Counts what is lost, from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._in_transport: Counter[str] = Counter()
+        self._in_recorder: Counter[str] = Counter()
+
+    @property
+    def total(self) -> int:
+        """Messages of all topics."""
+        with self._lock:
+            return self._in_transport.total() + self._in_recorder.total()
+
+    def add(self, topic: str, *, in_transport: int = 0, in_recorder: int = 0) -> None:
+        """Some messages of a topic were lost."""
+        with self._lock:
+            self._in_transport[topic] += in_transport
+            self._in_recorder[topic] += in_recorder
+
+    def by_topic(self) -> dict[str, Loss]:
+        """All that was lost so far, of topics that lost something."""
+        with self._lock:
+            topics = sorted({*+self._in_transport, *+self._in_recorder})
+            return {t: Loss(self._in_transport[t], self._in_recorder[t]) for t in topics}
+
+
+def news(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
+    """What was lost between two looks at `Losses.by_topic`, of topics that lost something."""
+    none = Loss(0, 0)
+    return {
+        topic: Loss(
+            loss.in_transport - before.get(topic, none).in_transport,
+            loss.in_recorder - before.get(topic, none).in_recorder,
+        )
+        for topic, loss in now.items()
+        if loss != before.get(topic)
+    }
+
 
 _FLUSH = 0.5  # s, after which messages are handed to the operating system
 _RETRY = 1.0  # s, between looks at a disk that was full
@@ -216,3 +263,43 @@ class WriteBehind:
             new = news(lost, self._noted)
             self._bag.note(LOST, {topic: str(sum(loss)) for topic, loss in new.items()})
             self._noted = lost
+
+
+class PreRoll:
+    """A ring of messages, as rosbag2's snapshot mode keeps it.
+
+    Of a latched topic the newest message is kept whatever its age: a late listener would get it,
+    and what is recorded makes no sense without it.
+
+    Args:
+        max_bytes: of messages; the oldest go.
+        duration: s before the newest message's; 0 for any.
+    """
+
+    def __init__(self, max_bytes: int, duration: float = 0.0) -> None:
+        self._max_bytes, self._duration = max_bytes, round(duration * 1e9)
+        self._ring: deque[Message] = deque()
+        self._bytes = 0
+        self._latched: dict[str, Message] = {}
+
+    def add(self, message: Message, *, latched: bool = False) -> None:
+        """Keep a message, and let go of what is too old or too much."""
+        if latched:
+            before = self._latched.get(message.topic)
+            self._latched[message.topic] = message
+            if before is None:
+                return
+            message = before
+        self._ring.append(message)
+        self._bytes += len(message.data)
+        oldest = message.log_time - self._duration if self._duration else 0
+        while self._ring and (self._bytes > self._max_bytes or self._ring[0].log_time < oldest):
+            self._bytes -= len(self._ring.popleft().data)
+
+    def take(self) -> list[Message]:
+        """What is kept, by its time; nothing is kept afterwards."""
+        messages = sorted([*self._latched.values(), *self._ring], key=lambda each: each.log_time)
+        self._ring.clear()
+        self._latched.clear()
+        self._bytes = 0
+        return messages

@@ -92,7 +92,7 @@ def _use_skin() -> None:
 
 
 def _show_blood() -> None:
-    from us_sim.slicing.flow.warm_up import warm_up
+    from us_sim.slicing.flow.doppler import warm_up
 
     warm_up()
 
@@ -101,8 +101,8 @@ def _make_image(method: str) -> None:
     """With everything on that imaging can do."""
     from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
     from us_sim.slicing.b_mode import BMode
-    from us_sim.slicing.formation.imaging import Imaging
     from us_sim.slicing.probe.probe import LinearProbe
+    from us_sim.slicing.settings import Imaging
     from us_sim.volume.volume import Volume
 
     voxels = np.zeros((4, 4, 4), dtype=np.uint8)
@@ -123,7 +123,7 @@ def _make_image(method: str) -> None:
 
 
 def _strain() -> None:
-    from us_sim.slicing.strain.warm_up import warm_up
+    from us_sim.slicing.strain_estimate import warm_up
 
     warm_up()
 

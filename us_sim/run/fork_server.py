@@ -354,7 +354,7 @@ def _forked(request: _Request) -> bool:
 
 def _become(request: _Request, between: int) -> None:
     """Make of this process what a program of its own would be."""
-    from us_sim.nodes.early_interrupt import end_at_once_when_interrupted
+    from us_sim.nodes import end_at_once_when_interrupted
 
     given, said, ready = request.files
     until = time.monotonic() + ADOPTED_S

@@ -495,7 +495,7 @@ def _report(
     summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
     tracked = None
     if video is not None:
-        from us_sim.demo.tracked_path import tracked_path
+        from us_sim.demo.session import tracked_path
 
         tracked = tracked_path(session, video)
         summary["tracked_path"] = tracked.summary

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.session_settings import SessionRecorderSettings
-from us_sim.nodes.settings import checked_parameters
+from us_sim.nodes.settings import SessionRecorderSettings, checked_parameters
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of

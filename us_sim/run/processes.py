@@ -56,7 +56,7 @@ COMPLAINT = "us_sim: "
 """With which a node begins to say why it cannot work."""
 STOP_S = 0.8
 """How long nodes may take to end before the recorder is told to."""
-# Of `us_sim.nodes.standby`, which needs rclpy.
+# Of `us_sim.nodes.process`, which needs rclpy.
 STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
-from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.nodes.settings import SessionControlSettings
 from us_sim.recording.reader import read_bag
 from us_sim.run.background import Background, bags_in_reach
 from us_sim.run.monitored import Monitored

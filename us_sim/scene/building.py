@@ -182,7 +182,7 @@ def tissue_model_of(
     if note is not None:
         for remark in (*remarks, *held):
             note(f"tissue mesh: {remark}")
-    from us_sim.tissue.mesh.node_selection import face_nodes, facing_nodes
+    from us_sim.tissue.model import face_nodes, facing_nodes
 
     touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top", 0.0)
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
@@ -314,7 +314,7 @@ def _fixed_nodes(
     fractions: LabelFractions | None,
 ) -> tuple[NDArray[np.bool_], list[str]]:
     """Nodes on the named faces and inside the named labels (the skeleton is rigid), and remarks."""
-    from us_sim.tissue.mesh.node_selection import FACES, face_nodes, held_remark, nodes_in_label
+    from us_sim.tissue.model import FACES, face_nodes, held_remark, nodes_in_label
 
     numbers = {name: label for label, name in volume.label_names.items()}
     fixed = np.zeros(len(mesh.nodes), dtype=bool)

@@ -4,7 +4,7 @@ Frame ``patient`` is the probe's where it touches the skin at the case's start: 
 middle of the probe's face, and +z goes into the body.
 
 >>> import numpy as np
->>> from us_sim.geometry.placement import Placement
+>>> from us_sim.geometry.pose import Placement
 >>> from us_sim.scene.case_document import patient_from_volume
 >>> start = Placement((0.0, 0.1, 0.0), (1.0, 0.0, 0.0, 0.0))  # on the volume's face, looking back
 >>> pose = patient_from_volume(start).pose
@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.placement import Placement
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.scene.tissue_box import footprint
 from us_sim.settings.registry import COLLIDERS, PROBES
@@ -87,7 +86,7 @@ def _path(settings: CaseSettings) -> str:
     if press is None:
         depth = settings.probe.array.settings(PROBES).depth
         press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
-    from us_sim.recording.pressing_path import pressing_path
+    from us_sim.recording.press_and_slide import pressing_path
 
     return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
 

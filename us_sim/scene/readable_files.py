@@ -72,7 +72,7 @@ def check_files(scene: Scene) -> list[str]:
 def _mesh_remarks(tissue: TissueSettings) -> list[str]:
     """What there is to say about the mesh of a file, as far as it says so without the volume."""
     from us_sim.tissue.mesh.file import read_mesh
-    from us_sim.tissue.mesh.node_selection import FACES, face_nodes, held_remark
+    from us_sim.tissue.model import FACES, face_nodes, held_remark
 
     given = tissue.mesh
     mesh, remarks = read_mesh(Path(given.file or ""), given.unit, given.pose.pose)

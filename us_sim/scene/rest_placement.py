@@ -16,7 +16,7 @@ from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.scene import Scene
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.reconstruction.settings import ImagePart

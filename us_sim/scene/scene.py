@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from us_sim.errors import SceneError
-from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
@@ -20,14 +20,16 @@ from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Settings, setting
 from us_sim.skin.settings import SkinSettings
 from us_sim.slicing.acoustics.settings import Acoustics
-from us_sim.slicing.flow.colour_settings import ColourSettings
-from us_sim.slicing.flow.settings import FlowSettings
-from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.m_mode_settings import MModeSettings
-from us_sim.slicing.strain.settings import Strain
+from us_sim.slicing.settings import (
+    ColourSettings,
+    FlowSettings,
+    Imaging,
+    MModeSettings,
+    SpectrumSettings,
+    Strain,
+)
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tracking.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.scene.scene import Scene
 from us_sim.settings.registry import COLLIDERS
-from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
-from us_sim.tissue.mesh.fitted_planes import fitted_planes, wanted_under_probe
-from us_sim.tissue.mesh.label_thickness import wanted_by_labels
+from us_sim.tissue.elasticity.material import LAYERS, kind_of
+from us_sim.tissue.mesh.box_planes import fitted_planes, wanted_by_labels, wanted_under_probe
 from us_sim.volume.volume import Volume
 
 _STEPS = 160

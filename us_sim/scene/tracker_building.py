@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from us_sim.geometry.placement import Placement
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.scene.scene import Scene
 from us_sim.settings.registry import TRACKERS
 

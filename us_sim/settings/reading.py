@@ -1,7 +1,7 @@
 """From a mapping of keys, as a file holds it, to settings: every key and value checked.
 
 >>> from us_sim.settings.reading import Reader
->>> from us_sim.slicing.formation.imaging import Imaging
+>>> from us_sim.slicing.settings import Imaging
 >>> Reader("my.yaml").read(Imaging, {"gain": "6 dB"}, "imaging").gain
 6.0
 >>> Reader("my.yaml").read(Imaging, {"gian": 6}, "imaging")

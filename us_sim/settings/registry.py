@@ -52,8 +52,8 @@ PROBES = Choice(
     error=ProbeError,
     needs=True,
     linear="us_sim.slicing.probe.probe:LinearProbe",
-    convex="us_sim.slicing.probe.fan_probe:ConvexProbe",
-    sector="us_sim.slicing.probe.fan_probe:SectorProbe",
+    convex="us_sim.slicing.probe.probe:ConvexProbe",
+    sector="us_sim.slicing.probe.probe:SectorProbe",
 )
 
 COLLIDERS = Choice(
@@ -89,15 +89,15 @@ TRACKERS = Choice(
     key="source",
     group="us_sim.trackers",
     error=TrackingError,
-    pose=Option(f"{_INPUTS}.pose_input:PoseInput", _NOTHING),
-    pose_array=Option(f"{_INPUTS}.pose_array_input:PoseArrayInput", _NOTHING),
-    tf=Option(f"{_INPUTS}.tf_input:TfInput", _NOTHING),
+    pose=Option(f"{_INPUTS}.topic_inputs:PoseInput", _NOTHING),
+    pose_array=Option(f"{_INPUTS}.topic_inputs:PoseArrayInput", _NOTHING),
+    tf=Option(f"{_INPUTS}.topic_inputs:TfInput", _NOTHING),
     camera=Option(f"{_INPUTS}.camera_input:CameraInput", "us_sim.tracking.settings:CameraSettings"),
     six_dof_mouse=Option(
-        f"{_INPUTS}.six_dof_mouse_input:SixDofMouseInput",
+        f"{_INPUTS}.topic_inputs:SixDofMouseInput",
         "us_sim.tracking.settings:SixDofMouseSettings",
     ),
-    haptic=Option(f"{_INPUTS}.haptic_input:HapticInput", "us_sim.tracking.settings:HapticSettings"),
+    haptic=Option(f"{_INPUTS}.topic_inputs:HapticInput", "us_sim.tracking.settings:HapticSettings"),
     openigtlink=Option(
         f"{_INPUTS}.openigtlink_input:OpenIGTLinkInput",
         "us_sim.tracking.settings:OpenIGTLinkSettings",
@@ -109,33 +109,32 @@ _EVALUATION = "us_sim.evaluation"
 EVALUATIONS = Choice(
     "evaluation",
     key="subject",
-    tissue=Option(f"{_EVALUATION}.tissue.measure:evaluate_tissue", _NOTHING),
-    stability=Option(f"{_EVALUATION}.stability.measure:evaluate_stability", _NOTHING),
+    tissue=Option(f"{_EVALUATION}.tissue.report:evaluate_tissue", _NOTHING),
+    stability=Option(f"{_EVALUATION}.stability.report:evaluate_stability", _NOTHING),
     slice=Option(
-        f"{_EVALUATION}.slice.measure:evaluate_slice",
-        f"{_EVALUATION}.slice.recorded_sweep:RecordedSweep",
+        f"{_EVALUATION}.slice.report:evaluate_slice",
+        f"{_EVALUATION}.settings:RecordedSweep",
     ),
     hand=Option(
-        f"{_EVALUATION}.hand.measure:evaluate_hand",
-        f"{_EVALUATION}.hand.settings:HandSettings",
+        f"{_EVALUATION}.hand.report:evaluate_hand",
+        f"{_EVALUATION}.settings:HandSettings",
     ),
-    tracking=Option(f"{_EVALUATION}.tracking.measure:evaluate_tracking", _NOTHING),
-    image=Option(f"{_EVALUATION}.image.measure:evaluate_image", _NOTHING),
-    latency=Option(f"{_EVALUATION}.latency.measure:evaluate_latency", _NOTHING),
-    viewer=Option(f"{_EVALUATION}.viewer.measure:evaluate_viewer", _NOTHING),
+    tracking=Option(f"{_EVALUATION}.tracking.report:evaluate_tracking", _NOTHING),
+    image=Option(f"{_EVALUATION}.image.report:evaluate_image", _NOTHING),
+    latency=Option(f"{_EVALUATION}.latency.report:evaluate_latency", _NOTHING),
+    viewer=Option(f"{_EVALUATION}.viewer.report:evaluate_viewer", _NOTHING),
 )
 
-_CALIBRATION = "us_sim.tracking.calibration"
-_ASKED = f"{_CALIBRATION}.settings"
+_CALIBRATION = "us_sim.command.calibration"
 CALIBRATIONS = Choice(
     "calibration",
     key="what",
     error=CalibrationError,
-    camera=Option(f"{_CALIBRATION}.camera_command:calibrate_photos", f"{_ASKED}:CameraSettings"),
-    pivot=Option(f"{_CALIBRATION}.recording_commands:calibrate_tip", f"{_ASKED}:PivotSettings"),
+    camera=Option(f"{_CALIBRATION}:calibrate_photos", f"{_CALIBRATION}_settings:CameraSettings"),
+    pivot=Option(f"{_CALIBRATION}:calibrate_tip", f"{_CALIBRATION}_settings:PivotSettings"),
     landmarks=Option(
-        f"{_CALIBRATION}.recording_commands:calibrate_registration", f"{_ASKED}:LandmarkSettings"
+        f"{_CALIBRATION}:calibrate_registration", f"{_CALIBRATION}_settings:LandmarkSettings"
     ),
-    probe=Option(f"{_CALIBRATION}.probe_command:calibrate_image", f"{_ASKED}:ProbeSettings"),
-    time=Option(f"{_CALIBRATION}.recording_commands:calibrate_clock", f"{_ASKED}:ClockSettings"),
+    probe=Option(f"{_CALIBRATION}:calibrate_image", f"{_CALIBRATION}_settings:ProbeSettings"),
+    time=Option(f"{_CALIBRATION}:calibrate_clock", f"{_CALIBRATION}_settings:ClockSettings"),
 )

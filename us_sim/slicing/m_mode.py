@@ -1,27 +1,106 @@
-"""M-mode: the echoes along one beam, over time.
-
->>> import numpy as np
->>> from us_sim.slicing.m_mode import MMode
->>> from us_sim.slicing.m_mode_settings import MModeSettings
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=64, rows=64)
->>> image = np.zeros((64, 64), np.uint8)
->>> image[32:, 48] = 200
->>> line = MMode(probe, MModeSettings(lateral=16.5 / 64)).line(image)  # column 48
->>> int(line[0]), int(line[-1])
-(0, 200)
-"""
+"""M-mode: the echoes along one beam over time, and pictures whose columns are moments."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.sweep_picture import SweepPicture
-from us_sim.slicing.m_mode_settings import MModeSettings
-from us_sim.slicing.probe.beam_places import pixels_of
+from us_sim.slicing.drawing.overlay import Colour, lettering
+from us_sim.slicing.probe.beams import pixels_of
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import MModeSettings
+
+_SCALE: Colour = (205, 215, 215)
+_LINE: Colour = (90, 100, 100)
+_TEXT = 11  # px, height of letters
+_BESIDE, _BELOW = 64, 24  # px, room for the scales
+_MOST = 6  # numbers along a scale
+_ROUNDING = 1e-6  # of a column's duration
+
+
+class SweepPicture:
+    """Grey columns with an axis of time below and another scale on the right.
+
+    Args:
+        rows, columns: px, without the scales.
+        sweep: s, from the first to the last column.
+        scale: what the top and the bottom row stand for, and the unit.
+    """
+
+    def __init__(
+        self, rows: int, columns: int, sweep: float, scale: tuple[float, float, str]
+    ) -> None:
+        #: What pictures have in common whose columns can stand side by side.
+        self.layout = rows, columns, sweep, scale
+        self._grey = np.zeros((rows, columns), np.uint8)
+        self._duration = sweep / columns
+        self._last: int | None = None
+        top, bottom, unit = scale
+        self._frame = np.zeros((rows + _BELOW, columns + _BESIDE, 3), np.uint8)
+        cv2.line(self._frame, (columns, 0), (columns, rows), _LINE, 1)
+        cv2.line(self._frame, (0, rows), (columns, rows), _LINE, 1)
+        self._marks: list[int] = []
+        for value in _round_numbers(min(top, bottom), max(top, bottom)):
+            row = round((value - top) / (bottom - top) * rows - 0.5)
+            text = f"{value:g} {unit}" if value == 0 else f"{value:g}"
+            label = lettering(text, _TEXT, _SCALE)
+            place = int(np.clip(row - label.height // 2, 0, rows - label.height))
+            cv2.line(self._frame, (columns, row), (columns + 4, row), _SCALE, 1)
+            label.draw(self._frame, columns + 7, place)
+            self._marks += [row] if value == 0.0 and 0 < row < rows - 1 else []
+        for value in _round_numbers(-sweep, 0.0):
+            column = columns - 1 + round(value / self._duration)
+            label = lettering(f"{value:g} s" if value == 0 else f"{value:g}", _TEXT, _SCALE)
+            cv2.line(self._frame, (column, rows), (column, rows + 4), _SCALE, 1)
+            label.draw(self._frame, max(0, column - label.width // 2), rows + 6)
+
+    @property
+    def grey(self) -> NDArray[np.uint8]:
+        """(rows, columns) without the scales; the newest column is the last."""
+        return self._grey
+
+    def moments(self, time: float) -> NDArray[np.float64]:
+        """The times (K,) s of the columns to be added now, up to ``time``.
+
+        After time went back, or stood still for longer than the picture, it begins anew.
+        """
+        newest = math.floor(time / self._duration + _ROUNDING)
+        columns = self._grey.shape[1]
+        if self._last is None or not self._last <= newest < self._last + columns:
+            self._grey[:] = 0
+            self._last = newest - 1
+        numbers = np.arange(self._last + 1, newest + 1)
+        self._last = newest
+        return np.asarray(numbers * self._duration, dtype=np.float64)
+
+    def add(self, columns: NDArray[np.uint8]) -> None:
+        """Move the picture to the left and put these columns (rows, K) on its right."""
+        count = columns.shape[1]
+        if count:
+            self._grey[:, :-count] = self._grey[:, count:]
+            self._grey[:, -count:] = columns
+
+    def drawn(self) -> NDArray[np.uint8]:
+        """A new picture of red, green and blue, with its scales."""
+        rows, columns = self._grey.shape
+        picture = self._frame.copy()
+        picture[:rows, :columns] = self._grey[:, :, None]
+        for row in self._marks:
+            picture[row, :columns] = np.maximum(picture[row, :columns], np.uint8(90))
+        return picture
+
+
+def _round_numbers(low: float, high: float) -> list[float]:
+    """Multiples of 1, 2 or 5 times a power of ten in that range, ends included; a few of them."""
+    rough = (high - low) / _MOST
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(step for step in (power, 2 * power, 5 * power, 10 * power) if step >= rough)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [round(number * step, 12) + 0.0 for number in range(first, last + 1)]
+
 
 _ROWS, _COLUMNS = 384, 512
 

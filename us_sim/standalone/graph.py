@@ -16,10 +16,18 @@ import numpy as np
 
 from . import ddsc
 from .cdr import CdrError, deserialize, serialize
-from .ddsc import BuiltinEndpoint, BuiltinParticipant, RawSampleInfo, check, lib
-from .endpoint_qos import EndpointQos, read_qos, user_data
+from .ddsc import (
+    BuiltinEndpoint,
+    BuiltinParticipant,
+    EndpointQos,
+    RawSampleInfo,
+    check,
+    lib,
+    read_qos,
+    user_data,
+)
 from .interfaces import type_hash
-from .message_class import message_class
+from .messages import message_class
 from .transport import Participant
 
 _BUILTIN_TOPICS = {

@@ -1,7 +1,7 @@
-"""What ROS 2 Jazzy's interfaces are made of: fields, constants, defaults and type hashes.
+"""ROS 2 Jazzy's interfaces: their fields, constants, defaults and type hashes.
 
-The .msg files come from rosbags' type store; what it lacks is written down here: the services, and
-events of rosbag2 that are newer than Jazzy.
+The .msg files come from rosbags' type store. Written down here are the services, which it lacks,
+and two events of rosbag2 that are newer than Jazzy.
 
 >>> from us_sim.standalone.interfaces import interface, type_hash
 >>> [(field.name, field.idl_type) for field in interface("sensor_msgs/msg/Image").fields][-2:]

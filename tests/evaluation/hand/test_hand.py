@@ -7,18 +7,31 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from us_sim.evaluation.hand import measure as hand
-from us_sim.evaluation.hand import points as following
-from us_sim.evaluation.hand.cases import APPROACH, RATE, TISSUES, Motion, Tissue, motions
-from us_sim.evaluation.hand.converged import CONVERGED, Converged, converged
-from us_sim.evaluation.hand.measure import evaluate_hand
-from us_sim.evaluation.hand.points import HOLD, Frames, Held, Live, Point, measure, those
-from us_sim.evaluation.hand.targets import JUDGED, targets
+from us_sim.evaluation.hand import measure as following
+from us_sim.evaluation.hand import report as hand
+from us_sim.evaluation.hand.measure import (
+    APPROACH,
+    CONVERGED,
+    HOLD,
+    RATE,
+    TISSUES,
+    Converged,
+    Frames,
+    Held,
+    Live,
+    Motion,
+    Point,
+    Tissue,
+    converged,
+    measure,
+    motions,
+    those,
+)
+from us_sim.evaluation.hand.report import JUDGED, evaluate_hand, targets
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.recording.hand_motion import HASTES, KINDS, Room
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_cg import FemCg
 
 MODEL = TissueModel.block(nodes=(5, 5, 4))
@@ -268,9 +281,11 @@ class Raising(FemCg):
 def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monkeypatch, capsys):
     for name in {*TISSUE_METHODS} - {"fem", "fem_cg", "fem_nonlinear"}:
         monkeypatch.delitem(TISSUE_METHODS, name)
-    made = hand.create_solver
+    made = following.create_solver
     monkeypatch.setattr(
-        hand, "create_solver", lambda name, m: Raising(m) if name == "fem_cg" else made(name, m)
+        following,
+        "create_solver",
+        lambda name, m, **s: Raising(m) if name == "fem_cg" else made(name, m, **s),
     )
     monkeypatch.setattr(Raising, "warm_up", lambda _: None)
     monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, seed=seed)])
@@ -295,7 +310,7 @@ def test_without_a_converged_answer_every_row_says_so(tmp_path, monkeypatch):
     def broken(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(hand, "converged", broken)
+    monkeypatch.setattr(following, "converged", broken)
     monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, seed=seed)])
     assert evaluate_hand(tmp_path / "out", quick=True) == 1
     report = (tmp_path / "out" / "hand.md").read_text(encoding="utf-8")

@@ -5,10 +5,9 @@ import csv
 import pytest
 
 from us_sim.command.main import main
-from us_sim.evaluation.image import measure
-from us_sim.evaluation.image.artefact import Artefact
-from us_sim.evaluation.image.points import Point
-from us_sim.evaluation.target import Target
+from us_sim.evaluation.image import report as measure
+from us_sim.evaluation.image.measure import Artefact, Point
+from us_sim.evaluation.report import Target
 
 ASKED = ["artefact", "probe", "tilt_deg", "depth_mm", "expected", "measured", "unit"]
 ASKED += ["error_percent", "ms_median"]

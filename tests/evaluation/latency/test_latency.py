@@ -11,14 +11,21 @@ import numpy as np
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.latency import measure as latency
-from us_sim.evaluation.latency.cases import COARSE, DEMO, FINE, LIVE, PLACED, Case, cases
-from us_sim.evaluation.latency.measure import evaluate_latency
-from us_sim.evaluation.latency.points import Point
-from us_sim.evaluation.latency.run_case import run_case
-from us_sim.evaluation.latency.scene import write_scene
-from us_sim.evaluation.latency.targets import targets
-from us_sim.evaluation.latency.usage import Usage, UsageOverTime, usage_of
+from us_sim.evaluation.latency import report as latency
+from us_sim.evaluation.latency.measure import (
+    COARSE,
+    DEMO,
+    FINE,
+    LIVE,
+    PLACED,
+    Case,
+    Point,
+    cases,
+    run_case,
+    write_scene,
+)
+from us_sim.evaluation.latency.report import evaluate_latency, targets
+from us_sim.evaluation.processes import Usage, UsageOverTime, usage_of
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 

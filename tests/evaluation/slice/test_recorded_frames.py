@@ -9,9 +9,12 @@ import pytest
 import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
-from us_sim.evaluation.slice.recorded_fan import LIVER_SWEEP, RecordedFan
-from us_sim.evaluation.slice.recorded_frames import compare_with_recorded
-from us_sim.evaluation.slice.recorded_pairs import normalised_cross_correlation
+from us_sim.evaluation.slice.recorded import (
+    LIVER_SWEEP,
+    RecordedFan,
+    compare_with_recorded,
+    normalised_cross_correlation,
+)
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.volume.files.readers import read_volume

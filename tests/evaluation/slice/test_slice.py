@@ -12,10 +12,9 @@ import pytest
 
 from us_sim.command.main import main
 from us_sim.evaluation.block import LARGEST_MESH, MESHES
-from us_sim.evaluation.slice import measure as evaluation
-from us_sim.evaluation.slice import report as slice_report
-from us_sim.evaluation.slice import targets as slice_targets
-from us_sim.evaluation.slice import vtk_images as slice_vtk
+from us_sim.evaluation.processes import peak_memory, publishing_ms
+from us_sim.evaluation.slice import measure as slice_vtk
+from us_sim.evaluation.slice import report as evaluation
 from us_sim.evaluation.slice.cases import (
     DEPTHS,
     MAIN,
@@ -25,15 +24,21 @@ from us_sim.evaluation.slice.cases import (
     black_and_white,
     cases,
     dented,
+    exact_slice,
+    sampled,
     speckle,
+    voxel_distance,
 )
-from us_sim.evaluation.slice.memory import peak_memory
-from us_sim.evaluation.slice.methods import SLICING_METHODS, Contender
-from us_sim.evaluation.slice.points import Point, Timing, compare, timed_together
-from us_sim.evaluation.slice.publishing import publishing_ms
-from us_sim.evaluation.slice.reference import exact_slice, sampled, voxel_distance
-from us_sim.evaluation.slice.targets import targets
-from us_sim.evaluation.slice.vtk_images import VtkSlicer
+from us_sim.evaluation.slice.measure import (
+    SLICING_METHODS,
+    Contender,
+    Point,
+    Timing,
+    VtkSlicer,
+    compare,
+    timed_together,
+)
+from us_sim.evaluation.slice.report import targets
 from us_sim.settings.choice import Option
 from us_sim.settings.registry import SLICERS
 from us_sim.volume.volume import Volume
@@ -215,14 +220,13 @@ def test_what_is_asked_is_held_against_what_was_seen():
 @pytest.fixture
 def small(monkeypatch):
     """One small case, and nothing around it that takes long."""
-    for module in (evaluation, slice_targets, slice_report):
-        monkeypatch.setattr(module, "MAIN", SMALL)
+    monkeypatch.setattr(evaluation, "MAIN", SMALL)
     monkeypatch.setattr(evaluation, "cases", lambda _: [SMALL, replace(SMALL, size=24)])
     monkeypatch.setattr(evaluation, "_QUICK_SECONDS", (0.0, 0.0))
     monkeypatch.setattr(evaluation, "peak_memory", lambda _: 512**3 + 10**8)
     monkeypatch.setattr(evaluation, "publishing_ms", lambda _: 0.5)
     monkeypatch.setattr(evaluation, "costs", lambda *_: ([], []))
-    monkeypatch.setattr("us_sim.evaluation.slice.pictures.SHOWN", (SMALL,))
+    monkeypatch.setattr("us_sim.evaluation.slice.report.SHOWN", (SMALL,))
 
 
 @pytest.mark.usefixtures("small")
@@ -300,6 +304,6 @@ def test_processes_of_their_own_tell_memory_and_publishing():
 def test_nothing_but_vtk_is_needed_beyond_what_is_always_installed():
     code = (
         "import sys; sys.modules['skfem'] = sys.modules['vtkmodules'] = None;"
-        "import us_sim.evaluation.slice.measure"
+        "import us_sim.evaluation.slice.report"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

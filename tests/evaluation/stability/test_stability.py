@@ -8,15 +8,33 @@ import pytest
 from numba.core import config
 
 from us_sim.cache import cache_folder
-from us_sim.evaluation.stability import measure as stability
-from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
-from us_sim.evaluation.stability.held_cases import HOLD, SMALL, held_cases
-from us_sim.evaluation.stability.measure import evaluate_stability
-from us_sim.evaluation.stability.meshes import MESHES, SUPPORTS, fixed_nodes, mesh_named, parts
-from us_sim.evaluation.stability.motions import poses_of
-from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
-from us_sim.evaluation.stability.points import Trial, agrees, equations_of, run_trial, try_case
-from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
+from us_sim.evaluation.stability import report as stability
+from us_sim.evaluation.stability.cases import (
+    HOLD,
+    MESHES,
+    SMALL,
+    SUPPORTS,
+    StabilityCase,
+    extreme_cases,
+    fixed_nodes,
+    held_cases,
+    mesh_named,
+    model_of,
+    parts,
+    poses_of,
+    sampled_cases,
+)
+from us_sim.evaluation.stability.measure import (
+    REFUSALS,
+    Trial,
+    agrees,
+    equations_of,
+    observed_step_limit,
+    refusal_of,
+    run_trial,
+    try_case,
+)
+from us_sim.evaluation.stability.report import evaluate_stability
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.kernels import kernel_folder
 from us_sim.tissue.solvers.fem_cg import FemCg

@@ -6,10 +6,9 @@ from skfem import Basis, ElementHex2, ElementVector, MeshHex
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from us_sim.errors import SolverError
+from us_sim.evaluation.block import graded_planes
 from us_sim.evaluation.tissue.cases import SCENES
-from us_sim.evaluation.tissue.graded_planes import graded_planes
-from us_sim.evaluation.tissue.linear_equations import LinearEquations
-from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
+from us_sim.evaluation.tissue.finite_elements import LinearEquations, NeoHookeanHexahedra
 from us_sim.evaluation.tissue.reference import solve_contact
 from us_sim.geometry.collider import Capsule, Sphere
 from us_sim.geometry.collider_distance import signed_distance

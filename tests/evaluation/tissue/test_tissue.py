@@ -11,19 +11,18 @@ import us_sim
 from us_sim.command.main import main
 from us_sim.errors import SettingsError
 from us_sim.evaluation.block import LARGEST_MESH, MESHES
-from us_sim.evaluation.power_law import exponent
-from us_sim.evaluation.tissue import kept_reference
-from us_sim.evaluation.tissue import measure as tissue
+from us_sim.evaluation.report import exponent
+from us_sim.evaluation.tissue import reference as kept_reference
+from us_sim.evaluation.tissue import report as tissue
 from us_sim.evaluation.tissue.cases import LOCKING, SCENES
-from us_sim.evaluation.tissue.measure import Trial, evaluate_tissue, plan
-from us_sim.evaluation.tissue.points import Outcome, Point, compare, held_memory
-from us_sim.evaluation.tissue.report import pareto_front
+from us_sim.evaluation.tissue.measure import Outcome, Point, Trial, compare, held_memory, plan
+from us_sim.evaluation.tissue.report import evaluate_tissue, pareto_front
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.mesh.check import signed_volumes
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.solvers.msds import SpringSettings
 from us_sim.tissue.solvers.solver import create_solver
-from us_sim.tissue.solvers.spring_tissue import SpringSettings
 
 COLUMNS = (
     "scene,method,nodes,tets,threads,setting,ms_median,ms_p99,rel_l2_error,max_error_mm,"

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from us_sim.command.main import main
-from us_sim.evaluation.tracking import measure as tracking
+from us_sim.evaluation.tracking import report as tracking
 from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, RIGID_BODY, SINGLE, Case
 from us_sim.evaluation.tracking.filters import FILTER_METHODS, delay, filter_point, filter_trials
-from us_sim.evaluation.tracking.points import Bench, Point, View, mirrored, visible
-from us_sim.evaluation.tracking.targets import targets
+from us_sim.evaluation.tracking.measure import Bench, Point, View, mirrored, visible
+from us_sim.evaluation.tracking.report import targets
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import FILTERS
 from us_sim.tracking.camera.body_pose import rotation_angle

@@ -15,14 +15,11 @@ from us_sim.errors import ProbeError, SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import scanner_of
 from us_sim.scene.reading import parse_scene
-from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
-from us_sim.slicing.acoustics.surface_normals import SurfaceNormals
-from us_sim.slicing.acoustics.tissue_table import table_constants
-from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.slicing.reach import beyond
+from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics, table_constants
+from us_sim.slicing.acoustics.surface_echo import SurfaceNormals
+from us_sim.slicing.b_mode import BMode, beyond
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
+from us_sim.slicing.settings import Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
@@ -52,7 +49,7 @@ def test_off_imports_nothing_and_changes_nothing():
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     room = "us_sim.slicing.acoustics"
-    assert set(ast.literal_eval(said.stdout)) <= {f"{room}.settings", f"{room}.tissue_table"}
+    assert set(ast.literal_eval(said.stdout)) <= {f"{room}.settings"}
 
 
 def test_behind_bone_is_dark_and_behind_blood_is_bright():
@@ -262,3 +259,6 @@ def test_an_image_that_is_deeper_than_a_box_says_by_how_much():
     half = np.radians(30) / 2
     turned = Pose(np.zeros(3), np.array([0.0, np.sin(half), 0.0, np.cos(half)]))
     assert beyond(deep, turned, box) == pytest.approx(0.08 - 0.05 / np.cos(np.radians(30)))
+    # 45° towards the box from beside it: the beam leaves the box's layer of depth before its side.
+    across = Pose(np.array([-0.08, 0.0, 0.03]), [0.0, np.sin(np.pi / 8), 0.0, np.cos(np.pi / 8)])
+    assert beyond(deep, across, np.array([[-0.05, -0.05, 0.0], [0.05, 0.05, 0.05]])) == 0.0

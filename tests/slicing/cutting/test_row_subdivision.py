@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from us_sim.errors import MeshError, SettingsError, VolumeError
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.cutting import location, resampling, section, trilinear
+from us_sim.slicing.cutting import resampling, row_subdivision, section, trilinear
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.row_subdivision import RowSubdivision, RowSubdivisionSettings
 from us_sim.slicing.cutting.slicer import warm_up
@@ -314,7 +314,8 @@ def test_other_bad_input_is_refused():
 
 def test_nothing_is_left_to_compile_after_warming_up():
     warm_up("row_subdivision")
-    kernels = (section._cut, location.cells, location.subdivide_rows, location.leave_black,
+    kernels = (section._cut, row_subdivision.cells, row_subdivision.subdivide_rows,
+               row_subdivision.leave_black,
                trilinear.sample_linear, resampling.sample_nearest)  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
     assert min(before) >= 1

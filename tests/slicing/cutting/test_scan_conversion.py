@@ -7,14 +7,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.cutting import (
-    clusters,
-    cut_polygons,
-    resampling,
-    rest_outline,
-    span_sampling,
-    spans,
-)
+from us_sim.slicing.cutting import cut_polygons, resampling, section, span_sampling
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.scan_conversion import ScanConversion
 from us_sim.slicing.cutting.slicer import warm_up
@@ -49,7 +42,7 @@ def times_written(slicer, nodes, plane):
     cuts = slicer._cuts
     found = np.empty((plane.rows, plane.columns), dtype=np.int64)
     used = np.empty(plane.rows, dtype=np.int32)
-    spans.convert_cuts(
+    cut_polygons.convert_cuts(
         cuts.corners, cuts.sides, count, cuts.outlines, cuts.points, cuts.owner, 0,
         slicer._shown(plane), 0, plane.rows, found, used,
     )  # fmt: skip
@@ -177,12 +170,12 @@ def test_nodes_of_any_kind_are_taken_and_none_are_kept():
     plane = LinearProbe(0.03, 0.03, 40, 40).plane(Pose([0, 1e-3, 5e-3]))
     nodes = (mesh.nodes * 1.1).astype(np.float32)
     expected = slicer.image(nodes.astype(np.float64), plane)
-    kernels = len(clusters._near.signatures)
+    kernels = len(section._near.signatures)
     wide = np.zeros((len(nodes), 6))
     wide[:, ::2] = nodes
     for given_nodes in (nodes, np.asfortranarray(nodes), nodes.tolist(), wide[:, ::2]):
         np.testing.assert_array_equal(slicer.image(given_nodes, plane), expected)
-    assert len(clusters._near.signatures) == kernels
+    assert len(section._near.signatures) == kernels
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -229,10 +222,10 @@ def test_grey_values_keep_within_a_level_along_the_longest_row():
 def test_nothing_is_left_to_compile_after_warming_up():
     warm_up("scan_conversion")
     kernels = (
-        clusters._near,
+        section._near,
         cut_polygons.cut_tetrahedra,
-        spans.convert_cuts,
-        rest_outline._cut,
+        cut_polygons.convert_cuts,
+        cut_polygons._cut,
         span_sampling.sample_spans,
         span_sampling.fill_elements,
         resampling.sample_nearest,

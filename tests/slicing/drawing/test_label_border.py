@@ -8,8 +8,7 @@ import pytest
 
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.drawing.label_border import onto_border
-from us_sim.slicing.drawing.label_outlines import label_outlines
+from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume

@@ -10,8 +10,7 @@ from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.flow.blood import Blood, Window
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 
 PROBE = LinearProbe(aperture=0.018, depth=0.025, columns=180, rows=250)
 LOWERED = -2e-3  # m, so that a tilted plane begins above the volume
@@ -175,7 +174,7 @@ def test_without_tissue_it_flows_as_at_rest(volume, vein):
 )
 def test_beams_that_spread_see_what_flows_along_them(volume, artery, probe):
     """With the tube in the image, across its middle: the sine of each beam's angle."""
-    from us_sim.slicing.probe.beam_places import beam_angles, fractions_and_depths
+    from us_sim.slicing.probe.beams import beam_angles, fractions_and_depths
 
     turned = Pose([0.0, 0.0, 0.0], [0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
     frame = BMode(volume, probe).frame(turned, None, time=0.0)

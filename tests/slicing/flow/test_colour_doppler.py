@@ -12,14 +12,10 @@ from tubes import ARTERY, SIDES, block, tube_vessel, tube_volume
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.flow.absence import Absence
-from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.colour_doppler import ColourDoppler
-from us_sim.slicing.flow.colour_settings import ColourSettings
-from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
-from us_sim.slicing.formation.imaging import Imaging
-from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.flow.blood import Absence, Blood
+from us_sim.slicing.flow.doppler import ColourDoppler
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
+from us_sim.slicing.settings import ColourSettings, Imaging, SpectrumSettings
 
 PROBE = LinearProbe(aperture=0.018, depth=0.02, columns=90, rows=100)
 TILT = np.radians(30)

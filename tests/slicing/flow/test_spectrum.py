@@ -10,10 +10,9 @@ from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.flow.blood import Blood
-from us_sim.slicing.flow.spectrum import Spectrum
-from us_sim.slicing.flow.spectrum_settings import SpectrumSettings
-from us_sim.slicing.probe.fan_probe import SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.flow.doppler import Spectrum
+from us_sim.slicing.probe.probe import LinearProbe, SectorProbe
+from us_sim.slicing.settings import SpectrumSettings
 
 PROBE = LinearProbe(aperture=0.018, depth=0.024, columns=90, rows=120)
 TILT = np.radians(30)

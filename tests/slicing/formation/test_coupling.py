@@ -1,17 +1,34 @@
-"""Where the transducer's face touches the skin, against what geometry says."""
+"""Where the transducer's face touches the skin, against what geometry says.
+
+What is shown between the face and a mesh that stands off it.
+
+Lines without contact: decibels lost, bands a lens apart, nothing of the tissue.
+"""
+
+import functools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.skin.surface import plane_surface
-from us_sim.slicing.formation.coupling import FULL_PRESS, GEL_FILM, LIGHT_CONTACT, ContactSurface
-from us_sim.slicing.probe.fan_probe import ConvexProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.formation.coupling import (
+    BAND_SPACING,
+    FULL_PRESS,
+    GEL_FILM,
+    LIGHT_CONTACT,
+    ContactSurface,
+    GelLayer,
+    Reverberation,
+)
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
+from us_sim.slicing.settings import Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.volume.volume import Volume
 
 BLOCK = box_mesh(
     uniform_planes(-0.05, 0.05, 14), uniform_planes(-0.03, 0.03, 7), uniform_planes(0, 0.05, 6)
@@ -152,3 +169,167 @@ def test_a_surface_that_cannot_be_is_refused(nodes, triangles, words):
 def test_nodes_of_another_mesh_are_refused():
     with pytest.raises(MeshError, match="588 nodes at rest"):
         SURFACE.contact(BLOCK.nodes[:5], PROBE, Pose())
+
+
+PROBES = {
+    "linear": LinearProbe(aperture=0.04, depth=0.04, columns=80, rows=100, lines=20),
+    "convex": ConvexProbe(
+        radius=0.04, opening_angle=1.0, depth=0.05, columns=120, rows=110, lines=24
+    ),
+    "sector": SectorProbe(
+        aperture=0.02, opening_angle=1.2, depth=0.05, columns=90, rows=100, lines=30, radius=0.012
+    ),
+}
+LAYERS = {name: GelLayer(probe) for name, probe in PROBES.items()}
+
+
+def graded(probe, gap):
+    """Grey values that say how deep they are, black in front of a gap; and the depths (m)."""
+    line, depth = probe.pixel_beams
+    grey = np.nan_to_num(20.0 + depth * 5000.0)
+    surface = np.interp(np.nan_to_num(line), np.arange(probe.lines), gap)
+    return np.where(depth > surface, grey, 0.0).astype(np.uint8), surface
+
+
+@pytest.mark.parametrize("name", PROBES)
+@settings(max_examples=15, deadline=None)
+@given(first=st.floats(0.2e-3, 4e-3), last=st.floats(0.2e-3, 4e-3))
+@example(first=3.2451774602223087e-3, last=2.3404710968436904e-3)  # left a sector's corner black
+def test_the_layer_shows_the_tissue_beyond_it_mirrored(name, first, last):
+    probe = PROBES[name]
+    gap = np.linspace(first, last, probe.lines)
+    image, surface = graded(probe, gap)
+    filled = LAYERS[name].filled(image, gap, np.ones(probe.lines))
+    depth = probe.pixel_beams[1]
+    pixel = float(np.hypot(*probe.pixel_spacing))
+    layer = depth < surface
+    mirrored = 20.0 + 5000.0 * (2 * surface - depth)
+    # To the margin of a pixel on both sides, and the rounding to the nearest.
+    np.testing.assert_allclose(filled[layer], mirrored[layer], atol=5000.0 * 3.5 * pixel + 1)
+    beyond = depth > surface + pixel
+    np.testing.assert_array_equal(filled[beyond], image[beyond])
+    np.testing.assert_array_equal(filled[np.isnan(depth)], image[np.isnan(depth)])
+
+
+@pytest.mark.parametrize("name", PROBES)
+def test_lines_in_air_and_a_face_in_full_contact_stay_as_they_are(name):
+    probe, layer = PROBES[name], LAYERS[name]
+    gap = np.full(probe.lines, 2e-3)
+    image, _ = graded(probe, gap)
+    assert layer.filled(image, gap, np.zeros(probe.lines)) is image
+    assert layer.filled(image, np.zeros(probe.lines), np.ones(probe.lines)) is image
+    assert layer.filled(image, np.full(probe.lines, np.inf), np.ones(probe.lines)) is image
+    assert layer.filled(image, np.full(probe.lines, 0.02), np.ones(probe.lines)) is image
+    half = np.where(np.arange(probe.lines) < probe.lines // 2, 1.0, 0.0)
+    filled = layer.filled(image, gap, half)
+    line = np.nan_to_num(probe.pixel_beams[0])
+    in_air = line > probe.lines // 2
+    np.testing.assert_array_equal(filled[in_air], image[in_air])
+    assert (filled[~in_air] != image[~in_air]).any()
+
+
+def test_no_black_wedge_where_a_coarse_mesh_stands_off_a_pressed_face():
+    planes = uniform_planes(-0.04, 0.04, 9), uniform_planes(-0.02, 0.02, 5)
+    block = box_mesh(*planes, uniform_planes(0.0, 0.05, 6))
+    grey = np.full((90, 50, 60), 120, np.uint8)
+    to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+    to_patient[:3, 3] = [-0.0445, -0.0245, -0.0045]
+    probe = LinearProbe(aperture=0.04, depth=0.03, columns=80, rows=120, lines=80)
+    pressed, nodes = Pose([0.0, 0.0011, 0.01]), block.nodes.copy()
+    # Every other node of the top lies 1.5 mm beneath the face, and the others on it.
+    top = nodes[:, 2] == 0.0
+    nodes[:, 2] += 0.01 * (1 - nodes[:, 2] / 0.05)
+    odd = np.round(nodes[:, 0] / 0.01).astype(int) % 2 == 1
+    nodes[top & odd, 2] += 0.0015
+
+    def shown(contact):
+        scanner = BMode(Volume(grey, to_patient), probe, Imaging(contact=contact))
+        scanner.carry(block.nodes, block.tetrahedra)
+        return scanner.image(pressed, nodes)
+
+    assert (shown(False)[:4] == 0).mean() > 0.3  # the wedges are there
+    assert (shown(True) == 120).all()
+
+
+AIR_PROBE = LinearProbe(aperture=0.04, depth=0.04, columns=200, rows=400, lines=100)
+TISSUE = np.random.Generator(np.random.PCG64(1)).integers(0, 256, (400, 200), dtype=np.uint8)
+
+
+@functools.cache
+def quiet():
+    return Reverberation(AIR_PROBE, Imaging(contact=True, reverberation=-60.0))
+
+
+@functools.cache
+def air():
+    return Reverberation(AIR_PROBE, Imaging(contact=True))
+
+
+def coupling(value):
+    return np.full(100, value, dtype=np.float32)
+
+
+def test_full_contact_leaves_the_image_as_it_is():
+    assert air().shown(TISSUE, coupling(1.0)) is TISSUE
+
+
+@pytest.mark.parametrize(("share", "decibels"), [(0.5, 6.02), (0.1, 20.0)])
+def test_a_badly_coupled_line_is_dimmer_by_decibels_at_every_depth(share, decibels):
+    expected = np.maximum(TISSUE.astype(int) - round(4.25 * decibels), 0)
+    np.testing.assert_array_equal(quiet().shown(TISSUE, coupling(share)), expected)
+
+
+def test_air_shows_no_tissue():
+    shown = air().shown(TISSUE, coupling(0.0))
+    np.testing.assert_array_equal(shown, air().shown(np.zeros_like(TISSUE), coupling(0.0)))
+    np.testing.assert_array_equal(shown, air().shown(TISSUE, coupling(0.0)))  # every frame
+    assert (shown[-100:] == 0).all()
+
+
+def test_bands_are_a_lens_apart_and_each_weaker_by_as_much():
+    mean = air().shown(TISSUE, coupling(0.0)).mean(axis=1)
+    spacing = 0.04 / 400
+    depths = (np.arange(400) + 0.5) * spacing
+    bands = [i for i in range(1, 120) if mean[i - 1] < mean[i] >= mean[i + 1]]
+    assert len(bands) >= 6
+    np.testing.assert_allclose(
+        depths[bands[:6]], (np.arange(6) + 0.5) * BAND_SPACING, atol=1.5 * spacing
+    )
+    np.testing.assert_allclose(np.diff(mean[bands[:6]]), -4.25 * 5.0, atol=3.0)
+    assert mean[bands[0]] == pytest.approx(255 - 4.25 * 10, abs=3.0)  # the setting's -10 dB
+
+
+def test_the_first_band_is_as_strong_as_was_set():
+    weaker = Reverberation(AIR_PROBE, Imaging(contact=True, reverberation=-30.0))
+    difference = air().shown(TISSUE, coupling(0.0)).astype(int) - weaker.shown(
+        TISSUE, coupling(0.0)
+    )
+    np.testing.assert_allclose(difference[:20], 85, atol=1)
+
+
+@pytest.mark.parametrize(("row", "aperture"), [(10, 1.5e-3), (100, 5e-3), (380, 0.04 / 3)])
+def test_a_shadow_is_as_soft_as_the_aperture_is_wide(row, aperture):
+    half = (np.arange(100) < 50).astype(np.float32)  # the face's middle is the edge
+    strong = np.full_like(TISSUE, 200)
+    shown = quiet().shown(strong, half)[row].astype(int)
+    x = (np.arange(200) - 99.5) * 0.2e-3  # m from the edge
+    margin = 0.5 * aperture + 0.6e-3  # a step of depth, and a line
+    assert (shown[x < -margin] == 200).all()
+    assert (shown[x > margin] == 0).all()
+    # Half of the aperture hears half the amplitude both ways; what it is in between is linear.
+    partly = np.abs(x) < 0.5 * aperture - 0.6e-3
+    share = 0.5 - x[partly] / aperture
+    np.testing.assert_allclose(10 ** ((shown[partly] - 200) / 4.25 / 40), share, atol=0.06)
+
+
+def test_a_fan_stays_black_beside_its_beams_and_its_bands_follow_the_face():
+    probe = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.05, columns=300, rows=300)
+    air = Reverberation(probe, Imaging(contact=True))
+    shown = air.shown(np.zeros((300, 300), np.uint8), np.zeros(probe.lines, np.float32))
+    line, way = probe.pixel_beams
+    assert (shown[np.isnan(line)] == 0).all()
+    bright = shown > 180
+    assert bright[np.nan_to_num(line) > 150].any()
+    assert bright[np.isfinite(line) & (line < 40)].any()
+    off = np.abs(way[bright] / BAND_SPACING % 1.0 - 0.5) * BAND_SPACING
+    assert off.max() < 0.5e-3

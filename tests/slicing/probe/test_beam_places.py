@@ -6,14 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from us_sim.errors import ProbeError
-from us_sim.slicing.probe.beam_places import (
+from us_sim.slicing.probe.beams import (
     beam_angles,
     fractions_and_depths,
     pixels_of,
     require_depth,
 )
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 
 PROBES = [
     LinearProbe(aperture=0.04, depth=0.05, columns=70, rows=80),

@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.outline import image_outline
-from us_sim.slicing.probe.probe import LinearProbe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe, image_outline
 
 PROBES = [
     LinearProbe(aperture=0.04, depth=0.05),

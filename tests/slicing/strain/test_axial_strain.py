@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.displacement import displacement
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.warm_up import warm_up
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
+from us_sim.slicing.strain import AxialStrain, displacement
+from us_sim.slicing.strain_estimate import warm_up
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 

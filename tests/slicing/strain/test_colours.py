@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from us_sim.slicing.strain.colours import FollowingEnd, strain_scale
+from us_sim.slicing.strain import FollowingEnd, strain_scale
 
 
 @pytest.mark.parametrize("mean", [-0.002, -0.03, -0.14, -0.45])

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
+from us_sim.tissue.contact.probe_gap import FlaredProbe
 
 FINE, COARSE = 0.002, 0.012  # m, spacings that resolve the roundings below, and that do not
 SPHERE = Sphere(0.022)

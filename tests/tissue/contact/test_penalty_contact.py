@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
 from us_sim.tissue.contact.penalty_contact import PenaltyContact
+from us_sim.tissue.contact.probe_gap import FlaredProbe
 
 FINE, COARSE = 0.002, 0.012  # m, spacings that resolve the roundings below, and that do not
 STIFF, STRONG, STIFFENING = 2e3, 20.0, 2e-3  # N/m, N and m of every spring

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
-from us_sim.tissue.contact.penalty_friction import PenaltyFriction
+from us_sim.tissue.contact.penalty_contact import PenaltyFriction
+from us_sim.tissue.contact.probe_gap import FlaredProbe
 
 COUNT, STIFF, STRONG = 6, 2e3, 20.0  # springs, N/m and N of each
 PLATE = FlaredProbe(RoundedBox(0.1, 0.1, 0.03, 0.001), 0.01)

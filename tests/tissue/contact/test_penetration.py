@@ -8,15 +8,14 @@ from hypothesis import strategies as st
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.triangle_parts import part_size
+from us_sim.geometry.triangles import part_size
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.penetration import only_forward, push_out, wrench_on_probe
+from us_sim.tissue.contact.probe_gap import only_forward, push_out, wrench_on_probe
 from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 from us_sim.tissue.solvers.solver import create_solver
 
 FINE, COARSE = 0.004, 0.02  # m, spacings that resolve a sphere of 30 mm, and that do not

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from skfem import ElementTriP1, InteriorBasis, LinearForm, MeshTri
 from tissue_block import block
 
-from us_sim.tissue.contact.surface_contact import surface_contact
 from us_sim.tissue.contact.surface_points import (
     SurfacePoints,
     add_springs,
     add_turns,
+    surface_contact,
 )
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh

@@ -10,9 +10,8 @@ from tissue_block import block_mesh
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients, stiffness
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material, volumetric_split
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
 RATIOS = pytest.mark.parametrize("ratio", [0.3, 0.49])

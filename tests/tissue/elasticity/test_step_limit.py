@@ -10,17 +10,16 @@ from scipy.linalg import eigh
 from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of
-from us_sim.tissue.elasticity.step_limit import (
+from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of, volume_term
+from us_sim.tissue.elasticity.stability import (
     highest_frequency,
     node_stiffness,
     stabilised,
     step_limit,
 )
-from us_sim.tissue.elasticity.volume_term import volume_term
+from us_sim.tissue.model import TissueState
 from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 MESH = block_mesh((4, 3, 3))

@@ -10,9 +10,8 @@ from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs
-from us_sim.tissue.elasticity.tangling import count_inverted
-from us_sim.tissue.elasticity.volume_term import volume_term
+from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, volume_term
+from us_sim.tissue.elasticity.stability import count_inverted
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 MESH = block_mesh((4, 3, 3))

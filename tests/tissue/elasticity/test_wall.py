@@ -10,7 +10,7 @@ from tissue_block import block_mesh
 
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.wall import wall_modulus, withstood_force
+from us_sim.tissue.elasticity.neo_hookean_material import wall_modulus, withstood_force
 
 MESH = block_mesh((4, 3, 3))
 COUNT = len(MESH.tetrahedra)

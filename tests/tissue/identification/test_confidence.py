@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.tissue.identification.confidence import blocks, covariance, jackknife, quantile
+from us_sim.tissue.identification.fit import blocks, covariance, jackknife, quantile
 
 TIMES = np.repeat(np.arange(60.0), 3)
 DEPTHS = np.repeat(np.sin(np.pi * (np.arange(60) + 0.5) / 60), 3)

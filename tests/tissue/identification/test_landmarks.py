@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from us_sim.errors import StiffnessError
-from us_sim.tissue.identification.landmarks import read_landmarks
-from us_sim.tissue.identification.pose_choice import ChosenPoses
-from us_sim.tissue.identification.press_record import without_wrench
+from us_sim.tissue.identification.press_record import ChosenPoses, without_wrench
+from us_sim.tissue.identification.stiffness import read_landmarks
 
 GOOD = "name,time,x,y,z\nvein,,0,0,10 mm\nvein,0.5,0,0,12 mm\n"
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import StiffnessError
-from us_sim.tissue.identification.pose_choice import choose_poses, spread
-from us_sim.tissue.identification.press_record import paired
+from us_sim.tissue.identification.press_record import choose_poses, paired, spread
 
 
 def clearance(pose):

@@ -11,15 +11,13 @@ from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import LabelFractions, average_over_labels
-from us_sim.tissue.identification.landmarks import Landmarks
 from us_sim.tissue.identification.press_model import PressModel
 from us_sim.tissue.identification.press_record import paired, without_wrench
 from us_sim.tissue.identification.settings import StiffnessSettings
-from us_sim.tissue.identification.stiffness import Tissue, fit_stiffness
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.identification.stiffness import Landmarks, Tissue, fit_stiffness
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 
 FEW = StiffnessSettings(poses=16)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import StiffnessError
-from us_sim.tissue.identification.wrench_delay import find_delay
+from us_sim.tissue.identification.press_record import find_delay
 
 TIMES = np.arange(0.0, 6.0, 1 / 60)
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.tissue.linear_algebra.dense_fields import DenseFields
+from us_sim.tissue.linear_algebra.compliance import DenseFields
 
 
 @settings(max_examples=25, deadline=None)

@@ -10,9 +10,8 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
-from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
-from us_sim.tissue.linear_algebra.two_level import TwoLevel, conjugate_gradients
+from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
+from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, conjugate_gradients
 
 NODES = (5, 4, 4)
 MESH = block_mesh(NODES)

@@ -6,8 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh.fitted_planes import Wanted, fitted_planes, wanted_under_probe
-from us_sim.tissue.mesh.label_thickness import wanted_by_labels
+from us_sim.tissue.mesh.box_planes import (
+    Wanted,
+    fitted_planes,
+    wanted_by_labels,
+    wanted_under_probe,
+)
 
 
 def wish(spacing, length):

@@ -8,15 +8,15 @@ from us_sim.errors import MeshError
 from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.materials import label_fractions, uniform_material
 from us_sim.tissue.mesh.file import read_mesh
-from us_sim.tissue.mesh.node_selection import (
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import (
     FACES,
+    TissueModel,
     face_nodes,
     facing_nodes,
     held_remark,
     nodes_in_label,
 )
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.file import read_mesh
-from us_sim.tissue.mesh.point_location import locate
 
 
 @given(seed=st.integers(0, 2**32 - 1))

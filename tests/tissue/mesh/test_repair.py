@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh.repair import repair
+from us_sim.tissue.mesh.tetrahedral_mesh import repair
 
 CORNER = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 

@@ -1,4 +1,7 @@
-"""The exact linear solver against independent sparse solves and the laws of contact."""
+"""The exact linear solver against independent sparse solves and the laws of contact.
+
+Reactions of nearly incompressible tissue against elements that do not lock.
+"""
 
 import logging
 from dataclasses import replace
@@ -12,9 +15,9 @@ from us_sim.cache import cache_folder
 from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.friction import FrictionalContact
-from us_sim.tissue.contact.penetration import push_out
-from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
+from us_sim.tissue.contact.compliant_contact import FrictionalContact
+from us_sim.tissue.contact.probe_gap import push_out
+from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra import compliance as compliance_module
@@ -24,6 +27,7 @@ from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem import Fem, FemSettings
+from us_sim.tissue.solvers.solver import create_solver
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.012]))
 
@@ -316,3 +320,33 @@ def test_sticking_nodes_go_where_the_probe_goes():
     moved = second.nodes[both] - first.nodes[both]
     np.testing.assert_allclose(moved, np.broadcast_to([0.002, 0.0, 0.0], moved.shape), atol=1e-8)
     assert second.force[0] < first.force[0] - 0.1
+
+
+YOUNG = 10e3  # Pa
+
+
+def settled_reaction(name, ratio):
+    """N, of the block pressed by 12 mm."""
+    mesh = block_mesh((20, 10, 10))
+    model = block((20, 10, 10), materials=uniform_material(mesh, Material(YOUNG, ratio)))
+    solver = create_solver(name, model)
+    poses = [Pose(np.array([0.0, 0.0, z])) for z in (0.0025, 0.005, 0.0075, 0.01, 0.012)]
+    for pose in poses + poses[-1:] * 200:
+        deformation = solver.deform(pose)
+    assert deformation.residual < 2e-5
+    return -deformation.force[2]
+
+
+@pytest.mark.parametrize(("ratio", "reference"), [(0.45, 3.905), (0.49, 4.035), (0.499, 4.106)])
+def test_nearly_incompressible_tissue_is_no_stiffer_than_27_node_hexahedra(ratio, reference):
+    """References: `evaluation.tissue.kept_reference`, its sizes 10 and 6.5 mm under the sphere."""
+    # So coarse a surface, flat between its nodes, makes the dent a tenth too wide.
+    assert settled_reaction("fem_nonlinear", ratio) == pytest.approx(1.1 * reference, rel=0.03)
+
+
+def test_only_plain_linear_tetrahedra_lock():
+    def growth(name):
+        return settled_reaction(name, 0.499) / settled_reaction(name, 0.45)
+
+    assert growth("fem") < 1.05
+    assert growth("fem_cg") > 1.2

@@ -10,7 +10,7 @@ from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.contact.probe_gap import push_out
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material

@@ -16,14 +16,12 @@ from us_sim.evaluation.independent_residual import IndependentResidual
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import only_forward
-from us_sim.tissue.deformation import TissueState
+from us_sim.tissue.contact.probe_gap import only_forward
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material, volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, TissueState
 from us_sim.tissue.solvers import fem_nonlinear
 from us_sim.tissue.solvers.fem import Fem
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings

@@ -10,8 +10,8 @@ from us_sim.errors import SolverError
 from us_sim.evaluation.independent_forces import neo_hookean_forces
 from us_sim.geometry.collider import RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.flared_probe import FlaredProbe
-from us_sim.tissue.contact.penalty_friction import PenaltyFriction
+from us_sim.tissue.contact.penalty_contact import PenaltyFriction
+from us_sim.tissue.contact.probe_gap import FlaredProbe
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.solvers.fem import Fem, FemSettings

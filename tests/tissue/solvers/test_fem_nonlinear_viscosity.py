@@ -9,7 +9,7 @@ from us_sim.geometry.collider import RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.overstress import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import PronyBranch
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 from us_sim.tissue.solvers.newton import Newton
 

@@ -1,6 +1,12 @@
-"""Switching between solvers, and comparing two on the same poses."""
+"""Switching between solvers, compiling them in another process, and preparing them in a thread."""
 
+import importlib
 import itertools
+import os
+import subprocess
+import sys
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +15,21 @@ from tissue_block import block
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import kernel_folder
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.solvers import switching
 from us_sim.tissue.solvers.fem_cg import FemCgSettings
-from us_sim.tissue.solvers.switching import Plan, SwitchableTissue, difference
+from us_sim.tissue.solvers.solver import SolverSettings
+from us_sim.tissue.solvers.switching import (
+    Failed,
+    Plan,
+    Preparation,
+    SwitchableTissue,
+    compiled_solver,
+    difference,
+)
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.008]))
 
@@ -119,3 +134,222 @@ def test_tissue_that_is_not_held_is_refused_before_anything_is_compiled(model, m
         with pytest.raises(SolverError, match="around node 0 has 0 fixed nodes"):
             tissue.use(name)
     assert tissue.name == "msds"
+
+
+SLOW = '''
+"""A solver with one kernel."""
+import os
+from numba import njit
+
+class Slow:
+    name = "slow"
+
+    @classmethod
+    def rehearse(cls, model, settings):
+        if os.environ.get("ALONE", str(os.getpid())) != str(os.getpid()):
+            raise OSError("no more memory")
+        kernel(1)
+
+    def __init__(self, model, settings, progress):
+        kernel(float(len(model.mesh.nodes)))  # as one that only a large tissue needs
+
+@njit(cache=True)
+def kernel(count):
+    return count + 1
+'''
+
+SAID = [f"compiling slow, {said}" for said in ("kernel 1", "kernel 2", "2 kernels")]
+
+FRAMES = """
+import sys
+import numba
+import numpy as np
+from us_sim.geometry.pose import Pose
+from us_sim.tissue.linear_algebra import compliance
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.solver import create_solver
+
+def kernels():
+    found = {
+        f"{value.__module__}.{value.__name__}": len(value.signatures)
+        for module in list(sys.modules.values())
+        for value in vars(module).values()
+        if isinstance(value, numba.core.dispatcher.Dispatcher)
+    }
+    return {name: count for name, count in found.items() if name.startswith("us_sim.")}
+
+compliance._KEPT = compliance._DOUBLE = 0  # as a large tissue's
+box = TissueModel.block(nodes=(7, 7, 5))
+mesh = TetrahedralMesh(box.mesh.nodes, box.mesh.tetrahedra)
+other = TissueModel(mesh, box.materials, box.fixed, box.collider, box.contact_nodes)
+presses = [(0, 0, -1), (0, 0, 4), (0, 0, 8), (4, 0, 8), (4, 0, 8), (4, 0, 2), (-9, 5, 12)]
+for model, method, settings in (
+    (other, "fem", {}),
+    (other, "fem", {"contact": "coulomb"}),
+    (box, "fem_nonlinear", {"contact": "coulomb", "viscosity": 1.0}),
+):
+    solver = create_solver(method, model, **settings)
+    solver.warm_up()
+    ready = kernels()
+    for place in presses:
+        solver.deform(Pose(position=1e-3 * np.array(place, float)))
+        solver.contact_stiffness()
+    solver.deform(None)
+    print({name for name, count in kernels().items() if count != ready.get(name)})
+"""
+
+
+def test_no_frame_meets_a_kernel_that_is_not_compiled(tmp_path, monkeypatch):
+    # What is kept of a tissue is not there, so that it is made; kernels are those of all tests.
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernel_folder()))
+    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
+    ran = subprocess.run([sys.executable, "-c", FRAMES], capture_output=True, text=True)
+    assert ran.stdout.split("\n") == ["set()"] * 3 + [""], ran.stderr
+
+
+@pytest.fixture
+def slow(tmp_path, monkeypatch):
+    """A module with a solver, of which nothing is compiled."""
+    (tmp_path / "slow_solver.py").write_text(SLOW)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield importlib.import_module("slow_solver")
+    del sys.modules["slow_solver"]
+
+
+def prepared(slow):
+    """What is said while it is compiled beside; then how often from the cache and how often not."""
+    said = []
+    model = block((3, 3, 3))
+    compiled_solver(
+        slow.Slow, model, SolverSettings(), lambda _, text: said.append(text), elsewhere=True
+    )
+    assert len(slow.kernel.signatures) == 2
+    return said, sum(slow.kernel.stats.cache_hits.values())
+
+
+def test_another_process_compiles_and_this_one_loads(slow):
+    assert prepared(slow) == (SAID, 2)
+    assert prepared(slow) == ([], 2)  # nothing is left to do
+
+
+def test_where_the_other_process_fails_this_one_compiles(slow, monkeypatch, caplog):
+    monkeypatch.setenv("ALONE", str(os.getpid()))
+    assert prepared(slow) == (SAID, 0)
+    assert "slow is compiled in this process: OSError: no more memory" in caplog.text
+
+
+def test_a_solver_that_no_other_process_can_import_is_compiled_here(slow):
+    slow.Slow.__qualname__ = "elsewhere.Slow"
+    assert prepared(slow) == (SAID, 0)
+
+
+class SlowTissue:
+    """Makes a plan when it is let; what is made is the plan itself."""
+
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+        self.has_begun = threading.Semaphore(0)
+        self.may_end = threading.Semaphore(0)
+
+    def make(self, plan: Plan, progress: object = None, *, beside: bool) -> Plan:  # noqa: ARG002
+        self.begun.append(plan.solver)
+        self.has_begun.release()
+        assert self.may_end.acquire(timeout=20)
+        if plan.solver == "impossible":
+            raise SolverError("it cannot be")
+        if plan.solver == "broken":
+            raise ZeroDivisionError("division by zero")
+        return plan
+
+
+@pytest.fixture
+def tissue():
+    return SlowTissue()
+
+
+@pytest.fixture
+def preparation(tissue):
+    return Preparation(tissue)
+
+
+def outcome_of(preparation):
+    """What comes of it in the end."""
+    deadline = time.monotonic() + 20
+    while (outcome := preparation.take()) is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    return outcome
+
+
+def test_nothing_waits_for_what_is_made_and_it_can_be_taken_once(preparation, tissue):
+    assert (preparation.state, preparation.take()) == ("", None)
+    plan = Plan("fem")
+    preparation.want(plan)
+    assert tissue.has_begun.acquire(timeout=20)
+    assert preparation.take() is None
+    assert preparation.state.endswith(" for 0 s")
+    tissue.may_end.release()
+    assert outcome_of(preparation) is plan
+    assert preparation.take() is None
+    assert preparation.state == ""
+
+
+def test_the_newest_plan_wins_and_those_between_are_never_made(preparation, tissue):
+    preparation.want(Plan("first"))
+    assert tissue.has_begun.acquire(timeout=20)
+    for name in ("second", "third", "newest"):
+        preparation.want(Plan(name))
+    tissue.may_end.release()
+    assert tissue.has_begun.acquire(timeout=20)
+    assert preparation.take() is None  # the first is no longer wanted
+    tissue.may_end.release()
+    assert outcome_of(preparation).solver == "newest"
+    assert tissue.begun == ["first", "newest"]
+
+
+def test_what_was_made_and_not_taken_gives_way_to_a_newer_plan(preparation, tissue):
+    preparation.want(Plan("first"))
+    tissue.may_end.release()
+    deadline = time.monotonic() + 20
+    while preparation.state:
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    preparation.want(Plan("newest"))
+    assert preparation.take() is None
+    tissue.may_end.release()
+    assert outcome_of(preparation).solver == "newest"
+
+
+def test_what_is_dropped_is_never_told(preparation, tissue):
+    preparation.want(Plan("first"))
+    assert tissue.has_begun.acquire(timeout=20)
+    preparation.drop()
+    assert preparation.state == ""
+    tissue.may_end.release()
+    preparation.want(Plan("newest"))
+    tissue.may_end.release()
+    assert outcome_of(preparation).solver == "newest"
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [("impossible", "it cannot be"), ("broken", "ZeroDivisionError: division by zero")],
+)
+def test_a_failure_is_told_and_the_next_plan_is_made(preparation, tissue, name, problem):
+    plan = Plan(name)
+    preparation.want(plan)
+    tissue.may_end.release()
+    assert outcome_of(preparation) == Failed(plan, problem)
+    preparation.want(Plan("fem"))
+    tissue.may_end.release()
+    assert outcome_of(preparation).solver == "fem"
+
+
+def test_a_failure_of_a_plan_that_is_no_longer_wanted_is_not_told(preparation, tissue):
+    preparation.want(Plan("impossible"))
+    assert tissue.has_begun.acquire(timeout=20)
+    preparation.want(Plan("fem"))
+    tissue.may_end.release(2)
+    assert outcome_of(preparation).solver == "fem"
+    assert preparation.take() is None

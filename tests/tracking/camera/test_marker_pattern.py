@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.evaluation.tracking.small_markers import small_marker_point
+from us_sim.evaluation.tracking.measure import small_marker_point
 from us_sim.tracking.camera.corner_refinement import refined_corners
 from us_sim.tracking.camera.markers import fitted_corners, pattern
 

@@ -1,45 +1,604 @@
-"""`us-sim evaluate hand`: how tissue follows a hand, with every method.
+"""Tissues that a hand presses, and its motions on each.
 
-Random motions of a hand (`us_sim.recording.hand_motion`) on several tissues are followed with every
-pose, and live, where a frame that takes too long costs poses; then the probe is held still. What is
-compared is where the nodes are with the converged answer at the same pose
-(`us_sim.evaluation.hand.converged`).
+>>> from us_sim.evaluation.hand.measure import TISSUES, motions
+>>> [str(motion) for motion in motions(quick=True, seed=1)][0]
+'arm, free, brisk'
+>>> len(TISSUES["block"].model.mesh.nodes)
+2000
+
+What every method is compared with: large deformation, converged at each pose of a motion.
+
+A ``fem_nonlinear`` with all the patience that its settings allow follows the poses in order, and is
+called again at each until it has converged, or goes no further.
+
+>>> from us_sim.evaluation.hand.measure import Converged
+>>> Converged.of_no_frame(3).trusted.tolist()
+[False, False, False]
+
+What came of a motion with one method: every pose fed, then as live, then the probe held still.
+
+>>> from us_sim.evaluation.hand.measure import Held
+>>> held = Held(np.array([0.3, 0.02, 5e-4, 1e-6]))
+>>> held.frames_to(1e-2), held.frames_to(1e-8)
+(2.0, nan)
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
-from threadpoolctl import threadpool_limits
+import numpy as np
+from numpy.typing import NDArray
 
-from us_sim.evaluation.hand.cases import TISSUES, Motion, motions
-from us_sim.evaluation.hand.converged import METHOD, Converged, converged, patient_solver
-from us_sim.evaluation.hand.points import Point, measure
-from us_sim.evaluation.hand.report import table, write_report
-from us_sim.evaluation.hand.settings import HandSettings
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures, words_of
+from us_sim.evaluation.block import EXTENT, MESHES
+from us_sim.evaluation.named import Named
+from us_sim.evaluation.report import (
+    Row,
+    words_of,
+)
+from us_sim.evaluation.timing import frames_until
+from us_sim.evaluation.tissue.cases import SCENES
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.progress import Progress
+from us_sim.geometry.pose import Pose
+from us_sim.recording.hand_motion import HASTES, KINDS, RATE, Room, hand_motion
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.reading import find_scene, load_scene
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
+from us_sim.tissue.solvers.frame_budget import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
+from us_sim.volume.volume import Volume
+
+__all__ = ["MAIN_TISSUE", "RATE", "TISSUES", "Motion", "Tissue", "motions"]
 
 
-def evaluate_hand(out: Path, quick: bool, settings: HandSettings | None = None) -> int:
-    """Write hand.csv, the plots and hand.md, as `us_sim.evaluation` says.
+MAIN_TISSUE = "arm"
+APPROACH = 0.5
+"""s, in which the probe comes to where a motion begins: these frames do not count."""
 
-    A quick run has fewer and shorter motions.
+_MAIN, _ELSEWHERE = 10.0, 4.0  # s, of a motion on the main tissue and on others
+_SIDE_KINDS = 4.0  # s, of a motion that is not free
+_QUICK_MOTIONS = (
+    (MAIN_TISSUE, "free", "brisk", 2.0),
+    (MAIN_TISSUE, "free", "violent", 0.7),
+    (MAIN_TISSUE, "rocking", "careful", 0.7),
+    ("liver", "fanning", "brisk", 0.5),
+    ("block", "sliding", "brisk", 0.7),
+    ("block", "stabbing", "violent", 0.7),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Tissue:
+    """What is pressed, how a report calls it, and how far the hand may go on it."""
+
+    name: str
+    words: str
+    colour: str
+    make: Callable[[], TissueModel]
+    room: Room
+
+    @cached_property
+    def model(self) -> TissueModel:
+        """Made once.
+
+        Raises:
+            UsSimError: it cannot be made.
+        """
+        return self.make()
+
+
+def _arm() -> TissueModel:
+    scene = load_scene("upper_arm")
+    return tissue_model_of(scene, volume_of(scene))
+
+
+def _liver() -> TissueModel:
+    # The scene's volume is not part of the package. It has no labels, so that the tissue is uniform
+    # and needs nothing of it: any file stands for it, and an empty volume.
+    scene = load_scene("liver_sweep", volume=find_scene("liver_sweep"))
+    return tissue_model_of(scene, Volume(np.zeros((1, 1, 1), np.uint8), np.eye(4)))
+
+
+_BLOCK = SCENES["tilt"]
+
+_ALL = (
+    Tissue(
+        MAIN_TISSUE,
+        "the scene `upper_arm` with its linear probe: skin, fat, muscle, vessels, bone",
+        "#0072B2",
+        _arm,
+        Room(),
+    ),
+    Tissue(
+        "liver",
+        "the block of the scene `liver_sweep` with its convex probe: uniform, 6 kPa, held at its "
+        "bottom",
+        "#009E73",
+        _liver,
+        Room(edge=0.12),
+    ),
+    Tissue(
+        "block",
+        "the uniform block of `us-sim evaluate tissue`, 10 kPa, under a capsule of 25 mm radius",
+        "#D55E00",
+        lambda: _BLOCK.model(MESHES[0]),
+        Room(edge=EXTENT[0][1]),
+    ),
+)
+TISSUES = Named("tissue of the hand evaluation", {tissue.name: tissue for tissue in _ALL})
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion on a tissue."""
+
+    tissue: str
+    kind: str  # of `us_sim.recording.hand_motion.KINDS`
+    haste: str  # of `us_sim.recording.hand_motion.HASTES`
+    seed: int
+    duration: float  # s, without the approach
+
+    def __str__(self) -> str:
+        return f"{self.tissue}, {self.kind}, {self.haste}"
+
+    @cached_property
+    def poses(self) -> list[Pose]:
+        """One a frame, those of the approach first."""
+        return hand_motion(
+            self.kind,
+            self.haste,
+            self.seed,
+            self.duration,
+            TISSUES[self.tissue].room,
+            approach=APPROACH,
+        ).poses
+
+    @property
+    def begins(self) -> int:
+        """The frame after the approach."""
+        return round(APPROACH * RATE)
+
+
+def motions(quick: bool, seed: int) -> list[Motion]:
+    """All that is measured, in order: a tissue's motions stand together.
+
+    The free hand in every haste on every tissue, the longest on the main one; there every kind in
+    every haste, elsewhere every kind in the middle one.
     """
-    folder = ReportFolder("hand", out, quick)
-    planned = motions(quick, (settings or HandSettings()).seed)
-    answers: dict[Motion, Converged] = {}
-    runs = sum(len(motion.poses) for motion in planned) * (1 + len(TISSUE_METHODS))
-    with Progress("hand", runs, "poses") as progress, threadpool_limits(1):
-        points = list(_points(planned, answers, progress.update))
-        progress.update(runs)
-    folder.write_rows("hand", points)
-    write_report(folder, points, answers)
-    return folder.finish(table(points), failures(points))
+    if quick:
+        rows = list(_QUICK_MOTIONS)
+    else:
+        rows = [
+            (tissue, kind, haste, _seconds(tissue, kind))
+            for tissue in TISSUES
+            for kind in KINDS
+            for haste in HASTES
+            if tissue == MAIN_TISSUE or kind == "free" or haste == "brisk"
+        ]
+    order = list(TISSUES)
+    found = [Motion(tissue, kind, haste, seed, length) for tissue, kind, haste, length in rows]
+    return sorted(found, key=lambda motion: order.index(motion.tissue))
+
+
+def _seconds(tissue: str, kind: str) -> float:
+    if kind != "free":
+        return _SIDE_KINDS
+    return _MAIN if tissue == MAIN_TISSUE else _ELSEWHERE
+
+
+METHOD = "fem_nonlinear"
+CONVERGED = 1e-5
+"""Residual at which a pose is left for the next."""
+TRUSTED = 1e-3
+"""Residual above which nothing is compared with what was reached."""
+HELD = 1e-6
+"""m that a fixed node may move before nothing is compared with it either."""
+
+_MOST_CALLS = 20  # at one pose
+_PATIENCE, _PROGRESS = 4, 0.7  # calls, in which the least residual must fall by that factor
+
+
+@dataclass(frozen=True, eq=False)
+class Converged:
+    """The answer at each of K poses."""
+
+    nodes: NDArray[np.float64]  # (K, N, 3) m
+    residual: NDArray[np.float64]  # (K,) as the solver said in the end
+    pressed: NDArray[np.bool_]  # (K,) whether the probe touches the tissue
+    smallest: NDArray[np.float64]  # (K,) volume ratio of the tetrahedron most crushed
+    slipped: NDArray[np.float64]  # (K,) m, of the fixed node that moved most
+
+    @classmethod
+    def of_no_frame(cls, count: int) -> Converged:
+        """In place of what failed: there is nothing to compare with."""
+        never = np.zeros(count, dtype=np.bool_)
+        unknown = np.full(count, np.nan)
+        return cls(np.empty((count, 0, 3)), np.full(count, np.inf), never, unknown, unknown)
+
+    @property
+    def trusted(self) -> NDArray[np.bool_]:
+        """(K,) whether something may be compared with it."""
+        return (self.residual <= TRUSTED) & (self.slipped <= HELD)
+
+    @property
+    def last_pressed(self) -> int:
+        """The last frame in which the probe touches; the last of all where it never does."""
+        touching = np.flatnonzero(self.pressed)
+        return int(touching[-1]) if len(touching) else len(self.pressed) - 1
+
+
+def converged(
+    model: TissueModel, poses: Sequence[Pose], progress: Callable[[int], None] | None = None
+) -> Converged:
+    """Follow the poses, each to convergence.
+
+    Args:
+        model: of the tissue.
+        poses: of the probe, in order.
+        progress: told how many of the poses are done.
+
+    Raises:
+        UsSimError: the method does not take the tissue.
+    """
+    solver = patient_solver(model)
+    nodes = np.empty((len(poses), *model.mesh.nodes.shape))
+    residual, pressed = np.empty(len(poses)), np.zeros(len(poses), dtype=np.bool_)
+    smallest, slipped = np.empty(len(poses)), np.empty(len(poses))
+    for k, pose in enumerate(poses):
+        found = settled(solver, pose)
+        nodes[k], residual[k] = found.nodes, found.residual
+        pressed[k] = len(found.contact_nodes) > 0
+        volumes = signed_volumes(found.nodes, model.mesh.tetrahedra)
+        smallest[k] = (volumes / model.mesh.volumes).min()
+        slipped[k] = moved_fixed(model, found)
+        if progress is not None:
+            progress(k + 1)
+    return Converged(nodes, residual, pressed, smallest, slipped)
+
+
+def moved_fixed(model: TissueModel, found: Deformation) -> float:
+    """m, of the fixed node that moved most: none should."""
+    return float(np.abs(found.nodes - model.mesh.nodes)[model.fixed].max(initial=0.0))
+
+
+def patient_solver(model: TissueModel) -> TissueSolver:
+    """The method with the settings with which it converges.
+
+    Raises:
+        UsSimError: it does not take the tissue.
+    """
+    return create_solver(METHOD, model, **(TISSUE_METHODS[METHOD].patient or {}))
+
+
+def settled(solver: TissueSolver, pose: Pose) -> Deformation:
+    """The last of many frames at one pose, or the best: until it settles, or goes no further.
+
+    Of frames in balance the last is the best: in the earlier ones the probe is still sunk in.
+    """
+    found = solver.deform(pose)
+    best = [found]
+    for _ in range(_MOST_CALLS - 1):
+        stalled = len(best) > _PATIENCE and (
+            best[-1].residual > max(CONVERGED, _PROGRESS * best[-1 - _PATIENCE].residual)
+        )
+        if solver.is_settled or stalled:
+            break
+        found = solver.deform(pose)
+        balanced = found.residual <= CONVERGED
+        best.append(found if balanced else min(best[-1], found, key=lambda each: each.residual))
+    return best[-1]
+
+
+ENOUGH = 0.9
+"""Fraction of the frames that must be compared before their errors are told of."""
+HOLD = 60
+"""Frames in which the probe stays where it is."""
+OWN_EVERY = 5
+"""Frames, of which one is converged by itself."""
+SENDING_S = 0.0005
+"""What it takes a node to send its result."""
+_SMALL = 1e-3
+"""Residual that a held probe must come to."""
+
+_Array = NDArray[np.float64]
+
+
+def _nothing() -> _Array:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of a motion, each array (K,); an error is NaN where there is no converged answer."""
+
+    number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))  # of the pose
+    error: _Array = field(default_factory=_nothing)  # mm, of the node that is farthest off
+    rms: _Array = field(default_factory=_nothing)  # mm, root mean square over all nodes
+    own: _Array = field(default_factory=_nothing)  # mm, to its own balance; NaN in most frames
+    residual: _Array = field(default_factory=_nothing)  # as reported
+    inverted: _Array = field(default_factory=_nothing)  # tetrahedra
+    slipped: _Array = field(default_factory=_nothing)  # mm, of the fixed node that moved most
+    cpu: _Array = field(default_factory=_nothing)  # ms, processor time of all threads
+    wall: _Array = field(default_factory=_nothing)  # ms
+
+    @property
+    def compared(self) -> float:
+        """Fraction of the frames that have an error; what there is of few says nothing of all."""
+        return float(np.isfinite(self.error).mean()) if len(self.error) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Live:
+    """A motion of which only those poses are seen for which there is time."""
+
+    poses: int = 0  # that came
+    frames: Frames = field(default_factory=Frames)  # that were made
+    latency: _Array = field(default_factory=_nothing)  # (K,) ms, from a pose to its frame
+
+    @property
+    def skipped(self) -> float:
+        """Fraction of the poses."""
+        return 1.0 - len(self.frames.number) / self.poses if self.poses else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Frames after the probe has stopped."""
+
+    residual: _Array = field(default_factory=_nothing)  # (K,), of the last frame before them first
+    inverted: int = 0  # tetrahedra in the last of them
+
+    def frames_to(self, residual: float) -> float:
+        """Frames until it is as small, and stays so; NaN where it never is."""
+        found = frames_until(self.residual, residual)
+        return math.nan if found is None else float(found)
+
+    @property
+    def last(self) -> float:
+        """The residual in the end."""
+        return float(self.residual[-1]) if len(self.residual) else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Point(Row):
+    """A row of hand.csv."""
+
+    motion: Motion
+    method: str
+    speed: float = math.nan  # m/s, median of the frames that count
+    turning: float = math.nan  # rad/s, likewise
+    frames: Frames = field(default_factory=Frames)
+    live: Live = field(default_factory=Live)
+    held: Held = field(default_factory=Held)
+    failure: str = ""
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What sums up the frames, by column."""
+        frames, live, held, motion = self.frames, self.live, self.held, self.motion
+        over = {
+            f"residual_over_{limit:g}": _mean(frames.residual > limit) for limit in (1e-2, 0.1, 1.0)
+        }
+        return {
+            "tissue": motion.tissue,
+            "kind": motion.kind,
+            "haste": motion.haste,
+            "seed": motion.seed,
+            "method": self.method,
+            "frames": len(frames.number),
+            "speed_mm_s": 1e3 * self.speed,
+            "turning_deg_s": math.degrees(self.turning),
+            **_percentiles("error_mm", frames.error, (50, 95, 99, 100)),
+            **_percentiles("rms_mm", frames.rms, (50, 95, 99, 100)),
+            "not_compared": int(np.isnan(frames.error).sum()),
+            **_percentiles("own_error_mm", frames.own, (50, 100)),
+            **_percentiles("residual", frames.residual, (50, 99, 100)),
+            **over,
+            "frames_inverted": int((frames.inverted > 0).sum()),
+            "fixed_nodes_moved_mm": float(frames.slipped.max(initial=0.0)),
+            **_percentiles("cpu_ms", frames.cpu, (50, 99, 100)),
+            **_percentiles("wall_ms", frames.wall, (50, 99, 100)),
+            "live_skipped": live.skipped,
+            **_percentiles("live_error_mm", live.frames.error, (50, 99, 100)),
+            **_percentiles("live_latency_ms", live.latency, (50, 99, 100)),
+            "live_frames_inverted": int((live.frames.inverted > 0).sum()),
+            "hold_frames_to_1e-2": held.frames_to(1e-2),
+            "hold_frames_to_1e-3": held.frames_to(_SMALL),
+            "hold_residual": held.last,
+            "hold_inverted": bool(held.inverted),
+            "failure": self.failure,
+        }
+
+    @property
+    def title(self) -> str:
+        """What was tried."""
+        return f"{self.method}, {self.motion}"
+
+
+def those(
+    points: Iterable[Point],
+    *,
+    method: str | None = None,
+    tissue: str | None = None,
+    kind: str | None = None,
+    haste: str | None = None,
+) -> list[Point]:
+    """Points that did not fail, of this method, tissue, kind and haste; None is any."""
+    wanted = (method, tissue, kind, haste)
+    return [
+        p
+        for p in points
+        if not p.failure
+        and all(
+            value is None or value == own
+            for value, own in zip(
+                wanted, (p.method, p.motion.tissue, p.motion.kind, p.motion.haste), strict=True
+            )
+        )
+    ]
+
+
+def measure(
+    solver: TissueSolver,
+    motion: Motion,
+    answer: Converged,
+    balance: TissueSolver | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Point:
+    """Follow a motion twice from rest, once with every pose and once live, and hold the probe.
+
+    Args:
+        solver: of the method.
+        motion: of the probe.
+        answer: the converged one at each of its poses.
+        balance: a solver of the same equations, with which frames are converged at their poses.
+        progress: told how many poses have been fed.
+
+    Raises:
+        FloatingPointError: a number that the solver returned is not finite.
+    """
+    bench = _Following(solver, motion, answer, balance)
+    frames = bench.every_pose(progress)
+    held = bench.held()
+    live = bench.live()
+    poses = motion.poses[motion.begins :]
+    speed, turning = _speeds(poses)
+    return Point(motion, solver.name, speed, turning, frames, live, held)
+
+
+class _Following:
+    """One solver and one motion."""
+
+    def __init__(
+        self,
+        solver: TissueSolver,
+        motion: Motion,
+        answer: Converged,
+        balance: TissueSolver | None,
+    ) -> None:
+        self._solver, self._motion, self._answer = solver, motion, answer
+        self._balance, self._mesh = balance, solver.model.mesh
+        self._last = solver.deform(None)
+
+    def every_pose(self, progress: Callable[[int], None] | None) -> Frames:
+        """No pose is left out, however long a frame takes; up to the last one that presses."""
+        self._solver.reset()
+        rows = []
+        for k in range(self._answer.last_pressed + 1):
+            row = self._frame(k, own_balance=k % OWN_EVERY == 0 and k >= self._motion.begins)
+            if k >= self._motion.begins:
+                rows.append(row)
+            if progress is not None:
+                progress(k + 1)
+        return _frames(rows)
+
+    def held(self) -> Held:
+        """The probe stays where the motion above ended."""
+        pose, found = self._motion.poses[self._answer.last_pressed], self._last
+        residual = [found.residual]
+        for _ in range(HOLD):
+            before, found = found, self._solver.deform(pose)
+            if found is before:  # settled: it will not change any more
+                break
+            residual.append(found.residual)
+        return Held(np.array(residual), self._inverted(found))
+
+    def live(self) -> Live:
+        """Poses come at their times, and a frame begins with the newest of them.
+
+        The clock is the wall's while a frame is made; waiting for a pose takes no time. A frame may
+        take as long as `frame_limit` says, as in the node.
+        """
+        self._solver.reset()
+        self._solver.frame_limit = frame_limit(SENDING_S, usable_cores())
+        poses = self._motion.poses
+        rows, latency = [], []
+        now, done = 0.0, -1
+        while True:
+            newest = int(now * RATE + 1e-9)
+            if newest <= done:
+                newest, now = done + 1, (done + 1) / RATE
+            if newest >= len(poses):
+                break
+            row = self._frame(newest)
+            now += 1e-3 * row[-1]
+            done = newest
+            if newest >= self._motion.begins:
+                rows.append(row)
+                latency.append(1e3 * (now - newest / RATE))
+        self._solver.frame_limit = None
+        return Live(len(poses) - self._motion.begins, _frames(rows), np.array(latency))
+
+    def _frame(self, k: int, *, own_balance: bool = False) -> tuple[float, ...]:
+        pose = self._motion.poses[k]
+        begun, processor = time.perf_counter(), time.process_time()
+        found = self._solver.deform(pose)
+        processor, wall = time.process_time() - processor, time.perf_counter() - begun
+        self._last = found
+        numbers = (found.nodes, found.force, found.torque, found.residual)
+        if not all(np.isfinite(number).all() for number in numbers):
+            raise FloatingPointError(f"frame {k} is not finite")
+        error = rms = own = math.nan
+        if own_balance and self._balance is not None:
+            own = self._to_own_balance(pose, found)
+        if self._answer.trusted[k]:
+            off = np.linalg.norm(found.nodes - self._answer.nodes[k], axis=1)
+            error, rms = float(off.max()), float(np.sqrt((off**2).mean()))
+        times = (1e3 * processor, 1e3 * wall)
+        errors = (1e3 * error, 1e3 * rms, 1e3 * own)
+        slipped = moved_fixed(self._solver.model, found)
+        return (k, *errors, found.residual, self._inverted(found), 1e3 * slipped, *times)
+
+    def _to_own_balance(self, pose: Pose, found: Deformation) -> float:
+        """m, from the frame to what it converges to where the probe is; NaN where to nothing."""
+        assert self._balance is not None
+        state = self._solver.state
+        state.displacement[self._solver.model.fixed] = 0.0  # what moved is in its own column
+        self._balance.take_over(state)
+        there = settled(self._balance, pose)
+        if there.residual > TRUSTED or moved_fixed(self._solver.model, there) > HELD:
+            return math.nan
+        return float(np.linalg.norm(found.nodes - there.nodes, axis=1).max())
+
+    def _inverted(self, found: Deformation) -> int:
+        """Tetrahedra that are inside out or flat."""
+        return int((signed_volumes(found.nodes, self._mesh.tetrahedra) <= 0).sum())
+
+
+def _frames(rows: Sequence[tuple[float, ...]]) -> Frames:
+    if not rows:
+        return Frames()
+    number, *others = np.array(rows).T
+    return Frames(number.astype(np.intp), *others)
+
+
+def _speeds(poses: Sequence[Pose]) -> tuple[float, float]:
+    """m/s and rad/s, medians from pose to pose."""
+    places = np.array([pose.position for pose in poses])
+    turns = np.array([pose.orientation for pose in poses])
+    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return RATE * float(np.median(moved)), RATE * float(np.median(2 * np.arccos(cosine)))
+
+
+def _percentiles(name: str, values: _Array, percents: Sequence[int]) -> dict[str, object]:
+    """By column: ``name_p50``, and ``name_worst`` for 100."""
+    known = values[~np.isnan(values)]
+    return {
+        f"{name}_{'worst' if p == 100 else f'p{p}'}": (
+            float(np.percentile(known, p)) if len(known) else math.nan
+        )
+        for p in percents
+    }
+
+
+def _mean(values: NDArray[np.bool_]) -> float:
+    return float(values.mean()) if len(values) else math.nan
 
 
 def _points(

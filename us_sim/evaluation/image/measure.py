@@ -1,57 +1,190 @@
-"""`us-sim evaluate image`: what images show of sound, strain and flow, against closed forms."""
+"""What each artefact that is measured says of itself: its numbers, what is asked, its pictures.
+
+What was measured of one artefact: a row of image.csv.
+
+>>> from us_sim.evaluation.image.measure import Point
+>>> Point.of("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB").error_percent.__round__(2)
+-1.14
+>>> Point.of("strain", "linear", 0.0, 0.02, 0.04, 0.0404, "").error_percent.__round__(2)
+1.0
+
+Layers of tissue, and what each of a probe's beams loses in them, in closed form.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.image.measure import LAYERS, lost
+>>> down = np.array([0.0, 0.0, 1.0])
+>>> float(lost(np.zeros(3), down, np.array([0.01]), 5e6)[0].round(3))  # 1 cm of liver
+-4.5
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
-from us_sim.evaluation.image.angles import Fibres, Surfaces
-from us_sim.evaluation.image.arm_tilts import ArmTilts
-from us_sim.evaluation.image.artefact import Artefact
-from us_sim.evaluation.image.attenuation import Attenuation
-from us_sim.evaluation.image.enhancement import Enhancement
-from us_sim.evaluation.image.flow import Flow
-from us_sim.evaluation.image.points import Point
-from us_sim.evaluation.image.report import table, write_report
-from us_sim.evaluation.image.run_time import RunTime
-from us_sim.evaluation.image.shadow import Shadow
-from us_sim.evaluation.image.strain import StrainImages
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures, words_of
-from us_sim.evaluation.steps import steps
+import numpy as np
+from numpy.typing import NDArray
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    Attenuation(),
-    Enhancement(),
-    Shadow(),
-    Surfaces(),
-    Fibres(),
-    ArmTilts(),
-    StrainImages(),
-    Flow(),
-    RunTime(),
+from us_sim.evaluation.report import ReportFolder, Row, Target
+from us_sim.geometry.pose import Pose
+from us_sim.slicing.acoustics.settings import TissueAcoustics
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.volume.volume import Volume
+
+
+class Artefact(ABC):
+    """One file each; `us_sim.evaluation.image.report` has the list of them."""
+
+    name: ClassVar[str]
+    """The first column of its rows: a word, or several with underscores."""
+    title: ClassVar[str]
+    """The heading of its part of the report."""
+    simplified: ClassVar[str]
+    """What it leaves out or takes as simpler than it is, a sentence or more."""
+
+    @abstractmethod
+    def points(self, quick: bool) -> list[Point]:
+        """The rows of image.csv."""
+
+    @abstractmethod
+    def targets(self, points: Sequence[Point]) -> list[Target]:
+        """What is asked, against its own rows."""
+
+    @abstractmethod
+    def report(self, points: Sequence[Point], folder: ReportFolder) -> list[str]:
+        """The paragraphs of its part of the report, whose pictures it draws into the folder."""
+
+
+@dataclass(frozen=True)
+class Point(Row):
+    """One number that an image should show, and what it does show."""
+
+    artefact: str
+    probe: str
+    tilt_deg: float = float("nan")
+    depth_mm: float = float("nan")
+    expected: float = float("nan")
+    measured: float = float("nan")
+    unit: str = ""
+    error_percent: float = float("nan")
+    ms_median: float = float("nan")  # processor time of an image, where that was measured
+    failure: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        artefact: str,
+        probe: str,
+        tilt: float,
+        depth: float,
+        expected: float,
+        measured: float,
+        unit: str,
+        *,
+        of: float | None = None,
+        ms: float = float("nan"),
+    ) -> Point:
+        """A row; the error of levels in dB is that of the amplitude.
+
+        Args:
+            tilt: degrees. depth: m.
+            of: what the error is a fraction of; None is the expected value, and of pixels one.
+        """
+        if unit == "dB":
+            error = 100.0 * (10.0 ** ((measured - expected) / 20.0) - 1.0)
+        else:
+            whole = of or (1.0 if unit == "px" else abs(expected))
+            error = 100.0 * (measured - expected) / whole if whole else float("nan")
+        return cls(artefact, probe, tilt, 1e3 * depth, expected, measured, unit, error, ms)
+
+    @property
+    def title(self) -> str:
+        """What it is about."""
+        return f"{self.artefact}, {self.probe}, {self.tilt_deg:g}°"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A tissue from one depth on to where the next one begins."""
+
+    name: str
+    begin: float  # m, along z of ``patient``
+    attenuation: float  # dB/cm/MHz
+    impedance: float  # Rayl
+
+    @property
+    def tissue(self) -> TissueAcoustics:
+        """Its constants as settings."""
+        return TissueAcoustics(attenuation=self.attenuation, impedance=self.impedance)
+
+
+LAYERS = (
+    Layer("liver", -np.inf, 0.45, 1.657e6),
+    Layer("fat", 0.0124, 0.6, 1.327e6),
+    Layer("blood", 0.0213, 0.14, 1.679e6),
+    Layer("muscle", 0.0301, 0.9, 1.645e6),
 )
-"""In the order of the report."""
+
+PROBES: dict[str, Probe] = {
+    "linear": LinearProbe(aperture=0.04, depth=0.045),
+    "convex": ConvexProbe(radius=0.05, opening_angle=np.radians(60), depth=0.07),
+    "sector": SectorProbe(aperture=0.02, opening_angle=np.radians(80), depth=0.07),
+}
+
+LAYER_GREY = 170
+"""Of all voxels."""
+
+_VOXEL = (4e-3, 4e-3, 0.1e-3)  # m; nothing changes along x and y
+_EXTENT = ((-0.16, 0.16), (-0.16, 0.16), (-0.06, 0.11))  # m
 
 
-def evaluate_image(out: Path, quick: bool) -> int:
-    """Write image.csv, the pictures and image.md, as `us_sim.evaluation` says.
+def layered_volume() -> Volume:
+    """The layers, with a border of theirs on a border of voxels."""
+    counts = [round((high - low) / step) for (low, high), step in zip(_EXTENT, _VOXEL, strict=True)]
+    to_patient = np.diag([*_VOXEL, 1.0])
+    to_patient[:3, 3] = [low + 0.5 * step for (low, _), step in zip(_EXTENT, _VOXEL, strict=True)]
+    z = to_patient[2, 3] + _VOXEL[2] * np.arange(counts[2])
+    labels = np.empty(counts, dtype=np.uint8)
+    labels[:] = np.searchsorted([layer.begin for layer in LAYERS], z)
+    names = {number: layer.name for number, layer in enumerate(LAYERS, 1)}
+    return Volume(np.full(counts, LAYER_GREY, dtype=np.uint8), to_patient, labels, names)
 
-    A quick run has fewer probes, tilts and repetitions.
+
+def lost(
+    start: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    distance: NDArray[np.float64],
+    frequency: float,
+) -> NDArray[np.float64]:
+    """dB by which echoes at distances (…,) m along beams are changed (Beer and Lambert).
+
+    Args:
+        start, direction: (…, 3) m and unit, in ``patient``. frequency: Hz.
     """
-    folder = ReportFolder("image", out, quick)
-    measured = {
-        artefact: _points(artefact, quick)
-        for artefact in steps("image", ARTEFACTS, "artefacts", lambda one: one.name)
-    }
-    points = [point for some in measured.values() for point in some]
-    folder.write_rows("image", points)
-    write_report(folder, measured)
-    return folder.finish(table(measured), failures(points))
+    z = start[..., 2]
+    slope = direction[..., 2]
+    end = z + slope * distance
+    upper, lower = np.minimum(z, end), np.maximum(z, end)
+    # Where a beam runs along the layers all of it is in one.
+    per_depth = np.abs(np.divide(distance, end - z, out=np.zeros_like(end), where=end != z))
+    level = np.zeros_like(end)
+    begins = [layer.begin for layer in LAYERS] + [np.inf]
+    for number, layer in enumerate(LAYERS):
+        top, bottom = np.maximum(upper, layer.begin), np.minimum(lower, begins[number + 1])
+        within = np.clip(bottom - top, 0, None) * per_depth
+        level -= 2.0 * 100.0 * layer.attenuation * frequency * 1e-6 * within
+        if number:
+            above = LAYERS[number - 1].impedance
+            ratio = (layer.impedance - above) / (layer.impedance + above)
+            passed = (upper < layer.begin) & (lower >= layer.begin)
+            level += 20.0 * np.log10(1.0 - ratio**2) * passed
+    return level
 
 
-def _points(artefact: Artefact, quick: bool) -> list[Point]:
-    try:
-        return artefact.points(quick)
-    # Whatever breaks in one artefact must not take the others' results along.
-    except Exception as error:
-        return [Point(artefact.name, "", failure=words_of(error))]
+def tilted(degrees: float, *, elevational: bool = False) -> Pose:
+    """A probe at the origin, turned about y in its image's plane, or about x out of it."""
+    half = 0.5 * np.radians(degrees)
+    axis = (np.sin(half), 0.0, 0.0) if elevational else (0.0, np.sin(half), 0.0)
+    return Pose(np.zeros(3), np.array([*axis, np.cos(half)]))

@@ -1,42 +1,51 @@
-"""Strain along the beams: of a block under a plate, of a stiff ball, and as an estimate has it."""
+"""Strain along the beams: of a block under a plate, of a stiff ball, and as an estimate has it.
+
+A block with a stiff ball in it under a plate: as the simulator deforms it, and as it should be.
+
+The reference is Hooke's law on quadratic tetrahedra, assembled by scikit-fem and solved by SciPy,
+for a quarter of the block, on planes that are close together around the ball.
+
+A homogeneous block under a plate, and the strain that each beam should meet in it.
+
+With Poisson's ratio 0 nothing is pushed aside, so that a block that its floor holds is strained by
+the plate's depth over its height everywhere, whatever the law of elasticity.
+
+The estimate of two images of a ball under a plate, against the strain itself.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import dia_array
 
-from us_sim.evaluation.block import EXTENT, MESHES, block
-from us_sim.evaluation.figure import new_figure, save
-from us_sim.evaluation.image.artefact import Artefact
-from us_sim.evaluation.image.inclusion import Ball, Reference, ball_mesh, ball_nodes, labelled
-from us_sim.evaluation.image.layers import tilted
-from us_sim.evaluation.image.points import Point
-from us_sim.evaluation.image.pressed_block import (
-    PRESS,
-    beam_displacement,
-    beam_strain,
-    pressed_block,
-)
-from us_sim.evaluation.image.strain_estimates import compared_ball
-from us_sim.evaluation.report_folder import ReportFolder
+from us_sim.evaluation.block import EXTENT, MESHES, block, graded_planes, solved
+from us_sim.evaluation.image.measure import Artefact, Point, tilted
+from us_sim.evaluation.report import ReportFolder, Target, new_figure, save
 from us_sim.evaluation.slice.cases import MAIN
 from us_sim.evaluation.slice.cases import speckle as block_volume
-from us_sim.evaluation.target import Target
+from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.displacement import displacement
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.fan_probe import ConvexProbe, SectorProbe
-from us_sim.slicing.probe.probe import LinearProbe, Probe
-from us_sim.slicing.strain.axial_strain import AxialStrain
-from us_sim.slicing.strain.colours import strain_scale
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
+from us_sim.slicing.settings import Strain
+from us_sim.slicing.strain import AxialStrain, displacement, strain_scale
+from us_sim.slicing.strain_estimate import Estimate, estimate_strain
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import average_over_labels, label_fractions
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+from us_sim.tissue.model import TissueModel, face_nodes
+from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
 PROBES: dict[str, Probe] = {
@@ -45,8 +54,6 @@ PROBES: dict[str, Probe] = {
     "sector": SectorProbe(aperture=0.02, opening_angle=np.radians(90), depth=0.08),
 }
 _TILTS = (0.0, 10.0, 20.0, 30.0, 40.0)
-_BALLS = {"ball_1.8": Ball(stiffer=1.8), "ball_3.2": Ball(stiffer=3.2)}
-"""As stiff as the third and fourth kind of lesion of the phantom CIRS 049 (45 and 80 in 25 kPa)."""
 _SHOWN = "ball_3.2"
 _PRESS = 0.002  # m, of 100
 _FINE, _COARSE = 3e-3, 6e-3  # m, between the reference's planes around a ball
@@ -239,8 +246,6 @@ def _ms(points: Sequence[Point], artefact: str) -> float:
 
 def _draw(folder: ReportFolder) -> None:
     """B-mode, true strain and estimate of the ball, side by side."""
-    from us_sim.evaluation.image.strain_estimates import comparison
-
     ball = _BALLS[_SHOWN]
     frame, strain, estimate = comparison(ball)
     annotation = Annotation(frame.probe, {2: ("stiff", (0.9, 0.9, 0.9))})
@@ -256,3 +261,287 @@ def _draw(folder: ReportFolder) -> None:
         panel.set_title(title, fontsize=10)
         panel.set_axis_off()
     save(figure, folder.picture("strain"))
+
+
+PLATE = RoundedBox(length=0.4, width=0.3, height=0.05, rounding=0.001)
+"""Larger than the block's top."""
+
+_ITERATIONS = 20_000
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball that is stiffer than what is around it."""
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.045)  # m
+    radius: float = 0.018  # m
+    stiffer: float = 3.0
+    poisson_ratio: float = 0.45  # of both
+
+    def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of points (…, 3) m lie in it."""
+        return np.asarray(np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius)
+
+
+_BALLS = {"ball_1.8": Ball(stiffer=1.8), "ball_3.2": Ball(stiffer=3.2)}
+"""As stiff as the third and fourth kind of lesion of the phantom CIRS 049 (45 and 80 in 25 kPa)."""
+
+
+def plate_model(
+    mesh: TetrahedralMesh, soft: Material, stiff: Material, labels: Volume
+) -> TissueModel:
+    """The block on a floor that holds it, below a plate; label 2 is the stiff material."""
+    assert labels.labels is not None
+    fractions = label_fractions(mesh, labels.labels, labels.patient_to_index)
+    return TissueModel(
+        mesh=mesh,
+        materials=average_over_labels(fractions, {1: soft, 2: stiff}),
+        fixed=np.isin(np.arange(len(mesh.nodes)), face_nodes(mesh, "bottom")),
+        collider=PLATE,
+        contact_nodes=face_nodes(mesh, "top"),
+    )
+
+
+def pressed_by_plate(solver: TissueSolver, depth: float) -> NDArray[np.float64]:
+    """(N, 3) m, the nodes with the plate ``depth`` m below the top, once nothing moves."""
+    pose = Pose(np.array([0.0, 0.0, depth]))
+    for _ in range(200):
+        deformation = solver.deform(pose)
+        if solver.deform(pose) is deformation:
+            break
+    return deformation.nodes
+
+
+def labelled(ball: Ball | None) -> Volume:
+    """The block without echoes in voxels of 1 mm: label 2 in the ball, 1 elsewhere."""
+    low, high = np.array(EXTENT).T
+    counts = np.rint((high - low) / 1e-3).astype(int)
+    to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+    to_patient[:3, 3] = low + 0.5e-3
+    labels = np.ones(counts, dtype=np.uint8)
+    if ball is not None:
+        places = np.moveaxis(np.indices(counts), 0, -1) * 1e-3 + to_patient[:3, 3]
+        labels[ball.holds(places)] = 2
+    names = {1: "soft", 2: "stiff"}
+    return Volume(np.zeros(counts, np.uint8), to_patient, labels, names)
+
+
+@cache
+def ball_mesh(ball: Ball) -> TetrahedralMesh:
+    """As many tetrahedra as the finest of the paper's meshes, with planes closer in the ball."""
+    half = ball.radius + 0.5e-3
+    planes: list[NDArray[np.float64]] = []
+    for (low, high), centre, count in zip(EXTENT, ball.centre, (15, 9, 9), strict=True):
+        fine = np.linspace(centre - half, centre + half, count + 1)
+        outside = (MESHES[-1][len(planes)] - count - 1) // 2
+        size = 2.0 * half / count
+        planes.append(
+            np.concatenate(
+                [
+                    fine[0] - _growing(fine[0] - low, size, outside)[::-1],
+                    fine,
+                    fine[-1] + _growing(high - fine[-1], size, outside),
+                ]
+            )
+        )
+        planes[-1][[0, -1]] = low, high
+    return box_mesh(*planes)
+
+
+def _growing(length: float, size: float, count: int) -> NDArray[np.float64]:
+    """Where planes lie whose distances grow from ``size`` on and fill a length, by bisection."""
+    least, most = 0.1, 10.0
+    for _ in range(60):
+        growth = (least * most) ** 0.5
+        far = size * (growth ** np.arange(1, count + 1)).sum() > length
+        least, most = (least, growth) if far else (growth, most)
+    return np.asarray(size * np.cumsum(growth ** np.arange(1, count + 1)))
+
+
+@cache
+def ball_nodes(ball: Ball, depth: float) -> NDArray[np.float64]:
+    """(N, 3) m, of that mesh with the ball in it, under the plate."""
+    return pressed_by_plate(_ball_solver(ball), depth)
+
+
+@cache
+def _ball_solver(ball: Ball) -> TissueSolver:
+    soft = Material(10e3, ball.poisson_ratio, 1000.0)
+    stiff = Material(10e3 * ball.stiffer, ball.poisson_ratio, 1000.0)
+    return create_solver("fem", plate_model(ball_mesh(ball), soft, stiff, labelled(ball)))
+
+
+class Reference:
+    """The linear solution on a fine mesh, for a unit of depth.
+
+    Args:
+        ball: what is in the block.
+        size: m, between planes around the ball.
+
+    Raises:
+        SolverError: SciPy's conjugate gradients did not converge.
+    """
+
+    def __init__(self, ball: Ball, size: float) -> None:
+        from skfem import Basis, BilinearForm, ElementTetP2, ElementVector, MeshTet
+        from skfem.helpers import ddot, div, sym_grad
+
+        (_, across), (_, along), (_, deep) = EXTENT
+        near = ball.radius + size
+        z = ball.centre[2]
+        mesh = box_mesh(
+            graded_planes(0.0, across, 0.0, near, size, 1.5),
+            graded_planes(0.0, along, 0.0, near, size, 1.5),
+            graded_planes(0.0, deep, z - near, z + near, size, 1.5),
+        )
+        self._mesh = MeshTet(*map(np.ascontiguousarray, (mesh.nodes.T, mesh.tetrahedra.T)))
+        self._basis = Basis(self._mesh, ElementVector(ElementTetP2()))
+        ratio = ball.poisson_ratio
+
+        @BilinearForm
+        def elasticity(u, v, w):  # type: ignore[no-untyped-def]
+            young = np.where(ball.holds(np.moveaxis(w.x, 0, -1)), ball.stiffer, 1.0)
+            shear = 0.5 * young / (1.0 + ratio)
+            bulk = young * ratio / ((1.0 + ratio) * (1.0 - 2.0 * ratio))
+            return 2.0 * shear * ddot(sym_grad(u), sym_grad(v)) + bulk * div(u) * div(v)
+
+        matrix = elasticity.assemble(self._basis).tocsr()
+        # Of a quarter: nothing crosses the planes of symmetry; the floor holds, the plate slides.
+        held = np.unique(
+            np.concatenate(
+                [
+                    self._on(0, 0.0, "u^1"),
+                    self._on(1, 0.0, "u^2"),
+                    *(self._on(2, deep, component) for component in ("u^1", "u^2", "u^3")),
+                ]
+            )
+        )
+        top = self._on(2, 0.0, "u^3")
+        self._unit = np.zeros(matrix.shape[0])
+        self._unit[top] = 1.0
+        free = np.setdiff1d(np.arange(matrix.shape[0]), np.concatenate([held, top]))
+        inner = matrix[free][:, free]
+        right = -(matrix @ self._unit)[free]
+        over = dia_array((1.0 / inner.diagonal()[None], [0]), shape=inner.shape)
+        self._unit[free] = solved(inner, right, 1e-8, over, _ITERATIONS)
+
+    def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P, 3, 3) the displacement's gradient per m of depth, at points (P, 3) m at rest."""
+        signs = np.where(points[:, :2] < 0.0, -1.0, 1.0)
+        mirror = np.column_stack([signs, np.ones(len(points))])
+        places = (points * mirror).T
+        cells = self._mesh.element_finder()(*places)
+        local = self._mesh.mapping().invF(places[:, :, None], tind=cells)
+        gradient = np.zeros((len(points), 3, 3))
+        for i in range(self._basis.Nbfun):
+            field = self._basis.elem.gbasis(self._basis.mapping, local, i, tind=cells)[0]
+            weight = self._unit[self._basis.element_dofs[i, cells]]
+            gradient += weight[:, None, None] * np.moveaxis(field.grad[..., 0], -1, 0)
+        return gradient * mirror[:, :, None] * mirror[:, None, :]
+
+    def _on(self, axis: int, place: float, component: str) -> NDArray[np.intp]:
+        facets = self._mesh.facets_satisfying(lambda x: np.isclose(x[axis], place))
+        return np.asarray(self._basis.get_dofs(facets).all(component))
+
+
+PRESS = 0.05
+"""Of the height."""
+
+
+@cache
+def pressed_block(counts: tuple[int, int, int]) -> NDArray[np.float64]:
+    """(N, 3) m, the nodes of the block's mesh with so many of them along each axis."""
+    material = Material(10e3, 0.0, 1000.0)
+    model = plate_model(block(counts), material, material, labelled(None))
+    return pressed_by_plate(create_solver("fem", model), PRESS * EXTENT[2][1])
+
+
+def beam_displacement(frame: Frame) -> NDArray[np.float64]:
+    """(rows, columns, 2) m, lateral and axial: on the floor nothing moves, at the plate all."""
+    floor = EXTENT[2][1]
+    down = PRESS * (floor - frame.plane.pixels()[..., 2]) / (1.0 - PRESS)
+    return np.asarray(down[..., None] * frame.pose.rotation[2, [0, 2]])
+
+
+def beam_strain(frame: Frame) -> NDArray[np.float64]:
+    """(rows, columns): a line along the beam now was |F⁻¹ d| as long, with F = diag(1, 1, 0.95)."""
+    x, z = frame.probe.pixel_directions.astype(np.float64)
+    directions = np.stack([x, np.zeros_like(x), z], axis=-1) @ frame.pose.rotation.T
+    before = directions / np.array([1.0, 1.0, 1.0 - PRESS])
+    return np.asarray(1.0 / np.linalg.norm(before, axis=-1) - 1.0)
+
+
+_PROBE = LinearProbe(aperture=0.06, depth=0.08)
+_FIRST, _SECOND = 0.001, 0.002  # m, the plate's depth in the two images
+_SETTINGS = Strain(search=1.5e-3)
+_SLAB = ((-0.034, 0.034), (-0.004, 0.004), (0.0, 0.09))  # m, that the probe can see
+_VOXEL = (0.2e-3, 0.4e-3, 0.15e-3)  # m
+_MARGIN = 4e-3  # m, around the border of the ball that belongs to neither side
+
+
+def speckled(ball: Ball, seed: int = 1) -> Volume:
+    """Speckle of a scanner of some 7 MHz in a slab around the image, and labels as `labelled`."""
+    counts = [round((high - low) / step) for (low, high), step in zip(_SLAB, _VOXEL, strict=True)]
+    generator = np.random.default_rng(seed)
+    echoes = generator.standard_normal((2, *counts), dtype=np.float32)
+    # The envelope of complex Gaussian noise is Rayleigh distributed, as fully developed speckle is.
+    envelope = np.hypot(*(ndimage.gaussian_filter(part, (2.0, 1.5, 1.2)) for part in echoes))
+    decibels = 20.0 * np.log10(np.maximum(envelope / envelope.mean(), 1e-3))
+    grey = np.clip(np.rint(150.0 + 255.0 / 60.0 * decibels), 0, 255).astype(np.uint8)
+    to_patient = np.diag([*_VOXEL, 1.0])
+    to_patient[:3, 3] = [low + 0.5 * step for (low, _), step in zip(_SLAB, _VOXEL, strict=True)]
+    places = np.moveaxis(np.indices(counts), 0, -1) * np.array(_VOXEL) + to_patient[:3, 3]
+    labels = np.where(ball.holds(places), 2, 1).astype(np.uint8)
+    return Volume(grey, to_patient, labels, {1: "soft", 2: "stiff"})
+
+
+@cache
+def _estimated(ball: Ball) -> tuple[Frame, NDArray[np.float32], Estimate, float]:
+    """The second frame, the strain between both, the estimate, and its ms."""
+    mesh = ball_mesh(ball)
+    scanner = BMode(speckled(ball), _PROBE)
+    scanner.carry(mesh.nodes, mesh.tetrahedra)
+    first, second = (
+        scanner.frame(Pose(np.array([0.0, 0.0, depth])), ball_nodes(ball, depth))
+        for depth in (_FIRST, _SECOND)
+    )
+    strain = AxialStrain.of(second).image(second, first.nodes)
+    taken = []
+    for _ in range(5):
+        began = time.thread_time()
+        estimate = estimate_strain(first.pixels, second.pixels, _PROBE, _SETTINGS)
+        taken.append(1e3 * (time.thread_time() - began))
+    return second, strain, estimate, float(np.median(taken))
+
+
+def comparison(ball: Ball) -> tuple[Frame, NDArray[np.float32], NDArray[np.float32]]:
+    """The second frame, the strain since the first, and the estimate of it."""
+    frame, strain, estimate, _ = _estimated(ball)
+    return frame, strain, estimate.strain
+
+
+def compared_ball(ball: Ball) -> list[Point]:
+    """Means inside and outside of the ball, and the error of all pixels."""
+    frame, strain, estimate, ms = _estimated(ball)
+    places = frame.located.rest_index()
+    to_patient = frame.volume.index_to_patient
+    rest = places @ to_patient[:3, :3].T + to_patient[:3, 3]
+    away = np.linalg.norm(rest - np.array(ball.centre), axis=-1) - ball.radius
+    found = np.isfinite(estimate.strain) & np.isfinite(strain)
+    rows = []
+    for name, part in (("inside", away < -_MARGIN), ("outside", away > _MARGIN)):
+        mine = found & part
+        rows.append(
+            Point.of(
+                f"strain_estimate_{name}", "linear", 0.0, ball.centre[2],
+                float(strain[mine].mean()), float(estimate.strain[mine].mean()), "",
+            )
+        )  # fmt: skip
+    error = float(np.sqrt(np.mean(np.square(estimate.strain[found] - strain[found]))))
+    applied = abs(float(strain[found].mean()))
+    rows.append(
+        Point.of(
+            "strain_estimate_rms", "linear", 0.0, ball.centre[2], 0.0, error, "", of=applied, ms=ms
+        )
+    )
+    return rows

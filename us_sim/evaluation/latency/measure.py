@@ -1,38 +1,422 @@
-"""`us-sim evaluate latency`: how old the pose is when its image has come.
+"""The ways to run the arm that are measured: one thing is changed at a time.
 
-The scene `upper_arm` is run in many ways, with its path played again and again at 60 Hz: as the
-separate processes of a live run, in one process, in lockstep; with meshes, methods and images of
-several sizes; recorded or not, looked at or not, and with every core kept busy by something else.
+>>> from us_sim.evaluation.latency.measure import cases
+>>> [str(case) for case in cases(quick=True)][:2]
+['fem, 2,000 nodes, 512 x 512, recorder', 'fem, 8,192 nodes, 512 x 512, recorder']
+
+What one way to run the arm shows: one row of the file.
+
+The scene file of a case: the arm, with another mesh, method or image.
+
+Runs the arm in one way, and listens to it.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from us_sim.evaluation.latency.cases import cases
-from us_sim.evaluation.latency.points import Point
-from us_sim.evaluation.latency.report import table, write_report
-from us_sim.evaluation.latency.run_case import run_case
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures
-from us_sim.evaluation.timed_cases import timed_cases
-from us_sim.run.live import prepare_volume
-from us_sim.run.processes import keep_on_this_host
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from us_sim.errors import UsSimError
+from us_sim.evaluation.processes import UsageOverTime, listening, start_program, usage_of
+from us_sim.evaluation.report import Row
+from us_sim.evaluation.timing import Tell
+from us_sim.recording.reader import read_bag
+from us_sim.run.lockstep import render
+from us_sim.run.plan import NodeProcess, player_settings, recorder_of, simulation_nodes
+from us_sim.run.processes import ProcessGroup
 from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from us_sim.nodes.arrivals import Arrivals
 
 
-def evaluate_latency(out: Path, quick: bool) -> int:
-    """Write latency.csv, the plots and latency.md, as `us_sim.evaluation` says."""
-    folder = ReportFolder("latency", out, quick)
-    keep_on_this_host(network=False)
-    planned = cases(quick)
-    prepare_volume(load_scene("upper_arm"))
-    points = timed_cases(
-        "latency",
-        {case: case.seconds for case in planned},
-        run_case,
-        lambda case, words: Point(case, failure=words),
-    )
-    folder.write_rows("latency", points)
-    write_report(folder, points)
-    return folder.finish(table(points), failures(points))
+RATE = 60.0
+"""Poses a second."""
+
+COARSE, FINE = (20, 10, 10), (32, 16, 16)
+"""Nodes of the meshes in x, y and z."""
+
+PLACED = ("processes", "one process", "lockstep")
+"""A process a node; all nodes in one, each with a thread; or there one pose after another."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way to run the scene ``upper_arm``."""
+
+    solver: str = "fem"
+    mesh: tuple[int, int, int] = COARSE
+    image: tuple[int, int] = (512, 512)  # columns and rows
+    placed: str = "processes"  # one of `PLACED`
+    recorder: bool = True
+    viewer: bool = False  # somebody looks at the annotated image and the structures
+    busy: bool = False  # something else keeps every core busy
+    realtime: bool = True  # the nodes go before ordinary programs, where the system allows that
+    seconds: float = 20.0
+
+    @property
+    def nodes(self) -> int:
+        """How many the mesh has."""
+        x, y, z = self.mesh
+        return x * y * z
+
+    def __str__(self) -> str:
+        columns, rows = self.image
+        parts = [self.solver, f"{self.nodes:,} nodes", f"{columns} x {rows}"]
+        parts += [self.placed] if self.placed != PLACED[0] else []
+        parts += ["recorder"] if self.recorder else []
+        parts += ["viewer"] if self.viewer else []
+        parts += ["cores busy"] if self.busy else []
+        return ", ".join([*parts, "as ordinary programs"] if not self.realtime else parts)
+
+
+LIVE = Case(mesh=FINE, seconds=300.0)
+"""What the limits for a live simulation are for."""
+
+DEMO = Case("fem_nonlinear")
+"""What the demo runs."""
+
+
+def cases(quick: bool) -> list[Case]:
+    """Those of a run; of a quick one a few, for some seconds each."""
+    base = Case()
+    if quick:
+        chosen = [base, LIVE, DEMO, *_beside(DEMO), replace(base, placed=PLACED[1])]
+        return [replace(case, seconds=8.0) for case in chosen]
+    return [
+        base,
+        replace(base, recorder=False),
+        replace(base, viewer=True),
+        replace(base, image=(256, 256)),
+        replace(base, image=(768, 768)),
+        *(replace(base, placed=placed) for placed in PLACED[1:]),
+        replace(base, busy=True),
+        *(replace(base, solver=solver) for solver in ("fem_cg", "msds", "msds_implicit")),
+        DEMO,
+        replace(DEMO, viewer=True),
+        *_beside(DEMO),
+        *(replace(DEMO, placed=placed) for placed in PLACED[1:]),
+        LIVE,
+        replace(LIVE, busy=True, seconds=base.seconds),
+        replace(DEMO, mesh=FINE),
+    ]
+
+
+def _beside(case: Case) -> list[Case]:
+    """The case beside something else that keeps every core busy, before it or not."""
+    busy = replace(case, busy=True)
+    return [busy, replace(busy, realtime=False)]
+
+
+HAND = 0.1
+"""m/s of a hand, with which a time becomes a way."""
+
+Heard = Sequence[tuple[int, int]]
+"""Stamps and times of arrival, ns."""
+
+
+@dataclass(frozen=True)
+class Point(Row):
+    """A case, and what was measured."""
+
+    case: Case
+    heard: Mapping[str, Heard] = field(default_factory=dict)  # by topic, in their order
+    recorded: int | None = None  # of the images that were heard; None without a recorder
+    usage: Mapping[str, UsageOverTime] = field(default_factory=dict)  # by node
+    scheduling: str = "ordinary"  # or realtime: what the nodes got
+    throughput: float = float("nan")  # images a second, in lockstep
+    failure: str = ""
+
+    @property
+    def title(self) -> str:
+        """The case."""
+        return str(self.case)
+
+    @property
+    def values(self) -> dict[str, object]:
+        """The case's settings, then ms, counts, cores and MB."""
+        case = self.case
+        columns, rows = case.image
+        return {
+            "solver": case.solver,
+            "nodes": case.nodes,
+            "image": f"{columns}x{rows}",
+            "placed": case.placed,
+            "recorder": case.recorder,
+            "viewer": case.viewer,
+            "cores_busy": case.busy,
+            "scheduling": self.scheduling,
+            "seconds": case.seconds,
+            "poses": len(self._heard("tracker/pose")),
+            "images": len(self.images),
+            "images_a_second": self.rate,
+            "dropped": self.dropped,
+            "not_recorded": self.lost,
+            **{
+                f"{topic.replace('/', '_')}_ms_{name}": self.latency(topic, percent)
+                for topic in self.heard
+                if topic != "tracker/pose"
+                for name, percent in (("p50", 50), ("p99", 99), ("worst", 100))
+            },
+            "image_mm_p50": HAND * self.latency("ultrasound/image", 50),
+            "image_mm_p99": HAND * self.latency("ultrasound/image", 99),
+            **{f"cores_{node}": use.processor for node, use in self.usage.items()},
+            "cores_all": sum(use.processor for use in self.usage.values()) or np.nan,
+            "memory_mb_all": 1e-6 * sum(use.memory for use in self.usage.values()) or np.nan,
+            "growth_mb_a_minute": self.growth,
+            "failure": self.failure,
+        }
+
+    @property
+    def images(self) -> Heard:
+        """Those that came."""
+        return self._heard("ultrasound/image")
+
+    @property
+    def rate(self) -> float:
+        """Images a second."""
+        if len(self.images) < 2:
+            return self.throughput
+        return (len(self.images) - 1) / (1e-9 * (self.images[-1][1] - self.images[0][1]))
+
+    @property
+    def dropped(self) -> int:
+        """Poses between the first and the last image of which there is no image."""
+        stamps = {stamp for stamp, _ in self.images}
+        if not stamps:
+            return 0
+        poses = {stamp for stamp, _ in self._heard("tracker/pose")}
+        return sum(min(stamps) <= stamp <= max(stamps) for stamp in poses - stamps)
+
+    @property
+    def lost(self) -> float:
+        """Images that came here and are not in the recording."""
+        return np.nan if self.recorded is None else len(self.images) - self.recorded
+
+    @property
+    def growth(self) -> float:
+        """MB a minute of the process whose memory grows fastest."""
+        grown = [use.growth for use in self.usage.values() if not np.isnan(use.growth)]
+        return 1e-6 * max(grown) if grown else np.nan
+
+    def ages(self, topic: str) -> NDArray[np.float64]:
+        """ms from the tracker's pose to the arrival of each message."""
+        return np.array([1e-6 * (came - stamp) for stamp, came in self._heard(topic)])
+
+    def latency(self, topic: str, percent: float) -> float:
+        """Percentile of these, ms; NaN where none came."""
+        ages = self.ages(topic)
+        return float(np.percentile(ages, percent)) if len(ages) else np.nan
+
+    def _heard(self, topic: str) -> Heard:
+        return self.heard.get(topic, ())
+
+
+_ARM = "upper_arm"
+
+
+def write_scene(case: Case, folder: Path) -> Path:
+    """Write ``scene.yaml`` to a folder, and return it."""
+    tissue: dict[str, object] = {"solver": case.solver}
+    if case.mesh != COARSE:
+        tissue["mesh"] = {"nodes": list(case.mesh), "planes": _planes(case.mesh)}
+    document = {
+        "name": "latency",
+        "based_on": _ARM,
+        "probe": {"image": list(case.image)},
+        "tissue": tissue,
+    }
+    file = folder / "scene.yaml"
+    file.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+    return file
+
+
+def _planes(counts: tuple[int, int, int]) -> dict[str, list[float]]:
+    """m, more planes of nodes than the arm has, as close together as there."""
+    arm = load_scene(_ARM)
+    assert arm.tissue is not None
+    planes = {}
+    for axis, count in zip("xyz", counts, strict=True):
+        own = arm.tissue.mesh.planes.get(axis)
+        if own is not None:
+            places = np.linspace(0, len(own) - 1, count)
+            planes[axis] = np.interp(places, np.arange(len(own)), own).round(6).tolist()
+    return planes
+
+
+_START_S = 300.0  # the first run compiles
+_WARMING_S = 2.0  # of images that do not count
+_SETTLE_S = 1.5  # for what is under way to arrive, and to be recorded
+_SAMPLE_S = 0.5
+
+
+def run_case(case: Case, tell: Tell) -> Point:
+    """What the case shows.
+
+    Args:
+        case: how to run the arm.
+        tell: is told how many of the case's seconds are over.
+
+    Raises:
+        UsSimError: a node ends, or no image comes.
+    """
+    with tempfile.TemporaryDirectory(prefix="us_sim_latency_") as name:
+        folder = Path(name)
+        scene = load_scene(str(write_scene(case, folder)))
+        with _busy_cores() if case.busy else contextlib.nullcontext():
+            if case.placed == "lockstep":
+                return _in_lockstep(case, scene, folder, tell)
+            return _live(case, scene, folder, tell)
+
+
+def _in_lockstep(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
+    """How many images a second there are where each pose waits for the one before."""
+    began: list[float] = []
+
+    def count(done: int, total: int) -> None:
+        began.append(time.monotonic())
+        tell(case.seconds * done / total, "in lockstep")
+
+    out = folder / "out"
+    out.mkdir()
+    images = render(scene, _path(scene), out, count)
+    if images < 2:
+        raise UsSimError("lockstep made no two images")
+    return Point(case, throughput=(len(began) - 1) / (began[-1] - began[0]))
+
+
+def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
+    file = folder / "session.mcap"
+    processes = [
+        replace(process, given={"realtime": case.realtime})
+        for process in simulation_nodes(scene, played=True)
+    ]
+    if case.recorder:
+        processes.insert(0, NodeProcess("session_recorder", {"file": str(file)}))
+    player = player_settings(scene, _path(scene), recorder_of(processes)) | {"loop": True}
+    processes.append(NodeProcess("path_player", player))
+    with listening(viewer=case.viewer) as arrivals, _started(case, processes, folder) as running:
+        _await_images(arrivals, running, tell)
+        usage: dict[str, UsageOverTime] = {node: UsageOverTime() for node in running.pids}
+        scheduling = running.scheduling
+        began, began_ns = time.monotonic(), time.time_ns()
+        while (passed := time.monotonic() - began) < case.seconds:
+            running.check()
+            for node, pid in running.pids.items():
+                usage[node].add(passed, usage_of(pid))
+            tell(passed, f"{len(arrivals.heard('ultrasound/image'))} images")
+            time.sleep(_SAMPLE_S)
+        ended_ns = time.time_ns()
+        time.sleep(_SETTLE_S)
+        heard = {
+            topic: [each for each in arrivals.heard(topic) if began_ns <= each[0] < ended_ns]
+            for topic in arrivals.topics
+        }
+    recorded = _recorded(file, {s for s, _ in heard["ultrasound/image"]}) if case.recorder else None
+    return Point(case, heard, recorded, usage, scheduling)
+
+
+def _path(scene: Scene) -> Path:
+    assert scene.path is not None
+    return Path(scene.path)
+
+
+@dataclass(frozen=True)
+class _Running:
+    """Processes of a graph."""
+
+    pids: Mapping[str, int]  # by node, or by how the nodes are placed
+    ended: Callable[[], list[str]]  # which of them have
+    log: Path | None = None
+
+    @property
+    def scheduling(self) -> str:
+        """As `scheduling_of` the node that has most to do."""
+        from us_sim.nodes.process import scheduling_of
+
+        return scheduling_of(self.pids.get("tissue_deformer") or next(iter(self.pids.values())))
+
+    def check(self) -> None:
+        """Raise UsSimError when one has ended."""
+        if ended := self.ended():
+            lines = self.log.read_text(encoding="utf-8").splitlines() if self.log else []
+            raise UsSimError(f"{ended[0]} has ended{': ' if lines else ''}{''.join(lines[-1:])}")
+
+
+@contextlib.contextmanager
+def _started(case: Case, processes: list[NodeProcess], folder: Path) -> Iterator[_Running]:
+    """The nodes' processes, which end with the context."""
+    if case.placed == PLACED[0]:
+        log = folder / "nodes.log"
+        group = ProcessGroup(log)
+        try:
+            group.start(processes)
+            pids = group.pids
+            yield _Running(pids, lambda: [node for node in pids if not group.is_running(node)], log)
+        finally:
+            group.stop()
+        return
+    nodes = [(process.node, process.all_parameters) for process in processes]
+    child = start_program("nodes", json.dumps(nodes))
+    try:
+        yield _Running(
+            {case.placed: child.pid}, lambda: [case.placed] if child.poll() is not None else []
+        )
+    finally:
+        child.terminate()
+        try:
+            child.communicate(timeout=10.0)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.communicate()
+
+
+def _await_images(arrivals: Arrivals, running: _Running, tell: Tell) -> None:
+    """Until images have come for a while."""
+    began, first = time.monotonic(), 0.0
+    while not first or time.monotonic() - first < _WARMING_S:
+        tell(0.0, "imaging" if first else "starting")
+        time.sleep(0.1)
+        running.check()
+        if not first and arrivals.heard("ultrasound/image"):
+            first = time.monotonic()
+        if time.monotonic() - began > _START_S:
+            raise UsSimError(f"no image came in {_START_S:g} s")
+
+
+def _recorded(file: Path, stamps: set[int]) -> int:
+    """How many images with one of the stamps (ns) the recording has."""
+    bag = read_bag(file)
+    there = set()
+    for message in bag.messages(["/ultrasound/image"]):
+        stamp = message.data[4:12]
+        seconds = int.from_bytes(stamp[:4], "little", signed=True)
+        there.add(1_000_000_000 * seconds + int.from_bytes(stamp[4:], "little"))
+    return len(stamps & there)
+
+
+@contextlib.contextmanager
+def _busy_cores() -> Iterator[None]:
+    """Something else that takes all it can get of every core."""
+    work = [sys.executable, "-c", "while True: pass"]
+    busy = [subprocess.Popen(work) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()

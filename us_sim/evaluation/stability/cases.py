@@ -4,6 +4,26 @@
 >>> cases = sampled_cases(64)
 >>> len(cases), cases == sampled_cases(64)
 (64, True)
+
+Small tissues on which solvers are tried: well shaped, badly shaped, in pieces, badly held.
+
+>>> from us_sim.evaluation.stability.cases import MESHES, mesh_named
+>>> sorted(MESHES)[:3], len(mesh_named("box").nodes)
+(['box', 'delaunay', 'fine'], 64)
+
+Cases within what anatomy is, in which a probe that is held must come to balance.
+
+>>> from us_sim.evaluation.stability.cases import held_cases
+>>> cases = held_cases(3, seed=1)
+>>> [case.case for case in cases], cases == held_cases(3, seed=1)
+(['held 1.0', 'held 1.1', 'held 1.2'], True)
+
+What a probe does to a tissue to break its solver: pressing, jumping, trembling, and worse.
+
+>>> from us_sim.evaluation.stability.cases import poses_of
+>>> from us_sim.evaluation.stability.cases import mesh_named
+>>> [round(float(pose.position[2]), 3) for pose in poses_of("press", mesh_named("box"), 0.5)]
+[0.008, 0.016, 0.024, 0.032, 0.04, 0.04, 0.04]
 """
 
 from __future__ import annotations
@@ -11,18 +31,27 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay
 from scipy.stats import qmc
 
-from us_sim.evaluation.stability.meshes import MESHES, fixed_nodes, mesh_named
 from us_sim.geometry.collider import Capsule, Collider, RoundedBox, Sphere
+from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import (
+    TetrahedralMesh,
+    box_mesh,
+    signed_volumes,
+    uniform_planes,
+)
+from us_sim.tissue.model import TissueModel, face_nodes
 
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),
@@ -44,7 +73,7 @@ MOTIONS = (
     *("press", "jump", "through", "tremor", "slide", "tilt", "sideways", "upside down"),
     *("scribble", "flicker"),
 )
-"""What the probe does, see `us_sim.evaluation.stability.motions`."""
+"""What the probe does, see `us_sim.evaluation.stability.cases`."""
 
 _STIFFEST = 12.0  # decimal logarithm of Pa
 _GREATEST_CONTRAST = 9.0  # decimal logarithm
@@ -213,3 +242,254 @@ def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
     if layout == "half":
         return np.asarray(place[:, 0] < 0.5)
     return np.asarray(np.random.default_rng(7).random(len(middle)) < 0.3)
+
+
+SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
+"""What of a tissue is held."""
+
+_FLATTEST = 1e-7
+"""Volume over the longest edge cubed, below which a tetrahedron of Delaunay's is left out."""
+
+
+@lru_cache
+def mesh_named(name: str) -> TetrahedralMesh:
+    """One of `MESHES`, made once: its top is z = 0 and its bottom the largest z."""
+    return MESHES[name]()
+
+
+def fixed_nodes(mesh: TetrahedralMesh, support: str) -> NDArray[np.bool_]:
+    """(N,) which nodes one of `SUPPORTS` holds."""
+    nodes = mesh.nodes
+    fixed = np.zeros(len(nodes), dtype=bool)
+    if support in ("bottom", "walls", "three", "one piece"):
+        fixed[face_nodes(mesh, "bottom")] = True
+    if support == "walls":
+        fixed[face_nodes(mesh, "sides")] = True
+    if support == "three":
+        bottom = np.flatnonzero(fixed)
+        across = nodes[bottom, :2] @ np.array([[1.0, 1, -1], [1, -1, 0.5]])
+        fixed[:] = False
+        fixed[bottom[across.argmax(axis=0)]] = True
+    if support == "one piece":
+        fixed &= parts(mesh) == 0
+    if support == "everything":
+        fixed[:] = True
+    return fixed
+
+
+def parts(mesh: TetrahedralMesh) -> NDArray[np.intp]:
+    """(N,) which connected part each node is of."""
+    count = len(mesh.nodes)
+    graph = coo_array((np.ones(len(mesh.edges)), tuple(mesh.edges.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _box(nx: int, ny: int, nz: int, size: float = 1.0) -> TetrahedralMesh:
+    x, y = (uniform_planes(-0.05 * size, 0.05 * size, count) for count in (nx, ny))
+    return box_mesh(x, y, uniform_planes(0.0, 0.08 * size, nz))
+
+
+def _layered() -> TetrahedralMesh:
+    """Cells a thousand times as wide as thick."""
+    across = uniform_planes(-0.05, 0.05, 4)
+    return box_mesh(across, across, [0.0, 3e-5, 0.02, 0.02003, 0.08])
+
+
+def _jittered(mesh: TetrahedralMesh, spread: float, seed: int) -> TetrahedralMesh:
+    """Every node that is not on a face moved at random; those on faces within their face."""
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    moved = mesh.nodes + spread * np.random.default_rng(seed).uniform(-1, 1, mesh.nodes.shape)
+    on_face = (mesh.nodes == low) | (mesh.nodes == high)
+    return TetrahedralMesh(np.where(on_face, mesh.nodes, moved), mesh.tetrahedra)
+
+
+def _delaunay() -> TetrahedralMesh:
+    """Of scattered points, with the slivers that come of that."""
+    points = _jittered(_box(5, 5, 5), 0.0003, seed=5).nodes
+    corners = Delaunay(points).simplices
+    a, b, c, d = np.moveaxis(points[corners], 1, 0)
+    volume = signed_volumes(points, corners)
+    corners[volume < 0] = corners[volume < 0][:, [0, 1, 3, 2]]
+    longest = np.max([np.linalg.norm(p - q, axis=1) for p in (a, b, c, d) for q in (a, b, c)], 0)
+    corners = corners[np.abs(volume) > _FLATTEST * longest**3]
+    used, renumbered = np.unique(corners, return_inverse=True)
+    return TetrahedralMesh(points[used], renumbered.reshape(corners.shape))
+
+
+def _sliver() -> TetrahedralMesh:
+    """A node pushed almost through the opposite faces: volumes down to 1e-6 of the edge cubed."""
+    mesh = _box(4, 4, 4)
+    nodes = mesh.nodes.copy()
+    inner = int(np.argmin(np.linalg.norm(nodes - [0.017, 0.017, 0.027], axis=1)))
+    beside = (mesh.tetrahedra == inner).any(axis=1)
+    inwards = nodes[mesh.tetrahedra[beside][0]].mean(axis=0) - nodes[inner]
+    nodes[inner] += 0.5 * inwards
+    before = mesh.volumes[beside]
+    slope = 2 * (TetrahedralMesh(nodes, mesh.tetrahedra).volumes[beside] - before)
+    # Volumes change linearly with the distance, and the first to vanish ends it.
+    shrinking = slope < 0
+    furthest = ((before[shrinking] - 1e-10) / -slope[shrinking]).min()
+    nodes[inner] += (furthest - 0.5) * inwards
+    return TetrahedralMesh(nodes, mesh.tetrahedra)
+
+
+def _tetrahedron() -> TetrahedralMesh:
+    nodes = [[0.0, 0, 0], [0.04, 0, 0.05], [-0.02, -0.035, 0.05], [-0.02, 0.035, 0.05]]
+    return TetrahedralMesh(np.array(nodes), np.array([[0, 2, 1, 3]]))
+
+
+def _two_pieces() -> TetrahedralMesh:
+    one = box_mesh([-0.05, -0.03, -0.01], [-0.02, 0.02], [0.0, 0.04, 0.08])
+    other = one.nodes + np.array([0.06, 0.0, 0.0])
+    return TetrahedralMesh(
+        np.concatenate([one.nodes, other]),
+        np.concatenate([one.tetrahedra, one.tetrahedra + len(other)]),
+    )
+
+
+def _slab() -> TetrahedralMesh:
+    """A skin, 2 mm thick."""
+    across = uniform_planes(-0.05, 0.05, 6)
+    return box_mesh(across, across, uniform_planes(0.0, 0.002, 3))
+
+
+MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
+    "box": lambda: _box(4, 4, 4),
+    "fine": lambda: _box(6, 5, 5),
+    "layered": _layered,
+    "perturbed": lambda: _jittered(_box(5, 4, 5), 0.004, seed=3),
+    "delaunay": _delaunay,
+    "sliver": _sliver,
+    "slab": _slab,
+    "tetrahedron": _tetrahedron,
+    "two pieces": _two_pieces,
+    "millimetre": lambda: _box(4, 4, 4, 0.01),
+    "ten metres": lambda: _box(4, 4, 4, 100.0),
+}
+"""The tissues by name."""
+
+
+HOLD = 30
+"""Frames in which the probe stays where its motion ended."""
+SMALL = 1e-3
+"""Residual that must be reached by then."""
+
+_MESHES = ("box", "fine", "layered", "perturbed", "delaunay", "slab")
+_MOTIONS = ("press", "jump", "slide", "tilt", "tremor")
+_COLLIDERS = ("sphere", "capsule", "plate", "pebble")
+_SUPPORTS = ("bottom", "walls")
+_MODULUS = (3.0, 5.0)  # decimal logarithms of Pa, of the softest tetrahedron
+_CONTRAST = (0.0, 3.0)  # decimal logarithms
+_COMPRESSIBLE = (0.005, 0.2)  # 0.5 - Poisson's ratio, from 0.495 to 0.3
+_DEPTH = (0.05, 0.5)  # of the thickness
+
+
+def held_cases(count: int, seed: int) -> list[StabilityCase]:
+    """So many cases at random; another seed gives others.
+
+    Moduli are 1 to 100 kPa (the softest), contrasts up to 1000, Poisson's ratios 0.3 to 0.495,
+    depths 5 to 50 % of the thickness; modulus, contrast and what is left to incompressibility are
+    even in their logarithms.
+    """
+    random = np.random.default_rng(seed)
+
+    def between(ends: tuple[float, float]) -> float:
+        return float(random.uniform(*ends))
+
+    def one_of(names: tuple[str, ...]) -> str:
+        return names[int(random.integers(len(names)))]
+
+    low, high = (float(np.log10(part)) for part in _COMPRESSIBLE)
+    return [
+        StabilityCase(
+            case=f"held {seed}.{number}",
+            young_modulus=10 ** between(_MODULUS),
+            contrast=10 ** between(_CONTRAST),
+            layout=one_of(LAYOUTS),
+            poisson_ratio=0.5 - 10 ** between((low, high)),
+            depth=between(_DEPTH),
+            motion=one_of(_MOTIONS),
+            mesh=one_of(_MESHES),
+            support=one_of(_SUPPORTS),
+            collider=one_of(_COLLIDERS),
+            release=one_of(("removed", "lifted")),
+            held=HOLD,
+        )
+        for number in range(count)
+    ]
+
+
+_TREMOR = 1000.0  # Hz
+_FRAME_RATE = 2718.0  # Hz; no small multiple of the tremor's, so that no phase repeats
+
+LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # far from any tissue
+
+
+def poses_of(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
+    """The probe's pose in every frame until it is released.
+
+    Args:
+        motion: one of `us_sim.evaluation.stability.cases.MOTIONS`.
+        mesh: whose top is z = 0. The probe is put above the node of the top that is nearest to the
+            middle, so that a needle hits one.
+        depth: reached, as a fraction of the mesh's thickness.
+    """
+    top = mesh.nodes[mesh.nodes[:, 2] == mesh.nodes[:, 2].min()]
+    middle = mesh.nodes[:, :2].min(axis=0) + np.ptp(mesh.nodes[:, :2], axis=0) / 2
+    nearest = top[np.argmin(np.linalg.norm(top[:, :2] - middle, axis=1))]
+    above = np.array([nearest[0], nearest[1], 0.0])
+    return [
+        pose if pose is None or pose is LIFTED else Pose(pose.position + above, pose.orientation)
+        for pose in _centred(motion, mesh, depth)
+    ]
+
+
+def _centred(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | None]:
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    thick = high[2] - low[2]
+    wide = high[0] - low[0]
+    deep = depth * thick
+    if motion == "press":
+        return [_at(z=part * deep) for part in (0.2, 0.4, 0.6, 0.8, 1, 1, 1)]
+    if motion == "jump":
+        return [_at(z=deep), _at(z=deep), _at(x=0.2 * wide, z=deep), _at(z=0.3 * deep)]
+    if motion == "through":
+        stops = (-0.2 * thick, deep, 2.5 * thick, deep, -0.2 * thick, deep)
+        return [_at(z=z) for z in stops]
+    if motion == "tremor":
+        phase = 2 * np.pi * _TREMOR / _FRAME_RATE * np.arange(14)
+        return [_at(z=deep + 0.02 * thick * shake) for shake in np.sin(phase)]
+    if motion == "slide":
+        aside = (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)
+        return [_at(x=x * wide, y=0.3 * x * wide, z=deep) for x in aside]
+    if motion == "tilt":
+        angles = (0.0, 0.2, 0.5, 0.9, 1.4, 1.4, -0.8)
+        return [_at(z=deep, angle=angle, about=(0.4, 1.0, 0.1)) for angle in angles]
+    if motion == "sideways":
+        reached = (0.2, 0.5, 1.0, 1.0, -0.5, 0.6)
+        return [
+            _at(x=low[0] + part * depth * wide, z=0.4 * thick, angle=np.pi / 2, about=(0, 1, 0))
+            for part in reached
+        ]
+    if motion == "upside down":
+        depths = (1.2 * thick, thick - deep, -0.5 * deep, -0.2 * deep)
+        return [_at(z=z, angle=np.pi, about=(1.0, 0.0, 0.0)) for z in depths]
+    if motion == "scribble":
+        random = np.random.default_rng(11)
+        reach = np.array([wide, high[1] - low[1], 2 * deep])
+        places = random.uniform(-0.5, 0.5, (8, 3)) * reach + [0.0, 0.0, deep]
+        return [Pose(place, random.standard_normal(4)) for place in places]
+    frames = [_at(z=deep), None, _at(z=0.5 * deep), LIFTED, _at(x=0.1 * wide, z=deep), None]
+    return [*frames, _at(z=deep)]  # flicker
+
+
+def _at(
+    x: float = 0.0,
+    y: float = 0.0,
+    z: float = 0.0,
+    angle: float = 0.0,
+    about: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> Pose:
+    axis = np.array(about) / np.linalg.norm(about)
+    turn = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
+    return Pose(np.array([x, y, z]), turn)

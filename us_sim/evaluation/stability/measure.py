@@ -1,142 +1,532 @@
-"""`us-sim evaluate stability`: try to break every tissue solver, and write down what happened.
+"""One solver on one extreme case: did it stay finite and bounded, come back, and say the truth.
 
-Thousands of stiff and extreme cases (see `us_sim.evaluation.stability.cases`) on small meshes, for
-every solver: does it stay finite and bounded, does it come back after release, is its residual
-true, and does it refuse what it must. And a thousand within what anatomy is (`held_cases`): does
-the tissue come to balance when the probe is held still. The cases are the same in every run.
+>>> from us_sim.evaluation.stability.cases import StabilityCase
+>>> from us_sim.evaluation.stability.measure import try_case
+>>> trial = try_case("fem_cg", StabilityCase("soft", young_modulus=1.0))
+>>> trial.finite, trial.bounded, trial.truthful, trial.recovered_mm
+(True, True, True, 0.0)
+
+Inputs that no solver may start on: each must be refused in one sentence.
+
+>>> from us_sim.evaluation.stability.measure import REFUSALS, refusal_of
+>>> trial = refusal_of("fem_cg", "a node is not a number")
+>>> trial.refused, trial.passed
+(True, True)
+
+The longest stable step of an explicit method, found by trying, beside the one it predicts.
+
+>>> from us_sim.evaluation.stability.measure import observed_step_limit
+>>> from us_sim.evaluation.stability.cases import StabilityCase
+>>> predicted, observed = observed_step_limit("msds", StabilityCase("paper's", damping=0.1))
+>>> bool(abs(observed / predicted - 1) < 0.02)
+True
 """
 
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
-from numba.core import config
-from threadpoolctl import threadpool_limits
+import numpy as np
+from numpy.typing import NDArray
 
-from us_sim.errors import SolverError
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures
-from us_sim.evaluation.stability.cases import StabilityCase, extreme_cases, model_of, sampled_cases
-from us_sim.evaluation.stability.held_cases import held_cases
-from us_sim.evaluation.stability.observed_step_limit import observed_step_limit
-from us_sim.evaluation.stability.points import Trial, Tried, try_case
-from us_sim.evaluation.stability.refusals import REFUSALS, refusal_of
-from us_sim.evaluation.stability.report import table, write_report
+from us_sim.errors import UsSimError
+from us_sim.evaluation.independent_residual import IndependentResidual, SpringSettings
+from us_sim.evaluation.report import Row
+from us_sim.evaluation.stability.cases import (
+    LIFTED,
+    SMALL,
+    StabilityCase,
+    mesh_named,
+    model_of,
+    parts,
+    poses_of,
+)
+from us_sim.evaluation.timing import frames_until
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.kernels import kernel_folder
-from us_sim.progress import Progress
-from us_sim.tissue.solvers.solver import create_solver
+from us_sim.geometry.collider import Sphere
+from us_sim.geometry.pose import Pose
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.registry import SOLVERS
+from us_sim.settings.setting import rules_of
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.elasticity.springs import springs_of
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
-_SAMPLES, _QUICK_SAMPLES = 2048, 64
-_STEP_LIMITS, _QUICK_STEP_LIMITS = 200, 24  # sampled cases whose step limit is looked for
-_STEP_LIMIT_ERROR = 0.02  # relative, of predicted step limits
-_HELD, _QUICK_HELD = 1000, 24
-_SEED = 1  # of the held cases
-_CHUNK = 12  # cases that a process is handed at a time
+_FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"
+"""What a solver says of a frame that failed, and where it kept the last good state after that."""
+
+_NEGLIGIBLE, _FACTOR = 1e-5, 2.0
+"""Residuals below the first are the same; above it they agree within the second."""
+
+_QUASI_STATIC_FRAMES, _DYNAMIC_FRAMES = 40, 150
+"""Frames after the release, of methods without masses and of those with them."""
+
+_HELD = ("frames_to_1e-3", "held_residual", "held_inverted")
+"""What only a case has in which the probe was held."""
+
+_RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_checked", "truthful")
+"""What only a case that was not refused has."""
+
+_RECOVERED = 1e-4  # of the thickness; a tissue that is so near its rest has come back
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A case for one method."""
+@dataclass(eq=False)
+class Trial:
+    """What came of a case."""
+
+    finite: bool = True
+    bounded: bool = True
+    truthful: bool = True
+    refused: bool = False
+    failure: str = ""  # why it counts as failed though the four above are fine
+    recovered_mm: float = math.nan  # farthest node from rest, in the end
+    recovery_frames: int | None = None  # until it was near rest; None when it never was
+    residual_reported: float = math.nan  # in the last frame with a probe, or the first untrue one
+    residual_checked: float = math.nan  # in the same frame
+    held: list[float] = field(default_factory=list)  # residuals, that when the probe stopped first
+    held_inverted: int = 0  # tetrahedra, at the end of the hold
+    step_limit_predicted: float = math.nan  # s
+    step_limit_observed: float = math.nan  # s
+    slowest_ms: float = 0.0
+    kept: int = 0  # frames that failed, so that the solver kept its last good state or rest
+    actions: list[str] = field(default_factory=list)  # what it said, each once
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing went wrong."""
+        return self.finite and self.bounded and self.truthful and not self.failure
+
+    @property
+    def frames_to_balance(self) -> int | None:
+        """Of the hold, until the residual is small and stays so; None where it never is."""
+        return frames_until(self.held, SMALL)
+
+    def say(self, action: str) -> None:
+        """Add what a solver said."""
+        if action and action not in self.actions:
+            self.actions.append(action)
+
+
+@dataclass(frozen=True, eq=False)
+class Tried(Row):
+    """A method, the case it was tried on, and what came of that."""
+
+    digits = 6
 
     method: str
-    case: StabilityCase | str  # or the name of what must be refused
-    bisect: bool = False  # whether its step limit is looked for
+    name: str
+    case: StabilityCase | None  # None for input that must be refused
+    trial: Trial
+
+    @property
+    def values(self) -> dict[str, object]:
+        """By column; what a method does not have, or a refused case lacks, is None."""
+        trial, method = self.trial, TISSUE_METHODS[self.method]
+        varied = {entry.name: None for entry in fields(StabilityCase)}
+        if self.case is not None:
+            varied = asdict(self.case)
+            if not method.has_springs:
+                varied |= {"time_step": None, "damping": None, "springs": None}
+            if not method.is_explicit:
+                varied |= {"stabilisation": None}
+        failed = [f"FAILED: {trial.failure}"] if trial.failure else []
+
+        def ran(name: str) -> object:
+            return None if trial.refused else getattr(trial, name)
+
+        return {
+            "method": self.method,
+            **(varied | {"case": self.name}),
+            "recovery_frames": ran("recovery_frames"),
+            **dict(zip(_HELD, self._held, strict=True)),
+            "dt_limit_predicted": trial.step_limit_predicted,
+            "dt_limit_observed": trial.step_limit_observed,
+            **{name: ran(name) for name in _RAN},
+            "action": " | ".join([*failed, *trial.actions[:3]]),
+        }
+
+    @property
+    def _held(self) -> tuple[object, ...]:
+        trial = self.trial
+        if not trial.held:
+            return (None, None, None)
+        return trial.frames_to_balance, trial.held[-1], bool(trial.held_inverted)
+
+    @property
+    def failure(self) -> str:
+        """What went wrong, and nothing where nothing did."""
+        trial = self.trial
+        if trial.failure or trial.passed:
+            return trial.failure
+        if not trial.finite:
+            return "not finite"
+        if not trial.bounded:
+            return "not bounded"
+        reported, checked = trial.residual_reported, trial.residual_checked
+        return f"reported a residual of {reported:.3g}, but it is {checked:.3g}"
 
 
-def evaluate_stability(out: Path, quick: bool) -> int:
-    """Write stability.csv, the maps and stability.md, as `us_sim.evaluation` says.
-
-    A quick run has fewer cases. A case has failed that was not finite, bounded or truthful, or was
-    refused for no reason, or was not in balance in the end though it should be.
-    """
-    folder = ReportFolder("stability", out, quick)
-    tasks = list(_tasks(quick))
-    with Progress("stability", len(tasks), "cases") as progress:
-        tried = _run(tasks, progress.update)
-    folder.write_rows("stability", tried)
-    write_report(folder, tried)
-    return folder.finish(table(tried), failures(tried))
-
-
-def _tasks(quick: bool) -> Iterator[_Task]:
-    named = extreme_cases(corners=not quick)
-    sampled = sampled_cases(_QUICK_SAMPLES if quick else _SAMPLES)
-    held = held_cases(_QUICK_HELD if quick else _HELD, _SEED)
-    limits = _QUICK_STEP_LIMITS if quick else _STEP_LIMITS
-    for name_of_method, method in TISSUE_METHODS.items():
-        for name in REFUSALS:
-            yield _Task(name_of_method, name)
-        for case in named:
-            yield _Task(name_of_method, case)
-        for number, case in enumerate(sampled):
-            yield _Task(name_of_method, case, method.is_explicit and number < limits)
-        for case in held:
-            yield _Task(name_of_method, case)
-
-
-def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list[Tried]:
-    """All tasks, in processes of their own, in order."""
-    tried: list[Tried] = []
-    with (
-        tempfile.TemporaryDirectory(prefix="us-sim-stability-") as cache,
-        ProcessPoolExecutor(
-            max_workers=max(1, min(2, os.cpu_count() or 1)),
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_prepare,
-            initargs=(cache, str(kernel_folder())),
-        ) as pool,
-    ):
-        try:
-            for task, trial in zip(tasks, pool.map(_try, tasks, chunksize=_CHUNK), strict=True):
-                case = None if isinstance(task.case, str) else task.case
-                name = case.case if case else str(task.case)
-                tried.append(Tried(task.method, name, case, trial))
-                progress(len(tried), task.method)
-        except BrokenProcessPool as error:
-            raise SolverError(
-                f"a process died while it tried {tasks[len(tried)].method}, or what comes after "
-                f"it: run it again with PYTHONFAULTHANDLER=1 to see where"
-            ) from error
-    return tried
-
-
-def _prepare(cache: str, kernels: str) -> None:
-    """In a new process: one thread for BLAS, and what is kept on disk goes to ``cache``.
-
-    Kernels alone are those of every other process: in a new folder all would be compiled again.
-    """
-    os.environ["US_SIM_CACHE"] = cache
-    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = kernels  # type: ignore[attr-defined]
-    threadpool_limits(1)
-
-
-@lru_cache
-def _warm_up(method: str) -> None:
-    """Once in a process, so that no frame's time contains a compilation."""
-    create_solver(method, model_of(StabilityCase("box"))).warm_up()
-
-
-def _try(task: _Task) -> Trial:
-    _warm_up(task.method)
-    if isinstance(task.case, str):
-        return refusal_of(task.method, task.case)
-    trial = try_case(task.method, task.case)
-    if task.bisect and not trial.refused:
-        predicted, observed = observed_step_limit(task.method, task.case)
-        if math.isfinite(predicted):
-            trial.step_limit_predicted, trial.step_limit_observed = predicted, observed
-            if abs(observed - predicted) > _STEP_LIMIT_ERROR * predicted:
-                trial.failure = (
-                    f"predicts a step limit of {predicted:.4g} s, but it is {observed:.4g} s"
-                )
+def try_case(method: str, case: StabilityCase) -> Trial:
+    """Make the solver and run the case; a refusal in one sentence is a result, too."""
+    trial = Trial()
+    unheld = False
+    try:
+        model = model_of(case)
+        unheld = TISSUE_METHODS[method].is_quasi_static and not _held(model).all()
+        solver = create_solver(method, model, **_settings(method, case, model))
+    except UsSimError as error:
+        trial.refused = True
+        trial.say(f"refused: {error}")
+        too_many_steps = case.stabilisation == "substeps" and TISSUE_METHODS[method].is_explicit
+        if not (unheld or too_many_steps):
+            trial.failure = "was refused, and has nothing to be refused for"
+        return trial
+    except Exception as error:  # whatever it is, a user would see a traceback
+        trial.failure = f"raised {type(error).__name__} while it was made: {error}"
+        return trial
+    if unheld:
+        trial.failure = "was not refused, though it is not held"
+    run_trial(solver, equations_of(method, case, model), case, trial)
     return trial
+
+
+def run_trial(
+    solver: TissueSolver, residual: IndependentResidual, case: StabilityCase, trial: Trial
+) -> None:
+    """Move the probe as the case says, release, and note what the solver returned."""
+    model = solver.model
+    poses = poses_of(case.motion, model.mesh, case.depth)
+    bound = _bound(model, poses)
+    moving = len(poses)
+    poses = [*poses, *poses[-1:] * case.held]
+    thickness = float(np.ptp(model.mesh.nodes[:, 2]))
+    released = None if case.release == "removed" else LIFTED
+    quasi_static = TISSUE_METHODS[solver.name].is_quasi_static
+    frames = _QUASI_STATIC_FRAMES if quasi_static else _DYNAMIC_FRAMES
+    last: Deformation | None = None
+    stuck = 0
+    for number, pose in enumerate([*poses, *[released] * frames]):
+        start = time.perf_counter()
+        try:
+            deformation = solver.deform(pose)
+        except Exception as error:  # a frame must never raise
+            trial.finite = False
+            trial.failure = f"raised {type(error).__name__} in frame {number}: {error}"
+            return
+        trial.slowest_ms = max(trial.slowest_ms, 1e3 * (time.perf_counter() - start))
+        trial.say(deformation.action)
+        if not _finite(deformation):
+            trial.finite = False
+            return
+        if case.held and moving <= number + 1 <= len(poses):
+            trial.held.append(float(deformation.residual))
+            volumes = signed_volumes(deformation.nodes, model.mesh.tetrahedra)
+            trial.held_inverted = int((volumes <= 0).sum())
+        failed = _FAILED in deformation.action
+        kept = _KEPT in deformation.action
+        if failed:
+            trial.kept += 1
+            residual.forget()
+        if kept:
+            same = last is None or np.array_equal(deformation.nodes, last.nodes)
+            if not same or (last is not None and deformation.residual != last.residual):
+                trial.failure = "said that it kept the last good state, and returned another one"
+        free = number - len(poses)
+        moved = np.abs(deformation.nodes - model.mesh.nodes).max()
+        trial.bounded = trial.bounded and bool(moved <= bound)
+        compared = free < 5 or free % 8 == 0 or free == frames - 1
+        if not failed:
+            checked = residual.check(deformation, pose)  # every frame: loads refer to those before
+            if compared:
+                _compare(trial, deformation.residual, *checked, residual.is_least, free < 0)
+        if free >= 0:
+            away = _from_rest(model, deformation.nodes)
+            trial.recovered_mm = 1e3 * away
+            if away > _RECOVERED * thickness:
+                trial.recovery_frames = None
+            elif trial.recovery_frames is None:
+                trial.recovery_frames = free + 1
+            if deformation is last:
+                break  # settled
+        last = deformation
+        stuck = stuck + 1 if failed else 0
+    if stuck >= frames and _held(model).all():
+        trial.failure = "went on failing after the release, in every frame"
+    if trial.held and TISSUE_METHODS[solver.name].is_judged_at_rest and not trial.failure:
+        trial.failure = _unbalanced(trial, case)
+
+
+def _unbalanced(trial: Trial, case: StabilityCase) -> str:
+    """What is wrong under the held probe; nothing where the tissue is in balance and upright."""
+    if trial.frames_to_balance is None:
+        return f"held for {case.held} frames it was left with a residual of {trial.held[-1]:.3g}"
+    if trial.held_inverted:
+        return f"held for {case.held} frames it left {trial.held_inverted} tetrahedra inside out"
+    return ""
+
+
+def agrees(reported: float, checked: float, rounding: float, least: bool = False) -> bool:
+    """Whether a reported residual is true: within a factor of two, or both negligible.
+
+    Negligible is below 1e-5, or below what rounding the nodes to doubles makes. Where what was
+    checked is only the ``least`` that it can be, it may be greater.
+    """
+    floor = max(_NEGLIGIBLE, rounding)
+    if not (math.isfinite(reported) and math.isfinite(checked)):
+        return False
+    low, high = sorted((reported, checked))
+    return high <= floor or high <= _FACTOR * low or (least and checked <= reported)
+
+
+def damping_factor(case: StabilityCase, model: TissueModel) -> float:
+    """s, damping over stiffness at which a node is damped as the case says.
+
+    Critical damping is that of the root mean square, over the free nodes, of the frequency of a
+    node among held neighbours.
+    """
+    free = ~model.fixed
+    if not free.any() or case.damping == 0:
+        return 0.0
+    springs = springs_of(model.mesh, model.materials)
+    stiffness = np.zeros(len(free))
+    np.add.at(stiffness, springs.edges, springs.stiffness[:, None])
+    return 2 * case.damping / math.sqrt(float((stiffness / model.lumped_mass)[free].mean()))
+
+
+def equations_of(method: str, case: StabilityCase, model: TissueModel) -> IndependentResidual:
+    """What checks the residuals of a method on a case."""
+    return TISSUE_METHODS[method].residual(model, spring_settings(case))
+
+
+def spring_settings(case: StabilityCase) -> SpringSettings:
+    """Settings of methods with springs for a case's ``springs``."""
+    stiffness = "algorithm_1" if case.springs == "algorithm_1" else "fitted"
+    return SpringSettings(stiffness, volume=case.springs == "fitted with volume")
+
+
+def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:
+    known = rules_of(SOLVERS.settings(method))
+    asked: dict[str, Any] = {
+        "time_step": case.time_step,
+        "damping_factor": damping_factor(case, model),
+        "stabilisation": case.stabilisation,
+        **asdict(spring_settings(case)),
+    }
+    return {name: value for name, value in asked.items() if name in known}
+
+
+def _finite(deformation: Deformation) -> bool:
+    numbers = (deformation.nodes, deformation.force, deformation.torque, deformation.residual)
+    return all(bool(np.isfinite(number).all()) for number in numbers)
+
+
+def _held(model: TissueModel) -> NDArray[np.bool_]:
+    """(P,) whether each connected part has three fixed nodes that are not on one line."""
+    part = parts(model.mesh)
+    held = np.zeros(part.max() + 1, dtype=bool)
+    for one in range(len(held)):
+        nodes = model.mesh.nodes[model.fixed & (part == one)]
+        if len(nodes) > 2:
+            spread = np.linalg.svd(nodes - nodes.mean(axis=0), compute_uv=False)
+            held[one] = spread[1] > 1e-9 * spread[0]
+    return held
+
+
+def _bound(model: TissueModel, poses: list[Pose | None]) -> float:
+    """m, three times as far as any node can be pushed; unheld parts may be thrown farther."""
+    nodes, box = model.mesh.nodes, model.collider.offset_box
+    pressing = (pose for pose in poses if pose is not None and pose is not LIFTED)
+    reach = max(float(np.linalg.norm(pose.position)) for pose in pressing)
+    size = np.ptp(nodes, axis=0)
+    bound = 3 * (float(np.linalg.norm(size)) + reach + 2 * float(box[2] + box[3]) + 0.1)
+    return bound if _held(model).all() else max(bound, 10 * float(size.max()))
+
+
+def _compare(
+    trial: Trial, reported: float, checked: float, rounding: float, least: bool, pressed: bool
+) -> None:
+    if not trial.truthful:
+        return
+    trial.truthful = agrees(reported, checked, rounding, least)
+    if pressed or not trial.truthful:
+        trial.residual_reported, trial.residual_checked = float(reported), checked
+
+
+def _from_rest(model: TissueModel, nodes: NDArray[np.float64]) -> float:
+    """m, farthest node from rest; unheld parts are laid over their rest by a rigid motion first."""
+    rest = model.mesh.nodes
+    part = parts(model.mesh)
+    away = 0.0
+    for one, held in enumerate(_held(model)):
+        there, here = rest[part == one], nodes[part == one]
+        if not held:
+            there, middle = there - there.mean(axis=0), here.mean(axis=0)
+            u, _, v = np.linalg.svd((here - middle).T @ there)
+            turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+            here = (here - middle) @ turn
+        away = max(away, float(np.linalg.norm(here - there, axis=1).max()))
+    return away
+
+
+def refusal_of(method: str, name: str) -> Trial:
+    """What a method does with one of the inputs of `REFUSALS`."""
+    trial = Trial()
+    try:
+        REFUSALS[name](method)
+    except UsSimError as error:
+        trial.refused = True
+        trial.say(f"refused: {error}")
+    except Exception as error:  # whatever it is, a user would see a traceback
+        trial.failure = f"raised {type(error).__name__} instead of refusing: {error}"
+    else:
+        trial.failure = "was not refused"
+    return trial
+
+
+def _moved_node(method: str, node: int, place: list[float]) -> None:
+    mesh = mesh_named("box")
+    nodes = mesh.nodes.copy()
+    nodes[node] = place
+    _solve(method, TetrahedralMesh(nodes, mesh.tetrahedra))
+
+
+def _other_tetrahedra(method: str, tetrahedra: np.ndarray, more_nodes: int = 0) -> None:
+    nodes = mesh_named("box").nodes
+    _solve(method, TetrahedralMesh(np.concatenate([nodes, nodes[:more_nodes] + 1]), tetrahedra))
+
+
+def _inverted(method: str) -> None:
+    tetrahedra = mesh_named("box").tetrahedra.copy()
+    tetrahedra[7] = tetrahedra[7][[0, 2, 1, 3]]
+    _other_tetrahedra(method, tetrahedra)
+
+
+def _flat(method: str) -> None:
+    mesh = mesh_named("tetrahedron")
+    _solve(method, TetrahedralMesh(mesh.nodes * [1.0, 1.0, 1e-12], mesh.tetrahedra))
+
+
+def _doubled_nodes(method: str) -> None:
+    box = mesh_named("box")
+    nodes = np.concatenate([box.nodes, box.nodes])
+    both = np.concatenate([box.tetrahedra, box.tetrahedra + len(box.nodes)])
+    _solve(method, TetrahedralMesh(nodes, both))
+
+
+def _solve(method: str, mesh: TetrahedralMesh) -> None:
+    constants = (np.full(len(mesh.tetrahedra), value) for value in (1e4, 0.45, 1e3))
+    materials = TissueMaterials(*constants)
+    fixed = mesh.nodes[:, 2] >= mesh.nodes[:, 2].max()
+    reached = np.flatnonzero(mesh.nodes[:, 2] <= 0).astype(np.int32)
+    create_solver(method, TissueModel(mesh, materials, fixed, Sphere(0.03), reached))
+
+
+def _constant(method: str, **constants: float) -> None:
+    create_solver(method, model_of(StabilityCase("unused", **constants)))  # type: ignore[arg-type]
+
+
+def _setting(method: str, **settings: Any) -> None:
+    create_solver(method, model_of(StabilityCase("unused")), **settings)
+
+
+def _pose(method: str, pose: Callable[[], Pose]) -> None:
+    create_solver(method, model_of(StabilityCase("unused"))).deform(pose())
+
+
+def _state(method: str, displacement: float, count: int = 64) -> None:
+    solver = create_solver(method, model_of(StabilityCase("unused")))
+    state = TissueState.at_rest(count)
+    state.displacement[0] = displacement
+    solver.take_over(state)
+
+
+REFUSALS: dict[str, Callable[[str], None]] = {
+    "a node is not a number": lambda m: _moved_node(m, 5, [np.nan, 0.0, 0.0]),
+    "a node is at infinity": lambda m: _moved_node(m, 5, [0.0, np.inf, 0.0]),
+    "a node pulled through its neighbours": lambda m: _moved_node(m, 21, [0.2, 0.2, 0.2]),
+    "a node on its neighbour": lambda m: _moved_node(m, 5, mesh_named("box").nodes[6].tolist()),
+    "an inverted tetrahedron": _inverted,
+    "a flat tetrahedron": _flat,
+    "every node twice": _doubled_nodes,
+    "a tetrahedron twice": lambda m: _other_tetrahedra(
+        m, np.concatenate([mesh_named("box").tetrahedra, mesh_named("box").tetrahedra[:1]])
+    ),
+    "a node of no tetrahedron": lambda m: _other_tetrahedra(m, mesh_named("box").tetrahedra, 1),
+    "a node that is not there": lambda m: _other_tetrahedra(m, mesh_named("box").tetrahedra + 9),
+    "no tetrahedra": lambda m: _other_tetrahedra(m, np.empty((0, 4), dtype=np.int32)),
+    "a modulus of zero": lambda m: _constant(m, young_modulus=0.0),
+    "a negative modulus": lambda m: _constant(m, young_modulus=-1e4),
+    "a modulus that is not a number": lambda m: _constant(m, young_modulus=np.nan),
+    "an infinite modulus": lambda m: _constant(m, young_modulus=np.inf),
+    "Poisson's ratio of one half": lambda m: _constant(m, poisson_ratio=0.5),
+    "Poisson's ratio of minus one": lambda m: _constant(m, poisson_ratio=-1.0),
+    "no density": lambda m: _constant(m, density=0.0),
+    "an unknown setting": lambda m: _setting(m, patience=3),
+    "a pose that is not a number": lambda m: _pose(m, lambda: Pose(np.array([0, 0, np.nan]))),
+    "a pose without orientation": lambda m: _pose(m, lambda: Pose(np.zeros(3), np.zeros(4))),
+    "a state that is not a number": lambda m: _state(m, np.nan),
+    "a state of another mesh": lambda m: _state(m, 0.0, 9),
+}
+"""Each gives a method one broken input, by what is wrong with it."""
+
+
+_AMPLITUDE = 1e-8
+"""First displacements over the shortest edge: so small that springs do not turn."""
+_SWELLING = 1e3
+"""Growth that shows instability. Just below the limit amplitudes swell by 20 times and stay so."""
+_STEPS = 3000
+_PRECISION = 2e-3  # relative, of the bisection
+
+
+def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]:
+    """s, the step limit that a solver predicts for a case without a probe, and the observed one.
+
+    Both are infinite where every node is fixed, or the limit is none that can be set.
+
+    Small random displacements are let go with unscaled masses, for some thousand steps of a length
+    that is bisected until it is known whether they grow.
+
+    Raises:
+        UsSimError: the case is refused.
+    """
+    model = model_of(case)
+    nodes = model.mesh.nodes
+    settings: dict[str, Any] = asdict(spring_settings(case))
+    settings |= {"damping_factor": damping_factor(case, model), "stabilisation": "none"}
+    shape = np.random.default_rng(1).uniform(-1.0, 1.0, nodes.shape)
+    shape[model.fixed] = 0.0
+    edges = nodes[model.mesh.edges]
+    shape *= _AMPLITUDE * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).min()
+    start = TissueState(shape, np.zeros_like(nodes))
+
+    def grows(step: float) -> bool:
+        going_on = {"steps": _STEPS, "rest_tolerance": 0.0, **settings}
+        solver = create_solver(method, model, time_step=step, **going_on)
+        solver.take_over(start)
+        with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
+            ended = solver.deform(None)
+        moved = np.abs(ended.nodes - nodes).max()
+        return bool(ended.has_failed or moved > _SWELLING * np.abs(shape).max())
+
+    if model.fixed.all():
+        return math.inf, math.inf
+    solver: Any = create_solver(method, model, time_step=1e-9, **settings)
+    predicted = float(solver.step_limit)
+    can_be_set = rules_of(SOLVERS.settings(method))["time_step"].quantity or Quantity("time")
+    low, high = 0.98 * predicted, 1.02 * predicted
+    if not can_be_set.minimum < low < high < can_be_set.maximum:
+        return math.inf, math.inf
+    while low > 2 * can_be_set.minimum and grows(low):
+        low /= 2
+    while high < can_be_set.maximum / 2 and not grows(high):
+        high *= 2
+    while high > (1 + _PRECISION) * low:
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if grows(middle) else (middle, high)
+    return predicted, (low * high) ** 0.5

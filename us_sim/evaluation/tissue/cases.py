@@ -17,15 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.block import EXTENT, block
+from us_sim.evaluation.block import EXTENT, block, graded_planes
 from us_sim.evaluation.named import Named
-from us_sim.evaluation.tissue.graded_planes import graded_planes
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 
 MAIN_SCENE = "press_25mm"
 """The scene that is pressed on every mesh."""

@@ -1,36 +1,210 @@
-"""`us-sim evaluate tissue`: how wrong each method is, against how long it takes.
+"""One point of error against run time: a method, its settings, a mesh, and what it got wrong.
 
-Every method follows the probe's path at its own pace, frame by frame; what it says at the path's
-end is compared with its own equations solved without regard to time, and with large deformation on
-fine quadratic elements (`us_sim.evaluation.tissue.reference`).
+>>> import numpy as np
+>>> from us_sim.evaluation.tissue.measure import Outcome, compare
+>>> nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+>>> exact = Outcome(nodes * 0.1, 10.0, 1.0)
+>>> errors = compare(Outcome(nodes * 0.11, 9.0, 1.01), exact, rest_volume=2.0)
+>>> [round(error, 4) for error in errors]
+[0.1, 10.0, 0.1, 0.005]
+
+A method's own equations, solved without regard to time: what more iterations would give.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from us_sim.evaluation.block import LARGEST_MESH, MESHES
-from us_sim.evaluation.report_folder import ReportFolder
-from us_sim.evaluation.row import failures, words_of
-from us_sim.evaluation.steps import steps
+from us_sim.evaluation.report import (
+    Row,
+    not_a_column,
+    words_of,
+)
+from us_sim.evaluation.timing import RunTimes
 from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES, Scene
-from us_sim.evaluation.tissue.kept_reference import Reference, kept_reference
-from us_sim.evaluation.tissue.own_equations import converged, solved_independently
-from us_sim.evaluation.tissue.points import Outcome, Point, Timing, compare, held_memory, timed
-from us_sim.evaluation.tissue.report import table, write_report
-from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting
-from us_sim.progress import Progress
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import create_solver
+from us_sim.evaluation.tissue.finite_elements import LinearEquations
+from us_sim.evaluation.tissue.reference import Reference
+from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting, TissueMethod
+from us_sim.tissue.contact.probe_gap import push_out
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
+from us_sim.tissue.solvers.solver import TissueSolver, create_solver
+
+_PASSES = 3  # along the path; the first is not timed
+_LONGEST = 20.0  # s, after which no further pass begins
+
+
+class Errors(NamedTuple):
+    """How much one outcome differs from another."""
+
+    rel_l2_error: float  # of the nodes' displacements
+    max_error_mm: float  # of the worst node
+    force_error: float  # of the force along the probe's axis, relative
+    volume_error: float  # of the block's volume, over its volume at rest
+
+
+@dataclass(frozen=True)
+class Point(Row):
+    """A row of tissue.csv, and what the report says beyond it."""
+
+    scene: str
+    method: str
+    nodes: int
+    tets: int
+    threads: int
+    setting: str
+    ms_median: float = float("nan")
+    ms_p99: float = float("nan")
+    rel_l2_error: float = float("nan")
+    max_error_mm: float = float("nan")
+    force_error: float = float("nan")
+    volume_error: float = float("nan")
+    reference: str = ""  # what the errors are against; begins with `own` or with `nonlinear`
+    default: bool = not_a_column(False)
+    memory: float = not_a_column(float("nan"))  # bytes
+    setup: float = not_a_column(float("nan"))  # s
+    smallest_volume_ratio: float = not_a_column(float("nan"))
+    failure: str = not_a_column("")
+
+    @property
+    def title(self) -> str:
+        """The method, its settings, and what it was tried on."""
+        return f"{self.method} ({self.setting}), {self.scene}, {self.nodes:,} nodes"
+
+    @property
+    def own(self) -> bool:
+        """Whether the errors are against the method's own converged equations."""
+        return self.reference.startswith("own")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What is compared: of a method, or of a reference at the same nodes."""
+
+    displacement: NDArray[np.float64]  # (N, 3) m
+    force: float  # N, on the probe along its axis
+    volume: float  # m3, of the deformed block
+
+    @classmethod
+    def of(cls, model: TissueModel, deformation: Deformation) -> Outcome:
+        """A solver's."""
+        return cls(
+            deformation.nodes - model.mesh.nodes,
+            float(deformation.force[2]),
+            float(signed_volumes(deformation.nodes, model.mesh.tetrahedra).sum()),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Timing(RunTimes):
+    """A scene's path, followed frame by frame; a run is a timed frame."""
+
+    last: Deformation
+
+
+def timed(solver: TissueSolver, scene: Scene, threads: int) -> Timing:
+    """Follow the path a few times from rest; the first pass warms caches and does not count."""
+    frames: list[float] = []
+    begin = time.perf_counter()
+    with threadpool_limits(threads):
+        for number in range(_PASSES):
+            solver.reset()
+            frames = [] if number <= 1 else frames
+            for pose in scene.path:
+                before = time.perf_counter()
+                last = solver.deform(pose)
+                frames.append((time.perf_counter() - before) * 1e3)
+            if time.perf_counter() - begin > _LONGEST:
+                break
+    return Timing(np.array(frames), last)
+
+
+def compare(found: Outcome, exact: Outcome, rest_volume: float) -> Errors:
+    """How wrong ``found`` is."""
+    difference = found.displacement - exact.displacement
+    return Errors(
+        float(np.linalg.norm(difference) / np.linalg.norm(exact.displacement)),
+        float(np.linalg.norm(difference, axis=1).max() * 1e3),
+        abs(found.force / exact.force - 1.0),
+        abs(found.volume - exact.volume) / rest_volume,
+    )
+
+
+def held_memory(solver: TissueSolver) -> int:
+    """Bytes of all arrays that a solver holds, each once, those of its mesh included."""
+    seen: set[int] = set()
+    arrays: dict[int, int] = {}
+    left: list[Any] = [solver]
+    while left:
+        thing = left.pop()
+        if id(thing) in seen:
+            continue
+        seen.add(id(thing))
+        if isinstance(thing, np.ndarray):
+            while isinstance(thing.base, np.ndarray):
+                thing = thing.base
+            arrays[id(thing)] = thing.nbytes
+        elif isinstance(thing, dict):
+            left.extend(thing.values())
+        elif isinstance(thing, list | tuple | set | frozenset):
+            left.extend(thing)
+        elif not isinstance(thing, type) and hasattr(thing, "__dict__") and not callable(thing):
+            left.extend(vars(thing).values())
+    return sum(arrays.values())
+
+
+_FRAMES = 400  # at the last pose, at the most
+_LONGEST_HOLD = 10.0  # s, of these frames together
+
+
+def converged(
+    scene: Scene, model: TissueModel, method: TissueMethod, setting: Setting
+) -> tuple[Outcome, str]:
+    """The scene's end by an iterative method that goes on until nothing changes.
+
+    The words say how far it came.
+    """
+    patient = method.without_effort(setting) | dict(method.patient or {})
+    solver = create_solver(method.name, model, **patient)
+    for pose in scene.path:
+        deformation = solver.deform(pose)
+    begin = time.perf_counter()
+    for _ in range(_FRAMES):
+        before, deformation = deformation, solver.deform(scene.path[-1])
+        if deformation is before or time.perf_counter() - begin > _LONGEST_HOLD:
+            break
+    settled = "settled" if deformation is before else "cut off"
+    words = f"own equations: {method.name} {settled} at residual {deformation.residual:.0e}"
+    return Outcome.of(model, deformation), words
+
+
+def solved_independently(
+    scene: Scene, model: TissueModel, deformation: Deformation
+) -> tuple[Outcome, str]:
+    """The linear equations by scikit-fem and SciPy, with the contact that `fem` found."""
+    pose, touched = scene.path[-1], deformation.contact_nodes
+    _, normals = push_out(scene.collider, pose, deformation.nodes[touched], model.contact_spacing)
+    depths = np.einsum("ij,ij->i", normals, deformation.nodes[touched] - model.mesh.nodes[touched])
+    displacement, pushes = LinearEquations(model).solve(touched, normals, depths)
+    force = -float(((pushes[:, None] * normals).sum(axis=0) @ pose.rotation)[2])
+    nodes = model.mesh.nodes + displacement
+    volume = float(signed_volumes(nodes, model.mesh.tetrahedra).sum())
+    words = "own equations: scikit-fem and SciPy on fem's contact"
+    return Outcome(displacement, force, volume), words
+
 
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")
+
+
 _QUICK_SETTINGS = 3  # of each method, the defaults among them
-_SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the reference's elements
 
 
 @dataclass(frozen=True)
@@ -75,41 +249,6 @@ def plan(quick: bool) -> list[Trial]:
                     settings = settings[:1]
                 trials += [Trial(scene, counts, method.name, setting, own) for setting in settings]
     return trials
-
-
-def evaluate_tissue(out: Path, quick: bool) -> int:
-    """Write tissue.csv, the plots and tissue.md, as `us_sim.evaluation` says.
-
-    A quick run has fewer scenes, meshes and settings, and a coarser reference. It raises UsSimError
-    too where no reference can be computed.
-    """
-    folder = ReportFolder("tissue", out, quick)
-    trials = plan(quick)
-    references = _references({trial.scene.name: trial.scene for trial in trials}.values(), quick)
-    bench = _Bench(references)
-    points = [
-        point
-        for trial in steps("errors and times", trials, "points")
-        for point in bench.points(trial)
-    ]
-    folder.write_rows("tissue", points)
-    write_report(folder, points, references)
-    return folder.finish(table(points), failures(points))
-
-
-def _references(scenes: Iterable[Scene], quick: bool) -> dict[str, Reference]:
-    scenes, found = list(scenes), {}
-    with Progress("nonlinear reference", len(scenes), "scenes") as progress:
-        for done, scene in enumerate(scenes):
-
-            def tell(fraction: float, text: str, done: int = done, name: str = scene.name) -> None:
-                progress.update(done + fraction, f"{name}: {text}")
-
-            tell(0.0, "")
-            coarse = quick or scene.name in LOCKING[1:]
-            found[scene.name] = kept_reference(scene, _QUICK_SIZES if coarse else _SIZES, tell)
-        progress.update(len(scenes))
-    return found
 
 
 class _Bench:

@@ -17,21 +17,42 @@ The block lies between its mirror plane y = 0 and its side; the probe must be as
 >>> solution = solve_contact(planes, soft, Sphere(0.03), [Pose(position=[0.0, 0.0, 0.002])])
 >>> bool(solution.force[2] < 0), bool(solution.penetration < 2e-5)
 (True, True)
+
+The linear equations that the solver `fem` solves, assembled by scikit-fem, solved by SciPy.
+
+>>> import numpy as np
+>>> from us_sim.evaluation.tissue.reference import LinearEquations
+>>> from us_sim.evaluation.tissue.cases import SCENES
+>>> model = SCENES["press_12mm"].model((5, 3, 3))
+>>> equations = LinearEquations(model)
+>>> turned = np.cross([0.0, 0.0, 1.0], model.mesh.nodes)
+>>> bool(abs(equations.forces(turned)).max() < 1e-12)  # a small turn strains nothing
+True
+
+Reference solutions on two meshes, kept in the user's cache folder by what decides them.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array, dia_array, kron
 from scipy.spatial import cKDTree
 
+from us_sim.cache import Form, kept
 from us_sim.errors import SolverError
-from us_sim.evaluation.tissue.neo_hookean_hexahedra import NeoHookeanHexahedra
-from us_sim.evaluation.tissue.two_level import TwoLevel
+from us_sim.evaluation.tissue import finite_elements as hexahedra
+from us_sim.evaluation.tissue.cases import Scene
+from us_sim.evaluation.tissue.finite_elements import (
+    NeoHookeanHexahedra,
+    TwoLevel,
+)
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -288,3 +309,98 @@ def _trilinear(planes: Sequence[NDArray[np.float64]], points: NDArray[np.float64
     )
     matrix.eliminate_zeros()
     return matrix
+
+
+_STRIDE = 0.005  # m, the least distance between the poses through which the last is approached
+
+_ARRAYS, _NUMBERS = ("displacement", "pressure", "force"), ("volume", "penetration")
+"""What is kept of a solution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The solution at the end of a scene's path, and how much a coarser mesh differs."""
+
+    solution: Solution
+    size: float  # m, of the elements under the probe
+    coarser: float  # m, likewise, of the mesh compared with
+    difference: float  # relative L2, between the two
+    force_difference: float  # relative
+
+    @property
+    def unknowns(self) -> int:
+        """Displacement components of the whole block's half that was solved."""
+        return self.solution.displacement.size
+
+
+def kept_reference(
+    scene: Scene, sizes: Sequence[float], progress: Callable[[float, str], None] | None = None
+) -> Reference:
+    """The reference of a scene, computed first if it is not kept.
+
+    Args:
+        scene: pressed as its path's end says.
+        sizes: m, of the elements under the probe, at least two: each mesh starts from the one
+            before, the last is the reference, and the one before it shows how far it has converged.
+        progress: called with the fraction that is done, and a word.
+
+    Raises:
+        SolverError: no equilibrium was found.
+    """
+    fine: Solution | None = None
+    for number, size in enumerate(sizes):
+
+        def tell(done: float, text: str, number: int = number) -> None:
+            if progress is not None:
+                progress((number + done) / len(sizes), text)
+
+        coarse, fine = fine, _kept(scene, size, fine, tell)
+    assert coarse is not None
+    assert fine is not None
+    points = fine.block.corners
+    here, there = fine.at(points), coarse.at(points)
+    difference = float(np.linalg.norm(there - here) / np.linalg.norm(here))
+    forces = float(np.linalg.norm(coarse.force - fine.force) / np.linalg.norm(fine.force))
+    return Reference(fine, sizes[-1], sizes[-2], difference, forces)
+
+
+def _kept(
+    scene: Scene, size: float, start: Solution | None, progress: Callable[[float, str], None]
+) -> Solution:
+    planes = scene.reference_planes(size)
+
+    def pack(solution: Solution) -> tuple[dict[str, NDArray], dict[str, Any]]:
+        arrays = {name: getattr(solution, name) for name in _ARRAYS}
+        return arrays, {name: getattr(solution, name) for name in _NUMBERS}
+
+    def unpack(arrays: dict[str, Any], numbers: dict[str, Any]) -> Solution:
+        block = NeoHookeanHexahedra(planes, scene.material)
+        return Solution(block, **arrays, **{name: numbers[name] for name in _NUMBERS})
+
+    def make() -> Solution:
+        poses = [scene.path[-1]] if start is not None else _approach(scene)
+        return solve_contact(planes, scene.material, scene.collider, poses, start, progress)
+
+    form = Form("reference.json", pack, unpack)
+    return kept(f"reference-{_hash(scene, planes)}", form, make)
+
+
+def _approach(scene: Scene) -> list[Pose]:
+    """The path's poses without those that are near the one before; the last is there."""
+    poses = [scene.path[0]]
+    for pose in scene.path[1:-1]:
+        turn = 1.0 - abs(float(pose.orientation @ poses[-1].orientation))
+        if np.linalg.norm(pose.position - poses[-1].position) > 0.999 * _STRIDE or turn > 0.0009:
+            poses.append(pose)
+    return [*poses, scene.path[-1]]
+
+
+def _hash(scene: Scene, planes: tuple[NDArray[np.float64], ...]) -> str:
+    """Of everything that decides the solution, the code included."""
+    digest = hashlib.sha256()
+    for file in (str(hexahedra.__file__), __file__):
+        digest.update(Path(file).read_bytes())
+    for array in (*planes, *(p.matrix for p in _approach(scene)), scene.collider.offset_box):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(repr(scene.material).encode())
+    return digest.hexdigest()[:16]

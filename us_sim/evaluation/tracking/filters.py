@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.named import Named
-from us_sim.evaluation.row import Row
+from us_sim.evaluation.report import Row
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp, rotation_log
 from us_sim.settings.registry import FILTERS

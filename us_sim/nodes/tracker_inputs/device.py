@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from std_msgs.msg import Header
 
     from us_sim.geometry.pose import Pose
-    from us_sim.nodes.health import Health
+    from us_sim.nodes.guarded_node import Health
     from us_sim.scene.scene import Scene
     from us_sim.tracking.measurement import Measurement
 

@@ -13,8 +13,8 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import VolumeError
-from us_sim.nodes.conversions import affine_from, colour_pixels_from, nanoseconds_of, pixels_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import affine_from, colour_pixels_from, nanoseconds_of, pixels_from
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.watched_topic import Make, WatchedTopic

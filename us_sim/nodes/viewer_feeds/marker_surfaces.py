@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.nodes.conversions import triangles_from
+from us_sim.nodes.messages import triangles_from
 from us_sim.viewer.meshes.coloured_surface import ColouredSurface
 from us_sim.viewer.meshes.welded import welded
 

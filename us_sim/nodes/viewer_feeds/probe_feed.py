@@ -10,13 +10,13 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.nodes.conversions import (
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import (
     line_from,
     nanoseconds_of,
     pose_from,
     wrench_from,
 )
-from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.viewer_feeds.marker_surfaces import surfaces_of

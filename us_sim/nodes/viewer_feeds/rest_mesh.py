@@ -9,8 +9,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int32MultiArray
 
 from us_sim.errors import MeshError
-from us_sim.nodes.conversions import tetrahedra_from, vectors_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import tetrahedra_from, vectors_from
 from us_sim.nodes.qos import LATCHED
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.meshes.rest_surface import RestSurface

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 
-from us_sim.nodes.conversions import mesh_from, nanoseconds_of, vectors_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import mesh_from, nanoseconds_of, vectors_from
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.viewer_feeds.watched_topic import WatchedTopic

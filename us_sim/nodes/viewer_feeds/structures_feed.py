@@ -9,8 +9,8 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError
-from us_sim.nodes.conversions import markers_stamp, nanoseconds_of, vectors_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import markers_stamp, nanoseconds_of, vectors_from
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import STREAM
 from us_sim.nodes.viewer_feeds.marker_surfaces import surfaces_of

@@ -6,8 +6,8 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from us_sim.errors import MeshError
-from us_sim.nodes.conversions import nanoseconds_of, vectors_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import nanoseconds_of, vectors_from
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
 from us_sim.nodes.viewer_feeds.watched_topic import WatchedTopic

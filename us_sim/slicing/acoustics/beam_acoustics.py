@@ -1,47 +1,40 @@
-"""What sound does along the beams as they are now, put on a slice: the room's facade.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
->>> from us_sim.slicing.acoustics.settings import Acoustics
->>> from us_sim.slicing.frame import Frame
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.volume.volume import Volume
->>> liver = np.ones((40, 4, 40), np.uint8)
->>> placed = np.diag([1e-3, 1e-3, 1e-3, 1.0])
->>> volume = Volume(100 * liver, placed, liver, {1: "liver"})
->>> probe = LinearProbe(aperture=0.02, depth=0.03, columns=8, rows=60)
->>> sound = BeamAcoustics(
-...     volume, probe, Acoustics(artefacts="live", frequency=5e6, compensation=0.0))
->>> frame = Frame(Pose([0.02, 0.001, 0.0]), None, probe, volume, None, lambda frame: liver)
->>> gain = sound.gain(frame)
->>> np.round(gain[:, 0] / sound.grid.distance / 1e2, 3)[:3]  # dB/cm: 2 × 0.45 × 5
-array([-4.5, -4.5, -4.5])
-"""
+"""Echoes as the beams bring them: loss, shadows, surfaces, fibres and noise, put on a slice."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
-from us_sim.slicing.acoustics.beam_grid import LOCATED, BeamGrid
-from us_sim.slicing.acoustics.fibres import Fibres
-from us_sim.slicing.acoustics.media import decibels_per_metre, media_of, surface_levels
-from us_sim.slicing.acoustics.noise import Noise
-from us_sim.slicing.acoustics.path_loss import follow_beams, room_for_crossings, sharpen_borders
-from us_sim.slicing.acoustics.penumbra import AMPLITUDES, cast_shadows, sharpen_edges
+from us_sim.slicing.acoustics.media import (
+    LOCATED,
+    BeamGrid,
+    decibels_per_metre,
+    media_of,
+    surface_levels,
+)
+from us_sim.slicing.acoustics.path_loss import (
+    AMPLITUDES,
+    cast_shadows,
+    follow_beams,
+    room_for_crossings,
+    sharpen_borders,
+    sharpen_edges,
+)
 from us_sim.slicing.acoustics.settings import Acoustics
-from us_sim.slicing.acoustics.surface_echo import ANGLES, GRAIN, draw_surfaces
-from us_sim.slicing.acoustics.surface_normals import surface_normals_of
-from us_sim.slicing.cutting.located import Located
-from us_sim.slicing.cutting.resampling import full_runs, label_voxels, pixel_to_index
-from us_sim.slicing.formation.grey_levels import GREYS_PER_DECIBEL
+from us_sim.slicing.acoustics.surface_echo import ANGLES, GRAIN, draw_surfaces, surface_normals_of
+from us_sim.slicing.cutting.resampling import Located, full_runs, label_voxels, pixel_to_index
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import ECHO_RANGE, Imaging
 from us_sim.volume.volume import Volume
 
 SPEED_OF_SOUND = 1540.0
@@ -112,6 +105,28 @@ class BeamAcoustics:
         plane = probe.plane(Pose())
         self._runs = full_runs(plane) if plane.spans is None else plane.spans
 
+    def resolved(self, imaging: Imaging) -> Imaging:
+        """The console's settings with the blur of a frequency below the volume's own.
+
+        A point is as long as 1.5 wavelengths and as wide as a wavelength times the f-number, 2
+        (Szabo 2014, section 6.6). The blur of the volume's own frequency is taken off in squares.
+        """
+        own = self._acoustics.volume_frequency
+        frequency = self._acoustics.frequency_among(self._probe.frequencies)
+        if own is None or frequency >= own:
+            return imaging
+        wavelength = SPEED_OF_SOUND * math.sqrt(1.0 / frequency**2 - 1.0 / own**2)
+        return dataclasses.replace(
+            imaging,
+            lateral_resolution=min(math.hypot(imaging.lateral_resolution, 2.0 * wavelength), 0.01),
+            axial_resolution=min(math.hypot(imaging.axial_resolution, 1.5 * wavelength), 0.01),
+        )
+
+    def warm_up(self) -> None:
+        """Load every kernel, and find the volume's surfaces."""
+        blank = np.zeros((self._probe.rows, self._probe.columns), dtype=np.uint8)
+        self.heard(blank, Frame(Pose(), None, self._probe, self._volume))
+
     def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
         """Let a mesh carry the volume: (N, 3) m at rest and (M, 4)."""
         to_index = self._volume.patient_to_index
@@ -169,7 +184,6 @@ class BeamAcoustics:
         return gain
 
     def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
-        """Where pixels lie in the mesh, and the mesh; without one all are rigid."""
         if frame.nodes is not None:
             return frame.locate_some(LOCATED), frame.nodes
         plane, (row_step, step) = frame.plane, LOCATED
@@ -215,3 +229,100 @@ def _add_gain(image, gain, greys, dither, out):
             level = np.float32(line[i]) + add[i] * greys + threshold[i]
             level = min(max(level, np.float32(0.0)), np.float32(255.0))
             result[i] = np.uint8(np.int32(level)) if line[i] > 0 else np.uint8(0)
+
+
+_FRAMES = 4
+_GRAIN = (0.8, 1.4)  # standard deviations in pixels, along columns and rows
+
+
+class Noise:
+    """Images of noise that is ``level`` dB at the face, and rises by ``rise`` dB/m."""
+
+    def __init__(self, probe: Probe, level: float, rise: float) -> None:
+        distance = probe.pixel_beams[1]
+        shown = np.isfinite(distance)
+        mean = level + rise * np.nan_to_num(distance)
+        random = np.random.Generator(np.random.PCG64(5))
+        self._frames = [self._frame(random, mean, shown) for _ in range(_FRAMES)]
+
+    @staticmethod
+    def _frame(
+        random: np.random.Generator, mean: NDArray[np.float32], shown: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        power = np.zeros(mean.shape, dtype=np.float32)
+        for _ in range(2):  # in phase and in quadrature
+            wave = random.standard_normal(mean.shape, dtype=np.float32)
+            wave = np.asarray(cv2.GaussianBlur(wave, (0, 0), _GRAIN[0], sigmaY=_GRAIN[1]))
+            power += wave * wave
+        power /= power.mean()
+        level = mean + 10.0 * np.log10(np.maximum(power, 1e-4)) + ECHO_RANGE
+        grey = np.clip(level * GREYS_PER_DECIBEL, 0.0, 255.0)
+        grey[~shown] = 0.0
+        return grey.astype(np.uint8)
+
+    def at(self, pose: Pose) -> NDArray[np.uint8]:
+        """(rows, columns) grey levels with the probe at a pose."""
+        bits = np.concatenate([pose.position, pose.orientation]).view(np.uint64)
+        return self._frames[int(np.bitwise_xor.reduce(bits) % np.uint64(251)) % _FRAMES]
+
+
+class Fibres:
+    """The directions of fibres at rest, carried by a mesh.
+
+    Args:
+        directions: (D, 3) unit vectors in ``patient``.
+    """
+
+    def __init__(self, directions: NDArray[np.float64]) -> None:
+        self._rest = directions
+        self._weights = np.empty((0, len(directions), 4), dtype=np.float32)
+        self._corners = np.empty((0, 4), dtype=np.int32)
+
+    def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
+        """Let a mesh carry them: (N, 3) m at rest and (M, 4)."""
+        edges = rest_nodes[corners[:, 1:]] - rest_nodes[corners[:, :1]]  # rows are edges
+        determinant = np.linalg.det(edges)
+        flat = np.abs(determinant) < 1e-30
+        edges[flat] = np.eye(3)
+        # Barycentric coordinates 1 to 3 along a direction: edges^T b = direction.
+        along = np.linalg.solve(
+            edges.transpose(0, 2, 1),
+            np.broadcast_to(self._rest.T, (len(edges), *self._rest.T.shape)),
+        )
+        weights = np.empty((len(corners), len(self._rest), 4))
+        weights[:, :, 1:] = along.transpose(0, 2, 1)
+        weights[:, :, 0] = -weights[:, :, 1:].sum(axis=2)
+        weights[flat] = 0.0
+        self._weights, self._corners = weights.astype(np.float32), corners
+
+    def now(
+        self, located: Located, nodes: NDArray[np.float64], plane: SlicePlane
+    ) -> NDArray[np.float32]:
+        """(E + 1, D, 2): x and z along the image of the unit direction in each map's tissue.
+
+        Args:
+            nodes: (N, 3) m, where the mesh is now.
+        """
+        across, down = (step / np.linalg.norm(step) for step in (plane.column_step, plane.row_step))
+        out = np.empty((len(located.maps), len(self._rest), 2), dtype=np.float32)
+        out[-1] = self._rest @ np.column_stack([across, down])  # tissue that is as at rest
+        _carried(located.tetrahedra, self._corners, nodes, self._weights, across, down, out)
+        return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _carried(tetrahedra, corners, nodes, weights, across, down, out):
+    for q in range(len(tetrahedra)):
+        e = np.uint32(tetrahedra[q])
+        for d in range(weights.shape[1]):
+            x = y = z = 0.0
+            for k in range(4):
+                n = np.uint32(corners[e, k])
+                w = np.float64(weights[e, d, k])
+                x += w * nodes[n, 0]
+                y += w * nodes[n, 1]
+                z += w * nodes[n, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            scale = 1.0 / length if length > 0.0 else 0.0
+            out[q, d, 0] = scale * (x * across[0] + y * across[1] + z * across[2])
+            out[q, d, 1] = scale * (x * down[0] + y * down[1] + z * down[2])

@@ -1,12 +1,16 @@
-"""The polygons in which an image cuts tetrahedra, and the maps from pixels to rest.
+"""Polygons in which an image cuts tetrahedra, their pixels, and the outline of the mesh at rest.
 
 A node on the plane counts as above it, so that every cut is a triangle or a quadrilateral between
-crossings of the plane with edges of the mesh. A crossing is computed from its edge alone and
-always from the upper node down. So tetrahedra with an edge in common have the very same corner, and
-those with a face in common the very same side.
+crossings of the plane with edges of the mesh. A crossing is computed from its edge alone, from the
+upper node down, so that neighbouring tetrahedra have the very same corners and sides. The cuts of
+outer faces are kept too, as closed outlines: triangles, segments or points.
 
-That rule leaves out what only touches the plane from above. The mesh includes its outer surface, so
-the cuts of its outer faces are kept too, as closed outlines: triangles, segments or points.
+Scan conversion: a row belongs to a side of a polygon from its upper end to just above its lower
+end, and a column to a polygon from its left side to just before its right side. So no pixel between
+two polygons is missed and none is written twice.
+
+Tissue that moved away leaves black behind: how often the outer faces of the mesh at rest wind
+around a pixel says whether it lay in the mesh.
 """
 
 from __future__ import annotations
@@ -17,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.barycentric import adjugate, is_solid
-from us_sim.slicing.cutting.clusters import ON_PLANE
+from us_sim.slicing.cutting.section import ON_PLANE, adjugate, is_solid
+from us_sim.slicing.probe.plane import SlicePlane
 
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Corners of the four faces of a tetrahedron; face f is opposite to corner f."""
@@ -172,7 +176,6 @@ def _cross(place, order, polygon):
 
 @njit(inline="always", error_model="numpy")
 def _is_on_image(place, polygon, sides, columns, rows):
-    """Whether the box around a tetrahedron's cut, or its nodes on the plane, meets the image."""
     left = np.inf
     right = -np.inf
     top = np.inf
@@ -248,7 +251,6 @@ def face_cut(place, a, b, c, points):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_face(place, f, columns, rows, cuts, pieces, count):
-    """Adds the outline of a tetrahedron's face, if the image meets it, to those of a cut."""
     points = cuts.outlines[pieces]
     number = face_cut(place, FACES[f, 0], FACES[f, 1], FACES[f, 2], points)
     if number == 0 or not _is_on_image(place, points, number, columns, rows):
@@ -284,3 +286,268 @@ def _close_around(
                     count += 1
                     break
     return pieces, count
+
+
+class Outline(NamedTuple):
+    """The cuts of the mesh's outer faces at rest; of each array the first ``number`` are in use."""
+
+    outlines: NDArray[np.float64]  # (cuts, 3, 2) column and row, closed
+    points: NDArray[np.int8]  # (cuts,) how many of the three there are
+    turns: NDArray[np.int8]  # (cuts,) by how much a crossing from the left winds further
+    number: int
+
+
+NO_OUTLINE = Outline(np.empty((0, 3, 2)), np.empty(0, dtype=np.int8), np.empty(0, dtype=np.int8), 0)
+"""The outline without a mesh, or where the mesh at rest does not matter."""
+
+
+class RestSurface:
+    """The outer faces of a mesh at rest.
+
+    Args:
+        rest_nodes: (N, 3) m. tetrahedra: (M, 4). determinants: (M,) m³, six times their volumes.
+        neighbours: (M, 4) the tetrahedron beyond each face, -1 where the mesh ends.
+    """
+
+    def __init__(
+        self,
+        rest_nodes: NDArray[np.float64],
+        tetrahedra: NDArray[np.int32],
+        determinants: NDArray[np.float64],
+        neighbours: NDArray[np.int32],
+    ) -> None:
+        element, face = np.nonzero((neighbours < 0) & (determinants != 0)[:, None])
+        triangles = tetrahedra[element[:, None], FACES[face]]
+        inverted = determinants[element] < 0
+        triangles[inverted] = triangles[inverted][:, ::-1]
+        used, inverse = np.unique(triangles, return_inverse=True)
+        self._nodes = np.ascontiguousarray(rest_nodes[used])
+        self._triangles = np.ascontiguousarray(inverse.reshape(-1, 3), dtype=np.int32)
+        self._places = np.empty((len(used), 3))
+        self._outline = Outline(
+            np.empty((len(triangles) + 1, 3, 2)),
+            np.empty(len(triangles) + 1, dtype=np.int8),
+            np.empty(len(triangles) + 1, dtype=np.int8),
+            0,
+        )
+
+    def cut(self, plane: SlicePlane) -> Outline:
+        """The cut by the plane of an image; overwritten by the next."""
+        count = _cut(
+            self._nodes,
+            self._triangles,
+            plane.to_pixel,
+            plane.columns,
+            plane.rows,
+            self._places,
+            *self._outline[:3],
+        )
+        return self._outline._replace(number=count)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, turns):
+    """Fills an outline and returns how many cuts it has."""
+    for n in range(len(nodes)):
+        place_node(nodes, n, to_pixel, place, n)
+    count = 0
+    for f in range(len(triangles)):
+        a = np.int64(triangles[f, 0])
+        b = np.int64(triangles[f, 1])
+        c = np.int64(triangles[f, 2])
+        least = min(min(place[a, 2], place[b, 2]), place[c, 2])
+        if least > 0.0 or max(max(place[a, 2], place[b, 2]), place[c, 2]) < 0.0:
+            continue
+        outline = outlines[count]
+        number = face_cut(place, a, b, c, outline)
+        left = outline[0, 0]
+        top = outline[0, 1]
+        bottom = outline[0, 1]
+        for k in range(1, number):
+            left = min(left, outline[k, 0])
+            top = min(top, outline[k, 1])
+            bottom = max(bottom, outline[k, 1])
+        # What lies left of the image winds around its pixels too.
+        if bottom < -1.0 or top > rows or left > columns:
+            continue
+        points[count] = number
+        turns[count] = _turn(place, a, b, c, outline) if least < 0.0 and number == 2 else 0
+        count += 1
+    return count
+
+
+@njit(inline="always", error_model="numpy")
+def _turn(place, a, b, c, outline):
+    """How a face that crosses the plane winds around points right of it; nodes on it are above.
+
+    The face's nodes turn counterclockwise as seen from outside the mesh.
+    """
+    # Turn the face until its first node is alone on its side of the plane.
+    for _ in range(2):
+        up = place[a, 2] >= 0.0
+        if up != (place[b, 2] >= 0.0) and up != (place[c, 2] >= 0.0):
+            break
+        a, b, c = b, c, a
+    if place[a, 2] >= 0.0:
+        cross_edge(place, a, b, outline[0])
+        cross_edge(place, a, c, outline[1])
+        return -1 if outline[1, 1] > outline[0, 1] else 1
+    cross_edge(place, b, a, outline[0])
+    cross_edge(place, c, a, outline[1])
+    return 1 if outline[1, 1] > outline[0, 1] else -1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mark_covered(outlines, points, turns, number, row, winding, covered):
+    """Sets which columns of a row lie in the closed mesh at rest.
+
+    Args:
+        outlines, points, turns, number: as `Outline`.
+        winding: (columns + 1,) int32 to work in. covered: (columns,) bool.
+    """
+    columns = len(covered)
+    winding[:] = 0
+    for q in range(number):
+        if turns[q] == 0:
+            continue
+        a, b = (0, 1) if outlines[q, 0, 1] < outlines[q, 1, 1] else (1, 0)
+        start = outlines[q, a, 1]
+        height = outlines[q, b, 1] - start
+        if start <= row < outlines[q, b, 1]:
+            slope = (outlines[q, b, 0] - outlines[q, a, 0]) / height
+            at = up_to(outlines[q, a, 0] + (row - start) * slope, 0, columns)
+            winding[at] += turns[q]
+    turn = 0
+    for i in range(columns):
+        turn += winding[i]
+        covered[i] = turn != 0
+    for q in range(number):
+        first, end = closed_columns(outlines[q], points[q], row, columns)
+        for i in range(first, end):
+            covered[i] = True
+
+
+CUT_SHIFT, END_SHIFT = 26, 13
+"""A span is one number: bits by which its cut and its end are shifted there. The lowest bits are
+its first column. A column is at most 4096."""
+
+_CLOSE = 1e-8
+"""Pixels from an outline within which a place is on it: rounding of positions."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def convert_cuts(
+    corners, sides, count, outlines, points, owner, pieces, runs, first_row, end_row, spans, used
+):  # fmt: skip
+    """Fills the spans of rows ``first_row`` to ``end_row - 1``; returns the most that a row has.
+
+    Where that is more than there is room for, the rest is lost. Where spans overlap the later one
+    holds.
+
+    Args:
+        corners … pieces: as `cut_polygons.Cuts`, with how many there are.
+        runs: (rows, 2, 2) int32, first and end columns that show something.
+        spans: (rows, room) int64. used: (rows,) int32, how many of them a row has.
+    """
+    low = np.empty(end_row - first_row, dtype=np.int64)
+    high = np.empty(end_row - first_row, dtype=np.int64)
+    columns = np.int64(0)
+    kinds = np.uint64(1)
+    for row in range(first_row, end_row):
+        used[row] = 0
+        columns = max(columns, max(np.int64(runs[row, 0, 1]), np.int64(runs[row, 1, 1])))
+        if runs[row, 1, 1] > runs[row, 1, 0]:
+            kinds = np.uint64(2)
+    for q in range(pieces):
+        top = np.inf
+        bottom = -np.inf
+        for k in range(points[q]):
+            top = min(top, outlines[q, k, 1])
+            bottom = max(bottom, outlines[q, k, 1])
+        for row in range(up_to(top - _CLOSE, first_row, end_row),
+                         min(up_to(bottom + _CLOSE, first_row, end_row) + 1, end_row)):  # fmt: skip
+            first, end = closed_columns(outlines[q], points[q], row, columns)
+            _add(owner[q], first, end, row, runs, kinds, spans, used)
+    for q in range(count):
+        if sides[q] == 0:
+            continue
+        top = np.inf
+        bottom = -np.inf
+        for k in range(sides[q]):
+            top = min(top, corners[q, k, 1])
+            bottom = max(bottom, corners[q, k, 1])
+        above = up_to(top, first_row, end_row)
+        below = up_to(bottom, first_row, end_row)
+        for row in range(above, below):
+            low[np.uint64(row - first_row)] = columns
+            high[np.uint64(row - first_row)] = 0
+        for k in range(sides[q]):
+            other = k + 1 if k + 1 < sides[q] else 0
+            a, b = (k, other) if corners[q, k, 1] < corners[q, other, 1] else (other, k)
+            column = corners[q, a, 0]
+            start = corners[q, a, 1]
+            slope = (corners[q, b, 0] - column) / (corners[q, b, 1] - start)
+            for row in range(
+                up_to(start, first_row, end_row), up_to(corners[q, b, 1], first_row, end_row)
+            ):
+                at = up_to(column + (row - start) * slope, 0, columns)
+                line = np.uint64(row - first_row)
+                low[line] = min(low[line], at)
+                high[line] = max(high[line], at)
+        for row in range(above, below):
+            line = np.uint64(row - first_row)
+            _add(q, low[line], high[line], row, runs, kinds, spans, used)
+    most = 0
+    for row in range(first_row, end_row):
+        most = max(most, used[row])
+    return most
+
+
+@njit(inline="always", error_model="numpy")
+def up_to(value, least, most):
+    """The least whole number not below a value, held between two others; the first if not one."""
+    held = value if value > least else np.float64(least)
+    held = held if held < most else np.float64(most)
+    return np.int64(np.ceil(held))
+
+
+@njit(inline="always", error_model="numpy")
+def _add(q, first, end, row, runs, kinds, spans, used):
+    line = np.uint64(row)
+    for k in range(kinds):
+        a = max(first, np.int64(runs[line, k, 0]))
+        b = min(end, np.int64(runs[line, k, 1]))
+        # An empty span is written too, and overwritten: faster than to test for it.
+        place = np.uint64(used[line])
+        if place < np.uint64(spans.shape[1]):
+            spans[line, place] = np.int64(q) << CUT_SHIFT | b << END_SHIFT | a
+        used[line] += a < b
+
+
+@njit(inline="always", error_model="numpy")
+def closed_columns(outline, points, row, columns):
+    """First and end column of a row that lie on a closed point, segment or triangle."""
+    left = np.inf
+    right = -np.inf
+    for k in range(points):
+        other = k + 1 if k + 1 < points else 0
+        a, b = (k, other) if outline[k, 1] <= outline[other, 1] else (other, k)
+        start = outline[a, 1]
+        height = outline[b, 1] - start
+        if row + _CLOSE < start or row - _CLOSE > start + height:
+            continue
+        t = 0.0
+        u = 1.0
+        if height > 0.0:
+            t = max(0.0, (row - _CLOSE - start) / height)
+            u = min(1.0, (row + _CLOSE - start) / height)
+        from_a = outline[a, 0] + t * (outline[b, 0] - outline[a, 0])
+        to_b = outline[a, 0] + u * (outline[b, 0] - outline[a, 0])
+        left = min(left, min(from_a, to_b))
+        right = max(right, max(from_a, to_b))
+    first = up_to(left - _CLOSE, 0, columns)
+    end = up_to(right + _CLOSE, 0, columns)
+    # The end is just beyond the last column that is not right of the outline.
+    if right + _CLOSE >= 0.0 and np.floor(right + _CLOSE) < columns and end <= right + _CLOSE:
+        end += 1
+    return first, end

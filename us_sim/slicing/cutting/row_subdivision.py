@@ -1,15 +1,12 @@
 """Images of deformed tissue by recursive subdivision of pixel rows (the paper, section IV).
 
 Both ends of a row are located in the deformed mesh. Where they lie in one tetrahedron, all pixels
-between do too, since it is convex, and the row runs linearly through the volume at rest; otherwise
-it is split in the middle. Lists of the tetrahedra in each region of the image keep the search
-short.
+between do too, and the row runs linearly through the volume at rest; otherwise it is split in the
+middle. Lists of the tetrahedra in each region of the image keep the search short.
 
-The paper leaves three things open. Where both ends lie outside the mesh, the row
-between them is only taken as outside when no tetrahedron of the regions it crosses meets it. A
-pixel is first sought in the tetrahedra of its neighbours. And a pixel outside the deformed mesh
-shows the rigid volume only where the mesh was not at rest either: tissue that was pushed away
-leaves black behind, not its ghost.
+Three things that the paper leaves open: a row whose ends lie outside the mesh is outside only when
+no tetrahedron of the regions it crosses meets it; a pixel is first sought in the tetrahedra of its
+neighbours; and where tissue was pushed away the image is black.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -35,13 +32,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.slicing.cutting.located import BLACK, Located
-from us_sim.slicing.cutting.location import cells, leave_black, subdivide_rows
-from us_sim.slicing.cutting.resampling import pixel_to_index, voxels_of
-from us_sim.slicing.cutting.row_bands import parallel_rows
-from us_sim.slicing.cutting.section import RestMesh, finite_nodes
+from us_sim.slicing.cutting.resampling import (
+    BLACK,
+    Located,
+    parallel_rows,
+    pixel_to_index,
+    voxels_of,
+)
+from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes, row_span
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import sample_linear
 from us_sim.slicing.probe.plane import SlicePlane
@@ -50,6 +51,182 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from us_sim.volume.volume import Volume
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cells(bounds, columns, rows, regions):
+    """The tetrahedra of each cell of the image, as lists one after the other.
+
+    Returns:
+        starts (cells + 1,), members (starts[-1],), and the rows and columns of one cell.
+    """
+    band = (rows + regions - 1) // regions
+    cell = (columns + regions - 1) // regions
+    across = (columns + cell - 1) // cell
+    down = (rows + band - 1) // band
+    starts = np.zeros(across * down + 1, dtype=np.int64)
+    for e in range(len(bounds)):
+        for v in range(_cell(bounds[e, 2], band, down), _cell(bounds[e, 3], band, down) + 1):
+            for u in range(
+                _cell(bounds[e, 0], cell, across), _cell(bounds[e, 1], cell, across) + 1
+            ):
+                starts[v * across + u + 1] += 1
+    for c in range(across * down):
+        starts[c + 1] += starts[c]
+    filled = starts[:-1].copy()
+    members = np.empty(starts[-1], dtype=np.int32)
+    for e in range(len(bounds)):
+        for v in range(_cell(bounds[e, 2], band, down), _cell(bounds[e, 3], band, down) + 1):
+            for u in range(
+                _cell(bounds[e, 0], cell, across), _cell(bounds[e, 1], cell, across) + 1
+            ):
+                members[filled[v * across + u]] = e
+                filled[v * across + u] += 1
+    return starts, members, band, cell
+
+
+@njit(inline="always", error_model="numpy")
+def _cell(pixel, size, count):
+    return np.int64(min(max(pixel, 0.0) / size, count - 1.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row, elements, outside):
+    """Locates the pixels of rows ``first_row`` to ``end_row - 1``; a thread has whole bands.
+
+    Args:
+        barycentric: (E, 4, 3); starts, members, band, cell: as `cells` returns them.
+        elements: (rows, columns) int32, set to the tetrahedron of each pixel, E outside all.
+        outside: (rows,) bool, set where a pixel of the row is outside.
+    """
+    # What is one kind of number everywhere has `_locate` compiled once.
+    none = np.int32(len(barycentric))
+    left = np.int64(0)
+    columns = elements.shape[1]
+    across = (columns + cell - 1) // cell
+    stack = np.empty((64, 2), dtype=np.int64)
+    for row in range(first_row, end_row):
+        line = elements[row]
+        lists = (row // band) * across
+        # The first row of a band takes no hints from the row above, so that the result does not
+        # depend on how bands are divided among threads.
+        hinted = row % band != 0
+        above = elements[row - 1] if hinted else line
+        any_outside = False
+        last = columns - 1
+        line[0] = _locate(
+            barycentric, starts, members, lists, cell, left, row, above[0] if hinted else none, none
+        )
+        hint = above[last] if hinted else none
+        line[last] = _locate(barycentric, starts, members, lists, cell, last, row, hint, line[0])
+        stack[0, 0] = 0
+        stack[0, 1] = last
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            a = stack[depth, 0]
+            z = stack[depth, 1]
+            if line[a] == none or line[z] == none:
+                any_outside = True
+            if z - a < 2:
+                continue
+            if line[a] == line[z]:
+                if line[a] != none:
+                    for i in range(a + 1, z):
+                        line[i] = line[a]
+                    continue
+                m, found = _first_inside(barycentric, starts, members, lists, cell, a, z, row)
+                for i in range(a + 1, m):
+                    line[i] = none
+                if found == none:
+                    continue
+                line[m] = found
+                stack[depth, 0] = m
+                stack[depth, 1] = z
+                depth += 1
+                continue
+            m = (a + z) // 2
+            hint = above[m] if hinted else none
+            if hint != none and _is_inside(barycentric, hint, m, row):
+                line[m] = hint
+            else:
+                line[m] = _locate(
+                    barycentric, starts, members, lists, cell, m, row, line[a], line[z]
+                )
+            stack[depth, 0] = m
+            stack[depth, 1] = z
+            stack[depth + 1, 0] = a
+            stack[depth + 1, 1] = m
+            depth += 2
+        outside[row] = any_outside
+
+
+@njit(inline="always", error_model="numpy")
+def _is_inside(barycentric, e, column, row):
+    b = barycentric[e]
+    return (
+        b[0, 0] + b[0, 1] * column + b[0, 2] * row >= INSIDE
+        and b[1, 0] + b[1, 1] * column + b[1, 2] * row >= INSIDE
+        and b[2, 0] + b[2, 1] * column + b[2, 2] * row >= INSIDE
+        and b[3, 0] + b[3, 1] * column + b[3, 2] * row >= INSIDE
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _locate(barycentric, starts, members, lists, cell, column, row, hint, second):
+    """The tetrahedron of a pixel, sought in two likely ones first; E when it is outside all."""
+    none = len(barycentric)
+    if hint != none and _is_inside(barycentric, hint, column, row):
+        return hint
+    if second != none and _is_inside(barycentric, second, column, row):
+        return second
+    c = lists + column // cell
+    for q in range(starts[c], starts[c + 1]):
+        if _is_inside(barycentric, members[q], column, row):
+            return members[q]
+    return none
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _first_inside(barycentric, starts, members, lists, cell, a, z, row):
+    """The first pixel strictly between ``a`` and ``z`` that is in a tetrahedron, and which.
+
+    Returns:
+        The column and the tetrahedron; ``z`` and E when all pixels between are outside.
+    """
+    for u in range((a + 1) // cell, (z - 1) // cell + 1):
+        first = max(a + 1, u * cell)
+        column = min(z - 1, (u + 1) * cell - 1)
+        found = -1
+        for q in range(starts[lists + u], starts[lists + u + 1]):
+            low, high = row_span(barycentric, members[q], row, first, column)
+            if low <= high and (found < 0 or low < column):
+                column = low
+                found = members[q]
+        if found >= 0:
+            return column, found
+    return z, np.int32(len(barycentric))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leave_black(barycentric, bounds, none, outside, elements):
+    """Marks the pixels outside the deformed mesh that the mesh covers at rest.
+
+    Args:
+        barycentric, bounds: of the section at rest.
+        none: what ``elements`` (rows, columns) holds at pixels outside the deformed mesh.
+        outside: (rows,) bool, which rows have such pixels.
+    """
+    rows, columns = elements.shape
+    for e in range(len(bounds)):
+        top = int(max(0.0, np.ceil(bounds[e, 2])))
+        bottom = int(min(rows - 1.0, np.floor(bounds[e, 3])))
+        for row in range(top, bottom + 1):
+            if outside[row]:
+                low, high = row_span(barycentric, e, row, 0, columns - 1)
+                for i in range(low, high + 1):
+                    if elements[row, i] == none:
+                        elements[row, i] = BLACK
 
 
 @dataclass(frozen=True)
@@ -92,22 +269,26 @@ class RowSubdivision(Slicer):
         )
         self._regions = (settings or RowSubdivisionSettings()).regions
         self._threads = threads
-        self._latest: Located | None = None
+        self._latest: tuple[ArrayLike, SlicePlane, Located] | None = None  # of an image
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         voxels, shape = voxels_of(self._volume.intensities)
-        elements, maps, _ = self.locate(nodes, plane)
+        located = self._locate(nodes, plane)
+        self._latest = nodes, plane, located
+        elements, maps, _ = located
         image = np.empty(elements.shape, dtype=np.uint8)
         self._in_bands(
             plane, lambda a, b: sample_linear(voxels, shape, maps, elements, a, b, image)
         )
         return image
 
-    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
-        if cut and cut == self.cuts and self._latest is not None:
-            return self._latest
+    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
+        if self._latest is not None and self._latest[0] is nodes and self._latest[1] is plane:
+            return self._latest[2]
+        return self._locate(nodes, plane)
+
+    def _locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
         moved = finite_nodes(nodes, len(self._mesh.nodes))
-        self.cuts += 1
         section = self._mesh.cut(moved, plane)
         self.skipped = section.skipped
         section.rest_index[-1] = pixel_to_index(self._volume, plane)
@@ -127,9 +308,7 @@ class RowSubdivision(Slicer):
             leave_black(rest.barycentric, rest.bounds, len(section.bounds), outside, elements)
         if plane.spans is not None:
             elements[~plane.is_shown()] = BLACK
-        self._latest = Located(elements, section.rest_index, section.tetrahedra.astype(np.intp))
-        return self._latest
+        return Located(elements, section.rest_index, section.tetrahedra.astype(np.intp))
 
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
-        """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""
         parallel_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))

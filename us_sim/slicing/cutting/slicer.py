@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.resampling import label_voxels, sample_nearest
-from us_sim.slicing.cutting.row_bands import parallel_rows
+from us_sim.slicing.cutting.resampling import label_voxels, parallel_rows, sample_nearest
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
-    from us_sim.slicing.cutting.located import Located
+    from us_sim.slicing.cutting.resampling import Located
     from us_sim.volume.volume import Volume
 
 
@@ -35,9 +34,6 @@ class Slicer(ABC):
 
     skipped: int = 0
     """Inverted or flat tetrahedra on the latest image, which were left out."""
-
-    cuts: int = 0
-    """How often the mesh was cut: the number of the latest cut, for `locate`."""
 
     _volume: Volume
     _threads: int
@@ -72,30 +68,19 @@ class Slicer(ABC):
         """
 
     @abstractmethod
-    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
+    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
         """Where each pixel lies in the mesh.
 
-        Args:
-            cut: what `cuts` was after an image, if it was of these nodes and this plane: while that
-                is the latest cut, it is not made again. 0 is none.
+        Right after an image of these same two objects the mesh is not cut again, so nodes must not
+        be written to in between.
 
         Raises:
             MeshError: as for `image`.
         """
 
-    def locate_some(
-        self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int], cut: int = 0
-    ) -> Located:
-        """Where every so many-th pixel lies in the mesh, for what need not know all of them.
-
-        Args:
-            steps: rows and columns from one pixel to the next; the first is in row and column 0.
-            cut: as for `locate`.
-
-        Raises:
-            MeshError: as for `image`.
-        """
-        return self.locate(nodes, plane, cut).some(steps)
+    def locate_some(self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]) -> Located:
+        """As `locate`, of every so many-th row and column from 0 on."""
+        return self.locate(nodes, plane).some(steps)
 
     def labels(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         """The label image (rows, columns): the nearest voxel's label, 0 where there is nothing.

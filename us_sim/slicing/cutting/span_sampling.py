@@ -1,9 +1,9 @@
 """Grey values of an image from its spans, a row of pixels at a time.
 
-Where the pixels of a row lie at rest is written span after span, and only then are they sampled,
-so that neither the loads nor the arithmetic stop at the short spans of a fine mesh. Coordinates
-are fixed-point numbers, accurate to a ten-thousandth of a voxel, and grey values are blended in
-16 bits, 32 pixels at a time on a processor with vectors of 512 bits, to a tenth of a level.
+Coordinates at rest are written span after span and only then sampled, so that short spans of a fine
+mesh stop neither loads nor arithmetic. They are fixed-point numbers, accurate to a ten-thousandth
+of a voxel, and grey values are blended in 16 bits, 32 pixels at a time with vectors of 512 bits, to
+a tenth of a level. Two vector operations that numba lacks are written in LLVM's instructions.
 
 Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
 their value; beyond that everything is 0. Values are rounded half up.
@@ -11,12 +11,15 @@ their value; beyond that everything is 0. Values are rounded half up.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.rest_outline import mark_covered
-from us_sim.slicing.cutting.simd import LANES, load_pairs, write_ramp
-from us_sim.slicing.cutting.spans import CUT_SHIFT, END_SHIFT
+from us_sim.slicing.cutting.cut_polygons import CUT_SHIFT, END_SHIFT, mark_covered
 from us_sim.slicing.cutting.trilinear import SLACK
 
 _FRACTION = 17  # bits behind the point of a coordinate
@@ -231,7 +234,6 @@ def _write_clipped(m, shape, row, first, end, x, y, z):
 
 @njit(inline="always", error_model="numpy")
 def _held(index, count):
-    """A coordinate from the first to just below the last voxel's centre."""
     last = max(count - 1, 0) * _ONE - 1.0
     return np.int32(max(0.0, min(index * _ONE, last)))
 
@@ -286,7 +288,6 @@ def _between(least, most, start, slope, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _least(x):
-    """The least of some numbers, or 0."""
     least = np.int32(0)
     for k in range(len(x)):
         least = min(least, x[k])
@@ -345,3 +346,90 @@ def _blend(low, high, weight):
     """The linear blend of two values, all in 64ths; ``weight`` is the second's, in 32768ths."""
     to_high = np.int16(np.int16(high - low) << np.int16(1))
     return np.int16(low + np.int16((np.int32(to_high) * np.int32(weight)) >> np.int32(16)))
+
+
+LANES = 16
+"""Numbers that are read or written at once: arrays need room for as many beyond their last one."""
+
+_NUMBER = ir.IntType(32)
+_VECTOR = ir.VectorType(_NUMBER, LANES)
+_PAIR = ir.IntType(16)
+_PAIRS = ir.VectorType(_PAIR, LANES)
+_INDEX = ir.IntType(64)
+
+
+def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array, index, *numbers = arguments
+        data = context.make_array(signature.args[0])(context, builder, array).data
+        start, step, count = (_broadcast(builder, number) for number in numbers)
+        lane = ir.Constant(_VECTOR, list(range(LANES)))
+        ramp = builder.add(start, builder.mul(step, lane))
+        place = builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+        before = builder.load(place)
+        before.align = 1
+        within = builder.icmp_signed("<", lane, count)
+        builder.store(builder.select(within, ramp, before), place).align = 1
+        return context.get_dummy_value()
+
+    # Indices and numbers of any type are converted.
+    numbers = [types.int32 for _ in (start, step, count)]
+    return types.void(array, index, *numbers), generate
+
+
+def _load_pairs(
+    _: Any, voxels: Any, near: Any, first: Any, to_y: Any, to_x: Any, p00: Any, p01: Any,
+    p10: Any, p11: Any,
+) -> Any:  # fmt: skip
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def data(argument: int) -> Any:
+            array = context.make_array(signature.args[argument])
+            return array(context, builder, arguments[argument]).data
+
+        _, _, first, to_y, to_x, *_ = arguments
+        origin = data(0)
+        corners = [
+            builder.gep(origin, [step])
+            for step in (ir.Constant(_INDEX, 0), to_y, to_x, builder.add(to_x, to_y))
+        ]
+        pairs = [ir.Constant(_PAIRS, ir.Undefined)] * 4
+        places = builder.gep(data(1), [first])
+        for lane in range(LANES):
+            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
+            place = builder.zext(place, _INDEX)
+            for k, corner in enumerate(corners):
+                pair = builder.load(
+                    builder.bitcast(builder.gep(corner, [place]), _PAIR.as_pointer())
+                )
+                pair.align = 1
+                pairs[k] = builder.insert_element(pairs[k], pair, ir.Constant(_NUMBER, lane))
+        for k, loaded in enumerate(pairs):
+            place = builder.bitcast(builder.gep(data(5 + k), [first]), _PAIRS.as_pointer())
+            builder.store(loaded, place).align = 1
+        return context.get_dummy_value()
+
+    index = types.uint64
+    numbers = [index for _ in (first, to_y, to_x)]
+    return types.void(voxels, near, *numbers, p00, p01, p10, p11), generate
+
+
+def _broadcast(builder: Any, number: Any) -> Any:
+    empty = ir.Constant(_VECTOR, ir.Undefined)
+    one = builder.insert_element(empty, number, ir.Constant(_NUMBER, 0))
+    return builder.shuffle_vector(one, empty, ir.Constant(_VECTOR, [0] * LANES))
+
+
+write_ramp: Any = intrinsic(_write_ramp)
+"""``write_ramp(array, index, start, step, count)`` writes start, start + step, … to an int32 array.
+
+It writes ``count`` numbers from ``array[index]`` on, at most `LANES` of them, without a loop: one
+of so few rounds is not vectorised, or does most of them in its tail.
+"""
+
+load_pairs: Any = intrinsic(_load_pairs)
+"""``load_pairs(voxels, near, first, to_y, to_x, p00, p01, p10, p11)`` loads for `LANES` pixels.
+
+From the voxel ``near[first]`` (uint32) of a uint8 array, the one ``to_y`` further, the one ``to_x``
+further, and the one both further: each with the next one times 256, as one uint16. They are put
+together in registers, since a store of each would take longer than its load.
+"""

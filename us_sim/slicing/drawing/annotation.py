@@ -19,10 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.colour_bar import ColourBar
 from us_sim.slicing.drawing.label_outlines import Settle, label_outlines
-from us_sim.slicing.drawing.lettering import Colour, Label, lettering
-from us_sim.slicing.drawing.overlay import mirrored
+from us_sim.slicing.drawing.overlay import Colour, ColourBar, Label, lettering, mirrored
 
 if TYPE_CHECKING:
     from us_sim.slicing.drawing.overlay import Overlay
@@ -136,7 +134,6 @@ class Annotation:
         return picture
 
     def _lay_out_depth(self, first: float, spacing: float) -> None:
-        """Lay out ticks and labels of depth below the face along the right side."""
         step, between = _steps(spacing, self._rows, 2.2 * self._text)
         edge = self._columns - 1
         for depth in _multiples(between, max(first - spacing, 0.0), first + self._rows * spacing):
@@ -152,7 +149,6 @@ class Annotation:
                 self._place(label, edge - self._text - 2 - label.width, top)
 
     def _lay_out_width(self, first: float, spacing: float) -> None:
-        """Lay out ticks and labels of lateral distance from the middle along the bottom."""
         widest = lettering(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
         if self.is_flipped:
             first = first + (self._columns - 1) * spacing
@@ -250,12 +246,10 @@ class Annotation:
 
 
 def _fine(line: NDArray[np.floating]) -> NDArray[np.int32]:
-    """Column and row (N, 2) as OpenCV takes them with fractions of pixels."""
     return np.rint(line * (1 << _FINE)).astype(np.int32)
 
 
 def _bright(colour: tuple[float, float, float]) -> Colour:
-    """The colour as 0 to 255, bright enough to be seen on black."""
     red, green, blue = (round(255 * (0.25 + 0.75 * level)) for level in colour)
     return red, green, blue
 
@@ -277,7 +271,6 @@ def _steps(spacing: float, count: int, pixels: float) -> tuple[float, float]:
 
 
 def _multiples(step: float, lowest: float, highest: float) -> NDArray[np.float64]:
-    """All multiples of ``step`` in that range, its ends too."""
     first, last = np.ceil(lowest / step - 1e-6), np.floor(highest / step + 1e-6)
     return np.arange(first, last + 1) * step + 0.0  # without -0
 

@@ -1,4 +1,4 @@
-"""Colours laid over a grey image, with a bar that says which value has which colour.
+"""Colours laid over a grey image, their bar, and small legible text.
 
 >>> import numpy as np
 >>> from us_sim.slicing.drawing.overlay import ColourScale, Overlay
@@ -14,13 +14,92 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.lettering import Colour
+Colour = tuple[int, int, int]
+"""Red, green and blue, 0 to 255."""
+
+_FINER = 4
+"""Letters are drawn this much larger and averaged, as OpenCV's own small ones are ragged."""
+
+_CAPITAL = 21
+"""Height of a capital letter of OpenCV's font at scale 1, px, without its strokes."""
+
+_HALO = 2
+"""Width of the halo around letters, px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Label:
+    """Text as a patch to be blended into a picture."""
+
+    colours: NDArray[np.uint8]  # (height, width, 3)
+    opacity: NDArray[np.float32]  # (height, width), 0 to 1
+
+    @property
+    def height(self) -> int:
+        """px."""
+        return self.opacity.shape[0]
+
+    @property
+    def width(self) -> int:
+        """px."""
+        return self.opacity.shape[1]
+
+    def draw(self, picture: NDArray[np.uint8], column: int, row: int) -> bool:
+        """Blend it into a (rows, columns, 3) picture with its upper left corner there.
+
+        Returns:
+            False where it would not be inside the picture; then nothing is drawn.
+        """
+        rows, columns = picture.shape[:2]
+        if not (0 <= row <= rows - self.height and 0 <= column <= columns - self.width):
+            return False
+        place = picture[row : row + self.height, column : column + self.width]
+        place[:] = cv2.blendLinear(place, self.colours, 1.0 - self.opacity, self.opacity)
+        return True
+
+
+@lru_cache(maxsize=64)
+def lettering(text: str, height: int, colour: Colour) -> Label:
+    """``text`` with capital letters about ``height`` px high."""
+    letters = _letters(text, height)
+    padded = np.pad(letters, _HALO)
+    halo = cv2.GaussianBlur(cv2.dilate(padded, np.ones((3, 3), np.uint8)), (3, 3), 0.0)
+    opacity = np.maximum(padded, 0.8 * halo)
+    letters = np.divide(padded, opacity, out=np.zeros_like(padded), where=opacity > 0)
+    colours = np.rint(letters[:, :, None] * np.array(colour, np.float32)).astype(np.uint8)
+    return Label(colours, opacity)
+
+
+def _letters(text: str, height: int) -> NDArray[np.float32]:
+    large = _FINER * height
+    letters = _cropped(text, large, _scale(large))
+    rows, columns = (-(-side // _FINER) for side in letters.shape)
+    whole = np.zeros((rows * _FINER, columns * _FINER), np.uint8)
+    whole[: letters.shape[0], : letters.shape[1]] = letters
+    averaged = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+    return averaged.astype(np.float32) / np.float32(255)
+
+
+@lru_cache(maxsize=64)
+def _scale(large: int) -> float:
+    """The scale at which capitals are that high; strokes add to it in some versions of OpenCV."""
+    first = large / _CAPITAL
+    return first * large / _cropped("H", large, first).shape[0]
+
+
+def _cropped(text: str, large: int, scale: float) -> NDArray[np.uint8]:
+    canvas = np.zeros((3 * large, 2 * large * (len(text) + 1)), np.uint8)
+    stroke = max(1, round(large / 7))
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(canvas, text, (large, 2 * large), font, scale, (255,), stroke, cv2.LINE_AA)
+    left, top, width, height = cv2.boundingRect(canvas)
+    return canvas[top : top + max(1, height), left : left + max(1, width)]
 
 
 @dataclass(frozen=True)
@@ -92,3 +171,55 @@ class Overlay:
 def mirrored(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
     """Column and row (N, 2) in an image of so many columns whose left and right are exchanged."""
     return np.column_stack([columns - 1 - line[:, 0], line[:, 1]])
+
+
+_TEXT: Colour = (205, 215, 215)
+_HEIGHT = 9
+"""Of the bar, in heights of a letter."""
+
+
+class ColourBar:
+    """Drawn over a picture, as far as that has room.
+
+    Args:
+        scale: which colour each value has.
+        text: px, height of its letters.
+        note: a line below it; empty for none.
+    """
+
+    def __init__(self, scale: ColourScale, text: int, note: str = "") -> None:
+        margin, width, height = text, text, _HEIGHT * text
+        title = lettering(f"{scale.title} {scale.unit}".strip(), text, _TEXT)
+        values = [
+            lettering(scale.text(value), text, _TEXT)
+            for value in (scale.high, 0.5 * (scale.low + scale.high), scale.low)
+        ]
+        top = margin + title.height + text // 2
+        beside = margin + width + text // 3
+        self._labels = [(title, margin, margin)] + [
+            (value, beside, top + round(part * height) - value.height // 2)
+            for value, part in zip(values, (0.0, 0.5, 1.0), strict=True)
+        ]
+        bottom = top + height + text
+        if note:
+            written = lettering(note, text, _TEXT)
+            self._labels.append((written, margin, bottom))
+            bottom += written.height
+        right = max(column + label.width for label, column, _ in self._labels)
+        #: Left, top, right and bottom of all of it, px.
+        self.box = margin, margin, right, bottom
+        levels = np.linspace(255.0, 0.0, height).round().astype(np.intp)
+        self._colours = np.repeat(scale.table[levels][:, None], width, axis=1)
+        self._corner = margin, top
+
+    def draw(self, picture: NDArray[np.uint8]) -> None:
+        """Draw it over a (rows, columns, 3) picture."""
+        column, row = self._corner
+        height, width = self._colours.shape[:2]
+        rows, columns = picture.shape[:2]
+        if row + height < rows and column + width < columns:
+            picture[row : row + height, column : column + width] = self._colours
+            corners = (column - 1, row - 1), (column + width, row + height)
+            cv2.rectangle(picture, *corners, _TEXT, 1)
+        for label, left, top in self._labels:
+            label.draw(picture, left, top)

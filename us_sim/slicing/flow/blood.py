@@ -1,29 +1,9 @@
-"""The blood of a scene: all vessels with a flow, on the frames of a scanner.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.b_mode import BMode
->>> from us_sim.slicing.flow.blood import Blood, Window
->>> from us_sim.slicing.flow.settings import FlowSettings
->>> from us_sim.slicing.flow.vessel import Vessel
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.volume.volume import Volume
->>> y, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
->>> tube = np.repeat((y**2 + z**2 < 36)[None], 60, axis=0).astype(np.uint8)
->>> volume = Volume(tube, np.diag([5e-4, 5e-4, 5e-4, 1.0]), tube, {1: "vein"})
->>> flow = FlowSettings("venous", (1, 0, 0), peak_velocity=0.1, mean_velocity=0.05)
->>> blood = Blood([Vessel("vein", volume, 1, flow)])
->>> probe = LinearProbe(aperture=0.02, depth=0.01, columns=41, rows=21)
->>> frame = BMode(volume, probe).frame(Pose([0.015, 5e-3, 0.0]), time=0.0)
->>> steered = np.full((21, 41), np.radians(-30.0))  # against the flow
->>> velocity = blood.velocity(frame, Window(probe, steered))
->>> round(float(velocity[10, 20]), 2), bool(np.isnan(velocity[0, 0]))
-(0.05, True)
-"""
+"""The blood of all vessels of a scene at the pixels of a frame, and why Doppler shows none."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -180,7 +160,6 @@ def _find_velocity(
 
 @njit(inline="always", error_model="numpy")
 def _blended(grid, i, j, k, u, v, w):
-    """Trilinear value in a cell of a grid."""
     c0 = (grid[i, j, k] * (1.0 - w) + grid[i, j, k + 1] * w) * (1.0 - v) + (
         grid[i, j + 1, k] * (1.0 - w) + grid[i, j + 1, k + 1] * w
     ) * v
@@ -188,3 +167,56 @@ def _blended(grid, i, j, k, u, v, w):
         grid[i + 1, j + 1, k] * (1.0 - w) + grid[i + 1, j + 1, k + 1] * w
     ) * v
     return c0 * (1.0 - u) + c1 * u
+
+
+_HEARD = 0.3  # coupling below which blood, 20 dB fainter than tissue, is lost
+_STANDING = 1e-3  # m/s on a vessel's axis
+_ACROSS = 0.12  # cosine between beam and flow: 83 degrees
+
+
+class Absence(Enum):
+    """Why no flow is seen in a part of the image; nothing where it should be seen."""
+
+    NOTHING = ""
+    NO_CONTACT = "no_contact"  # the beams there have no contact, or too little
+    NO_VESSEL = "no_vessel"  # no lumen with a flow is there
+    NO_FLOW = "no_flow"  # the vessel is closed
+    ACROSS_FLOW = "across_flow"  # the beams are square to it
+    TOO_SLOW = "too_slow"  # for the wall filter
+
+
+def absence(
+    blood: Blood, frame: Frame, window: Window, lines: NDArray[np.integer], wall_filter: float
+) -> Absence:
+    """Why flow cannot be seen at the places of a window.
+
+    Args:
+        blood: in it.
+        lines: of the probe, as many as places in the window, whose echoes come from there.
+        wall_filter: m/s.
+    """
+    coupling = np.ones(1) if frame.contact is None else frame.contact[0]
+    heard = coupling[np.minimum(lines.ravel(), len(coupling) - 1)]
+    if heard.max(initial=0.0) < _HEARD:
+        return Absence.NO_CONTACT
+    velocity, which = (each.ravel() for each in blood.mean_velocities(frame, window))
+    within = which >= 0
+    if not within.any():
+        return Absence.NO_VESSEL
+    if heard[within].max() < _HEARD:
+        return Absence.NO_CONTACT
+    cosine = fastest = speed = 0.0
+    for number in np.unique(which[within]):
+        vessel = blood.vessels[number]
+        axis = float(np.linalg.norm(vessel.axis_velocity, axis=1).mean())
+        along = float(np.abs(velocity[which == number]).max())
+        speed = max(speed, axis)
+        cosine = max(cosine, along / axis if axis > _STANDING else 0.0)
+        # On the axis blood flows twice as fast as in the mean.
+        peak = 0.5 * vessel.settings.peak_velocity / vessel.settings.mean_velocity
+        fastest = max(fastest, along * peak)
+    if speed < _STANDING:
+        return Absence.NO_FLOW
+    if cosine < _ACROSS:
+        return Absence.ACROSS_FLOW
+    return Absence.TOO_SLOW if fastest < wall_filter else Absence.NOTHING

@@ -1,37 +1,25 @@
-"""A vessel's lumen where the tissue has carried it: its middle, its areas, and how blood fills it.
+"""A vessel's lumen as the tissue carries it, and the voxels' places in it.
 
-Points on rings around each station go with the tissue's tetrahedra. The area that a ring encloses
-across the vessel is the area vector of its polygon along the vessel's tangent, which a flow through
-it sees whatever the ring's own plane has become. Blood flows fastest at radial coordinate 0 and
-stands at the wall, 1, as the square of the coordinate falls (Poiseuille). What a lumen is filled
-by a flow with speed 1 on its axis is the sum over the rings of that profile times area.
-
->>> import numpy as np
->>> from us_sim.slicing.flow.carried_lumen import CarriedLumen
->>> from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> centres = np.array([[0.05, y, 0.05] for y in (0.02, 0.04, 0.06, 0.08)])
->>> along, across = np.tile([0.0, 1, 0], (4, 1)), np.tile([[0.0, 0, 1], [1, 0, 0]], (4, 1, 1))
->>> tube = Lumen(centres, along, across, np.full((4, DIRECTIONS), 0.01))
->>> mesh = box_mesh(*[np.linspace(0.0, 0.1, 5)] * 3)
->>> squeezed = CarriedLumen(tube, mesh).carry(mesh.nodes * [1.0, 1.0, 0.5])
->>> (squeezed.areas / tube.areas).round(3).tolist()
-[0.5, 0.5, 0.5, 0.5]
->>> (squeezed.filled / squeezed.areas).round(3).tolist()
-[0.5, 0.5, 0.5, 0.5]
+Points on rings around each station move with the tissue's tetrahedra. The area of a ring is the
+component of its polygon's area vector along the vessel's tangent. Blood flows fastest on the axis
+and stands at the wall, as the square of the radial coordinate (Poiseuille).
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.cache import Form, kept
 from us_sim.kernels import njit
-from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen, lumen_of
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.volume.volume import Volume
 
 _RINGS = 4
 """Rings around a station that share its area at rest evenly."""
@@ -137,3 +125,72 @@ def _measure(points, nodes, weights, moved, tangents, polygons):
             polygons[s, k] = 0.5 * (
                 area[0] * tangents[s, 0] + area[1] * tangents[s, 1] + area[2] * tangents[s, 2]
             )
+
+
+_WAY = 1
+"""Raised when another lumen or map is made of the same voxels."""
+_OUTSIDE = 3.0  # radial coordinate that is well outside the wall
+_MARGIN = 2  # voxels beyond the wall in which coordinates are known
+
+
+@dataclass(frozen=True, eq=False)
+class LumenMap:
+    """Place along a vessel, and offset across it as `Lumen.locate` says, of voxels around it.
+
+    The offset is kept and not the radial coordinate, since it is as good as linear from voxel to
+    voxel.
+    """
+
+    station: NDArray[np.float32]  # (I, J, K)
+    offset: NDArray[np.float32]  # (I, J, K, 2)
+    corner: NDArray[np.int64]  # (3,), the volume's voxel that cell (0, 0, 0) is
+
+
+def mapped_lumen(volume: Volume, label: int) -> tuple[Lumen, LumenMap]:
+    """The lumen of a label, and the map of the voxels around it; from the cache if it is there.
+
+    Raises:
+        VolumeError: as `lumen_of`.
+    """
+    assert volume.labels is not None
+    inside = volume.labels == label
+    about = hashlib.sha256(np.packbits(inside))
+    about.update(repr((_WAY, inside.shape, volume.index_to_patient.tolist())).encode())
+
+    def make() -> tuple[Lumen, LumenMap]:
+        lumen = lumen_of(inside, volume.index_to_patient)
+        return lumen, _map(lumen, inside, volume.index_to_patient)
+
+    return kept(f"lumen-{about.hexdigest()[:16]}", _FORM, make)
+
+
+def _map(lumen: Lumen, inside: NDArray[np.bool_], to_patient: NDArray[np.float64]) -> LumenMap:
+    voxels = np.argwhere(inside)
+    low, high = voxels.min(axis=0) - _MARGIN, voxels.max(axis=0) + _MARGIN + 1
+    shape = tuple(high - low)
+    index = np.indices(shape).reshape(3, -1).T + low
+    station, offset = lumen.locate(index @ to_patient[:3, :3].T + to_patient[:3, 3])
+    return LumenMap(
+        station.astype(np.float32).reshape(shape),
+        np.clip(offset, -_OUTSIDE, _OUTSIDE).astype(np.float32).reshape(*shape, 2),
+        low,
+    )
+
+
+def _pack(found: tuple[Lumen, LumenMap]) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    lumen, places = found
+    arrays: dict[str, NDArray] = {**vars(lumen), **vars(places)}
+    return {name: arrays[name] for name in (*_OF_LUMEN, *_OF_MAP)}, {}
+
+
+def _unpack(arrays: dict[str, NDArray], _: dict[str, Any]) -> tuple[Lumen, LumenMap]:
+    own = {name: np.array(array) for name, array in arrays.items()}  # kernels take no read-only
+    return (
+        Lumen(**{name: own[name] for name in _OF_LUMEN}),
+        LumenMap(**{name: own[name] for name in _OF_MAP}),
+    )
+
+
+_OF_LUMEN = ("centres", "tangents", "across", "radii")
+_OF_MAP = ("station", "offset", "corner")
+_FORM = Form("lumen.json", _pack, _unpack)

@@ -1,8 +1,15 @@
-"""Depth along a probe's beams, and the width of a beam there, for all parts of image formation.
+"""Places on a probe's beams: fractions of its face, depths, and the width of a beam there.
 
->>> from us_sim.slicing.probe.beams import beam_width
->>> round(float(beam_width(0.0, 2e-3, focus=0.02)) * 1e3, 3)  # mm, at the face
-2.828
+A place across the array is a fraction: -0.5 at its first end, 0.5 at its other, of the face of a
+linear array and of the opening angle where beams spread.
+
+>>> import numpy as np
+>>> from us_sim.slicing.probe.beams import pixels_of
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=80, rows=80)
+>>> pixels_of(probe, np.array([0.0, 0.25]), np.full(2, 0.02)).round(6)  # column and row
+array([[39.5, 39.5],
+       [59.5, 39.5]])
 """
 
 from __future__ import annotations
@@ -12,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.slicing.probe.probe import Probe
+from us_sim.errors import ProbeError
+from us_sim.slicing.probe.probe import LinearProbe, Probe
 
 DEPTH_STEPS = 512
 """Steps of depth in which tables of what changes with depth are made."""
@@ -42,3 +50,68 @@ def depth_steps(probe: Probe) -> NDArray[np.uint16]:
     step = probe.pixel_beams[1] * np.float32(DEPTH_STEPS / probe.depth)
     np.nan_to_num(step, copy=False)
     return np.clip(step, 0, DEPTH_STEPS - 1, out=step).astype(np.uint16)
+
+
+def require_depth(probe: Probe, key: str, depth: float | None, what: str) -> float:
+    """The depth, m, or half of the image's where none is given.
+
+    Raises:
+        ProbeError: it lies outside the image.
+    """
+    if depth is None:
+        return 0.5 * probe.depth
+    if depth >= probe.depth:
+        raise ProbeError(
+            f"{key}: {what} at {1e3 * depth:g} mm lies outside the image, which is "
+            f"{1e3 * probe.depth:g} mm deep"
+        )
+    return depth
+
+
+def require_steering(probe: Probe, key: str, steering: float) -> None:
+    """Check that a probe can steer its beams.
+
+    Raises:
+        ProbeError: its beams spread, and it shall.
+    """
+    if steering != 0.0 and not isinstance(probe, LinearProbe):
+        raise ProbeError(f"{key}: is for linear probes only: beams of this one spread, so give 0")
+
+
+def beam_angles(probe: Probe, fraction: NDArray[Any], steering: float = 0.0) -> NDArray[np.float64]:
+    """Angles (as ``fraction``) rad of the beams there from the probe's z towards its x."""
+    directions = probe.beam_directions
+    angles = np.arctan2(directions[:, 0], directions[:, 1])
+    return np.asarray(_at(probe, fraction, angles) + steering)
+
+
+def pixels_of(
+    probe: Probe, fraction: NDArray[Any], depth: NDArray[Any], steering: float = 0.0
+) -> NDArray[np.float64]:
+    """(P, 2) column and row, with fractions of pixels, of places (P,) along beams.
+
+    Args:
+        fraction: of the beam's start.
+        depth: m, along the beam.
+        steering: rad, of all beams.
+    """
+    angle = beam_angles(probe, fraction, steering)
+    x = _at(probe, fraction, probe.beam_starts[:, 0]) + depth * np.sin(angle)
+    z = _at(probe, fraction, probe.beam_starts[:, 1]) + depth * np.cos(angle)
+    matrix = probe.image_to_probe
+    return np.stack([(x - matrix[0, 3]) / matrix[0, 0], (z - matrix[2, 3]) / matrix[2, 1]], axis=-1)
+
+
+def fractions_and_depths(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of each pixel (rows, columns), along beams that are not steered; NaN where none reaches."""
+    line, depth = probe.pixel_beams
+    return (line + np.float32(0.5)) / np.float32(probe.lines) - np.float32(0.5), depth
+
+
+def _at(probe: Probe, fraction: NDArray[Any], of_lines: NDArray[np.float64]) -> NDArray[Any]:
+    """What is known of each line, between lines, and on beyond the outermost two."""
+    if probe.lines == 1:
+        return np.full(np.shape(fraction), of_lines[0])
+    line = (np.asarray(fraction) + 0.5) * probe.lines - 0.5
+    low = np.clip(np.nan_to_num(line), 0, probe.lines - 2).astype(int)
+    return np.asarray(of_lines[low] + (line - low) * (of_lines[low + 1] - of_lines[low]))

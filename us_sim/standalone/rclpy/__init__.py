@@ -7,14 +7,21 @@ Names, arguments, defaults and errors are those of rclpy 7.1 (Jazzy).
 import inspect
 from typing import Any
 
-from .context import Context
+from .context import (
+    Context,
+    SignalHandlerOptions,
+    get_default_context,
+    get_rmw_implementation_identifier,
+    install_signal_handlers,
+    ok,
+    try_shutdown,
+    uninstall_signal_handlers,
+)
+from .context import shutdown as _shutdown
 from .executors import Executor, SingleThreadedExecutor
 from .node import Node
 from .parameter import Parameter
-from .signals import SignalHandlerOptions, install_signal_handlers, uninstall_signal_handlers
 from .task import Future
-from .utilities import get_default_context, get_rmw_implementation_identifier, ok, try_shutdown
-from .utilities import shutdown as _shutdown
 
 __all__ = [
     "Context",
@@ -80,7 +87,6 @@ def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None 
 
 
 def create_node(node_name: str, **arguments: Any) -> Node:
-    """Make a node; the arguments are those of `rclpy.node.Node`."""
     return Node(node_name, **arguments)
 
 

@@ -1,13 +1,11 @@
-"""The parameters of a node: declaring, getting and setting them, and who has a say in it."""
+"""The parameters of a node: declaring, getting and setting them, and the callbacks that check."""
 
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..messages import message_class
-from ._node_graph import NodeGraph
-from ._parameter_ranges import reason_against
-from .clock import ROSClock
+from .endpoints import Publisher
 from .exceptions import (
     InvalidParameterException,
     InvalidParameterTypeException,
@@ -17,8 +15,8 @@ from .exceptions import (
     ParameterNotDeclaredException,
     ParameterUninitializedException,
 )
-from .parameter import PARAMETER_SEPARATOR_STRING, Parameter
-from .publisher import Publisher
+from .parameter import PARAMETER_SEPARATOR_STRING, Parameter, reason_against
+from .time import ROSClock
 
 ParameterDescriptor: Any = message_class("rcl_interfaces/msg/ParameterDescriptor")
 ParameterValue: Any = message_class("rcl_interfaces/msg/ParameterValue")
@@ -30,13 +28,18 @@ ListParametersResult: Any = message_class("rcl_interfaces/msg/ListParametersResu
 _RECURSIVE = 0  # ListParameters.Request.DEPTH_RECURSIVE
 
 
-class NodeParameters(NodeGraph):
+class NodeParameters:
     """A node's parameters by name, which have to be declared before they are used."""
 
     PARAM_REL_TOL = 1e-06
 
     _clock: ROSClock
+    _rcl_name: str
+    _rcl_namespace: str
     _parameter_event_publisher: Publisher | None
+
+    def get_fully_qualified_name(self) -> str:
+        return f"{self._rcl_namespace.rstrip('/')}/{self._rcl_name}"
 
     def _rcl_keep_parameters(
         self, overrides: dict[str, Parameter], allow_undeclared_parameters: bool
@@ -157,7 +160,6 @@ class NodeParameters(NodeGraph):
         return name, second, descriptor
 
     def undeclare_parameter(self, name: str) -> None:
-        """Forget a parameter."""
         if name not in self._parameters:
             raise ParameterNotDeclaredException(name)
         if self._descriptors[name].read_only:
@@ -166,7 +168,6 @@ class NodeParameters(NodeGraph):
         del self._descriptors[name]
 
     def describe_parameter(self, name: str) -> Any:
-        """The `rcl_interfaces/msg/ParameterDescriptor` of a parameter."""
         if name in self._descriptors:
             return self._descriptors[name]
         if self._allow_undeclared_parameters:
@@ -174,15 +175,12 @@ class NodeParameters(NodeGraph):
         raise ParameterNotDeclaredException(name)
 
     def describe_parameters(self, names: list[str]) -> list[Any]:
-        """The descriptors of several parameters."""
         return [self.describe_parameter(name) for name in names]
 
     def has_parameter(self, name: str) -> bool:
-        """Whether a parameter is known."""
         return name in self._parameters
 
     def get_parameter_types(self, names: list[str]) -> list[Parameter.Type]:
-        """The types of several parameters."""
         _require_strings(names)
         return [self.get_parameter_type(name) for name in names]
 
@@ -195,7 +193,6 @@ class NodeParameters(NodeGraph):
         raise ParameterNotDeclaredException(name)
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:
-        """Several parameters."""
         _require_strings(names)
         return [self.get_parameter(name) for name in names]
 
@@ -229,7 +226,6 @@ class NodeParameters(NodeGraph):
         }
 
     def list_parameters(self, prefixes: list[str], depth: int) -> Any:
-        """The names of parameters, as a `rcl_interfaces/msg/ListParametersResult`."""
         if not isinstance(prefixes, list):
             raise TypeError("The prefixes argument must be a list")
         if not all(isinstance(prefix, str) for prefix in prefixes):

@@ -1,4 +1,7 @@
-"""Contexts: several can exist in one process, each with its own arguments, domain and life.
+"""Contexts, each with its own arguments, domain and life; the default one; and signals.
+
+As in rclpy, SIGINT shuts all contexts down and also does what Python does (KeyboardInterrupt in the
+main thread), while SIGTERM ends nothing by itself: `spin` raises ExternalShutdownException.
 
 >>> with Context() as context:
 ...     context.ok()
@@ -7,22 +10,118 @@ True
 False
 """
 
+import _thread
 import os
+import signal
 import sys
+import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from enum import Enum
 from inspect import ismethod
-from threading import RLock
+from threading import TIMEOUT_MAX, RLock
+from types import FrameType
+from typing import Any
 
 from ..graph import Graph, GraphNode
 from ..transport import DdsError, Participant
-from . import _logging_outputs, signals
 from ._arguments import parse_arguments
-from ._rclpy_pybind11 import RCLError
-from ._wake_up import WakeUp
-from .exceptions import NotInitializedException
+from .exceptions import NotInitializedException, RCLError
+from .logging import configure, release
+
+
+class WakeUp:
+    """One thread waits; any thread or signal handler wakes it, now or for its next wait."""
+
+    __slots__ = ("__weakref__", "_lock")
+
+    def __init__(self) -> None:
+        self._lock = _thread.allocate_lock()
+        self._lock.acquire()
+
+    def wake(self) -> None:
+        """End the current wait, or the next one if nobody waits."""
+        if self._lock.locked():
+            try:  # noqa: SIM105 (this runs for every message)
+                self._lock.release()
+            except RuntimeError:
+                pass  # somebody else woke it in between
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait for `wake`; False after `timeout` seconds without."""
+        if timeout is None:
+            return self._lock.acquire()
+        return self._lock.acquire(True, min(max(timeout, 0.0), TIMEOUT_MAX))
+
+
+class SignalHandlerOptions(Enum):
+    NO = 0
+    SIGINT = 1
+    SIGTERM = 2
+    ALL = 3
+
+
+# Replaced, never changed: a signal handler may read it at any time.
+_contexts: tuple[weakref.ReferenceType[Any], ...] = ()
+_contexts_lock = threading.Lock()
+_previous: dict[int, Any] = {}
+
+
+def add_context(context: Any) -> None:
+    """Have a context shut down by the signals whose handlers are installed."""
+    global _contexts
+    with _contexts_lock:
+        alive = tuple(reference for reference in _contexts if reference() is not None)
+        _contexts = (*alive, weakref.ref(context))
+
+
+def remove_context(context: Any) -> None:
+    global _contexts
+    with _contexts_lock:
+        _contexts = tuple(
+            reference for reference in _contexts if reference() not in (None, context)
+        )
+
+
+def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions.ALL) -> None:
+    """Add handlers for the given signals to those that are installed.
+
+    Python takes signals in the main thread only; called from another thread this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for bit, number in ((1, signal.SIGINT), (2, signal.SIGTERM)):
+        if options.value & bit and number not in _previous:
+            _previous[number] = signal.getsignal(number)
+            signal.signal(number, _shut_down_contexts)
+
+
+def get_current_signal_handlers_options() -> SignalHandlerOptions:
+    return SignalHandlerOptions((signal.SIGINT in _previous) + 2 * (signal.SIGTERM in _previous))
+
+
+def uninstall_signal_handlers() -> None:
+    """Give back the signals to whoever handled them before."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for number in list(_previous):
+        previous = _previous.pop(number)
+        if signal.getsignal(number) is _shut_down_contexts:
+            signal.signal(number, signal.SIG_DFL if previous is None else previous)
+
+
+def _shut_down_contexts(number: int, frame: FrameType | None) -> None:
+    # Nothing here takes a lock: the interrupted code may hold it.
+    for reference in _contexts:
+        context = reference()
+        if context is not None:
+            context._invalidate()
+    previous = _previous.get(number)
+    if callable(previous):
+        previous(number, frame)
+
 
 Callback = Callable[[], None]
 
@@ -55,7 +154,6 @@ class Context(AbstractContextManager["Context"]):
         initialize_logging: bool = True,
         domain_id: int | None = None,
     ) -> None:
-        """Start this context's life."""
         with self._lock:
             if domain_id is not None and domain_id < 0:
                 raise RuntimeError(f"Domain id ({domain_id}) should not be lower than zero.")
@@ -69,23 +167,20 @@ class Context(AbstractContextManager["Context"]):
                 raise RCLError(f"failed to initialize rcl: {error}") from None
             self._graph = Graph(self._participant)
             self._initialized = self._valid = True
-            signals.add_context(self)
+            add_context(self)
             if initialize_logging:
-                _logging_outputs.configure(self._arguments)
+                configure(self._arguments)
                 self._logging_initialized = True
 
     def ok(self) -> bool:
-        """Whether this context was initialised and not yet shut down."""
         return self._valid
 
     def get_domain_id(self) -> int:
-        """The DDS domain that this context is in."""
         if not self._initialized:
             raise RuntimeError("Context must be initialized before it can have a domain id")
         return self._domain_id
 
     def shutdown(self) -> None:
-        """End this context's life: executors stop, and everything leaves the network."""
         if not self._initialized:
             raise RuntimeError("Context must be initialized before it can be shutdown")
         was_ok = self._valid
@@ -97,7 +192,7 @@ class Context(AbstractContextManager["Context"]):
         """As `shutdown`, but without an error when it already happened."""
         if not self._initialized:
             return
-        signals.remove_context(self)
+        remove_context(self)
         self._invalidate()
         with self._lock:
             callbacks, self._callbacks = self._callbacks, []
@@ -108,7 +203,7 @@ class Context(AbstractContextManager["Context"]):
                 callback()
         self.destroy()
         if logging_initialized:
-            _logging_outputs.release()
+            release()
 
     def destroy(self) -> None:
         """Leave the network. What the nodes still hold does nothing from now on."""
@@ -171,13 +266,11 @@ class Context(AbstractContextManager["Context"]):
             self._waiting = (*alive, weakref.ref(waiting))
 
     def _add_node(self, node: LocalNode) -> None:
-        """Have a node known to others."""
         with self._lock:
             self._nodes.append(node)
         self._announce()
 
     def _remove_node(self, node: LocalNode) -> None:
-        """The counterpart of `_add_node`."""
         with self._lock:
             if node in self._nodes:
                 self._nodes.remove(node)
@@ -215,3 +308,39 @@ def _domain_from_environment() -> int:
             "but it has to be a whole number from 0 to 232"
         )
     return int(text)
+
+
+_default_context: Context | None = None
+_lock = threading.RLock()
+
+
+def get_default_context(*, shutting_down: bool = False) -> Context:
+    """The context that is used where none is given; forgotten when it is shutting down."""
+    global _default_context
+    with _lock:
+        context = Context() if _default_context is None else _default_context
+        _default_context = None if shutting_down else context
+        return context
+
+
+def ok(*, context: Context | None = None) -> bool:
+    return (get_default_context() if context is None else context).ok()
+
+
+def shutdown(*, context: Context | None = None) -> None:
+    (get_default_context(shutting_down=True) if context is None else context).shutdown()
+
+
+def try_shutdown(*, context: Context | None = None) -> None:
+    """Shut a context down if it is up."""
+    (get_default_context(shutting_down=True) if context is None else context).try_shutdown()
+
+
+def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
+    """A command line (`sys.argv` when None) without what is between --ros-args and --."""
+    return list(parse_arguments(sys.argv if args is None else args).others)
+
+
+def get_rmw_implementation_identifier() -> str:
+    """Which middleware this speaks: the mapping of ROS onto DDS is Cyclone's."""
+    return "rmw_cyclonedds_cpp"

@@ -17,14 +17,40 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from operator import attrgetter
 from typing import Any
 
-from ._rclpy_pybind11 import InvalidHandle
-from ._running import RunningCallbacks
-from ._wake_up import WakeUp
-from .constants import S_TO_NS
-from .context import Context
+from .context import Context, WakeUp, get_default_context
+from .exceptions import InvalidHandle
 from .node import Node
 from .task import Future
-from .utilities import get_default_context
+from .time import S_TO_NS
+
+
+class RunningCallbacks:
+    """Counts the callbacks that run, by thread."""
+
+    def __init__(self) -> None:
+        self._threads: dict[int, int] = {}
+        self._changed = threading.Condition()
+
+    def begin(self) -> None:
+        me = threading.get_ident()
+        with self._changed:
+            self._threads[me] = self._threads.get(me, 0) + 1
+
+    def end(self) -> None:
+        me = threading.get_ident()
+        with self._changed:
+            self._threads[me] -= 1
+            if not self._threads[me]:
+                del self._threads[me]
+            self._changed.notify_all()
+
+    def wait(self, timeout_sec: float | None) -> bool:
+        """Wait until no other thread runs a callback; False when it takes longer."""
+        me = threading.get_ident()
+        if timeout_sec is not None and timeout_sec < 0:
+            timeout_sec = None
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._threads.keys() - {me}, timeout_sec)
 
 
 class ExternalShutdownException(Exception):
@@ -60,7 +86,6 @@ class Executor(AbstractContextManager["Executor"]):
         return True
 
     def add_node(self, node: Node) -> bool:
-        """Run a node's callbacks; False when it was added before."""
         with self._nodes_lock:
             if node in self._nodes:
                 return False
@@ -70,7 +95,6 @@ class Executor(AbstractContextManager["Executor"]):
         return True
 
     def remove_node(self, node: Node) -> None:
-        """Run a node's callbacks no more."""
         with self._nodes_lock:
             if node in self._nodes:
                 del self._nodes[node]
@@ -81,12 +105,10 @@ class Executor(AbstractContextManager["Executor"]):
         self._wake_up.wake()
 
     def get_nodes(self) -> list[Node]:
-        """The nodes that were added."""
         with self._nodes_lock:
             return list(self._nodes)
 
     def spin(self) -> None:
-        """Run callbacks until the context or this executor is shut down."""
         while self._context.ok() and not self._is_shutdown:
             self.spin_once()
 

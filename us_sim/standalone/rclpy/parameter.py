@@ -1,4 +1,4 @@
-"""Parameters: a name, a type and a value.
+"""Parameters: a name, a type and a value; their services, and a client of another node's.
 
 >>> Parameter("rate", value=60.0).type_.name
 'DOUBLE'
@@ -9,11 +9,25 @@ ValueError: Type 'Type.INTEGER' and value '60.0' do not agree
 """
 
 import array
+import math
+import weakref
+from collections.abc import Callable, Sequence
 from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from ..messages import message_class
+from ..messages import message_class, service_class
+from .endpoints import CallbackGroup, wait_until
+from .exceptions import (
+    ParameterNotDeclaredException,
+    ParameterUninitializedException,
+)
+from .qos import (
+    QoSProfile,
+    qos_profile_parameters,
+    qos_profile_services_default,
+)
+from .task import Future
 
 PARAMETER_SEPARATOR_STRING = "."
 
@@ -63,7 +77,6 @@ class Parameter:
             raise TypeError(f"The given value is not one of the allowed types '{parameter_value}'.")
 
         def check(self, parameter_value: Any) -> bool:
-            """Whether a Python value is of this type."""
             if self.value == 0:
                 return parameter_value is None
             for python_type, scalar, sequence in _PYTHON_TYPES:
@@ -94,19 +107,16 @@ class Parameter:
 
     @classmethod
     def from_parameter_msg(cls, param_msg):
-        """The parameter that a `rcl_interfaces/msg/Parameter` holds."""
         type_ = Parameter.Type(param_msg.value.type)
         return cls(param_msg.name, type_, getattr(param_msg.value, _field(type_), None))
 
     def get_parameter_value(self):
-        """This value as a `rcl_interfaces/msg/ParameterValue`."""
         message: Any = message_class("rcl_interfaces/msg/ParameterValue")(type=self._type.value)
         if self._value is not None:
             setattr(message, _field(self._type), self._value)
         return message
 
     def to_parameter_msg(self):
-        """This parameter as a `rcl_interfaces/msg/Parameter`."""
         cls = message_class("rcl_interfaces/msg/Parameter")
         return cls(name=self._name, value=self.get_parameter_value())
 
@@ -117,3 +127,221 @@ class Parameter:
 def _field(type_: Parameter.Type) -> str:
     """The field of a `rcl_interfaces/msg/ParameterValue` that holds a value of a type."""
     return f"{type_.name.lower()}_value"
+
+
+def reason_against(parameter: Parameter, descriptor: Any, tolerance: float) -> str:
+    """Why a value is outside its descriptor's range or between its steps.
+
+    Args:
+        parameter: the value to be set.
+        descriptor: a `rcl_interfaces/msg/ParameterDescriptor`.
+        tolerance: relative, for comparing floating-point numbers.
+    """
+    if parameter.type_ is Parameter.Type.INTEGER and descriptor.integer_range:
+        return _against_integers(parameter, descriptor.integer_range[0])
+    if parameter.type_ is Parameter.Type.DOUBLE and descriptor.floating_point_range:
+        return _against_floats(parameter, descriptor.floating_point_range[0], tolerance)
+    return ""
+
+
+def _against_integers(parameter: Parameter, limits: Any) -> str:
+    value = parameter.value
+    least, most = sorted((limits.from_value, limits.to_value))
+    if value in (least, most):
+        return ""
+    if not least < value < most:
+        return f"Parameter {parameter.name} out of range. Min: {least}, Max: {most}, value: {value}"
+    if limits.step and (value - least) % limits.step:
+        return (
+            f"The parameter value for {parameter.name} is not a valid step. "
+            f"Min: {least}, max: {most}, value: {value}, step: {limits.step}"
+        )
+    return ""
+
+
+def _against_floats(parameter: Parameter, limits: Any, tolerance: float) -> str:
+    value = parameter.value
+    least, most = sorted((limits.from_value, limits.to_value))
+    if any(math.isclose(value, limit, rel_tol=tolerance) for limit in (least, most)):
+        return ""
+    if not least < value < most:
+        return f"Parameter {parameter.name} out of range Min: {least}, Max: {most}, value: {value}"
+    if limits.step:
+        nearest = least + round((value - least) / limits.step) * limits.step
+        if not math.isclose(nearest, value, rel_tol=tolerance):
+            return (
+                f"The parameter value for {parameter.name} is not close enough to a valid step. "
+                f"Min: {least}, max: {most}, value: {value}, step: {limits.step}"
+            )
+    return ""
+
+
+class ParameterService:
+    """Offers `<node>/get_parameters` and the five others."""
+
+    def __init__(self, node: Any):
+        self._node = weakref.ref(node)
+        for name, callback in {
+            "DescribeParameters": self._describe_parameters,
+            "GetParameters": self._get_parameters,
+            "GetParameterTypes": self._get_parameter_types,
+            "ListParameters": self._list_parameters,
+            "SetParameters": self._set_parameters,
+            "SetParametersAtomically": self._set_parameters_atomically,
+        }.items():
+            node.create_service(
+                service_class(f"rcl_interfaces/srv/{name}"),
+                f"{node.get_name()}/{_snake_case(name)}",
+                callback,
+                qos_profile=qos_profile_parameters,
+            )
+
+    # A request with an unknown name is answered by an empty list, as rclpy does.
+
+    def _describe_parameters(self, request: Any, response: Any) -> Any:
+        node = self._require_node()
+        try:
+            response.descriptors = [node.describe_parameter(name) for name in request.names]
+        except ParameterNotDeclaredException:
+            response.descriptors = []
+        return response
+
+    def _get_parameters(self, request: Any, response: Any) -> Any:
+        node = self._require_node()
+        try:
+            response.values = [
+                node.get_parameter(name).get_parameter_value() for name in request.names
+            ]
+        except (ParameterNotDeclaredException, ParameterUninitializedException):
+            response.values = []
+        return response
+
+    def _get_parameter_types(self, request: Any, response: Any) -> Any:
+        node = self._require_node()
+        try:
+            for name in request.names:
+                type_ = node.get_parameter_type(name)
+                response.types.append(type_.value if isinstance(type_, Parameter.Type) else type_)
+        except ParameterNotDeclaredException:
+            del response.types[:]
+        return response
+
+    def _list_parameters(self, request: Any, response: Any) -> Any:
+        response.result = self._require_node().list_parameters(
+            list(request.prefixes), request.depth
+        )
+        return response
+
+    def _set_parameters(self, request: Any, response: Any) -> Any:
+        node = self._require_node()
+        response.results = [_set_atomically(node, [parameter]) for parameter in request.parameters]
+        return response
+
+    def _set_parameters_atomically(self, request: Any, response: Any) -> Any:
+        response.result = _set_atomically(self._require_node(), request.parameters)
+        return response
+
+    def _require_node(self) -> Any:
+        node = self._node()
+        if node is None:
+            raise ReferenceError("Expected valid node weak reference")
+        return node
+
+
+def _set_atomically(node: Any, messages: list[Any]) -> Any:
+    try:
+        parameters = [Parameter.from_parameter_msg(message) for message in messages]
+        return node.set_parameters_atomically(parameters)
+    # The others: a parameter of a type that there is not.
+    except (ParameterNotDeclaredException, ValueError, TypeError) as error:
+        return message_class("rcl_interfaces/msg/SetParametersResult")(
+            successful=False, reason=str(error)
+        )
+
+
+def _snake_case(name: str) -> str:
+    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name)[1:]
+
+
+Callback = Callable[[Future], Any]
+
+
+class AsyncParameterClient:
+    """Asks another node's parameter services; every answer is a future of the response.
+
+    Each request takes an optional `callback`, which is called with the future when it is done.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        remote_node_name: str,
+        qos_profile: QoSProfile = qos_profile_services_default,
+        callback_group: CallbackGroup | None = None,
+    ):
+        self.remote_node_name = remote_node_name
+        self.node = node
+        self._clients = {
+            service: node.create_client(
+                service_class(f"rcl_interfaces/srv/{type_name}"),
+                f"{remote_node_name}/{service}",
+                qos_profile=qos_profile,
+                callback_group=callback_group,
+            )
+            for service, type_name in (
+                ("get_parameters", "GetParameters"),
+                ("list_parameters", "ListParameters"),
+                ("set_parameters", "SetParameters"),
+                ("get_parameter_types", "GetParameterTypes"),
+                ("describe_parameters", "DescribeParameters"),
+                ("set_parameters_atomically", "SetParametersAtomically"),
+            )
+        }
+
+    def services_are_ready(self) -> bool:
+        return all(client.service_is_ready() for client in self._clients.values())
+
+    def wait_for_services(self, timeout_sec: float | None = None) -> bool:
+        """Wait until all six services are connected; whether they were within the time."""
+        return wait_until(self.services_are_ready, self.node.context, timeout_sec)
+
+    def list_parameters(
+        self,
+        prefixes: list[str] | None = None,
+        depth: int | None = None,
+        callback: Callback | None = None,
+    ) -> Future:
+        return self._call("list_parameters", callback, prefixes=prefixes or [], depth=depth or 0)
+
+    def get_parameters(self, names: list[str], callback: Callback | None = None) -> Future:
+        return self._call("get_parameters", callback, names=names)
+
+    def set_parameters(self, parameters: Sequence[Any], callback: Callback | None = None) -> Future:
+        """Set Parameters or `rcl_interfaces/msg/Parameter`s one by one."""
+        return self._call("set_parameters", callback, parameters=_messages(parameters))
+
+    def describe_parameters(self, names: list[str], callback: Callback | None = None) -> Future:
+        return self._call("describe_parameters", callback, names=names)
+
+    def get_parameter_types(self, names: list[str], callback: Callback | None = None) -> Future:
+        return self._call("get_parameter_types", callback, names=names)
+
+    def set_parameters_atomically(
+        self, parameters: Sequence[Any], callback: Callback | None = None
+    ) -> Future:
+        """Set all Parameters or `rcl_interfaces/msg/Parameter`s, or none."""
+        return self._call("set_parameters_atomically", callback, parameters=_messages(parameters))
+
+    def _call(self, service: str, callback: Callback | None, **fields: Any) -> Future:
+        client = self._clients[service]
+        future = client.call_async(client.srv_type.Request(**fields))
+        if callback is not None:
+            future.add_done_callback(callback)
+        return future
+
+
+def _messages(parameters: Sequence[Any]) -> list[Any]:
+    return [
+        parameter.to_parameter_msg() if isinstance(parameter, Parameter) else parameter
+        for parameter in parameters
+    ]

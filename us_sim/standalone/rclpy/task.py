@@ -39,11 +39,9 @@ class Future:
         self._call_back()
 
     def cancelled(self):
-        """Whether it was cancelled before it was done."""
         return self._cancelled
 
     def done(self):
-        """Whether there is a result or an exception."""
         return self._done
 
     def result(self):
@@ -53,17 +51,14 @@ class Future:
         return self._result
 
     def exception(self):
-        """The exception, or None."""
         self._exception_fetched = True
         return self._exception
 
     def set_result(self, result):
-        """Be done, with a result."""
         self._conclude(result, None)
         self._call_back()
 
     def set_exception(self, exception):
-        """Be done, with an exception."""
         self._conclude(None, exception)
         self._call_back()
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import GAP_TOLERANCE, push_out
+from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, push_out
 
 _CLEARANCE = 1e-3
 """A touched node is let go at once when the probe is this far from it and from its rest position,

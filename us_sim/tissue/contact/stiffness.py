@@ -25,7 +25,7 @@ from threadpoolctl import ThreadpoolController
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import push_out
+from us_sim.tissue.contact.probe_gap import push_out
 
 _STEP = 1e-7  # m, of the differences by which gaps and normals are differentiated
 

@@ -1,6 +1,6 @@
 """Points spread over the surface that a probe can touch, and what they share with its nodes.
 
-They are in the middles of the triangles' parts (`us_sim.geometry.triangle_parts`) and at the nodes.
+They are in the middles of the triangles' parts (`us_sim.geometry.triangles`) and at the nodes.
 A node that the probe can touch, but no triangle's, is a point by itself.
 
 >>> import numpy as np
@@ -14,6 +14,15 @@ A node that the probe can touch, but no triangle's, is a point by itself.
 >>> sunk[2] = 0.01
 >>> points.moved(sunk)[0]
 array([0.  , 0.  , 0.01])
+
+The springs between a tissue's surface and a probe: where they are, and how firm.
+
+>>> from us_sim.tissue.contact.surface_points import surface_contact
+>>> from us_sim.tissue.model import TissueModel
+>>> model = TissueModel.block()
+>>> points, contact = surface_contact(model)
+>>> len(points.rest), len(contact.gap)
+(236, 236)
 """
 
 from __future__ import annotations
@@ -24,8 +33,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.triangle_parts import TriangleParts
+from us_sim.geometry.triangles import TriangleParts, part_size
 from us_sim.kernels import njit
+from us_sim.tissue.contact.penalty_contact import PenaltyContact, PenaltyFriction
+from us_sim.tissue.contact.probe_gap import FlaredProbe
+from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
+from us_sim.tissue.elasticity.neo_hookean_material import withstood_force
 from us_sim.tissue.model import TissueModel
 
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
@@ -295,3 +308,34 @@ def add_turns(nodes, weights, turn, change, image):
             image[d, i] += weights[p, 0] * force
             image[d, j] += weights[p, 1] * force
             image[d, k] += weights[p, 2] * force
+
+
+_FIRMNESS = 30.0
+"""Stiffness of the springs of a node, over the shear stiffness of the tissue there. The softer, the
+deeper the probe sinks in; the firmer, the worse conditioned the equations, and the more a surface
+counts that is flat where it should be bent. From 25 to 40 nodes are nearest to a fine mesh's."""
+
+_STIFFENING = 0.2
+"""Depth at which a spring pushes twice as much as if it were linear, over the nodes' spacing."""
+
+_GREATEST_PUSH = 25.0
+"""Greatest force of a node's springs, over `withstood_force` there: less than what a crushed
+tetrahedron resists, so that no probe turns one inside out."""
+
+
+def surface_contact(
+    model: TissueModel, friction: float = 0.0
+) -> tuple[SurfacePoints, PenaltyContact]:
+    """Points on the surface of a tissue, and the contact at these.
+
+    Args:
+        model: of the tissue and the probe.
+        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
+    """
+    # A lone node has no neighbour to be apart from.
+    spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
+    points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
+    firm = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
+    strongest = _GREATEST_PUSH * points.spread(withstood_force(model.mesh, model.materials))
+    law = (FlaredProbe(model.collider, spacing), firm, strongest, _STIFFENING * spacing)
+    return points, PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)

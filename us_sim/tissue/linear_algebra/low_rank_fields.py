@@ -1,27 +1,14 @@
-"""The displacement fields of forces on a surface, compressed: what is far varies little.
+"""Displacement fields of forces on a surface, compressed to products of low rank.
 
-A block of neighbouring nodes moves alike under all forces that are some way off. So what the forces
-of a patch of the surface do to a block is kept as a product of low rank, its singular vectors
-(W. Hackbusch, A sparse matrix arithmetic based on H-matrices, Computing 62, 1999). Patches are as
-large as pays: two halves are joined where their forces together need clearly fewer vectors than one
-by one, which is far from the block; next to it they stay small, of nearly full rank. Nothing is
-assumed about the mesh or its materials.
+A block of neighbouring nodes moves alike under all forces that are some way off. So the fields of
+the forces on a patch of the surface in a block are kept as a product of low rank, its singular
+vectors (W. Hackbusch, A sparse matrix arithmetic based on H-matrices, Computing 62, 1999). Patches
+are as large as pays: two halves are joined where their forces together need clearly fewer vectors
+than one by one, which is far from the block; next to it they stay small, of nearly full rank.
+Nothing is assumed about the mesh or its materials.
 
 Reading the vectors of the blocks is most of the time. So they are integers with a scale each: of 16
 bits, and the many with small singular values of 8 bits.
-
->>> import numpy as np
->>> from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
->>> line = np.column_stack([np.linspace(0, 1, 200), np.zeros(200), np.zeros(200)])
->>> def solve(chosen):  # something smooth
-...     reach = 1 / (0.05 + abs(line[:, 0][:, None] - line[chosen, 0]))
-...     return np.einsum("nk,ab->nakb", reach, np.eye(3)).reshape(200, 3, -1)
->>> fields = LowRankFields.made(line, np.arange(200), line, solve, 1e-4)
->>> displacement = np.zeros((200, 3))
->>> fields.add(np.tile([0.0, 0.0, 1.0], 200), displacement)
->>> exact = solve(np.arange(200))[:, 2, 2::3].sum(axis=1)
->>> bool(abs(displacement[:, 2] - exact).max() < 1e-4 * exact.max())
-True
 """
 
 from __future__ import annotations

@@ -28,17 +28,18 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import setting
-from us_sim.tissue.contact.compliant_contact import CompliantContact
-from us_sim.tissue.contact.friction import FrictionalContact
-from us_sim.tissue.contact.laws_of_friction import COEFFICIENT, CONTACTS
-from us_sim.tissue.contact.penetration import wrench_on_probe
+from us_sim.tissue.contact.compliant_contact import (
+    COEFFICIENT,
+    CONTACTS,
+    CompliantContact,
+    FrictionalContact,
+)
+from us_sim.tissue.contact.probe_gap import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
-from us_sim.tissue.elasticity.tangling import count_inverted, watched_tetrahedra
-from us_sim.tissue.linear_algebra.compliance import surface_compliance
-from us_sim.tissue.linear_algebra.dense_fields import DenseFields
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
+from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
+from us_sim.tissue.linear_algebra.compliance import DenseFields, surface_compliance
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
 
 _ROUNDING = 1e-8

@@ -27,12 +27,11 @@ import numpy as np
 from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.penetration import wrench_on_probe
-from us_sim.tissue.deformation import Deformation, TissueState
+from us_sim.tissue.contact.probe_gap import wrench_on_probe
 from us_sim.tissue.elasticity.linear_tetrahedra import free_stiffness, require_held, stiffness
-from us_sim.tissue.elasticity.tangling import count_inverted, watched_tetrahedra
+from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
 from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients, product_rows
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,

@@ -4,8 +4,8 @@ Quasi-static: every frame the energy of `neo_hookean` and of a penalty contact i
 Newton's method with a line search (see `us_sim.tissue.solvers.newton`), from where the frame before
 ended. A new pose of the probe is met with the exact linear answer to it first (contact is a
 complementarity problem on the surface compliance). Friction and viscous tissue, where they are
-asked for, remember the frames before (see `us_sim.tissue.contact.penalty_friction` and
-`us_sim.tissue.elasticity.overstress`). What a frame's time does not allow for goes on
+asked for, remember the frames before (see `us_sim.tissue.contact.penalty_contact` and
+`us_sim.tissue.elasticity.neo_hookean`). What a frame's time does not allow for goes on
 in the next; under a probe at rest, until the forces balance. A tissue that is inside out is worked
 on but never shown.
 
@@ -18,6 +18,12 @@ on but never shown.
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.02]))
 >>> deformation.residual <= 1e-5, deformation.action
 (True, '')
+
+What may be set of the solver ``fem_nonlinear``.
+
+>>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinearSettings
+>>> FemNonlinearSettings(frame_budget="8 ms").frame_budget
+0.008
 """
 
 from __future__ import annotations
@@ -25,6 +31,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -32,51 +39,119 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.penetration import GAP_TOLERANCE, wrench_on_probe
-from us_sim.tissue.contact.prediction import predict_forces
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import setting
+from us_sim.tissue.contact.complementarity import predict_forces
+from us_sim.tissue.contact.compliant_contact import COEFFICIENT, CONTACTS
+from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.elasticity.lumen import require_solid
-from us_sim.tissue.elasticity.overstress import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.fem_nonlinear_settings import FemNonlinearSettings
-from us_sim.tissue.solvers.newton import Newton
-from us_sim.tissue.solvers.solver import TissueSolver, same_pose
-from us_sim.tissue.solvers.strides import strides
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.solvers.newton import Newton, strides
+from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver, same_pose
+
+
+@dataclass(frozen=True)
+class FemNonlinearSettings(SolverSettings):
+    """The settings of the solver ``fem_nonlinear``."""
+
+    section = "fem_nonlinear"
+
+    frame_tolerance: float = setting(
+        TOLERANCE,
+        "residual, unbalanced over contact forces, at which a frame with a moving probe ends",
+        default=0.003,
+    )
+    frame_budget: float | None = setting(
+        Quantity("time", 0.0005, 10.0),
+        "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
+        "parameter: live, what the rate leaves, and up to three times that until the forces are "
+        "balanced; in lockstep no limit, lest results depend on the machine",
+        default=None,
+    )
+    most_iterations: int = setting(
+        COUNT,
+        "conjugate-gradient iterations of a frame at most, each step of Newton's method counting "
+        "as eight more; twice as many while the probe rests",
+        default=440,
+    )
+    tolerance: float = setting(
+        TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
+    )
+    contact: str = setting(
+        choices=CONTACTS,
+        default="frictionless",
+        description="what holds between probe and tissue; sticking: a touched node keeps its place "
+        "on the probe until it is let go",
+    )
+    friction: float = setting(
+        COEFFICIENT,
+        "Coulomb's coefficient, where contact is coulomb; the default is a choice, meant for gel",
+        default=0.07,
+    )
+    viscosity: float = setting(
+        Quantity("number", 0.0, 10.0),
+        "stiffness that relaxes while a deformation lasts, over the one that stays: tissue gives "
+        "way slowly and creeps back when it is let go; 0: none",
+        default=0.0,
+    )
+    relaxation_time: float = setting(
+        Quantity("time", 1e-3, 1e3),
+        "time in which that falls to 37 percent (1/e)",
+        default=0.5,
+    )
+    frame_interval: float = setting(
+        Quantity("time", 1e-4, 10.0),
+        "time that is taken to pass from one frame to the next, for viscous tissue; a frame is "
+        "one pose of the probe",
+        default=0.0167,
+    )
+
 
 __all__ = ["FemNonlinear", "FemNonlinearSettings"]
+
 
 _TOUCHING = 0.1
 """Gap up to which a node may come to touch in one frame, over the tissue's smallest extent."""
 
+
 _RESTING = 30
 """Frames of a probe at rest after which one may take longer than it should, if that is needed."""
+
 
 _SUNK = 10.0
 """Change of what springs hold that settled tissue may still see, over the spacing of the nodes that
 the probe can touch, for a tolerance of 1."""
 
+
 _SINKS = 0.5
 """Depth of the probe in the tissue, over that spacing, that is worth saying."""
+
 
 _APPROACHING, _SPENT = 0.7, 0.6
 """Part of a frame's time, and of its iterations, after which no stride is begun any more."""
 
+
 _ANEW = 6
 """How many times the iterations of other frames one may take that is begun anew from rest."""
 
+
 _STEP = 8
 """What a step costs besides its iterations, in iterations."""
+
 
 _OVERTIME = 3.0
 """How many times the time that a live simulation leaves a frame may take that is not in balance:
 tissue that is left behind is harder to balance than poses that were missed, and shows more."""
 
+
 _LOOSE, _STEPS = 0.2, 5
 """Residual with which a stride ends, and the most steps that it may take."""
+
 
 _PATIENCE = 10
 """Frames in a row that may end inside out before the tissue is begun anew from rest. None where

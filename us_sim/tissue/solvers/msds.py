@@ -6,6 +6,30 @@
 >>> solver = Msds(TissueModel.block())
 >>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
 masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
+
+Settings and forces that the mass-spring solvers have in common.
+
+The paper's time integration (eqs. 3 to 5) of a spring network that a moving probe enters.
+
+Forces change velocities, and the new velocities move the nodes: here a kilogram of free springs
+drifts on at its initial speed.
+
+>>> import numpy as np
+>>> from us_sim.geometry.collider import Sphere
+>>> from us_sim.tissue.elasticity.springs import SpringArrays
+>>> from us_sim.tissue.elasticity.springs import VolumeTerm
+>>> from us_sim.tissue.solvers.msds import (
+...     Contact, Particles, ProbeMotion, advance_frame,
+... )
+>>> edges, one = np.array([[0, 1]], dtype=np.int32), np.ones(1)
+>>> springs = SpringArrays(edges, 100.0 * one, 0.1 * one, one)
+>>> positions, velocity = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.0, 0, 2], [0.0, 0, 2]])
+>>> particles = Particles(np.ones(2), positions, velocity, np.zeros((2, 3)))
+>>> away = ProbeMotion(Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)))
+>>> volumes, contact = VolumeTerm.nothing(2).arrays, Contact.at(np.empty(0, np.int32))
+>>> advance_frame(springs, volumes, particles, away, contact, 0.01, 1, 20)
+>>> positions.round(6).tolist()
+[[0.0, 0.0, 0.4], [1.0, 0.0, 0.4]]
 """
 
 from __future__ import annotations
@@ -13,29 +37,141 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.geometry.collider_distance import turned, turned_back
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
-from us_sim.tissue.contact.penetration import only_forward, push_out
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
-from us_sim.tissue.elasticity.step_limit import highest_frequency, stabilised, step_limit
-from us_sim.tissue.elasticity.tangling import Tangling
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import COUNT, TissueSolver
-from us_sim.tissue.solvers.spring_tissue import SpringSettings, spring_tissue
-from us_sim.tissue.solvers.symplectic_euler import Contact, Particles, ProbeMotion, advance_frame
+from us_sim.tissue.contact.probe_gap import only_forward, push_out, pushing_gap
+from us_sim.tissue.elasticity.springs import (
+    SpringNetwork,
+    VolumeTerm,
+    add_volume_forces,
+    fitted_springs,
+    spring_forces,
+    springs_of,
+    volume_term,
+)
+from us_sim.tissue.elasticity.stability import (
+    ElasticBalance,
+    Tangling,
+    highest_frequency,
+    stabilised,
+    step_limit,
+)
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.solvers.solver import COUNT, SolverSettings, TissueSolver
 
 _REST_TIME = 0.2
 """Shortest time for which motion is watched before the tissue counts as settled, s."""
 
+
 _NEARLY_RESTING = 1e-4
 """Distance from its rest state up to which a released, settled tissue is put to rest, m."""
+
+
+def spring_stiffness(default: str) -> Any:
+    """The setting of the springs' stiffness."""
+    return setting(
+        choices=("algorithm_1", "fitted"),
+        default=default,
+        description="how springs get their stiffness: algorithm_1 is the paper's; fitted fits them "
+        "to the elasticity of the same mesh, and needs no stiffness_factor",
+    )
+
+
+def spring_volume(default: bool) -> Any:
+    """The setting of the tetrahedra's resistance."""
+    return setting(
+        default=default,
+        description="whether tetrahedra resist changes of volume as the material does, and not "
+        "only as springs do, which have Poisson's ratio 1/4",
+    )
+
+
+@dataclass(frozen=True)
+class SpringSettings(SolverSettings):
+    """The settings of every mass-spring solver.
+
+    Raises:
+        SolverError: a value is out of range, with its name and the range.
+    """
+
+    stiffness: str = spring_stiffness("algorithm_1")
+    volume: bool = spring_volume(False)
+    stiffness_factor: float = setting(
+        Quantity("length", 1e-9, 1e3),
+        "spring constant over Young's modulus, for algorithm_1",
+        default=0.002,
+    )
+    damping_factor: float = setting(
+        Quantity("time", 0.0, 1e6), "damping constant over spring constant", default=0.1
+    )
+    rest_tolerance: float = setting(
+        Quantity("length", 0.0, 1.0),
+        "motion in a frame (in 0.2 s, or in damping_factor, if these are longer) below which the "
+        "tissue counts as settled",
+        default=1e-6,
+    )
+
+
+def spring_tissue(
+    model: TissueModel, settings: SpringSettings, *, yielding: bool = False
+) -> tuple[SpringNetwork, VolumeTerm]:
+    """The springs, without those between fixed nodes, and the volume term, as the settings say.
+
+    Args:
+        model: the tissue.
+        settings: of the solver.
+        yielding: as in `us_sim.tissue.elasticity.springs.volume_term`.
+    """
+    mesh, materials, damping = model.mesh, model.materials, settings.damping_factor
+    if settings.stiffness == "fitted":
+        springs = fitted_springs(mesh, materials, damping, with_volume=settings.volume)
+    else:
+        springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
+    term = VolumeTerm.nothing(len(mesh.nodes))
+    if settings.volume:
+        term = volume_term(mesh, materials, springs, damping, yielding=yielding)
+    return springs.without(model.fixed), term
+
+
+class Particles(NamedTuple):
+    """Masses, where they are and how fast they move; kernels write on all but the masses."""
+
+    inverse_mass: NDArray[np.float64]  # (N,), 1/kg, 0 where a particle is fixed
+    positions: NDArray[np.float64]  # (N, 3), m
+    velocity: NDArray[np.float64]  # (N, 3), m/s
+    force: NDArray[np.float64]  # (N, 3), N
+
+
+class ProbeMotion(NamedTuple):
+    """The probe's shape, and where it is in each step; in S = 0 steps when there is no probe."""
+
+    box: NDArray[np.float64]  # the collider's `offset_box`
+    forward: bool  # see `us_sim.tissue.contact.probe_gap.only_forward`
+    rotations: NDArray[np.float64]  # (S, 3, 3), probe to patient
+    origins: NDArray[np.float64]  # (S, 3), m
+
+
+class Contact(NamedTuple):
+    """Which particles the probe can touch, and what kernels find out about them."""
+
+    reachable: NDArray[np.int32]  # (C,), the particles
+    touched: NDArray[np.bool_]  # (C,), in the last sub-step
+    normal: NDArray[np.float64]  # (C, 3), where the probe pushes them
+    wrench: NDArray[np.float64]  # (2, 3), N and N m on the probe in its frame, mean of the frame
+
+    @classmethod
+    def at(cls, reachable: NDArray[np.int32]) -> Contact:
+        """A contact in which nothing is touched."""
+        count = len(reachable)
+        return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
 
 
 @dataclass(frozen=True)
@@ -61,7 +197,7 @@ class Msds(TissueSolver):
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
     so either each mass is raised to what the step set needs or each step is divided. Both follow
     the bound w**2 <= 2 max(sum of a node's springs / its mass), which holds however the springs
-    turn and stretch (`us_sim.tissue.elasticity.step_limit`).
+    turn and stretch (`us_sim.tissue.elasticity.stability`).
 
     The probe moves from the last pose to the new one over the frame. A node that would enter it
     loses its velocity towards it, which is the measured push, and is put onto its surface.
@@ -239,3 +375,78 @@ class Msds(TissueSolver):
             self._velocity[:] = 0.0
             self._balance.forget()
         return "; ".join(filter(None, [self._action, words]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance_frame(springs, volumes, particles, probe, contact, time_step, substeps, steps):
+    """Moves the particles by ``steps`` of ``substeps`` of ``time_step`` (s) each, symplectic Euler.
+
+    Args:
+        springs: their `SpringArrays`.
+        volumes: their `VolumeArrays`.
+        particles: `Particles`, moved here.
+        probe: `ProbeMotion` of S = ``steps`` steps, or of none.
+        contact: `Contact`, filled in here as of the last sub-step; its wrench is added to.
+    """
+    inverse_mass, positions, velocity, force = particles
+    duration = time_step * steps * substeps
+    for step in range(steps):
+        for _sub in range(substeps):
+            spring_forces(springs, positions, velocity, force)
+            if len(volumes.tetrahedra) > 0:
+                add_volume_forces(volumes, positions, velocity, force)
+            for i in range(len(positions)):
+                for axis in range(3):
+                    v = velocity[i, axis] + time_step * inverse_mass[i] * force[i, axis]
+                    # Ahead of a press motion decays to denormal numbers, ten times as slow.
+                    velocity[i, axis] = v if abs(v) > 1e-30 else 0.0
+            for i in range(len(positions)):
+                for axis in range(3):
+                    positions[i, axis] += time_step * velocity[i, axis]
+            if len(probe.origins) > 0:
+                contact.touched[:] = False
+                _stop_at_probe(particles, probe, step, contact, duration)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _stop_at_probe(particles, probe, step, contact, duration):
+    """Puts particles that have entered the probe onto it; they lose their velocity towards it.
+
+    The impulses on the probe, over ``duration`` (s), are added to the wrench.
+    """
+    inverse_mass, positions, velocity, _ = particles
+    reachable, touched, normal, wrench = contact
+    r, origin = probe.rotations[step], probe.origins[step]
+    for k in range(len(reachable)):
+        i = reachable[k]
+        a = positions[i, 0] - origin[0]
+        b = positions[i, 1] - origin[1]
+        c = positions[i, 2] - origin[2]
+        x, y, z = turned_back(r, a, b, c)
+        gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
+        if gap >= 0.0:
+            continue
+        nx, ny, nz = turned(r, u, v, w)
+        positions[i, 0] -= gap * nx
+        positions[i, 1] -= gap * ny
+        positions[i, 2] -= gap * nz
+        along = velocity[i, 0] * nx + velocity[i, 1] * ny + velocity[i, 2] * nz
+        if along >= 0.0:
+            continue
+        velocity[i, 0] -= along * nx
+        velocity[i, 1] -= along * ny
+        velocity[i, 2] -= along * nz
+        touched[k] = True
+        normal[k, 0] = nx
+        normal[k, 1] = ny
+        normal[k, 2] = nz
+        push = along / (inverse_mass[i] * duration)
+        x -= gap * u
+        y -= gap * v
+        z -= gap * w
+        wrench[0, 0] += push * u
+        wrench[0, 1] += push * v
+        wrench[0, 2] += push * w
+        wrench[1, 0] += push * (y * w - z * v)
+        wrench[1, 1] += push * (z * u - x * w)
+        wrench[1, 2] += push * (x * v - y * u)

@@ -2,7 +2,7 @@
 
 The step is the minimum of `us_sim.tissue.elasticity.incremental_potential`. It is approached by
 conjugate gradients with the constant factored matrix of
-`us_sim.tissue.linear_algebra.scalar_preconditioner`; each of their steps lowers the function, so
+`us_sim.tissue.linear_algebra.sparse_factors`; each of their steps lowers the function, so
 that no energy comes from nowhere and no time step is too long.
 
 >>> from us_sim.geometry.pose import Pose
@@ -29,27 +29,24 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.penetration import push_out, wrench_on_probe
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.elastic_balance import ElasticBalance
+from us_sim.tissue.contact.probe_gap import push_out, wrench_on_probe
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
-from us_sim.tissue.elasticity.springs import SpringNetwork
-from us_sim.tissue.elasticity.tangling import Tangling
-from us_sim.tissue.elasticity.volume_term import VolumeTerm
-from us_sim.tissue.linear_algebra.scalar_preconditioner import ScalarPreconditioner
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm
+from us_sim.tissue.elasticity.stability import ElasticBalance, Tangling
+from us_sim.tissue.linear_algebra.sparse_factors import ScalarPreconditioner
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.solvers.msds import (
+    SpringSettings,
+    spring_stiffness,
+    spring_tissue,
+    spring_volume,
+)
 from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,
     TissueSolver,
     same_pose,
-)
-from us_sim.tissue.solvers.spring_tissue import (
-    SpringSettings,
-    spring_stiffness,
-    spring_tissue,
-    spring_volume,
 )
 
 _REST_TIME = 0.2

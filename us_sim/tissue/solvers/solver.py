@@ -8,6 +8,13 @@
 >>> deformation = solver.deform(Pose(position=[0.0, 0.0, 0.012]))
 >>> bool(deformation.force[2] < 0)  # the tissue pushes the probe back
 True
+
+A tissue as small as can be, on which a solver calls the same kernels as on another.
+
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solvers.solver import rehearsal_model
+>>> len(rehearsal_model(TissueModel.block()).mesh.tetrahedra)
+40
 """
 
 from __future__ import annotations
@@ -27,9 +34,9 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.rehearsal import rehearsal_model
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
@@ -163,7 +170,7 @@ class TissueSolver(ABC):
     def warm_up(self) -> None:
         """Compile the kernels on a tissue of eight cells; this solver's own state is not touched.
 
-        See `us_sim.tissue.solvers.rehearsal`, and `us_sim.tissue.solvers.compilation` for doing it
+        See `us_sim.tissue.solvers.solver`, and `us_sim.tissue.solvers.switching` for doing it
         in another process.
         """
         self.rehearse(rehearsal_model(self.model), self.settings)
@@ -251,3 +258,28 @@ def same_pose(a: Pose | None, b: Pose | None) -> bool:
     if a is None or b is None:
         return a is b
     return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
+
+
+def rehearsal_model(model: TissueModel) -> TissueModel:
+    """A tissue of eight cells, like another in what decides which kernels are used: a box mesh or
+    another, the highest Poisson's ratio, how far moduli are apart, lumens, and the probe.
+    """
+    side = np.linspace(-0.01, 0.01, 3)
+    mesh = box_mesh(side, side, side + 0.01)
+    if model.mesh.planes is None:
+        mesh = TetrahedralMesh(mesh.nodes, mesh.tetrahedra)
+    own, count = model.materials, len(mesh.tetrahedra)
+    hollow = np.arange(count) == 0
+    return TissueModel(
+        mesh,
+        TissueMaterials(
+            np.linspace(own.young_modulus.min(), own.young_modulus.max(), count),
+            np.full(count, own.poisson_ratio.max()),
+            np.full(count, own.density.max()),
+            hollow * own.lumen_fraction.max(),
+            hollow * own.lumen_pressure.max(),
+        ),
+        mesh.nodes[:, 2] > 0.015,
+        model.collider,
+        np.flatnonzero(mesh.nodes[:, 2] == 0.0).astype(np.int32),
+    )

@@ -11,24 +11,46 @@
 ...     deformation = tissue.deform(Pose(position=[0.0, 0.0, 0.01]))
 >>> tissue.difference.maximum < 1e-5  # m: the same equations below Poisson's ratio 0.4
 True
+
+Making a solver with its kernels compiled, where frames must go on in another process.
+
+Numba's compiler holds the interpreter's lock for most of its time, so that a frame in another
+thread takes many times as long. Another process has a lock of its own: it makes the same solver
+once, which leaves the kernels in numba's cache on disk, from where this one loads them. Where that
+cache cannot be written, or the process fails, they are compiled here.
+
+>>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.tissue.solvers.switching import compiled_solver
+>>> from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
+>>> compiled_solver(FemCg, TissueModel.block(), FemCgSettings()).name
+'fem_cg'
+
+Making the next solver in a thread, while the present one goes on deforming the tissue.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+import logging
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numba.core import event
 from numpy.typing import NDArray
 
-from us_sim.errors import SolverError
+from us_sim.errors import SolverError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
-from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.compilation import compiled_solver
-from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
+from us_sim.tissue.model import Deformation, TissueModel
+from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, rehearsal_model
 
 
 @dataclass(frozen=True)
@@ -224,3 +246,227 @@ class SwitchableTissue:
             other = self._beside.deform(pose)
             self.difference = difference(deformation.nodes, other.nodes)
         return deformation
+
+
+Progress = Callable[[float, str], None]
+
+_NICENESS = 5
+"""By how much the process that compiles gives way to the one that deforms."""
+
+_logger = logging.getLogger(__name__)
+
+
+def compiled_solver(
+    solver: type[TissueSolver],
+    model: TissueModel,
+    settings: SolverSettings,
+    progress: Progress | None = None,
+    *,
+    elsewhere: bool = False,
+) -> TissueSolver:
+    """A solver, none of whose frames will have to compile anything.
+
+    Args:
+        solver: the class of the method.
+        model: of the tissue.
+        settings: of the solver.
+        progress: told the fraction done and what is being made or compiled.
+        elsewhere: what is not compiled yet is compiled in another process, so that other threads
+            of this one are not held up.
+
+    Raises:
+        SolverError: as `create_solver`.
+    """
+    if elsewhere:
+        # What was made until then is let go before the other process makes it.
+        with (
+            contextlib.suppress(_ColdError),
+            event.install_listener("numba:compile", _Listener(_refuse)),
+        ):
+            return _made(solver, model, settings, progress)
+        _make_elsewhere(solver, model, settings, progress)
+    with _compiling_said(solver.name, progress):
+        return _made(solver, model, settings, progress)
+
+
+def _made(
+    solver: type[TissueSolver],
+    model: TissueModel,
+    settings: SolverSettings,
+    progress: Progress | None,
+) -> TissueSolver:
+    solver.rehearse(rehearsal_model(model), settings)
+    return solver(model, settings, progress)
+
+
+@contextlib.contextmanager
+def _compiling_said(method: str, progress: Progress | None) -> Iterator[None]:
+    """Tell ``progress`` of each kernel that this thread compiles within the context."""
+
+    def say(number: int) -> None:
+        if progress is not None:
+            progress(0.0, f"compiling {method}, kernel {number}")
+
+    with event.install_listener("numba:compile", _Listener(say)) as listener:
+        yield
+    if listener.count and progress is not None:
+        progress(1.0, f"compiling {method}, {listener.count} kernels")
+
+
+class _ColdError(Exception):
+    """A kernel is not compiled."""
+
+
+class _Listener(event.Listener):
+    """Counts the kernels that the thread in which it was made begins to compile."""
+
+    def __init__(self, tell: Callable[[int], None]) -> None:
+        self._tell = tell
+        self._thread = threading.get_ident()
+        self.count = 0
+
+    def on_start(self, _: event.Event) -> None:
+        if threading.get_ident() == self._thread:
+            self.count += 1
+            self._tell(self.count)
+
+    def on_end(self, _: event.Event) -> None:
+        pass
+
+
+def _refuse(_: int) -> None:
+    raise _ColdError
+
+
+def _make_elsewhere(
+    solver: type[TissueSolver],
+    model: TissueModel,
+    settings: SolverSettings,
+    progress: Progress | None,
+) -> None:
+    """Let another process fill the cache; where it fails, why goes into the log only."""
+    try:
+        task = pickle.dumps((solver, model, settings))
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # an interrupt from the terminal is for this process
+        )
+    except (pickle.PicklingError, AttributeError, TypeError, OSError) as error:
+        _logger.info("%s is compiled in this process: %s", solver.name, error)
+        return
+    assert process.stdin is not None
+    assert process.stdout is not None
+    said = ""
+    with process:
+        with contextlib.suppress(BrokenPipeError), process.stdin:
+            process.stdin.write(task)
+        for line in process.stdout:
+            said = line.decode(errors="replace").strip() or said
+            fraction, _, text = said.partition("\t")
+            with contextlib.suppress(ValueError):  # a warning, say
+                if progress is not None:
+                    progress(float(fraction), text)
+    if process.returncode:
+        _logger.warning("%s is compiled in this process: %s", solver.name, said)
+
+
+def _main() -> None:
+    """Make what comes in at stdin; a line on stdout for each word of progress."""
+    if hasattr(os, "nice"):
+        os.nice(_NICENESS)
+    solver, model, settings = pickle.load(sys.stdin.buffer)
+
+    def show(fraction: float, text: str) -> None:
+        # When nobody reads any more, the pipe breaks, and this process ends.
+        print(f"{fraction:.3f}\t{text}", flush=True)
+
+    with contextlib.suppress(UsSimError):  # which the process that asked will find as well
+        compiled_solver(solver, model, settings, show)
+
+
+if __name__ == "__main__":
+    _main()
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A plan that cannot be carried out, and why."""
+
+    plan: Plan
+    problem: str
+
+
+class Preparation:
+    """Makes what a plan needs in a thread; the newest plan wins.
+
+    Args:
+        tissue: that goes on meanwhile, and that adopts what was made.
+    """
+
+    def __init__(self, tissue: SwitchableTissue) -> None:
+        self._tissue = tissue
+        self._lock = threading.Lock()
+        self._wanted: Plan | None = None  # that no thread has begun with
+        self._newest: Plan | None = None
+        self._outcome: Prepared | Failed | None = None
+        self._thread: threading.Thread | None = None
+        self._began = 0.0
+        self._progress = ""
+
+    @property
+    def state(self) -> str:
+        """What is being made, for how long already, and how far it is; '' when nothing is."""
+        with self._lock:
+            if self._thread is None or self._newest is None:
+                return ""
+            seconds = time.monotonic() - self._began
+            return f"preparing {self._newest.reason} for {seconds:.0f} s{self._progress}"
+
+    def want(self, plan: Plan) -> None:
+        """Begin to make what a plan needs; what is still being made for another is then dropped."""
+        with self._lock:
+            self._wanted = self._newest = plan
+            self._outcome = None
+            if self._thread is None:
+                self._began = time.monotonic()
+                self._thread = threading.Thread(target=self._work, name="solver", daemon=True)
+                self._thread.start()
+
+    def drop(self) -> None:
+        """Want nothing any more; a thread ends with what it is making."""
+        with self._lock:
+            self._wanted = self._newest = self._outcome = None
+
+    def take(self) -> Prepared | Failed | None:
+        """The outcome of the newest plan, once; None until there is one."""
+        with self._lock:
+            outcome, self._outcome = self._outcome, None
+            return outcome
+
+    def _show(self, fraction: float, text: str) -> None:
+        with self._lock:
+            share = f"{100 * fraction:.0f} % of " if fraction > 0.0 else ""
+            self._progress = f", {share}{text}"
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                plan, self._wanted, self._progress = self._wanted, None, ""
+                if plan is None:
+                    self._thread = None
+                    return
+            outcome: Prepared | Failed
+            try:
+                outcome = self._tissue.make(plan, self._show, beside=True)
+            except UsSimError as error:
+                outcome = Failed(plan, str(error))
+            except Exception as error:  # so that the thread does not end silently
+                _logger.exception("preparing %s", plan.solver)
+                outcome = Failed(plan, f"{type(error).__name__}: {error}")
+            with self._lock:
+                if self._newest is plan:
+                    self._outcome = outcome

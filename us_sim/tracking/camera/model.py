@@ -1,6 +1,5 @@
-"""The camera model: a pinhole and its lens, as ROS's camera_info has them.
+"""The camera model of ROS' camera_info, a pinhole with a lens, and its YAML file.
 
->>> import numpy as np
 >>> from us_sim.tracking.camera.model import CameraModel
 >>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]], [-0.2, 0, 0, 0, 0])
 >>> pixels = camera.project(np.array([[0.1, 0.05, 0.5]]))
@@ -8,17 +7,6 @@
 array([[438.8, 299.4]])
 >>> camera.rays(pixels).round(6)
 array([[0.2, 0.1]])
-
-Camera info: ROS's YAML file of a calibrated camera, read and written.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.tracking.camera.model import read_camera_info, write_camera_info
->>> from us_sim.tracking.camera.model import CameraModel
->>> path = Path(tempfile.mkdtemp()) / "webcam.yaml"
->>> write_camera_info(path, CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]]))
->>> read_camera_info(path).matrix[0]
-array([600.,   0., 320.])
 """
 
 from __future__ import annotations

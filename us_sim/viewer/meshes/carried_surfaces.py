@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.meshes.clustering import at_most
 from us_sim.viewer.meshes.coloured_surface import ColouredSurface

@@ -21,7 +21,7 @@ def transducer_packet(
 
     Args:
         parts: in frame ``probe``.
-        outline: (P, 3) m, as of `us_sim.slicing.probe.outline.image_outline`.
+        outline: (P, 3) m, as of `us_sim.slicing.probe.probe.image_outline`.
     """
     header = {
         "parts": [

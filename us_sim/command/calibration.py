@@ -1,0 +1,493 @@
+"""The calibrations of `us-sim calibrate`: they read files, write files, and return a sentence."""
+
+from __future__ import annotations
+
+import glob
+import math
+import os
+import re
+from collections.abc import Sequence
+from itertools import compress
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.command.calibration_pictures import draw_coverage, draw_offset
+from us_sim.command.calibration_settings import (
+    CameraSettings,
+    ClockSettings,
+    LandmarkSettings,
+    PivotSettings,
+    ProbeSettings,
+    Progress,
+)
+from us_sim.errors import CalibrationError, PoseError
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import interpolate
+from us_sim.settings.spelling import counted
+from us_sim.settings.text_file import read_text
+from us_sim.tracking.calibration.camera import (
+    INTRINSICS,
+    Board,
+    BoardView,
+    CameraCalibration,
+    calibrate_camera,
+)
+from us_sim.tracking.calibration.landmarks import (
+    read_landmarks,
+    read_table,
+    read_wires,
+    register_landmarks,
+)
+from us_sim.tracking.calibration.pivot import ENOUGH_FEATURES, calibrate_pivot, find_dwells
+from us_sim.tracking.calibration.probe import PixelSighting, ProbeCalibration, calibrate_probe
+from us_sim.tracking.calibration.recorded_motion import read_motion, read_signal, seconds_of
+from us_sim.tracking.calibration.time_offset import find_time_offset
+from us_sim.tracking.calibration.transform_file import (
+    read_transform,
+    write_calibration,
+    write_transform,
+)
+from us_sim.tracking.camera.model import write_camera_info
+from us_sim.tracking.settings import columns_and_rows
+
+_IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
+
+
+def calibrate_photos(settings: CameraSettings, progress: Progress | None = None) -> str:
+    """Calibrate a camera and write its info and a picture; returns a sentence with the result.
+
+    Args:
+        settings: the photos, what they show, the camera's name, and the file to write.
+        progress: told the fraction of the photos that is done, and how many show the board.
+
+    Raises:
+        CalibrationError: the photos cannot be read or do not determine the camera, or a file to
+            write exists.
+    """
+    out, picture = settings.out, settings.picture
+    lengths = (settings.square, settings.marker, settings.separation)
+    markers = settings.dictionary or ("" if settings.board == "chessboard" else "4X4_50")
+    shape = columns_and_rows(settings.size)
+    board = Board(settings.board, *shape, *lengths, markers, settings.legacy)
+    photos = find_photos(settings.photos)
+    names, views, blank, size = _views(photos, board, progress)
+    if not views:
+        raise CalibrationError(
+            f"none of the {len(photos)} photos shows the board: check --board, --size and "
+            f"--dictionary, and try --legacy with an old ChArUco board"
+        )
+    found = calibrate_camera(views, *size)
+    far_off = list(compress(names, ~found.used))
+    names, views = list(compress(names, found.used)), list(compress(views, found.used))
+    notes = _notes(found, board, names, views)
+    notes |= {"photos_without_board": blank, "photos_left_out": far_off}
+    write_camera_info(out, found.camera, settings.name, notes)
+    draw_coverage(picture, found, views, names)
+    focal = " and ".join(
+        f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
+        for k, intrinsic in enumerate(INTRINSICS[:2])
+    )
+    said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {counted(len(views), 'photo')}, "
+    said += f"coverage in {picture}"
+    if blank:
+        said += f"; {len(blank)} without the board: {', '.join(blank)}"
+    if far_off:
+        said += f"; {len(far_off)} left out that fit far worse: {', '.join(far_off)}"
+    return f"{said}; {found.note}" if found.note else said
+
+
+def find_photos(patterns: Sequence[str]) -> list[Path]:
+    """The files that are named, lie in named folders or match patterns, in natural order.
+
+    Raises:
+        CalibrationError: a name stands for no photo.
+    """
+    photos: dict[Path, None] = {}
+    for text in patterns:
+        path = Path(os.path.expanduser(text))
+        if path.is_file():
+            photos[path] = None
+            continue
+        if path.is_dir():
+            candidates = list(path.iterdir())
+        else:
+            candidates = [Path(match) for match in glob.glob(str(path), recursive=True)]
+        matches = [file for file in candidates if file.suffix.lower() in _IMAGES]
+        if not matches:
+            raise CalibrationError(f"{text}: there is no such photo, and no folder with any")
+        photos.update(dict.fromkeys(sorted(matches, key=_natural)))
+    return list(photos)
+
+
+def _natural(path: Path) -> list[tuple[bool, int, str]]:
+    """A sort key that puts 2.jpg before 10.jpg."""
+    parts = re.findall(r"\d+|\D+", str(path))
+    return [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
+
+
+def _views(
+    photos: Sequence[Path], board: Board, progress: Progress | None
+) -> tuple[list[str], list[BoardView], list[str], tuple[int, int]]:
+    """Names and views of the photos that show the board, names of those that do not, the size."""
+    names, views, blank = [], [], []
+    size: tuple[int, int] | None = None
+    for k, photo in enumerate(photos):
+        image = _read(photo)
+        columns_rows = (image.shape[1], image.shape[0])
+        if size is not None and columns_rows != size:
+            raise CalibrationError(
+                f"{photo}: has {columns_rows[0]} × {columns_rows[1]} pixels and the photos "
+                f"before it {size[0]} × {size[1]}: all must come from one camera at one size"
+            )
+        size = columns_rows
+        view = board.find(image)
+        if view is None:
+            blank.append(photo.name)
+        else:
+            names.append(photo.name)
+            views.append(view)
+        if progress is not None:
+            progress((k + 1) / len(photos), f"{len(views)} with the board")
+    if size is None:
+        raise CalibrationError("no photo is given; name files, a folder or a pattern")
+    return names, views, blank, size
+
+
+def _read(photo: Path) -> NDArray[np.uint8]:
+    """Grey values (rows, columns), turned by nothing: a calibration is of the sensor."""
+    data = np.fromfile(photo, np.uint8)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise CalibrationError(f"{photo}: is no image that can be read")
+    return np.asarray(image, np.uint8)
+
+
+def _notes(
+    found: CameraCalibration, board: Board, names: Sequence[str], views: Sequence[BoardView]
+) -> dict[str, object]:
+    """What the file says in addition to the camera; ROS' readers ignore it."""
+    return {
+        "method": f"{board.kind} board {board.columns}x{board.rows}, Zhang",
+        "residuals": {
+            "rms": found.rms,  # pixels
+            "photos": dict(zip(names, found.residuals.tolist(), strict=True)),  # RMS, pixels
+            "corners": sum(len(view) for view in views),
+        },
+        "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
+        "largest_tilt": found.tilt,  # rad, between two boards
+        "reach": found.reach,  # fraction of the distance from the image's middle to its corners
+        "note": found.note,
+    }
+
+
+_SIGHTED_PIXEL = {"column": "number", "row": "number"}
+_SIGHTED_POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(
+    ("qx", "qy", "qz", "qw"), "number"
+)
+_LONGEST_GAP = 0.2  # s, between poses that are interpolated
+_ROUNDED = 1e-3  # s, by which a time may differ from the stamp that it means
+_LITTLE_TURN = math.radians(20.0)
+_FEATURE, _PART = "feature", "part of a feature's sightings"
+
+
+def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
+    """Find where the image lies on the probe and write it; returns a sentence with the result.
+
+    Raises:
+        UsSimError: the files cannot be read or do not determine the image's place.
+    """
+    out = settings.out
+    to_phantom = read_transform(settings.registration) if settings.registration else Pose()
+    if settings.recording is None:
+        seen = _with_poses(settings.sightings, to_phantom)
+    else:
+        seen = _with_times(settings.sightings, settings.recording, settings.pose, to_phantom)
+    phantom = _features(settings.phantom) if settings.phantom else {}
+    unknown = sorted({sighting.feature for sighting in seen} - set(phantom))
+    if phantom and unknown:
+        raise CalibrationError(
+            f"{settings.phantom}: has no {unknown[0]}, which {settings.sightings} shows; its "
+            f"features are {', '.join(phantom)}"
+        )
+    found = calibrate_probe(
+        seen, phantom, spacing=None if settings.pixel is None else np.array(settings.pixel)
+    )
+    deviations = np.sqrt(np.diag(found.covariance))
+    rejected = int((~found.inliers).sum())
+    clusters = len(np.unique(found.clusters[found.inliers]))
+    features = len({sighting.feature for sighting in seen})
+    write_transform(
+        out,
+        found.probe_pose(*settings.origin),
+        from_frame="probe",
+        to_frame="body",
+        method=f"probe calibration, {settings.sightings.name}",
+        residuals={
+            "rms": found.rms,  # m
+            "features": _by_feature(seen, found.residuals, found.inliers),  # m, RMS of each
+            "sightings": len(seen),
+            "rejected": rejected,
+            "turned": found.turned,  # rad, by which the body turned
+        },
+        more={
+            "pixel_spacing": found.spacing,  # m, between columns and between rows
+            "origin_pixel": list(settings.origin),  # column, row
+            "image_to_body": found.image_to_body,  # m, from (column, row, 0, 1)
+            "standard_deviations": {
+                "position": deviations[:3],  # m, of pixel (0, 0)
+                "rotation": deviations[3:6],  # rad, about the body's axes
+                "pixel_spacing": deviations[6:],  # m
+                # Errors are taken to be independent between these, and related within each.
+                "clusters": clusters,
+                "cluster": _FEATURE if features >= ENOUGH_FEATURES else _PART,
+            },
+            **({"points": found.points} if found.points else {}),  # m
+        },
+    )
+    return (
+        f"{out}: pixels of {1e3 * found.spacing[0]:.4f} × {1e3 * found.spacing[1]:.4f} mm, RMS "
+        f"{1e3 * found.rms:.2f} mm over {counted(len(seen) - rejected, 'sighting')}, "
+        f"{rejected} left out, "
+        f"± {1e3 * float(np.linalg.norm(deviations[:3])):.2f} mm and "
+        f"{np.degrees(float(np.linalg.norm(deviations[3:6]))):.2f}°{_remarks(found, features)}"
+    )
+
+
+def _remarks(found: ProbeCalibration, features: int) -> str:
+    """What makes the result less certain than it could be."""
+    said = ""
+    if found.turned < _LITTLE_TURN:
+        said += (
+            f"; the probe turned by only {math.degrees(found.turned):.0f}°, which determines "
+            f"little: turn it by 30° or more about all axes"
+        )
+    if len(found.points) < features < ENOUGH_FEATURES:
+        said += (
+            f"; {features} {'feature is' if features == 1 else 'features are'} too few to tell "
+            f"what a misplaced one does to the result: the deviations leave that out"
+        )
+    return said
+
+
+def _features(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Wires (2, 3) m, or where the file has none points (1, 3) m, by name."""
+    if path.suffix.lower() == ".xml" or _has_ends(path):
+        return read_wires(path)
+    return {name: point[None] for name, point in read_landmarks(path).items()}
+
+
+def _has_ends(path: Path) -> bool:
+    try:
+        return "x2" in read_text(path).partition("\n")[0]
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: cannot be read: {error}") from error
+
+
+def _with_poses(path: Path, to_phantom: Pose) -> list[PixelSighting]:
+    seen: list[PixelSighting] = []
+    for feature, numbers in read_table(path, _SIGHTED_PIXEL | _SIGHTED_POSE, label="feature"):
+        try:
+            pose = to_phantom @ Pose(np.array(numbers[2:5]), np.array(numbers[5:]))
+        except PoseError as error:
+            raise CalibrationError(f"{path}: sighting {len(seen) + 1}: {error}") from error
+        seen.append(PixelSighting(feature, numbers[0], numbers[1], pose))
+    return seen
+
+
+def _with_times(
+    path: Path, recording: Path, name: str | None, to_phantom: Pose
+) -> list[PixelSighting]:
+    motion = read_motion(recording, name)
+    stamps, first = np.unique(seconds_of(motion), return_index=True)
+    seen: list[PixelSighting] = []
+    for feature, (column, row, time) in read_table(
+        path, _SIGHTED_PIXEL | {"time": "time"}, label="feature"
+    ):
+        before, after, fraction = _around(stamps, time)
+        if stamps[after] - stamps[before] > _LONGEST_GAP or not 0.0 <= fraction <= 1.0:
+            raise CalibrationError(
+                f"{path}: sighting {len(seen) + 1}: {recording.name} has no pose around "
+                f"{time:.3f} s; it goes from {stamps[0]:.3f} to {stamps[-1]:.3f} s"
+            )
+        pose = interpolate(motion.pose(first[before]), motion.pose(first[after]), fraction)
+        pose = to_phantom @ pose
+        seen.append(PixelSighting(feature, column, row, pose))
+    return seen
+
+
+def _around(stamps: NDArray[np.float64], time: float) -> tuple[int, int, float]:
+    """The stamps before and after a time, and the fraction of the way from one to the other.
+
+    Where a stamp is the time but for rounding, it is both. Before the first and after the last
+    stamp the fraction is not from 0 to 1.
+    """
+    after = int(np.clip(np.searchsorted(stamps, time), 1, max(len(stamps) - 1, 1)))
+    for k in (after - 1, min(after, len(stamps) - 1)):
+        if abs(stamps[k] - time) <= _ROUNDED:
+            return k, k, 0.0
+    if after == len(stamps):
+        return 0, 0, math.nan
+    before = after - 1
+    return before, after, float((time - stamps[before]) / (stamps[after] - stamps[before]))
+
+
+def _by_feature(
+    seen: Sequence[PixelSighting], residuals: NDArray[np.float64], used: NDArray[np.bool_]
+) -> dict[str, float]:
+    names = np.array([sighting.feature for sighting in seen])
+    return {
+        str(name): float(np.sqrt((residuals[(names == name) & used] ** 2).mean()))
+        for name in np.unique(names[used])
+    }
+
+
+_TABLES = {".csv", ".txt", ".xml"}
+
+
+def calibrate_tip(settings: PivotSettings, _: Progress | None = None) -> str:
+    """Find a stylus' tip and write it; returns a sentence with the result.
+
+    Raises:
+        UsSimError: the recording cannot be read or does not determine the tip.
+    """
+    out = settings.out
+    motion = read_motion(settings.recording, settings.pose)
+    found = calibrate_pivot(motion.poses)
+    write_transform(
+        out,
+        Pose(found.tip),
+        from_frame="tip",
+        to_frame=motion.topic,
+        method=f"pivot about one point, {settings.recording.name}",
+        residuals={"rms": found.rms, "poses": len(found.inliers), "rejected": found.rejected},
+        more={
+            "standard_deviations": {"position": found.deviations},  # m
+            "pivot": found.pivot,  # m, frame of the recording
+            "swing": found.swing,  # rad, of the direction that turned least
+        },
+    )
+    said = ", ".join(f"{1e3 * number:z.2f}" for number in found.tip)
+    largest = 1e3 * float(found.deviations.max())
+    return (
+        f"{out}: tip at {said} mm (± {largest:.2f}), RMS {1e3 * found.rms:.2f} mm over "
+        f"{int(found.inliers.sum())} poses, {found.rejected + motion.rejected} left out"
+    )
+
+
+def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None) -> str:
+    """Register a device to the patient by landmarks; returns a sentence with the result.
+
+    Landmarks on a probe's face, measured in the frame of its marker, likewise give the probe's
+    calibration when inverted.
+
+    Raises:
+        UsSimError: the files cannot be read or do not determine the registration.
+    """
+    known_file, measured_file = settings.known, settings.measured
+    to, out = settings.to, settings.out
+    known = read_landmarks(known_file)
+    if measured_file.suffix.lower() in _TABLES:
+        measured, frame = read_landmarks(measured_file), "tracker"
+        names = [landmark for landmark in known if landmark in measured]
+        if not names:
+            raise CalibrationError(
+                f"{measured_file} and {known_file} share no landmark's name: name the same "
+                f"landmarks alike"
+            )
+    else:
+        measured, frame = _touched(list(known), measured_file, settings.tip, settings.pose)
+        names = list(known)
+    theirs = np.array([measured[landmark] for landmark in names])
+    ours = np.array([known[landmark] for landmark in names])
+    found = register_landmarks(theirs, ours, names)
+    if settings.invert:
+        found, frame, to = register_landmarks(ours, theirs, names), to, frame
+    moved, turned = found.deviations[:3], found.deviations[3:]  # m and rad
+    left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
+    write_transform(
+        out,
+        found.pose,
+        from_frame=frame,
+        to_frame=to,
+        method=f"point registration, {measured_file.name} on {known_file.name}",
+        residuals={
+            "fre": found.fre,  # m
+            "tre_leave_one_out": None if math.isnan(found.tre) else found.tre,  # m
+            "landmarks": dict(zip(names, found.residuals, strict=True)),  # m
+            "left_out": dict(zip(names, left_out, strict=True)),  # m
+        },
+        more={"standard_deviations": {"position": moved, "rotation": turned}},
+    )
+    worst = int(found.residuals.argmax())
+    tre = "" if math.isnan(found.tre) else f", leave-one-out TRE {1e3 * found.tre:.2f} mm"
+    alone = sorted(set(known) ^ set(measured))
+    unused = f"; in one file only: {', '.join(alone)}" if alone else ""
+    return (
+        f"{out}: FRE {1e3 * found.fre:.2f} mm over {len(names)} landmarks (worst "
+        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){tre}{unused}"
+    )
+
+
+def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -> str:
+    """Find the offset of a device's stamps; returns a sentence with the result.
+
+    A picture of both signals goes beside the file.
+
+    Raises:
+        UsSimError: the recordings cannot be read or do not determine the offset.
+    """
+    out, picture = settings.out, settings.picture
+    moving = read_signal(settings.moving, settings.pose, progress=progress)
+    name = settings.fixed_pose or settings.pose
+    fixed = read_signal(settings.fixed, name, images=settings.images, progress=progress)
+    found = find_time_offset(moving, fixed, largest=settings.largest)
+    write_calibration(
+        out,
+        {
+            "time_offset": found.offset,  # s, to add to the device's stamps
+            "standard_deviation": found.deviation,  # s
+            "method": f"correlation of {settings.moving.name} with {settings.fixed.name}",
+            "residuals": {
+                "correlation": found.correlation,
+                "unexplained": found.residual,  # of the fixed signal's standard deviation
+                "seconds": found.seconds,
+                "left_out": moving.left_out + fixed.left_out,
+            },
+        },
+    )
+    draw_offset(picture, found, moving, fixed)
+    return (
+        f"{out}: time_offset {1e3 * found.offset:z.1f} ms ± {1e3 * found.deviation:.1f} ms, "
+        f"correlation {found.correlation:.3f} over {found.seconds:.0f} s, signals in {picture}"
+    )
+
+
+def _touched(
+    names: list[str], recording: Path, tip: Path | None, name: str | None
+) -> tuple[dict[str, NDArray[np.float64]], str]:
+    """Where a stylus touched the landmarks, m, and in which frame."""
+    if tip is None:
+        raise CalibrationError(
+            f"{recording}: is a recording of the stylus, whose tip must be known: give --tip FILE "
+            f"as `us-sim calibrate pivot` writes it"
+        )
+    motion = read_motion(recording, name)
+    offset = read_transform(tip).position
+    tips = np.array([pose.apply(offset) for pose in motion.poses])
+    rotations = np.array([pose.rotation for pose in motion.poses])
+    dwells = find_dwells(seconds_of(motion), tips, rotations)
+    if len(dwells) != len(names):
+        start = seconds_of(motion)[0]
+        at = ", ".join(f"{dwell.start - start:.0f}" for dwell in dwells)
+        where = counted(len(dwells), "place") + (f" (at {at} s)" if at else "")
+        raise CalibrationError(
+            f"{recording}: the stylus pivoted on {where} where "
+            f"{counted(len(names), 'landmark is', 'landmarks are')} named: touch each for two "
+            f"seconds in the file's order, tilting the stylus with its tip still"
+        )
+    places = [dwell.position for dwell in dwells]
+    return dict(zip(names, places, strict=True)), motion.frame_id

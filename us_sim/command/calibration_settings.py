@@ -1,0 +1,160 @@
+"""The options of `us-sim calibrate`, each a field of settings.
+
+>>> from us_sim.command.calibration_settings import ClockSettings
+>>> ClockSettings("tracker.mcap", "video.mcap", largest="300 ms").largest
+0.3
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from us_sim.errors import CalibrationError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.tracking.settings import BOARD_LENGTH, BOARDS
+
+Progress = Callable[[float, str], None]
+"""A callback that is told the fraction done, and what is being done."""
+
+_PIXEL = Quantity("length", 1e-6, 0.01)
+_PLACE = Quantity("image distance", -1e5, 1e5)
+_POSE = (
+    "topic of a bag, or transform of Plus such as StylusToReference; may be left out where "
+    "there is one only"
+)
+
+
+def _out(what: str, name: str) -> Path:
+    """The setting of the file that a calibration writes."""
+    file: Path = setting(description=f"file to write{what}", default=Path(name), kw_only=True)
+    return file
+
+
+@dataclass(frozen=True)
+class CalibrationSettings(Settings):
+    """Base of the settings of a calibration, each of which has a file ``out`` to write."""
+
+    error = CalibrationError
+
+    out: Path = _out("", "calibration.yaml")
+
+    def check(self) -> None:
+        """Refuse to write over a file, which is worth knowing before the work."""
+        if self.out.suffix.lower() not in (".yaml", ".yml"):
+            raise self.refused("out", f"{self.out}: must be a file that ends in .yaml")
+        if self.out.exists():
+            raise self.refused("out", f"{self.out}: exists already; choose another name")
+        if not self.out.absolute().parent.is_dir():
+            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+
+    @property
+    def picture(self) -> Path:
+        """The picture that goes beside the file.
+
+        Raises:
+            CalibrationError: it exists already.
+        """
+        picture = self.out.with_suffix(".png")
+        if picture.exists():
+            raise CalibrationError(f"{picture}: exists already; choose another name for --out")
+        return picture
+
+
+@dataclass(frozen=True)
+class CameraSettings(CalibrationSettings):
+    """Lens and focal length from photos of a board."""
+
+    photos: tuple[str, ...] = setting(
+        description="files, folders or patterns such as 'shots/*.jpg'"
+    )
+    size: str = setting(description="squares or markers across and down: 5x7", kw_only=True)
+    board: str = setting(description="its kind", choices=BOARDS, default="charuco")
+    square: float = setting(BOARD_LENGTH, "side of a square", default=0.0)
+    marker: float = setting(BOARD_LENGTH, "side of a marker", default=0.0)
+    separation: float = setting(BOARD_LENGTH, "between the markers of a grid", default=0.0)
+    dictionary: str | None = setting(
+        description="of the markers, where there are some; not given: 4X4_50", default=None
+    )
+    legacy: bool = setting(
+        description="the ChArUco board is as OpenCV before 4.6 drew it", default=False
+    )
+    name: str = setting(description="the camera's name in the file", default="camera")
+    out: Path = _out(": camera info; a picture of the coverage goes beside it", "camera.yaml")
+
+
+@dataclass(frozen=True)
+class PivotSettings(CalibrationSettings):
+    """A stylus' tip from turning it about the tip."""
+
+    recording: Path = setting(description="bag, or tracker recording of Plus")
+    pose: str | None = setting(description=_POSE, default=None)
+    out: Path = _out(": the tip in the stylus' frame", "tip.yaml")
+
+
+@dataclass(frozen=True)
+class LandmarkSettings(CalibrationSettings):
+    """Where the tracker or the probe is, from points touched."""
+
+    known: Path = setting(
+        description="landmarks in the patient's frame: CSV name,x,y,z or Plus' XML"
+    )
+    measured: Path = setting(
+        description="the same as the tracker measured them: CSV, or a recording of the stylus that "
+        "touched them in the file's order"
+    )
+    tip: Path | None = setting(description="the stylus' tip, of a recording", default=None)
+    to: str = setting(description="frame of the known ones", default="patient")
+    invert: bool = setting(
+        description="the known frame in the measured one: a calibration, from points of the "
+        "probe's face (--to probe) measured in its marker's frame",
+        default=False,
+    )
+    pose: str | None = setting(description=_POSE, default=None)
+    out: Path = _out(": the registration", "registration.yaml")
+
+
+@dataclass(frozen=True)
+class ProbeSettings(CalibrationSettings):
+    """Where the image lies on the probe, from a phantom."""
+
+    sightings: Path = setting(
+        description="CSV: feature,column,row,x,y,z,qx,qy,qz,qw with the body's poses, or "
+        "feature,column,row,time with --recording"
+    )
+    origin: tuple[float, float] = setting(
+        _PLACE, "column and row of the pixel at the middle of the transducer's face", kw_only=True
+    )
+    phantom: Path | None = setting(
+        description="CSV name,x,y,z of points or name,x1,y1,z1,x2,y2,z2 of wires, or Plus' XML; "
+        "without it features are points at unknown places",
+        default=None,
+    )
+    recording: Path | None = setting(description="the body's poses over time", default=None)
+    registration: Path | None = setting(
+        description="from the poses' frame to the phantom's", default=None
+    )
+    pixel: tuple[float, float] | None = setting(
+        _PIXEL, "width and height of a pixel, where known: '0.2 mm' '0.2 mm'", default=None
+    )
+    pose: str | None = setting(description=_POSE, default=None)
+    out: Path = _out(": the calibration", "calibration.yaml")
+
+
+@dataclass(frozen=True)
+class ClockSettings(CalibrationSettings):
+    """Offset of a tracker's clock from one motion."""
+
+    moving: Path = setting(description="recording whose stamps are to be mended")
+    fixed: Path = setting(description="recording whose stamps are right: poses or images")
+    largest: float = setting(Quantity("time", 0.01, 60.0), "largest offset to believe", default=0.5)
+    images: bool = setting(
+        description="the fixed recording's images, though it has poses", default=False
+    )
+    pose: str | None = setting(description=_POSE, default=None)
+    fixed_pose: str | None = setting(
+        description="the same of the fixed recording, where it differs", default=None
+    )
+    out: Path = _out(": the offset; a picture of both signals goes beside it", "time.yaml")

@@ -1,0 +1,89 @@
+"""The commands `evaluate`, `calibrate`, `print-marker` and `compile`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from functools import partial
+from pathlib import Path
+
+from us_sim.command.options import add_setting_options, read_settings
+from us_sim.progress import late_progress
+from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
+from us_sim.settings.setting import Settings
+from us_sim.settings.spelling import counted
+
+
+def evaluate_options(parser: argparse.ArgumentParser) -> None:
+    subjects = parser.add_subparsers(required=True, metavar="|".join(EVALUATIONS))
+    for name, option in EVALUATIONS.options.items():
+        package = importlib.import_module(option.target.partition(":")[0].rpartition(".")[0])
+        subjects.add_parser(name, help=package.__doc__, add_options=partial(_subject_options, name))
+
+
+def _subject_options(name: str, parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--quick", action="store_true", help="a part of it, in a few minutes")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path(f"us_sim_{name}"),
+        help="folder to write to, without a report so far; default: %(default)s",
+    )
+    add_setting_options(parser, EVALUATIONS.settings(name))
+    parser.set_defaults(command=partial(_evaluate, name))
+
+
+def _evaluate(name: str, args: argparse.Namespace) -> int:
+    settings = read_settings(args, EVALUATIONS.settings(name))
+    more = [] if type(settings) is Settings else [settings]
+    return int(EVALUATIONS.load(name)(args.out, args.quick, *more))
+
+
+def calibrate_options(parser: argparse.ArgumentParser) -> None:
+    calibrations = parser.add_subparsers(required=True, metavar="|".join(CALIBRATIONS))
+    for name in CALIBRATIONS:
+        settings = CALIBRATIONS.settings(name)
+        calibration = calibrations.add_parser(name, help=settings.__doc__)
+        add_setting_options(calibration, settings)
+        calibration.set_defaults(command=partial(_calibrate, name))
+
+
+def _calibrate(name: str, args: argparse.Namespace) -> int:
+    settings = read_settings(args, CALIBRATIONS.settings(name))
+    print(CALIBRATIONS.load(name)(settings, late_progress(f"calibrate {name}")))
+    return 0
+
+
+def print_marker_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.tracking.camera.marker_print import PrintSettings
+
+    parser.add_argument(
+        "body", nargs="?", type=Path, help="file of a rigid body; default: one marker, or a board"
+    )
+    add_setting_options(parser, PrintSettings)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help=".pdf, or .png for one sheet"
+    )
+    parser.set_defaults(command=_print_marker)
+
+
+def _print_marker(args: argparse.Namespace) -> int:
+    from us_sim.tracking.camera.marker_print import PrintSettings, print_markers
+    from us_sim.tracking.camera.rigid_body import read_rigid_body
+
+    asked = read_settings(args, PrintSettings)
+    body = read_rigid_body(args.body, asked.dictionary) if args.body else asked.body()
+    pages = print_markers(body, args.out, asked.paper)
+    count = counted(len(pages), "sheet")
+    print(f"{args.out}: {pages[0].foot}; {count} of {asked.paper}, to be printed at 100 %")
+    return 0
+
+
+def compile_options(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_compile)
+
+
+def _compile(_: argparse.Namespace) -> int:
+    from us_sim.run.compilation import compile_kernels
+
+    return compile_kernels()

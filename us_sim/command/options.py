@@ -1,0 +1,237 @@
+"""Options of commands: made from settings, and those of every command that takes a scene.
+
+A field of settings without a default is a positional argument, or a required option where it is
+keyword-only; a field with one is an option, and a flag where it is a truth.
+
+>>> import argparse
+>>> from us_sim.command.calibration_settings import ClockSettings
+>>> parser = argparse.ArgumentParser()
+>>> add_setting_options(parser, ClockSettings)
+>>> args = parser.parse_args(["a.mcap", "b.mcap", "--largest", "2 min", "--images"])
+>>> read_settings(args, ClockSettings)
+Traceback (most recent call last):
+...
+us_sim.errors.CalibrationError: --largest: '2 min' is not a time: its units are s, ms, us, µs
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+
+from us_sim.errors import UsSimError
+from us_sim.run.watch import SupervisionSettings
+from us_sim.settings.setting import Settings, kinds_of, rules_of
+from us_sim.share import find_bag
+
+if TYPE_CHECKING:
+    from us_sim.viewer.viewer_settings import ViewerSettings
+
+
+class ChosenParser(argparse.ArgumentParser):
+    """A parser to which ``add_options`` adds the options when it is first used."""
+
+    def __init__(
+        self,
+        *args: Any,
+        add_options: Callable[[argparse.ArgumentParser], None] | None = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(*args, **settings)
+        self._add_options = add_options
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """As argparse does, with the options added."""
+        add_options, self._add_options = self._add_options, None
+        if add_options is not None:
+            add_options(self)
+        return super().parse_known_args(args, namespace)
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def add_setting_options(
+    parser: argparse.ArgumentParser, settings: type[Settings], only: Iterable[str] = ()
+) -> None:
+    """Add an option for each setting, or only for some."""
+    wanted = set(only) or set(rules_of(settings))
+    for field in dataclasses.fields(settings):
+        if field.name in wanted:
+            _add(parser, settings, field)
+
+
+def read_settings(
+    args: argparse.Namespace, settings: type[S], only: Iterable[str] = (), **values: Any
+) -> S:
+    """The settings that the options say.
+
+    Args:
+        args: of a parser that `add_setting_options` has filled.
+        settings: their class.
+        only: as they were added.
+        values: of fields that are no options.
+
+    Raises:
+        UsSimError: of the settings' own kind: an option's value will not do.
+    """
+    for name in set(only) or set(rules_of(settings)):
+        if name in args:
+            values[name] = getattr(args, name)
+    try:
+        return settings(**values)
+    except UsSimError as error:
+        if error.key:
+            option = error.key.split("[")[0].replace("_", "-")
+            raise type(error)(f"--{option}: {error.problem}") from error
+        raise
+
+
+def _add(
+    parser: argparse.ArgumentParser, settings: type[Settings], field: dataclasses.Field[Any]
+) -> None:
+    rule, kind = rules_of(settings)[field.name], kinds_of(settings)[field.name]
+    option = f"--{field.name.replace('_', '-')}"
+    if kind is bool:
+        parser.add_argument(option, action="store_true", help=rule.description)
+        return
+    if get_origin(kind) is not tuple:  # a type, or one that may be None
+        kind = next((part for part in get_args(kind) if part is not type(None)), kind)
+    unit = rule.quantity.unit if rule.quantity else ""
+    names = ", ".join(rule.choice.names if rule.choice else rule.choices)
+    told: dict[str, Any] = {"type": Path} if kind is Path else {}
+    told["help"] = rule.description + (names and f": {names}")
+    if get_origin(kind) is tuple:
+        told["nargs"] = "+" if Ellipsis in get_args(kind) else len(get_args(kind))
+    required = field.default is dataclasses.MISSING
+    if required and not field.kw_only:
+        parser.add_argument(field.name, **told)
+        return
+    if not required:
+        told["default"] = argparse.SUPPRESS
+        told["help"] += f"; default: {field.default} {unit}".rstrip() if field.default else ""
+    named = "FILE" if kind is Path else "N" if rule.quantity else "NAME"
+    parser.add_argument(option, metavar=unit.upper() or named, required=required, **told)
+
+
+_OF_THE_VIEWER = ("host", "port", "recordings")
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """A case in place of a scene, another volume, and parameters of the scene's nodes."""
+    parser.add_argument(
+        "--case", metavar="NAME", help="case to make the scene from: its name or folder"
+    )
+    parser.add_argument(
+        "--volume", type=Path, metavar="FILE", help="volume in place of the scene's"
+    )
+    parser.add_argument(
+        "--param",
+        action="append",
+        default=[],
+        metavar="NODE.NAME=VALUE",
+        help="set a node's parameter; may be given again",
+    )
+
+
+def add_path_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """A probe path to play, and the body in it."""
+    parser.add_argument("--path", type=find_bag, metavar="BAG", help=what)
+    parser.add_argument(
+        "--topic",
+        metavar="NAME",
+        help="of the path's poses, where the bag has several: a topic, TOPIC:NUMBER in a "
+        "PoseArray, TOPIC:FRAME or TOPIC:FRAME:PARENT in tf, or a recording's transform",
+    )
+
+
+def scene_name(args: argparse.Namespace, default: str | None = None) -> str:
+    """The scene that is asked for, or ``case:`` and the case.
+
+    Raises:
+        UsSimError: both are given, or neither and there is no default.
+    """
+    from us_sim.scene.scene import CASE_PREFIX
+
+    if args.case is not None:
+        if args.scene is not None:
+            raise UsSimError(
+                f"--case {args.case}: the scene {args.scene} is given too; keep one, or write "
+                f"`case: {args.case}` into the scene"
+            )
+        return f"{CASE_PREFIX}{args.case}"
+    name = args.scene or default
+    if name is None:
+        raise UsSimError("name a scene, or a case with --case; `us-sim cases` lists cases")
+    return str(name)
+
+
+def add_network_option(parser: argparse.ArgumentParser) -> None:
+    """Whether other machines are talked to."""
+    parser.add_argument("--network", action="store_true", help="talk beyond this host")
+
+
+def add_supervision_options(parser: argparse.ArgumentParser) -> None:
+    """When a node hangs, and how often one is started again."""
+    add_setting_options(parser, SupervisionSettings)
+
+
+def supervision(args: argparse.Namespace) -> SupervisionSettings:
+    """Settings of the supervision; a wrong value raises a UsSimError."""
+    return read_settings(args, SupervisionSettings)
+
+
+def add_viewer_options(parser: argparse.ArgumentParser) -> None:
+    """Where the page is served."""
+    from us_sim.viewer.viewer_settings import ViewerSettings
+
+    add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
+
+
+def add_view_option(parser: argparse.ArgumentParser) -> None:
+    """Whether the simulation is shown in browsers, too."""
+    parser.add_argument("--view", action="store_true", help="show it in a browser, too")
+    add_viewer_options(parser)
+
+
+def viewer(args: argparse.Namespace) -> ViewerSettings:
+    """Settings of the viewer; a wrong value raises a UsSimError."""
+    from us_sim.viewer.viewer_settings import ViewerSettings
+
+    return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
+
+
+def viewed(args: argparse.Namespace) -> ViewerSettings | None:
+    """Settings of the viewer; None without ``--view``.
+
+    Raises:
+        UsSimError: a value is wrong, or given without ``--view``.
+    """
+    if args.view:
+        return viewer(args)
+    if any(name in args for name in _OF_THE_VIEWER):
+        raise UsSimError("--host, --port and --recordings are the viewer's: add --view")
+    return None
+
+
+def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Values that ``--param`` sets, by name, by node.
+
+    Raises:
+        UsSimError: a text is not written ``node.name=value``.
+    """
+    parameters: dict[str, dict[str, str]] = {}
+    for text in texts:
+        target, equals, value = text.partition("=")
+        node, dot, name = target.partition(".")
+        if not (equals and dot and node and name):
+            raise UsSimError(
+                f"--param {text}: write NODE.NAME=VALUE, e.g. tissue_deformer.solver=msds"
+            )
+        parameters.setdefault(node, {})[name] = value
+    return parameters

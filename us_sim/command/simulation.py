@@ -1,0 +1,264 @@
+"""The commands that simulate: `demo`, `run`, `render`, `view`, `play`."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+from us_sim.command.options import (
+    add_network_option,
+    add_path_option,
+    add_scene_options,
+    add_setting_options,
+    add_supervision_options,
+    add_view_option,
+    add_viewer_options,
+    node_parameters,
+    read_settings,
+    scene_name,
+    supervision,
+    viewed,
+    viewer,
+)
+from us_sim.errors import UsSimError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.share import find_bag
+
+
+def demo_options(demo: argparse.ArgumentParser) -> None:
+    demo.add_argument(
+        "scene",
+        nargs="?",
+        help="scene file or name; default: upper_arm, or upper_arm_camera with --source camera",
+    )
+    demo.add_argument(
+        "--source",
+        choices=("path", "camera"),
+        help="poses as they were recorded, or tracked in a camera video that is rendered of them; "
+        "default: camera where the scene's tracker is one",
+    )
+    add_path_option(
+        demo, "play this probe path, such as hand.mcap, a brisk hand; default: the scene's own"
+    )
+    demo.add_argument(
+        "--out",
+        type=Path,
+        default=Path("us_sim_demo"),
+        help="folder to write to; default: %(default)s",
+    )
+    add_scene_options(demo)
+    add_supervision_options(demo)
+    add_view_option(demo)
+    add_network_option(demo)
+    demo.set_defaults(command=_demo)
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from us_sim.run.fork_server import ForkServer
+
+    with ForkServer() as forks:  # which imports what the nodes need while this process does
+        from us_sim.run.live import demo
+
+        return demo(
+            scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
+            args.volume,
+            args.out,
+            node_parameters(args.param),
+            network=args.network,
+            supervision=supervision(args),
+            source=args.source,
+            path=args.path,
+            topic=args.topic,
+            view=viewed(args),
+            forks=forks,
+        )
+
+
+@dataclass(frozen=True)
+class RunSettings(Settings):
+    """The recording and the end of a run."""
+
+    record: Path | None = setting(description="record the session to this MCAP", default=None)
+    duration: float | None = setting(Quantity("time", 1e-3, 1e7), "end after so long", default=None)
+
+    def check(self) -> None:
+        """Refuse a recording that cannot be made, before anything is started."""
+        if self.record is not None and self.record.suffix != ".mcap":
+            raise self.refused("record", f"{self.record}: must be a file that ends in .mcap")
+        if self.record is not None and self.record.exists():
+            raise self.refused("record", f"{self.record}: exists already; choose another name")
+
+
+def run_options(run: argparse.ArgumentParser) -> None:
+    run.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
+    add_setting_options(run, RunSettings)
+    add_supervision_options(run)
+    add_path_option(run, "play this bag's probe path")
+    run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
+    add_scene_options(run)
+    add_view_option(run)
+    add_network_option(run)
+    run.set_defaults(command=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from us_sim.run.fork_server import ForkServer
+
+    asked = read_settings(args, RunSettings)
+    if args.dry_run:
+        return _dry_run(args, asked)
+    parameters = node_parameters(args.param)
+    with ForkServer() as forks:  # which imports what the nodes need while this process does
+        from us_sim.run.live import run
+        from us_sim.scene.reading import load_scene
+
+        return run(
+            load_scene(scene_name(args), volume=args.volume),
+            parameters,
+            record=asked.record,
+            path=args.path,
+            topic=args.topic,
+            duration=asked.duration,
+            network=args.network,
+            supervision=supervision(args),
+            view=viewed(args),
+            forks=forks,
+        )
+
+
+def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
+    """Print the nodes that would run, having checked the files of the scene."""
+    from us_sim.run.live import dry_run
+    from us_sim.scene.readable_files import check_files
+    from us_sim.scene.reading import load_scene
+
+    scene = load_scene(scene_name(args), volume=args.volume)
+    checked = check_files(scene)
+    path = args.path or (Path(scene.path) if scene.path else None)
+    if path is not None and not scene.volume.phantom:
+        from us_sim.scene.building import volume_of
+        from us_sim.scene.image_in_volume import check_path_in_volume
+
+        check_path_in_volume(scene, path, volume_of(scene), args.topic if args.path else None)
+    parameters = node_parameters(args.param)
+    asked_of = {"record": asked.record, "path": args.path, "topic": args.topic}
+    print(dry_run(scene, parameters, **asked_of, view=viewed(args)))
+    if checked:
+        print(f"readable  {', '.join(checked)}")
+    return 0
+
+
+def render_options(render: argparse.ArgumentParser) -> None:
+    render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
+    add_path_option(render, "bag with the probe path; default: the scene's")
+    render.add_argument("--out", type=Path, required=True, help="folder to write to")
+    render.add_argument(
+        "--truth",
+        action="store_true",
+        help="beside each image what is known of it: labels (PNG) and displacement (NumPy's .npy)",
+    )
+    add_scene_options(render)
+    render.set_defaults(command=_render)
+
+
+def _render(args: argparse.Namespace) -> int:
+    from us_sim.run.lockstep import render_scene
+    from us_sim.scene.reading import load_scene
+
+    scene = load_scene(scene_name(args), volume=args.volume)
+    parameters = node_parameters(args.param)
+    return render_scene(scene, args.path, args.out, parameters, topic=args.topic, truth=args.truth)
+
+
+def view_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scene", nargs="?", help="scene file, or name of an installed one; default: upper_arm"
+    )
+    add_viewer_options(parser)
+    add_setting_options(parser, RunSettings, ("record",))
+    add_path_option(
+        parser, "play this bag's probe path, and hold the probe at its end until it is taken"
+    )
+    parser.add_argument("--loop", action="store_true", help="play the path again and again")
+    parser.add_argument(
+        "--tracker",
+        action="store_true",
+        help="take poses from the scene's own tracker; default: from the hand in the page, and "
+        "from whatever else publishes tracker/pose",
+    )
+    parser.add_argument(
+        "--attach", action="store_true", help="show a simulation that runs already, anywhere"
+    )
+    add_scene_options(parser)
+    add_supervision_options(parser)
+    add_network_option(parser)
+    parser.set_defaults(command=_view)
+
+
+def _view(args: argparse.Namespace) -> int:
+    from us_sim.run.fork_server import ForkServer
+
+    parameters = node_parameters(args.param)
+    if args.attach:
+        asked = (args.scene, args.case, args.volume, args.path, args.tracker or None)
+        if "record" in args or any(each is not None for each in asked):
+            raise UsSimError(
+                "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
+                "--record and --tracker, or leave out --attach"
+            )
+        from us_sim.run.live import view_running
+
+        return view_running(
+            viewer(args), parameters, network=args.network, supervision=supervision(args)
+        )
+    if args.loop and args.path is None:
+        raise UsSimError("--loop plays a path again and again: name one with --path")
+    with ForkServer() as forks:  # which imports what the nodes need while this process does
+        from us_sim.run.live import run
+        from us_sim.scene.reading import load_scene
+
+        return run(
+            load_scene(scene_name(args, "upper_arm"), volume=args.volume),
+            parameters,
+            record=read_settings(args, RunSettings, ("record",)).record,
+            path=args.path,
+            topic=args.topic,
+            duration=None,
+            network=args.network,
+            supervision=supervision(args),
+            view=viewer(args),
+            by_hand=not args.tracker,
+            playing={"stay": True, "loop": args.loop} if args.path is not None else None,
+            forks=forks,
+        )
+
+
+_OF_THE_PLAYER = ("rate", "loop")
+
+
+def play_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.nodes.settings import SessionPlayerSettings
+
+    parser.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")
+    parser.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
+    add_setting_options(parser, SessionPlayerSettings, _OF_THE_PLAYER)
+    parser.add_argument("--everything", action="store_true", help="publish every topic as recorded")
+    add_network_option(parser)
+    parser.set_defaults(command=_play)
+
+
+def _play(args: argparse.Namespace) -> int:
+    from us_sim.nodes.settings import SessionPlayerSettings
+    from us_sim.run.live import play
+
+    player = read_settings(args, SessionPlayerSettings, _OF_THE_PLAYER)
+    return play(
+        args.bag,
+        topic=args.topic,
+        rate=player.rate,
+        loop=player.loop,
+        everything=args.everything,
+        network=args.network,
+    )

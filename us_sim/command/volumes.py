@@ -1,0 +1,155 @@
+"""The commands about volumes and cases: `import`, `reconstruct`, `segment`, `cases`."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+from us_sim.command.options import add_setting_options, read_settings
+from us_sim.errors import UsSimError
+from us_sim.progress import late_progress
+
+_REPORT = Path("us_sim_import")
+
+
+def import_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.volume.deidentification.settings import ImportSettings
+
+    parser.add_argument(
+        "files",
+        nargs="+",
+        type=Path,
+        help="DICOM files of one series, or a folder of them; or an MHA, NRRD or NIfTI volume",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="CASE|FILE",
+        help="new folder of a case, volume (.nrrd, .mha, .nii, .nii.gz), or .igs.mha for 2D images",
+    )
+    parser.add_argument(
+        "--report",
+        type=Path,
+        nargs="?",
+        const=_REPORT,
+        metavar="FOLDER",
+        help=f"list what is kept, blanked and dropped, with a picture; default: {_REPORT}",
+    )
+    add_setting_options(parser, ImportSettings)
+    parser.set_defaults(command=_import)
+
+
+def _import(args: argparse.Namespace) -> int:
+    from us_sim.volume.deidentification.importing import look_at
+    from us_sim.volume.deidentification.report import (
+        refuse_report,
+        report_text,
+        summary,
+        write_report,
+    )
+    from us_sim.volume.deidentification.settings import ImportSettings
+
+    if args.out is None and args.report is None:
+        raise UsSimError("say where to with --out CASE|FILE, or --report to see what would be done")
+    settings = read_settings(args, ImportSettings)
+    if args.report is not None:
+        refuse_report(args.report)
+    found = look_at(args.files, args.out, settings)
+    if args.report is not None:  # before what is refused: its picture shows what to say
+        written = write_report(args.report, found.imported)
+        print(report_text(found.imported))
+        print(f"{written[0]} and {written[1].name} beside it, which may show a name")
+    if args.out is not None:
+        found.write(late_progress("import"))
+        print(f"{args.out}: {summary(found.imported)}")
+    return 0
+
+
+def reconstruct_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.volume.reconstruction.settings import Compounding, ImagePart
+    from us_sim.volume.reconstruction.sweep_command import SweepSettings
+
+    for settings in (SweepSettings, Compounding, ImagePart):
+        add_setting_options(parser, settings)
+    parser.add_argument(
+        "--undo-pressure",
+        metavar="SCENE",
+        help="place the images where the tissue of this scene lies while no probe presses it; the "
+        "sweep's reference frame is the scene's patient",
+    )
+    parser.set_defaults(command=_reconstruct)
+
+
+def _reconstruct(args: argparse.Namespace) -> int:
+    from us_sim.volume.reconstruction.settings import Compounding, ImagePart
+    from us_sim.volume.reconstruction.sweep_command import SweepSettings, reconstruct_sweep
+
+    settings = read_settings(args, SweepSettings)
+    compounding, part = read_settings(args, Compounding), read_settings(args, ImagePart)
+    rest_of = None
+    if args.undo_pressure is not None:
+        from us_sim.scene.reading import load_scene
+        from us_sim.scene.rest_placement import rest_placement
+
+        rest_of = partial(rest_placement, load_scene(args.undo_pressure))
+
+    progress = late_progress(f"reconstruct {Path(settings.sweep).name}")
+    print(reconstruct_sweep(settings, compounding, part, rest_of=rest_of, progress=progress))
+    return 0
+
+
+def segment_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.volume.segmentation.settings import SegmentRequest
+    from us_sim.volume.surfaces.settings import SurfaceSettings
+
+    add_setting_options(parser, SegmentRequest)
+    add_setting_options(parser, SurfaceSettings)
+    parser.set_defaults(command=_segment)
+
+
+def _segment(args: argparse.Namespace) -> int:
+    from us_sim.volume.segmentation.case_segmentation import segment_as_asked
+    from us_sim.volume.segmentation.settings import SegmentRequest
+    from us_sim.volume.surfaces.settings import SurfaceSettings
+
+    asked = read_settings(args, SegmentRequest)
+    surfaces = read_settings(args, SurfaceSettings)
+    print(segment_as_asked(asked, surfaces, late_progress("segment")))
+    return 0
+
+
+def cases_options(cases: argparse.ArgumentParser) -> None:
+    cases.add_argument(
+        "folders",
+        nargs="*",
+        type=Path,
+        metavar="DIR",
+        help="folder of cases, or a case; default: those in US_SIM_CASES, or in the user's data "
+        "folder",
+    )
+    cases.add_argument(
+        "--picture", type=Path, metavar="FILE", help="write what the probe sees in each as a PNG"
+    )
+    cases.set_defaults(command=_cases)
+
+
+def _cases(args: argparse.Namespace) -> int:
+    from us_sim.volume.cases.case import case_roots, cases_in, listed, table
+
+    if args.picture is not None and args.picture.suffix.lower() != ".png":
+        raise UsSimError(f"--picture {args.picture}: must be a file that ends in .png")
+    roots = args.folders or [root for root in case_roots() if root.is_dir()]
+    folders = [folder for root in roots for folder in cases_in(root)]
+    if not folders:
+        where = ", ".join(map(str, args.folders or case_roots()))
+        print(f"no case in {where}; `us-sim import` and `us-sim reconstruct` make one")
+        return 0
+    rows = [listed(folder) for folder in folders]
+    print(table(rows))
+    if args.picture is not None:
+        from us_sim.demo.case_pictures import picture_cases
+
+        picture_cases([row.folder for row in rows if not row.problem], args.picture)
+        print(args.picture)
+    return 1 if any(row.problem for row in rows) else 0

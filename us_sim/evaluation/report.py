@@ -1,0 +1,318 @@
+"""The rows of a report's CSV file: each a dataclass whose fields are the columns.
+
+>>> from dataclasses import dataclass
+>>> from us_sim.evaluation.report import Row, not_a_column
+>>> @dataclass(frozen=True)
+... class Point(Row):
+...     method: str
+...     ms: float = float("nan")
+...     setup: float = not_a_column(0.5)
+>>> row = Point("fem", 0.123456)
+>>> list(row.values), row.cells
+(['method', 'ms'], ['fem', '0.1235'])
+
+Tables that can be read in Markdown and in a terminal.
+
+>>> from us_sim.evaluation.report import markdown_table
+>>> print(markdown_table(("method", "ms"), [("fem", "0.75"), ("msds", "12")]))
+| method | ms   |
+| ------ | ---- |
+| fem    | 0.75 |
+| msds   | 12   |
+
+What is asked of a measure, against what was seen in one run.
+
+>>> from us_sim.evaluation.report import Target
+>>> Target.at_most("an image", 2.0, 1.5, "ms").cells
+('an image', 'at most 2 ms', '1.5 ms', 'yes')
+
+Figures of the reports: one size of letters, one kind of grid, one place for keys.
+
+The machine that a report's times were measured on.
+
+>>> from us_sim.evaluation.report import machine
+>>> machine("numpy", "no-such-library")
+'..., ... cores, ..., Python 3..., numpy ...'
+
+How a cost grows with a size.
+
+>>> from us_sim.evaluation.report import exponent
+>>> round(exponent({10: 2.0, 20: 8.0, 40: 32.0}), 3)
+2.0
+
+The folder that a run's rows, pictures and report are written to.
+
+A folder that holds a report is refused before anything is measured, so that nothing that took
+hours is lost; what a run that was interrupted left there is written over.
+"""
+
+from __future__ import annotations
+
+import csv
+import platform
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from importlib.metadata import PackageNotFoundError, version
+from os import cpu_count
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from us_sim.errors import UsSimError
+
+
+@dataclass(frozen=True)
+class Row:
+    """Base of the dataclasses of which each instance is a row."""
+
+    digits: ClassVar[int] = 4
+    """Significant digits of the numbers in the file."""
+    decimals: ClassVar[int | None] = None
+    """Or the digits after their points."""
+
+    @property
+    def values(self) -> dict[str, object]:
+        """By column, in order."""
+        columns = (entry for entry in fields(self) if entry.metadata.get("column", True))
+        return {entry.name: getattr(self, entry.name) for entry in columns}
+
+    @property
+    def cells(self) -> list[str]:
+        """The values as in the file; a number that is not known is empty."""
+        return [self._cell(value) for value in self.values.values()]
+
+    @property
+    def title(self) -> str:
+        """What the row is about, in a sentence about a failure."""
+        return ", ".join(self.cells[:2])
+
+    def _cell(self, value: object) -> str:
+        if value is None or (isinstance(value, float) and np.isnan(value)):
+            return ""
+        if isinstance(value, bool):
+            return str(value).lower()
+        if not isinstance(value, float):
+            return str(value)
+        if self.decimals is not None:
+            return str(round(value, self.decimals))
+        return f"{value:.{self.digits}g}"
+
+
+def not_a_column(default: Any) -> Any:
+    """A field that the report knows and the file does not have."""
+    return field(default=default, metadata={"column": False})
+
+
+def failures(rows: Iterable[Row]) -> list[str]:
+    """What went wrong in which rows: those whose ``failure`` is not empty."""
+    failed = ((row.title, getattr(row, "failure", "")) for row in rows)
+    return [f"{title}: {failure}" for title, failure in failed if failure]
+
+
+def words_of(error: Exception) -> str:
+    """An error in one line."""
+    return f"{type(error).__name__}: {error}".replace("\n", " ")
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table whose columns stand below each other; every row has as many cells as the head."""
+    widths = [max(len(cell) for cell in column) for column in zip(head, *rows, strict=True)]
+    lines = [head, ["-" * max(width, 1) for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
+        for line in lines
+    )
+
+
+@dataclass(frozen=True)
+class Target:
+    """One line of a report's table of targets."""
+
+    what: str
+    asked: str
+    seen: str = "not measured"
+    met: bool | None = None  # None where it was not measured
+
+    @classmethod
+    def at_most(
+        cls, what: str, limit: float, seen: float, unit: str = "", *, form: str = ".3g"
+    ) -> Target:
+        """A limit from above; ``seen`` is NaN where it was not measured."""
+        return cls._limit(what, f"at most {limit:g}", seen, seen <= limit, unit, form)
+
+    @classmethod
+    def under(cls, what: str, limit: float, seen: float, unit: str = "") -> Target:
+        """A limit from above that is itself too much."""
+        return cls._limit(what, f"under {limit:g}", seen, seen < limit, unit, ".3g")
+
+    @classmethod
+    def at_least(cls, what: str, limit: float, seen: float, *, form: str = ".3g") -> Target:
+        """A limit from below."""
+        return cls._limit(what, f"at least {limit:g}", seen, seen >= limit, "", form)
+
+    @classmethod
+    def _limit(cls, what: str, asked: str, seen: float, met: bool, unit: str, form: str) -> Target:
+        unit = unit and f" {unit}"
+        if not np.isfinite(seen):
+            return cls(what, asked + unit)
+        return cls(what, asked + unit, f"{seen:{form}}{unit}", bool(met))
+
+    @property
+    def cells(self) -> tuple[str, str, str, str]:
+        """Its cells in the table."""
+        return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
+
+
+def target_table(targets: Sequence[Target]) -> str:
+    """All of them in Markdown."""
+    return markdown_table(("", "asked", "seen", "met"), [target.cells for target in targets])
+
+
+def new_figure(width: float, height: float, title: str) -> Figure:
+    """An empty figure (inches) with its title at the left."""
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=12, x=0.01, ha="left")
+    return figure
+
+
+def save(figure: Figure, file: Path) -> None:
+    """Write it as PNG, as many pixels as it has been laid out for."""
+    figure.savefig(file, dpi=figure.dpi)
+
+
+def plain(panel: Axes) -> None:
+    """Numbers without powers of ten, a faint grid, and no frame at the top and the right."""
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.grid(True, which="major", color="0.93")
+    panel.set_axisbelow(True)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.tick_params(labelsize=8.5)
+
+
+def key_beside(panel: Axes, handles: list | None = None) -> None:  # type: ignore[type-arg]
+    """What colours and marks mean, to the right of a panel; nothing where it has none."""
+    if handles is None and not panel.get_legend_handles_labels()[0]:
+        return
+    panel.legend(
+        handles=handles, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5)
+    )
+
+
+def machine(*libraries: str) -> str:
+    """Processor, cores, system, and the versions of Python and of those libraries it has."""
+    processor = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                processor = line.partition(":")[2].strip()
+                break
+    except OSError:
+        pass
+    parts = [processor, f"{cpu_count()} cores", platform.system()]
+    parts.append(f"Python {platform.python_version()}")
+    for name in libraries:
+        try:
+            parts.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join(parts)
+
+
+def exponent(cost_of_size: Mapping[float, float]) -> float:
+    """k in cost ~ size^k, by least squares of the logarithms; NaN with fewer than two sizes.
+
+    Costs that are not positive and finite are left out.
+    """
+    known = {n: cost for n, cost in cost_of_size.items() if np.isfinite(cost) and cost > 0}
+    if len(known) < 2:
+        return float("nan")
+    return float(np.polyfit(np.log(list(known)), np.log(list(known.values())), 1)[0])
+
+
+_PRINTED = 10  # failures, at the end of a run
+_LISTED = 60  # failures, in the report
+
+
+class ReportFolder:
+    """Where one run of ``us-sim evaluate`` writes.
+
+    Args:
+        subject: that is evaluated.
+        out: the folder, made if it is not there.
+        quick: whether it is the short run.
+
+    Raises:
+        UsSimError: the folder cannot be written, or holds a report.
+    """
+
+    def __init__(self, subject: str, out: Path, quick: bool) -> None:
+        self.subject, self.quick = subject, quick
+        self._out, self._begun = out, time.perf_counter()
+        self._pictures: list[Path] = []
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=out):
+                pass
+        except OSError as error:
+            raise UsSimError(
+                f"--out {out}: cannot be written ({error.strerror or error}); name another folder"
+            ) from error
+        if self.report.exists():
+            raise UsSimError(f"{self.report} exists already; choose another folder with --out")
+
+    @property
+    def report(self) -> Path:
+        """The file that is written last."""
+        return self._out / f"{self.subject}.md"
+
+    def picture(self, name: str) -> Path:
+        """The file of a picture that is about to be drawn, named after the subject."""
+        self._pictures.append(self._out / f"{self.subject}_{name}.png")
+        return self._pictures[-1]
+
+    def write_rows(self, name: str, rows: Sequence[Row]) -> None:
+        """Write ``name``.csv."""
+        write_rows(self._out / f"{name}.csv", rows)
+
+    def opening(self, *libraries: str, tables: Sequence[str] = ()) -> str:
+        """The report's first words: what was run, for how long, on what, and where the rows are."""
+        command = f"us-sim evaluate {self.subject}{' --quick' if self.quick else ''}"
+        files = " and ".join(f"[{name}.csv]({name}.csv)" for name in tables or [self.subject])
+        seconds = time.perf_counter() - self._begun
+        return f"`{command}`, {seconds:.0f} s, on {machine(*libraries)}. Every row is in {files}."
+
+    def write_report(self, parts: Iterable[str], failures: Sequence[str]) -> None:
+        """Write the report: its paragraphs but for empty ones, and what failed."""
+        lines = [f"- {failure}" for failure in failures[:_LISTED]]
+        if len(failures) > _LISTED:
+            lines.append(f"- and {len(failures) - _LISTED} more")
+        failed = ["## Failed", "\n".join(lines)] if failures else []
+        text = "\n\n".join(part for part in (*parts, *failed) if part) + "\n"
+        self.report.write_text(text, encoding="utf-8")
+
+    def finish(self, table: str, failures: Sequence[str]) -> int:
+        """Print a table, where everything is, and what failed; 1 if anything did, else 0."""
+        print(table)
+        print(f"Report: {self.report}; pictures: {', '.join(map(str, self._pictures))}")
+        for failure in failures[:_PRINTED]:
+            print(f"failed: {failure}")
+        if len(failures) > _PRINTED:
+            print(f"and {len(failures) - _PRINTED} more, see {self.report}")
+        return 1 if failures else 0
+
+
+def write_rows(file: Path, rows: Sequence[Row]) -> None:
+    """Write a CSV file whose first line names its columns."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(rows[0].values)
+        writer.writerows(row.cells for row in rows)

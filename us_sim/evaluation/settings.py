@@ -1,0 +1,36 @@
+"""What of the evaluation may be chosen: each field is an option of the command.
+
+A recorded sweep that images are compared with: each field is an option of the command.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from us_sim.errors import SettingsError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+
+@dataclass(frozen=True)
+class HandSettings(Settings):
+    """Motions other than those of the reports."""
+
+    seed: int = setting(Quantity("number", 0, 2**31), "of all motions", default=1)
+
+
+@dataclass(frozen=True)
+class RecordedSweep(Settings):
+    """Both files, or none of them."""
+
+    volume: Path | None = setting(description="volume compounded from --sweep", default=None)
+    sweep: Path | None = setting(description="tracked sweep to compare images with", default=None)
+
+    def check(self) -> None:
+        """Refuse one file without the other."""
+        if (self.volume is None) != (self.sweep is None):
+            raise SettingsError(
+                "--volume and --sweep belong together: give the tracked sweep and the volume that "
+                "was compounded from it"
+            )

@@ -1,0 +1,356 @@
+"""Settings of the console: image formation, strain, M-mode, flow and Doppler."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from us_sim.errors import ProbeError, SceneError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+
+ECHO_RANGE = 60.0
+"""dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
+
+GREY_MAPS = ("linear", "soft", "contrast")
+
+_GAIN = Quantity("level", -60.0, 60.0)
+_RESOLUTION = Quantity("length", 0.0, 0.01)
+
+
+@dataclass(frozen=True)
+class Imaging(Settings):
+    """The settings of image formation; with the defaults the volume's grey values are shown.
+
+    Each is a key of a scene's ``imaging:`` and a parameter of the node that makes the images.
+
+    Raises:
+        ProbeError: a value is out of range, with its name and the range.
+    """
+
+    section = "imaging"
+    error = ProbeError
+    live = True
+
+    gain: float = setting(_GAIN, default=0.0, description="added to every echo")
+    time_gain: tuple[float, ...] = setting(
+        _GAIN,
+        default=(),
+        description="added at evenly spaced depths from the face to the end of the beams, "
+        "linear in between",
+    )
+    dynamic_range: float = setting(
+        Quantity("level", 10.0, 120.0),
+        default=ECHO_RANGE,
+        description="level shown from black to white",
+    )
+    grey_map: str = setting(
+        default="linear",
+        choices=GREY_MAPS,
+        description="curve from dB to grey: soft lifts faint echoes, contrast parts middle ones",
+    )
+    elevation_planes: int = setting(
+        Quantity("number", 1, 15),
+        default=1,
+        description="slices averaged across the thickness of the beam; 1 is ideally thin",
+    )
+    elevation_width: float = setting(
+        Quantity("length", 1e-4, 0.02),
+        default=2e-3,
+        description="thickness of the beam at its focus, full width at half maximum",
+    )
+    lateral_resolution: float = setting(
+        _RESOLUTION,
+        default=0.0,
+        description="width of a point along the array at the focus, 6 dB below its peak; "
+        "0 is ideal",
+    )
+    axial_resolution: float = setting(
+        _RESOLUTION,
+        default=0.0,
+        description="length of a point along the beam at the face, 6 dB below its peak; 0 is ideal",
+    )
+    contact: bool = setting(
+        default=False,
+        description="whether beams whose part of the face touches no skin see only air",
+    )
+    reverberation: float = setting(
+        Quantity("level", -ECHO_RANGE, 0.0),
+        default=-10.0,
+        description="the face's first echo in air, where the strongest echo is 0",
+    )
+
+    @property
+    def changes_grey_levels(self) -> bool:
+        """Whether echoes are shown with grey values other than the volume's own."""
+        plain = (0.0, ECHO_RANGE, "linear")
+        return any(self.time_gain) or plain != (self.gain, self.dynamic_range, self.grey_map)
+
+
+_LENGTH = Quantity("length", 0.2e-3, 0.05)
+
+
+@dataclass(frozen=True)
+class Strain(Settings):
+    """Strain images: the tissue's own, and an estimate made from two images as a scanner makes it.
+
+    Raises:
+        ProbeError: a value is out of range, with its name and the range.
+    """
+
+    section = "strain"
+    error = ProbeError
+    live = True
+
+    since: str = setting(
+        default="rest",
+        choices=("rest", "image"),
+        description="what the tissue's own strain counts from: the tissue at rest, or the image "
+        "that the estimate is compared with, too",
+    )
+    interval: int = setting(
+        Quantity("number", 1, 60),
+        "images from one to the one it is compared with; a slow press needs several",
+        default=2,
+    )
+    borders: str = setting(
+        default="smooth",
+        choices=("smooth", "sharp"),
+        description="of the tissue's own strain between two labels: averaged like all else, or not "
+        "averaged, which is truer near borders, and shows the tetrahedra there",
+    )
+    colours: float | None = setting(
+        Quantity("number", 1e-4, 1.0),
+        "strain at the ends of the colour bar; not given: a round value that follows the images",
+        default=None,
+    )
+    window: float = setting(
+        _LENGTH,
+        "along the beam, of what is found again in the other image; a third of it across",
+        default=3e-3,
+    )
+    search: float = setting(
+        Quantity("length", 0.05e-3, 0.02),
+        "along the beam, how far it is looked for",
+        default=0.6e-3,
+    )
+    fit: float = setting(
+        _LENGTH,
+        "along the beam, of the line that is fitted to displacement, whose slope is the strain",
+        default=6e-3,
+    )
+    correlation: float = setting(
+        Quantity("number", 0.0, 1.0),
+        "of what was found with what was looked for: the least that is used",
+        default=0.7,
+    )
+
+
+@dataclass(frozen=True)
+class MModeSettings(Settings):
+    """The line, and how long it is shown.
+
+    Raises:
+        ProbeError: a value is out of range.
+    """
+
+    section = "m_mode"
+    error = ProbeError
+    live = True
+
+    lateral: float = setting(
+        Quantity("number", -0.5, 0.5),
+        "of the line across the face, or the opening angle, as a fraction of that",
+        default=0.0,
+    )
+    sweep: float = setting(Quantity("time", 0.5, 20.0), "that the picture shows", default=4.0)
+
+
+_PRESSURE = Quantity("pressure", 10.0, 40e3)
+_RATE = Quantity("rate", 0.02, 5.0)
+_VENOUS = ("kind", ("venous",))
+
+_ARTERIAL_PRESSURE, _VENOUS_PRESSURE = 12.4e3, 1.0e3
+"""Pa, mean pressures in a vessel of the arm at the height of the heart: 93 and 8 mmHg
+(Hall, Guyton and Hall Textbook of Medical Physiology, 13th ed., 2016, chapters 14 and 15)."""
+
+
+@dataclass(frozen=True)
+class FlowSettings(Settings):
+    """The blood in a vessel: how fast, whereto, and what drives it.
+
+    The defaults of the pressures are those of Hall, Guyton and Hall Textbook of Medical Physiology,
+    13th ed., 2016, chapters 14 and 15.
+
+    Raises:
+        SceneError: a value is out of range, or two do not go together.
+    """
+
+    section = "flow"
+    error = SceneError
+    live = True
+
+    kind: str = setting(
+        description="arterial: a pulse, and pressure enough to go on until the vessel closes; "
+        "venous: swings with breathing, fills up behind a closure and surges once that opens",
+        choices=("arterial", "venous"),
+    )
+    direction: tuple[float, float, float] = setting(
+        Quantity("number", -1.0, 1.0),
+        "whereto blood flows, as x, y and z in `patient`; roughly, the vessel says the rest",
+    )
+    peak_velocity: float = setting(
+        Quantity("speed", 0.01, 5.0),
+        "on the vessel's axis at the height of the pulse: an artery's systolic peak",
+    )
+    mean_velocity: float = setting(
+        Quantity("speed", 1e-3, 2.0), "over time and the cross-section, with the tissue at rest"
+    )
+    heart_rate: float = setting(_RATE, "beats: `66 /min`", default=1.1)
+    respiration_rate: float = setting(_RATE, "breaths: `15 /min`", default=0.25, applies=_VENOUS)
+    pressure: float | None = setting(
+        _PRESSURE,
+        "mean in the vessel at rest, over that where its blood goes; not given: 12.4 kPa arterial, "
+        "1 kPa venous",
+        default=None,
+    )
+    bed_pressure: float = setting(
+        Quantity("pressure", 1e3, 40e3),
+        "mean of the capillaries, to which a vein fills up behind a closure; over that in the vein "
+        "it is how many times the flow at rest the surge begins with",
+        default=3.3e3,
+        applies=_VENOUS,
+    )
+    filling_time: float = setting(
+        Quantity("time", 0.05, 120.0),
+        "constant of the filling behind a closure",
+        default=6.0,
+        applies=_VENOUS,
+    )
+    closed_at: float = setting(
+        Quantity("number", 0.0, 0.9),
+        "fraction of its area at rest at which opposite walls touch and the vessel is closed",
+        default=0.27,
+    )
+
+    def check(self) -> None:
+        """Refuse velocities, pressures and a direction that cannot be."""
+        if math.hypot(*self.direction) < 1e-3:
+            raise self.refused("direction", "has no length: give where the blood flows")
+        if self.peak_velocity < 2.0 * self.mean_velocity:
+            raise self.refused(
+                "peak_velocity",
+                f"{self.peak_velocity:g} m/s is less than twice mean_velocity, "
+                f"{self.mean_velocity:g} m/s: on the axis of a vessel blood flows twice as fast as "
+                f"in its mean",
+            )
+        if self.kind == "venous" and self.bed_pressure <= self.pressure_at_rest:
+            raise self.refused(
+                "bed_pressure",
+                f"{self.bed_pressure:g} Pa is not above the {self.pressure_at_rest:g} Pa in the "
+                f"vein, so nothing would flow into it",
+            )
+
+    @property
+    def pressure_at_rest(self) -> float:
+        """Pa, mean in the vessel at rest, over that where its blood goes."""
+        if self.pressure is not None:
+            return self.pressure
+        return _ARTERIAL_PRESSURE if self.kind == "arterial" else _VENOUS_PRESSURE
+
+
+@dataclass(frozen=True)
+class DopplerSettings(Settings):
+    """Beams and velocities of Doppler ultrasound.
+
+    Raises:
+        ProbeError: a value is out of range, or the wall filter takes all velocities.
+    """
+
+    error = ProbeError
+    live = True
+
+    lateral: float = setting(
+        Quantity("number", -0.5, 0.5),
+        "of the middle across the face, or the opening angle, as a fraction of that",
+        default=0.0,
+    )
+    depth: float | None = setting(
+        Quantity("length", 1e-3, 0.4), "of the middle; not given: the image's middle", default=None
+    )
+    follow: bool = setting(
+        description="keep the middle on the vessel nearest to it in the image", default=False
+    )
+    steering: float = setting(
+        Quantity("angle", math.radians(-30), math.radians(30)),
+        "of the beams towards +x of the probe; linear probes only",
+        default=0.0,
+    )
+    nyquist_velocity: float = setting(
+        Quantity("speed", 0.01, 5.0), "along the beam, at which velocities turn over", default=0.3
+    )
+    wall_filter: float = setting(
+        Quantity("speed", 0.0, 0.2), "along the beam, of what is halved as tissue", default=0.015
+    )
+    gain: float = setting(Quantity("level", -30.0, 30.0), "of the blood's echoes", default=0.0)
+
+    def check(self) -> None:
+        """Refuse a wall filter that leaves nothing."""
+        if self.wall_filter >= self.nyquist_velocity:
+            raise self.refused(
+                "wall_filter",
+                f"{self.wall_filter:g} m/s is not below nyquist_velocity, "
+                f"{self.nyquist_velocity:g} m/s: nothing would be left to show",
+            )
+
+
+@dataclass(frozen=True)
+class ColourSettings(DopplerSettings):
+    """The colour box, and how velocities in it are estimated."""
+
+    section = "colour"
+
+    width: float = setting(
+        Quantity("number", 0.02, 1.0),
+        "of the box across the face, or the opening angle, as a fraction of that",
+        default=0.5,
+    )
+    height: float | None = setting(
+        Quantity("length", 1e-3, 0.4),
+        "of the box along the beams; not given: half of the image",
+        default=None,
+    )
+    pulses: int = setting(
+        Quantity("number", 3, 64), "along each beam; the more, the less noise", default=10
+    )
+    resolution: float = setting(
+        Quantity("length", 0.0, 5e-3), "full width at half maximum", default=0.6e-3
+    )
+    persistence: float = setting(
+        Quantity("number", 0.0, 0.95), "weight of the frames before", default=0.3
+    )
+
+
+@dataclass(frozen=True)
+class SpectrumSettings(DopplerSettings):
+    """The gate, and how its spectrum is shown."""
+
+    section = "spectrum"
+
+    size: float = setting(
+        Quantity("length", 5e-4, 0.02), "length of the gate along the beam", default=1.5e-3
+    )
+    angle_correction: float = setting(
+        Quantity("angle", math.radians(-80), math.radians(80)),
+        "between beam and vessel, as the sonographer sets it",
+        default=0.0,
+    )
+    baseline: float = setting(
+        Quantity("number", -0.9, 0.9),
+        "of 0 m/s: by which fraction of the Nyquist velocity it is moved down",
+        default=0.0,
+    )
+    dynamic_range: float = setting(
+        Quantity("level", 10.0, 80.0), default=30.0, description="level from black to white"
+    )
+    sweep: float = setting(Quantity("time", 0.5, 20.0), "that the picture shows", default=4.0)

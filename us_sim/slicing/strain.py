@@ -1,0 +1,452 @@
+"""Displacement and strain of the tissue in an image, without error, and the colours of strain.
+
+Axial strain is the engineering strain of a line of tissue that lies along the beam *now*: its
+length now over its length in the other state, less 1. A tissue line along the unit vector d was
+1 / λ times as long in another state, with 1 / λ² = d · c d. The tensor c = F⁻ᵀ F⁻¹ is Cauchy's
+deformation tensor (Holzapfel, *Nonlinear Solid Mechanics*, 2000, section 2.5); F maps that state to
+now. It is constant in a linear tetrahedron, averaged at each node over its tetrahedra by their
+volumes (Zienkiewicz and Zhu, Int. J. Numer. Methods Eng. 24:337, 1987), and linear in between.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.slicing.b_mode import BMode
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.strain import AxialStrain
+>>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> from us_sim.volume.volume import Volume
+>>> volume = Volume(np.zeros((41, 41, 41), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+>>> mesh = box_mesh([0.0, 0.02, 0.04], [0.0, 0.04], [0.0, 0.04])
+>>> scanner = BMode(volume, LinearProbe(aperture=0.01, depth=0.02, columns=2, rows=3))
+>>> scanner.carry(mesh.nodes, mesh.tetrahedra)
+>>> frame = scanner.frame(Pose([0.02, 0.02, 0.01]), mesh.nodes * [1.02, 1.02, 0.95])
+>>> AxialStrain.of(frame).image(frame)[:, 0].round(4)
+array([-0.05, -0.05, -0.05], dtype=float32)
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from us_sim.errors import MeshError
+from us_sim.kernels import njit
+from us_sim.slicing.cutting.resampling import evaluate, parallel_rows
+from us_sim.slicing.cutting.section import adjugate, is_solid
+from us_sim.slicing.drawing.overlay import ColourScale
+from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.probe import LinearProbe, Probe
+
+if TYPE_CHECKING:
+    from us_sim.volume.volume import Volume
+
+
+def displacement(frame: Frame) -> NDArray[np.float32]:
+    """(rows, columns, 2) m: the tissue's way from rest to each pixel, lateral and axial.
+
+    These are its components along +x and +z of frame ``probe`` as the probe is now; the part across
+    the image is left out. It is the way in frame ``patient``: the probe's own motion is no part of
+    it. NaN where no tissue of the mesh is: outside it, where tissue has moved away, and beside the
+    beams.
+
+    Raises:
+        MeshError: there is no mesh, another number of nodes than at rest, or nodes that are not
+            finite.
+        ProbeError: the pose is nowhere near.
+    """
+    located, plane = frame.located, frame.plane
+    to_patient = frame.volume.index_to_patient
+    now = np.stack([plane.origin, plane.column_step, plane.row_step], axis=1)
+    rest = to_patient[:3, :3] @ located.maps[: len(located.tetrahedra)]
+    rest[:, :, 0] += to_patient[:3, 3]
+    across = frame.pose.rotation[:, [0, 2]].T
+    return evaluate(across @ (now - rest), located.elements, threads=frame.threads)
+
+
+_PARTS = 5
+"""Of an edge: the points that are looked up lie evenly, 56 in each tetrahedron."""
+
+
+def main_labels(
+    nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer], volume: Volume
+) -> NDArray[np.uint8]:
+    """(M,) the label with most of some evenly spaced points; 0 without labels.
+
+    Args:
+        nodes: (N, 3) m, at rest. tetrahedra: (M, 4).
+    """
+    if volume.labels is None:
+        return np.zeros(len(tetrahedra), dtype=np.uint8)
+    to_index = volume.patient_to_index
+    index = nodes @ to_index[:3, :3].T + to_index[:3, 3]
+    last = np.array(volume.shape) - 1
+    corners = index[tetrahedra]
+    most = np.zeros(len(tetrahedra), dtype=np.int16)
+    found = np.zeros(len(tetrahedra), dtype=np.uint8)
+    seen = np.stack(
+        [
+            volume.labels[tuple(np.clip(np.rint(place), 0, last).astype(np.intp).T)]
+            for place in (np.einsum("k,ekj->ej", weight, corners) for weight in _weights())
+        ],
+        axis=1,
+    )
+    for label in np.unique(seen):
+        count = (seen == label).sum(axis=1, dtype=np.int16)
+        more = count > most
+        most[more], found[more] = count[more], label
+    return found
+
+
+def _weights() -> list[NDArray[np.float64]]:
+    """Barycentric coordinates (4,) of evenly spaced points, none of them on a face."""
+    counts = itertools.product(range(_PARTS + 1), repeat=3)
+    inner = [(*each, _PARTS - sum(each)) for each in counts if sum(each) <= _PARTS]
+    return [(np.array(each) + 0.25) / (_PARTS + 1.0) for each in inner]
+
+
+class Corners(NamedTuple):
+    """The P corners that tetrahedra of one tissue share: a node between two tissues is two."""
+
+    numbers: NDArray[np.int32]  # (M, 4) of the tetrahedra's corners
+    starts: NDArray[np.int64]  # (P + 1,) of the list of tetrahedra around each, one after the other
+    members: NDArray[np.int32]  # (starts[-1],)
+
+
+def corners_by_tissue(tetrahedra: NDArray[np.int32], tissue: NDArray[np.integer]) -> Corners:
+    """Corners over which strain is averaged, and not from one tissue to another.
+
+    Args:
+        tetrahedra: (M, 4). tissue: (M,) which one each is of, at least 0.
+    """
+    width = int(tissue.max(initial=0)) + 1
+    keys = tetrahedra.astype(np.int64) * width + np.asarray(tissue, dtype=np.int64)[:, None]
+    _, numbers = np.unique(keys.ravel(), return_inverse=True)
+    numbers = numbers.ravel()  # NumPy 2.0 gives it the shape of the keys
+    count = int(numbers.max(initial=-1)) + 1
+    starts = np.zeros(count + 1, dtype=np.int64)
+    np.cumsum(np.bincount(numbers, minlength=count), out=starts[1:])
+    members = (np.argsort(numbers, kind="stable") // 4).astype(np.int32)
+    return Corners(numbers.reshape(-1, 4).astype(np.int32), starts, members)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nodal_deformation(
+    shown, tetrahedra, corners, starts, members, before, now, to_pixel, pixel_volume, steps, place,
+    deformed, done, mean,
+):  # fmt: skip
+    """Fills ``mean`` (P, 3) at the corners of the tetrahedra that are shown.
+
+    It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A corner
+    around which all tetrahedra are inverted or flat is left without deformation: 1, 0, 1.
+
+    Args:
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
+        corners, starts, members: as `Corners`.
+        before, now: (N, 3) m, nodes in the other state and now.
+        to_pixel: (3, 4) from m to column, row and height. pixel_volume: m³ per unit of those.
+        steps: (2,) m, from one column to the next, and from one row to the next.
+        place: (N, 3) column, row and height of the nodes now, filled here.
+        deformed: (M, 4) room for volume and c of tetrahedra. done: (M + P,) bool, room.
+    """
+    for n in range(len(now)):
+        for a in range(3):
+            place[n, a] = (
+                to_pixel[a, 3]
+                + to_pixel[a, 0] * now[n, 0]
+                + to_pixel[a, 1] * now[n, 1]
+                + to_pixel[a, 2] * now[n, 2]
+            )
+    for i in range(len(done)):
+        done[i] = False
+    count = len(tetrahedra)
+    for s in shown:
+        for k in range(4):
+            n = corners[s, k]
+            if done[count + n]:
+                continue
+            done[count + n] = True
+            volume = 0.0
+            first = 0.0
+            mixed = 0.0
+            last = 0.0
+            for q in range(starts[n], starts[n + 1]):
+                e = members[q]
+                if not done[e]:
+                    done[e] = True
+                    _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed)
+                volume += deformed[e, 0]
+                first += deformed[e, 0] * deformed[e, 1]
+                mixed += deformed[e, 0] * deformed[e, 2]
+                last += deformed[e, 0] * deformed[e, 3]
+            mean[n, 0] = first / volume if volume > 0.0 else 1.0
+            mean[n, 1] = mixed / volume if volume > 0.0 else 0.0
+            mean[n, 2] = last / volume if volume > 0.0 else 1.0
+
+
+@njit(inline="always", error_model="numpy")
+def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
+    """Fills a tetrahedron's row: its volume now in any unit (0 if it is not solid), and c."""
+    n0 = tetrahedra[e, 0]
+    n1 = tetrahedra[e, 1]
+    n2 = tetrahedra[e, 2]
+    n3 = tetrahedra[e, 3]
+    size, to_1, to_2, to_3 = adjugate(place, n0, n1, n2, n3)
+    ax = before[n1, 0] - before[n0, 0]
+    ay = before[n1, 1] - before[n0, 1]
+    az = before[n1, 2] - before[n0, 2]
+    bx = before[n2, 0] - before[n0, 0]
+    by = before[n2, 1] - before[n0, 1]
+    bz = before[n2, 2] - before[n0, 2]
+    cx = before[n3, 0] - before[n0, 0]
+    cy = before[n3, 1] - before[n0, 1]
+    cz = before[n3, 2] - before[n0, 2]
+    earlier = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+    if not is_solid(size, pixel_volume, earlier):
+        deformed[e, 0] = 0.0
+        deformed[e, 1] = 0.0
+        deformed[e, 2] = 0.0
+        deformed[e, 3] = 0.0
+        return
+    # How fast the place in the other state changes along the image's columns and rows.
+    p = 1.0 / (size * steps[0])
+    ux = p * (to_1[1] * ax + to_2[1] * bx + to_3[1] * cx)
+    uy = p * (to_1[1] * ay + to_2[1] * by + to_3[1] * cy)
+    uz = p * (to_1[1] * az + to_2[1] * bz + to_3[1] * cz)
+    r = 1.0 / (size * steps[1])
+    wx = r * (to_1[2] * ax + to_2[2] * bx + to_3[2] * cx)
+    wy = r * (to_1[2] * ay + to_2[2] * by + to_3[2] * cy)
+    wz = r * (to_1[2] * az + to_2[2] * bz + to_3[2] * cz)
+    deformed[e, 0] = abs(size)
+    deformed[e, 1] = ux * ux + uy * uy + uz * uz
+    deformed[e, 2] = ux * wx + uy * wy + uz * wz
+    deformed[e, 3] = wx * wx + wy * wy + wz * wz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def to_pixels(shown, tetrahedra, corners, place, mean, maps):
+    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of what corners have.
+
+    Args:
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes. corners: (M, 4).
+        place: (N, 3) column, row and height of the nodes.
+        mean: (P, 3), as `nodal_deformation` fills it.
+    """
+    for s in range(len(shown)):
+        e = shown[s]
+        n0 = tetrahedra[e, 0]
+        size, to_1, to_2, to_3 = adjugate(
+            place, n0, tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
+        )
+        r = 1.0 / size
+        for k in range(3):
+            at = mean[corners[e, 0], k]
+            b = r * (mean[corners[e, 1], k] - at)
+            c = r * (mean[corners[e, 2], k] - at)
+            d = r * (mean[corners[e, 3], k] - at)
+            maps[s, k, 0] = at + b * to_1[0] + c * to_2[0] + d * to_3[0]
+            maps[s, k, 1] = b * to_1[1] + c * to_2[1] + d * to_3[1]
+            maps[s, k, 2] = b * to_1[2] + c * to_2[2] + d * to_3[2]
+
+
+class AxialStrain:
+    """Strain images of a mesh's deformations.
+
+    Args:
+        rest_nodes: (N, 3) m. tetrahedra: (M, 4) indices into them.
+        tissue: (M,) which tissue each is of, at least 0: strain is averaged at the nodes of one
+            tissue only. None is one for all.
+    """
+
+    def __init__(
+        self,
+        rest_nodes: ArrayLike,
+        tetrahedra: ArrayLike,
+        tissue: NDArray[np.integer] | None = None,
+    ) -> None:
+        self._rest = np.array(rest_nodes, dtype=np.float64)
+        self._tetrahedra = np.array(tetrahedra, dtype=np.int32)
+        nodes, count = self._rest.shape, len(self._tetrahedra)
+        self._corners = corners_by_tissue(
+            self._tetrahedra, np.zeros(count, dtype=np.int64) if tissue is None else tissue
+        )
+        corners = len(self._corners.starts) - 1
+        self._now, self._before, self._place = np.empty(nodes), np.empty(nodes), np.empty(nodes)
+        self._mean = np.empty((corners, 3))
+        self._deformed = np.empty((count, 4))
+        self._done = np.empty(count + corners, dtype=np.bool_)
+        self._directions: tuple[Probe, NDArray[np.float32]] | None = None
+
+    @classmethod
+    def of(cls, frame: Frame, *, sharp: bool = False) -> AxialStrain:
+        """Of the mesh that carries the volume in a frame.
+
+        Args:
+            sharp: average nothing over borders of the volume's labels, as far as the mesh follows
+                them.
+
+        Raises:
+            MeshError: there is none.
+        """
+        if frame.mesh is None:
+            raise MeshError("no tissue carries the volume, so there is no strain")
+        nodes, tetrahedra = frame.mesh
+        return cls(
+            nodes, tetrahedra, main_labels(nodes, tetrahedra, frame.volume) if sharp else None
+        )
+
+    def image(self, frame: Frame, before: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
+        """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
+
+        Args:
+            frame: of this mesh.
+            before: (N, 3) m, where the nodes were; None for at rest.
+
+        Returns:
+            NaN where no tissue of the mesh is, and beside the beams.
+
+        Raises:
+            MeshError: the frame has no mesh or another, or nodes of either state are not as many
+                as this mesh has.
+            ProbeError: the pose is nowhere near.
+        """
+        located, plane = frame.located, frame.plane
+        now = self._as_kernels_take(frame.nodes, self._now)
+        then = self._rest if before is None else self._as_kernels_take(before, self._before)
+        shown = located.tetrahedra
+        nodal_deformation(
+            shown, self._tetrahedra, *self._corners, then, now, plane.to_pixel,
+            float(np.linalg.det(plane.basis)), frame.probe.pixel_spacing, self._place,
+            self._deformed, self._done, self._mean,
+        )  # fmt: skip
+        maps = np.empty((len(shown), 3, 3))
+        numbers = self._corners.numbers
+        to_pixels(shown, self._tetrahedra, numbers, self._place, self._mean, maps)
+        values = np.empty(located.elements.shape, dtype=np.float32)
+        elements, directions = located.elements, self._directions_of(frame.probe)
+        parallel_rows(
+            frame.threads,
+            plane.rows,
+            lambda first, end: _strain(maps, elements, directions, first, end, values),
+        )
+        return values
+
+    def _as_kernels_take(self, nodes: ArrayLike | None, room: NDArray[np.float64]) -> Any:
+        array = np.asarray(nodes)
+        if array.shape != room.shape:
+            raise MeshError(
+                f"the strain is that of a mesh of {len(room)} nodes, but {array.shape} came"
+            )
+        room[:] = array
+        return room
+
+    def _directions_of(self, probe: Probe) -> NDArray[np.float32]:
+        """As `Probe.pixel_directions`; of one row and column where all beams are parallel."""
+        if self._directions is None or self._directions[0] is not probe:
+            directions = probe.pixel_directions
+            if isinstance(probe, LinearProbe):
+                directions = directions[:, :1, :1]
+            self._directions = probe, np.array(directions)
+        return self._directions[1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _strain(maps, elements, directions, first_row, end_row, values):
+    """Fills rows of ``values`` (rows, columns) a run of pixels of one tetrahedron at a time.
+
+    Args:
+        maps: (E, 3, 3) as `to_pixels` fills them. elements: (rows, columns).
+        directions: (2, rows, columns) x and z of each pixel's beam, or (2, 1, 1) for 0 and 1.
+    """
+    columns = elements.shape[1]
+    along_z = directions.shape[1] == 1 and directions.shape[2] == 1
+    one = np.float32(1.0)
+    for row in range(first_row, end_row):
+        line = elements[row]
+        start = 0
+        while start < columns:
+            element = line[start]
+            end = start + 1
+            while end < columns and line[end] == element:
+                end += 1
+            if element < 0 or element >= len(maps):
+                for i in range(start, end):
+                    values[row, i] = np.nan
+                start = end
+                continue
+            m = maps[element]
+            axial = np.float32(m[2, 0] + m[2, 2] * row)
+            d_axial = np.float32(m[2, 1])
+            if along_z:
+                for i in range(start, end):
+                    values[row, i] = one / np.sqrt(axial + d_axial * np.float32(i)) - one
+            else:
+                lateral = np.float32(m[0, 0] + m[0, 2] * row)
+                d_lateral = np.float32(m[0, 1])
+                mixed = np.float32(m[1, 0] + m[1, 2] * row)
+                d_mixed = np.float32(m[1, 1])
+                for i in range(start, end):
+                    at = np.float32(i)
+                    x = directions[0, row, i]
+                    z = directions[1, row, i]
+                    values[row, i] = one / np.sqrt(
+                        x * x * (lateral + d_lateral * at)
+                        + np.float32(2.0) * x * z * (mixed + d_mixed * at)
+                        + z * z * (axial + d_axial * at)
+                    ) - one  # fmt: skip
+            start = end
+
+
+class Compression(NamedTuple):
+    """Of all tissue in a strain image."""
+
+    mean: float  # strain, negative where the tissue got shorter; 0 without tissue
+    quality: float
+    """0 to 1: the mean over the root mean square.
+
+    It is 1 where all tissue is strained alike, and falls where the press slides, turns or lets go
+    one part while it presses another. With the signal-to-noise ratio of an elastogram, its mean
+    over its standard deviation (Céspedes and Ophir, Ultrasonic Imaging 15:73, 1993), it is
+    SNR / √(1 + SNR²): what an even press makes of the image, and not how well it can be tracked.
+    """
+
+
+def compression(strain: NDArray[np.floating]) -> Compression:
+    """Of an image (any shape) of strain, NaN where there is no tissue."""
+    there = strain[np.isfinite(strain)].astype(np.float64)
+    if not there.size:
+        return Compression(0.0, 0.0)
+    mean, square = float(there.mean()), float(np.square(there).mean())
+    return Compression(mean, abs(mean) / square**0.5 if square > 0.0 else 0.0)
+
+
+_COLOURS = ((215, 48, 39), (253, 174, 97), (48, 48, 48), (116, 173, 209), (69, 117, 180))
+
+_ENDS = tuple(step / power for power in (100, 10, 1) for step in (1, 2, 3, 5))
+"""Round values at which a bar may end; strain beyond the last has its colour."""
+_HELD = 95.0  # percent of the pixels that lie within the bar; a vein that collapses need not
+_STAYS = 0.4  # the bar's end stays until strain is less than this much of it
+_STEP = 4  # pixels from one that is looked at to the next
+
+
+class FollowingEnd:
+    """The strain at the ends of a bar that holds nearly all of an image, and seldom changes."""
+
+    def __init__(self) -> None:
+        self._end = 0.0
+
+    def of(self, values: NDArray[np.floating]) -> float:
+        """The end for an image (rows, columns), NaN where there is no strain."""
+        sizes = np.abs(values[::_STEP, ::_STEP])
+        sizes = sizes[np.isfinite(sizes)]
+        most = float(np.percentile(sizes, _HELD)) if sizes.size else 0.0
+        if not _STAYS * self._end < most <= self._end:
+            self._end = next((end for end in _ENDS if most <= end), _ENDS[-1])
+        return self._end
+
+
+def strain_scale(name: str, most: float) -> ColourScale:
+    """From -most to most, in percent at the bar; red and blue differ to colour-blind eyes, too."""
+    title = name.replace("_", " ")
+    return ColourScale(title, -most, most, "%", factor=100.0, colours=_COLOURS)

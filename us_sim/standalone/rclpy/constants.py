@@ -1,3 +1,0 @@
-"""Numbers that rclpy names."""
-
-S_TO_NS = 1_000_000_000
