@@ -92,7 +92,8 @@ LIVE_COMPOUNDINGS = ("mean", "max", "latest")
 """Those that need no image twice."""
 
 _PLACE = Quantity("length", -100.0, 100.0)
-_VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
+VOLUME_ENDINGS = (".nrrd", ".mha", ".nii", ".nii.gz")
+"""Of the names of files that volumes are written to."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +147,8 @@ class LiveVolume(Settings):
 
     def check(self) -> None:
         """Refuse a file that could not be written at the end."""
-        if not self.file.lower().endswith(_VOLUMES):
-            raise self.refused("file", f"{self.file}: must end in {', '.join(_VOLUMES)}")
+        if not self.file.lower().endswith(VOLUME_ENDINGS):
+            raise self.refused("file", f"{self.file}: must end in {', '.join(VOLUME_ENDINGS)}")
 
     @property
     def image_to_probe(self) -> NDArray[np.float64]:
