@@ -24,6 +24,7 @@ from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.provenance import Step, add_step
 from us_sim.volume.cases.settings import AROUND, CaseSettings, check_name
+from us_sim.volume.partial_file import partial_file
 
 
 @contextmanager
@@ -102,12 +103,8 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
     text = yaml.safe_dump(
         document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
     )
-    partial = folder / f".{CASE}.partial"
-    try:
+    with partial_file(folder / CASE, error_type=CaseError) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, folder / CASE)
-    except OSError as error:
-        raise CaseError(f"{folder / CASE}: cannot be written: {error.strerror}") from error
 
 
 def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSettings:

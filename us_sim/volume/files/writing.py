@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_image import file_order
+from us_sim.volume.partial_file import partial_file
 from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
@@ -55,7 +54,7 @@ def write_volume(
     grid = _grid_in_mm(path, volume)
     _check_fields(path, fields)
     head = (_nrrd_header if name.endswith(".nrrd") else _metaimage_header)(volume, *grid, fields)
-    with _partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
+    with partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
         file.write(head.encode("utf-8"))
         for k, step in _slabs(voxels):
             file.write(file_order(voxels[:, :, k : k + step]).data)
@@ -131,7 +130,7 @@ def write_image_sequence(
         fields[f"Seq_Frame{number:04}_ImageStatus"] = "OK"
         fields[f"Seq_Frame{number:04}_Timestamp"] = f"{time:.9g}"
     fields["ElementDataFile"] = "LOCAL"
-    with _partial_file(path, "image.mha") as partial, partial.open("wb") as file:
+    with partial_file(path, "image.mha") as partial, partial.open("wb") as file:
         file.write(_lines(fields).encode("ascii"))
         for image in images:
             file.write(np.ascontiguousarray(image).tobytes())
@@ -163,22 +162,6 @@ def _check_fields(path: Path, fields: Mapping[str, str]) -> None:
                 f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
                 f"without blanks, colons and equals signs, and one line of text"
             )
-
-
-@contextmanager
-def _partial_file(path: Path, name: str) -> Iterator[Path]:
-    """The path of a file to write; at the end it takes the place of another."""
-    folder = ""
-    try:
-        folder = tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.parent)
-        yield Path(folder, name)
-        os.replace(Path(folder, name), path)
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        if folder:
-            Path(folder, name).unlink(missing_ok=True)
-            os.rmdir(folder)
 
 
 def _slabs(voxels: NDArray[np.uint8]) -> Iterator[tuple[int, int]]:
@@ -298,7 +281,7 @@ def _write_by_itk(
     image.SetDirection(direction.ravel().tolist())
     for key, value in fields.items():
         image.SetMetaData(key, value)
-    with _partial_file(path, f"image{ending}") as partial:
+    with partial_file(path, f"image{ending}") as partial:
         try:
             # zlib's fastest level; speckle hardly becomes smaller with any other
             sitk.WriteImage(image, str(partial), packed, 1)
