@@ -74,7 +74,7 @@ class Asked:
 class Reds:
     """Red over the right half, half opaque."""
 
-    overlay_name = "strain"
+    topic = "ultrasound/strain"
     is_wanted = False
 
     def overlay(self, frame):

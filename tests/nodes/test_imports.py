@@ -6,7 +6,7 @@ import sys
 import pytest
 
 UNUSED = [
-    ("us_sim.nodes.viewer, us_sim.viewer.application", {"numba", "scipy"}),
+    ("us_sim.viewer.viewer, us_sim.viewer.page", {"numba", "scipy"}),
     ("us_sim.nodes.probe_tracker", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.session_recorder", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.path_player", {"numba", "scipy", "cv2"}),

@@ -12,11 +12,11 @@ from rclpy.parameter import Parameter as RosParameter
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.remote_parameters import RemoteParameters
 from us_sim.nodes.settings import TissueDeformerSettings
 from us_sim.settings.registry import SOLVERS
 from us_sim.slicing.settings import ColourSettings, Imaging
 from us_sim.viewer.parameters import Kind, State
+from us_sim.viewer.remote_parameters import RemoteParameters
 
 
 @pytest.fixture
@@ -189,7 +189,7 @@ def test_a_parameter_without_a_value_does_not_hide_the_others(bench, remote):
 
 
 def test_a_node_without_parameter_services_is_silent(bench, remote, monkeypatch):
-    monkeypatch.setattr("us_sim.nodes.remote_node.SERVICES_S", 0.0)
+    monkeypatch.setattr("us_sim.viewer.remote_parameters.SERVICES_S", 0.0)
     bench.add(Node("mute", context=bench.context, start_parameter_services=False))
     remote.board.watch("mute")
     bench.spin_until(lambda: remote.board.of("mute").state is State.SILENT)
@@ -199,7 +199,7 @@ def test_a_node_without_parameter_services_is_silent(bench, remote, monkeypatch)
 def test_a_node_that_does_not_answer_is_told_so(bench, remote, monkeypatch):
     node = console(bench)
     looked_at(bench, remote, "console")
-    monkeypatch.setattr("us_sim.nodes.remote_node.ANSWER_S", 0.0)
+    monkeypatch.setattr("us_sim.viewer.remote_parameters.ANSWER_S", 0.0)
     bench.executor.remove_node(node)  # it hangs
     reason = answered(bench, remote.board.set("console", "gain", 3))
     assert reason == "console did not answer within 0 s"

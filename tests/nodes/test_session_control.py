@@ -8,9 +8,8 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.session_control import SessionControl
 from us_sim.nodes.settings import SessionControlSettings
-from us_sim.nodes.viewer_session import ViewerSession
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.session import NOT_THERE
+from us_sim.viewer.session import NOT_THERE, ViewerSession
 
 
 class Simulation:

@@ -8,8 +8,7 @@ from geometry_msgs.msg import WrenchStamped
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.status_listener import StatusListener
-from us_sim.viewer.status import Level
+from us_sim.viewer.status import Level, StatusListener
 
 
 def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):

@@ -11,7 +11,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import affine_message, colour_image_message, image_message
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED
-from us_sim.nodes.viewer_feeds.image_feed import image_feeds
+from us_sim.viewer.feeds import image_feeds
 
 
 class Watcher(GuardedNode):

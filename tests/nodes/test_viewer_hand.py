@@ -15,13 +15,12 @@ from us_sim.nodes.messages import mesh_message, nanoseconds_of, pose_message
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.qos import LATCHED
-from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
-from us_sim.nodes.viewer_hand import ViewerHand
 from us_sim.skin.surface import bent_surface
-from us_sim.viewer.feed import Feed
+from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.hand import ViewerHand
 from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
 from us_sim.viewer.session import SessionBoard, SessionState
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Simulator
 
 
 class Holder(GuardedNode):
@@ -296,7 +295,7 @@ def test_no_tracker_that_listens_is_said(bench, page):
 
 
 def test_a_simulator_that_does_not_follow_is_said(bench, page, tracked, monkeypatch):
-    monkeypatch.setattr("us_sim.nodes.viewer_hand.UNANSWERED", 0.5)
+    monkeypatch.setattr("us_sim.viewer.hand.UNANSWERED", 0.5)
     page.open()
     bench.spin_until(lambda: len(tracked) > 2)
     assert page.state["warning"] == ""

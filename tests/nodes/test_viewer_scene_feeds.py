@@ -26,14 +26,9 @@ from us_sim.nodes.messages import (
     wrench_message,
 )
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.viewer_feeds.probe_feed import ProbeFeeds
-from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
-from us_sim.nodes.viewer_feeds.skin_feed import SkinFeeds
-from us_sim.nodes.viewer_feeds.structures_feed import StructuresFeed
-from us_sim.nodes.viewer_feeds.tissue_feed import TissueFeeds
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.feeds import ProbeFeeds, RestMesh, SkinFeeds, StructuresFeed, TissueFeeds
+from us_sim.viewer.stream import Feed, Packet
 
 PLANES = uniform_planes(-0.02, 0.02, 4)
 MESH = box_mesh(PLANES, PLANES, PLANES)

@@ -10,10 +10,10 @@ from std_msgs.msg import Int32MultiArray
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import cloud_message, mesh_message, tetrahedra_message
 from us_sim.nodes.qos import LATCHED
-from us_sim.nodes.viewer_feeds.rest_mesh import RestMesh
-from us_sim.nodes.viewer_surface import ViewerSurface
 from us_sim.skin.surface import plane_surface
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.hand import ViewerSurface
 
 
 class Stander(GuardedNode):

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from chromium import watched
 
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 
 @pytest.fixture(scope="session")

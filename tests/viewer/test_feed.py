@@ -3,10 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
-from us_sim.viewer.stream import PageStream
+from us_sim.viewer.stream import Feed, Packet, PageStream, Simulator
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.text(),

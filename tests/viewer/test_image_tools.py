@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from awaiting import until
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 COLUMNS, ROWS = 400, 300
 ACROSS, DOWN = 1e-4, 1.4e-4  # m a pixel: not square

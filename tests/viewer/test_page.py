@@ -13,12 +13,10 @@ import pytest
 from awaiting import until
 
 from us_sim.errors import UsSimError
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.listening import listening
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.server import listening
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 PIXEL = 1e-4  # m
 MATRIX = [PIXEL, 0, 0, -0.0256, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]

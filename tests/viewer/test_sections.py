@@ -1,9 +1,9 @@
 """Which parameters stand where in the panels."""
 
-from us_sim.viewer.panels.section import common_first
-from us_sim.viewer.panels.tissue import arrange_tissue
+from us_sim.viewer.panels.controls import on_sliders, slider_count
+from us_sim.viewer.panels.nodes import arrange_tissue
+from us_sim.viewer.panels.sections import common_first
 from us_sim.viewer.parameters import Kind, Parameter
-from us_sim.viewer.time_gain_sliders import on_sliders, slider_count
 
 
 def known(*names: str, **fields: object) -> dict[str, Parameter]:

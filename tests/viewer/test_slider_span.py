@@ -4,7 +4,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from us_sim.viewer.slider_span import slider_span
+from us_sim.viewer.panels.controls import slider_span
 
 
 @pytest.mark.parametrize(

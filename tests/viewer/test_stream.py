@@ -4,9 +4,7 @@ from typing import Any
 
 from awaiting import until
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 TAKE = """async () => {
     const { stream } = await import('/us_sim/assets/stream.js');

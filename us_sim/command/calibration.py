@@ -27,7 +27,7 @@ from us_sim.errors import CalibrationError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
 from us_sim.settings.spelling import counted
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 from us_sim.tracking.calibration.camera import (
     INTRINSICS,
     Board,

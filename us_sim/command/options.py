@@ -28,7 +28,7 @@ from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
 
 class ChosenParser(argparse.ArgumentParser):
@@ -188,7 +188,7 @@ def supervision(args: argparse.Namespace) -> SupervisionSettings:
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
     """Where the page is served."""
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
     add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
 
@@ -201,7 +201,7 @@ def add_view_option(parser: argparse.ArgumentParser) -> None:
 
 def viewer(args: argparse.Namespace) -> ViewerSettings:
     """Settings of the viewer; a wrong value raises a UsSimError."""
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 

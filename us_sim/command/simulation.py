@@ -131,15 +131,14 @@ def _run(args: argparse.Namespace) -> int:
 def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
     """Print the nodes that would run, having checked the files of the scene."""
     from us_sim.run.live import dry_run
-    from us_sim.scene.readable_files import check_files
-    from us_sim.scene.reading import load_scene
+    from us_sim.scene.reading import check_files, load_scene
 
     scene = load_scene(scene_name(args), volume=args.volume)
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
     if path is not None and not scene.volume.phantom:
         from us_sim.scene.building import volume_of
-        from us_sim.scene.image_in_volume import check_path_in_volume
+        from us_sim.scene.placement import check_path_in_volume
 
         check_path_in_volume(scene, path, volume_of(scene), args.topic if args.path else None)
     parameters = node_parameters(args.param)

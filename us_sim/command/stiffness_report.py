@@ -48,7 +48,6 @@ def table(found: StiffnessFit) -> str:
 
 
 def _left_over(found: StiffnessFit) -> str:
-    """RMS of the residuals, in a line."""
     force, torque, landmark = (found.scatter(kind) for kind in ("force", "torque", "landmark"))
     parts = []
     if force is not None:
@@ -66,7 +65,6 @@ def _left_over(found: StiffnessFit) -> str:
 
 
 def _offsets(found: StiffnessFit) -> np.ndarray:
-    """(n,) what the sensor's offsets and delay make of the measurements."""
     return np.asarray(found.observations.nuisance @ found.fitted.nuisance)
 
 
@@ -132,7 +130,6 @@ def draw_fit(file: Path, found: StiffnessFit, title: str) -> None:
 
 
 def _draw_kind(over_time: Axes, left_over: Axes, found: StiffnessFit, kind: str) -> None:
-    """Measured and modelled values of one kind, without the sensor's offsets; and the residuals."""
     observed = found.observations
     scale, unit = _SCALES[kind]
     its = observed.groups == GROUPS.index(kind)
@@ -162,7 +159,6 @@ def _draw_kind(over_time: Axes, left_over: Axes, found: StiffnessFit, kind: str)
 
 
 def _channels(found: StiffnessFit, its: np.ndarray, kind: str) -> list[tuple[str, np.ndarray]]:
-    """Names of curves, and the numbers of their measurements."""
     observed = found.observations
     if kind == "landmark":
         numbers = np.flatnonzero(its).reshape(-1, 3)
@@ -175,7 +171,6 @@ def _channels(found: StiffnessFit, its: np.ndarray, kind: str) -> list[tuple[str
 
 
 def _draw_force_over_depth(panel: Axes, found: StiffnessFit) -> None:
-    """The force along the probe over how deep it is in the undeformed tissue."""
     observed = found.observations
     pressed = observed.depths > 0.0
     for place, channel in enumerate(observed.channels):
@@ -200,7 +195,6 @@ def _draw_force_over_depth(panel: Axes, found: StiffnessFit) -> None:
 
 
 def _draw_moduli(panel: Axes, found: StiffnessFit) -> None:
-    """Moduli with their intervals; kept ones are hollow."""
     names = list(found.moduli)
     for row, name in enumerate(names):
         modulus, interval = found.moduli[name] / 1e3, found.intervals.get(name)

@@ -89,8 +89,8 @@ def _reconstruct(args: argparse.Namespace) -> int:
     compounding, part = read_settings(args, Compounding), read_settings(args, ImagePart)
     rest_of = None
     if args.undo_pressure is not None:
+        from us_sim.scene.placement import rest_placement
         from us_sim.scene.reading import load_scene
-        from us_sim.scene.rest_placement import rest_placement
 
         rest_of = partial(rest_placement, load_scene(args.undo_pressure))
 

@@ -24,16 +24,14 @@ from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate, rotation_between
 from us_sim.recording.path import ProbePath
+from us_sim.scene.building import camera_body_of, tracker_poses_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.tracker_building import camera_body_of, tracker_poses_of
 from us_sim.tracking.camera.model import write_camera_info
 from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 CAMERA = WEBCAMS["640x480"]
-RATE = 30.0
-"""Images per second."""
-
+RATE = 30.0  # images per second
 _EXPOSURE = 0.008  # s
 _CODEC = "FFV1"  # lossless
 _FORM = 1  # of what is kept: another number for whatever changes the images

@@ -16,10 +16,9 @@ from matplotlib.figure import Figure
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.building import colour_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 
 _COLUMNS = 4

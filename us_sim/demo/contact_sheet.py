@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.scene.blood import blood_of
-from us_sim.scene.building import probe_of, scanner_of, volume_of
+from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.drawing.overlay import Overlay
@@ -85,9 +83,7 @@ def _pressing(session: Session, stamps: list[int]) -> tuple[int, int] | None:
     return (stamps[first], stamps[middle]) if first >= 0 else None
 
 
-TILT = 20.0
-"""Degrees of the plane, about the array."""
-
+TILT = 20.0  # degrees of the plane, about the array
 _LET_GO = 0.35  # of the deepest press, from which on the vessels are open again
 
 
@@ -99,8 +95,6 @@ def colour_pictures(
     None of a scene without flows or without tissue, or whose vessels no image shows.
 
     Args:
-        session: that was recorded.
-        scene: of the session.
         areas: of its vessels: moments are chosen among those whose images show the vessels whole.
     """
     if not scene.flows or session.rest is None or session.tetrahedra is None:

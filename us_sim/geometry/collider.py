@@ -12,8 +12,8 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
+# A curved face is refused when it is steeper than this at its ends, rad.
 _STEEPEST = math.radians(75)
-"""A curved face is refused when it is steeper than this at its ends, rad."""
 _SIZE = Quantity("length", 1e-4, 0.5)
 _ROUNDING = Quantity("length", 1e-5, 0.25)
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# The four outward faces of a positively oriented tetrahedron.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-"""The four outward faces of a positively oriented tetrahedron."""
-
-MOST_NODES = 2**21
-"""Most nodes of a mesh, so that the three of a face fit into one 64-bit number."""
+MOST_NODES = 2**21  # Most nodes of a mesh, so that the three of a face fit into one 64-bit number
 
 
 def face_order(

@@ -12,8 +12,7 @@ import numpy as np
 
 from us_sim.errors import MeshError
 
-_MEMORY = 1 << 30
-"""Bytes that reading a file may take, and `_MEMORY_PER_BYTE` times its size."""
+_MEMORY = 1 << 30  # Bytes that reading a file may take, and `_MEMORY_PER_BYTE` times its size
 _MEMORY_PER_BYTE = 64
 
 

@@ -20,10 +20,9 @@ from us_sim.errors import PoseError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
+# m: the coordinates of poses are no larger, so that no product of a few of them overflows.
 _FARTHEST = 1e15
-"""m: the coordinates of poses are no larger, so that no product of a few of them overflows."""
-_LONGEST = 1e6
-"""Of a quaternion's components."""
+_LONGEST = 1e6  # Of a quaternion's components
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +151,7 @@ def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion / np.linalg.norm(quaternion)
 
 
-PLACE = Quantity("length", -10.0, 10.0)
-"""A coordinate of something near the patient."""
+PLACE = Quantity("length", -10.0, 10.0)  # A coordinate of something near the patient
 
 
 @dataclass(frozen=True)
@@ -178,8 +176,7 @@ class Placement(Settings):
         return Pose(np.array(self.position), np.array(self.orientation))
 
 
-_MOST = 1000
-"""Most frames kept; a tree of more is somebody's mistake."""
+_MOST = 1000  # Most frames kept; a tree of more is somebody's mistake
 
 
 class FrameTree:

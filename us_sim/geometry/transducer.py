@@ -30,10 +30,7 @@ class ProbeSettings(Settings):
     error = SceneError
 
     array: Chosen = setting(
-        description="kind of transducer",
-        choice=PROBES,
-        place="beside",
-        default=Chosen("linear"),
+        description="kind of transducer", choice=PROBES, place="beside", default=Chosen("linear")
     )
     image: tuple[int, int] | int | None = setting(
         Quantity("number", 1, 4096),
@@ -52,19 +49,14 @@ class ProbeSettings(Settings):
 
 
 Colour = tuple[float, float, float]
-
+# Parts of a ring's long sides, of each of its corners, and of the rounding from front to side.
 _ALONG, _ROUND, _LATITUDES = 16, 6, 6
-"""Parts of a ring's long sides, of each of its corners, and of the rounding from front to side."""
-_NOSE = 0.006
-"""m, of the face's part that is straight behind its rounding."""
+_NOSE = 0.006  # m, of the face's part that is straight behind its rounding
+# m, how long the taper is, the grip, what keeps the cable from kinking, and the cable's stub.
 _SHOULDER, _GRIP, _RELIEF, _CABLE = 0.022, 0.058, 0.020, 0.045
-"""m, how long the taper is, the grip, what keeps the cable from kinking, and the cable's stub."""
-_NARROWEST, _WIDEST = 0.024, 0.034
-"""m, a grip across its flat, as a hand holds it."""
+_NARROWEST, _WIDEST = 0.024, 0.034  # m, a grip across its flat, as a hand holds it
 _CABLE_RADIUS, _RELIEF_RADIUS = 0.0028, 0.0055
-_NOTCH = (0.0016, 0.0022, 0.009)
-"""m, half the orientation notch's height, width and length."""
-
+_NOTCH = (0.0016, 0.0022, 0.009)  # m, half the orientation notch's height, width and length
 FACE, HOUSING = (0.20, 0.23, 0.26), (0.86, 0.88, 0.89)
 CABLE, NOTCH = (0.13, 0.14, 0.16), (0.31, 0.70, 0.75)
 
@@ -180,7 +172,7 @@ def _flat_ring(half_x: float, half_y: float, rounding: float, z: float) -> NDArr
 
 def _face_rings(
     half_x: float, half_y: float, rounding: float, curvature: float
-) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+) -> tuple[list[NDArray], NDArray]:
     """Rings on the collider: of the front, from its middle line outwards, and the last, its side.
 
     A point of a ring is one of the core's front, grown by the rounding along a normal there: of
@@ -208,7 +200,7 @@ def _turned(ring: NDArray[np.float64], scale: tuple[float, float]) -> NDArray[np
 
 
 def _part(
-    name: str, colour: Colour, rings: Sequence[NDArray[np.float64]], has_front: bool = True
+    name: str, colour: Colour, rings: Sequence[NDArray], has_front: bool = True
 ) -> TransducerPart:
     """Bands from ring to ring, and flat ends; points that are at the same place are one.
 
@@ -232,9 +224,7 @@ def _part(
     return TransducerPart(name, colour, *_joined(vertices, np.concatenate(triangles)))
 
 
-def _joined(
-    vertices: NDArray[np.float64], triangles: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _joined(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
     """The same with points that lie on each other, to a nanometre, as one."""
     _, first, which = np.unique(
         np.rint(vertices * 1e9), axis=0, return_index=True, return_inverse=True

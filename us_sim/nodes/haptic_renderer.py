@@ -27,7 +27,7 @@ from us_sim.nodes.messages import (
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.scene.tracker_building import haptic_rendering_of, source_settings
+from us_sim.scene.building import haptic_rendering_of, source_settings
 
 _MEASURED = 2000
 """Ticks of which the jitter is told."""

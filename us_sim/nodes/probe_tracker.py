@@ -36,8 +36,7 @@ from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import TrackerInput
-from us_sim.scene.building import collider_of, probe_of
-from us_sim.scene.tracker_building import source_settings, tracking_of
+from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
 from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter

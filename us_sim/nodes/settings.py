@@ -20,15 +20,12 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
 from us_sim.settings.spelling import unknown
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml
+from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
-from us_sim.slicing.settings import Imaging
-from us_sim.viewer.viewer_settings import ViewerSettings
+from us_sim.slicing.settings import OVERLAYS, TISSUE_PARAMETERS, Imaging
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
-
-OVERLAYS = ("strain", "strain_estimate", "velocity", "none")
-"""Colours over the annotated image, by the names of the streams that they are of."""
 
 _AGE = Quantity("time", 0.01, 3600.0)
 
@@ -55,7 +52,7 @@ class AnnotatedImageSettings(Settings):
 
     overlay: str = setting(
         description="colours over the annotated image, where the scene can provide them",
-        choices=OVERLAYS,
+        choices=(*OVERLAYS, "none"),
         default="none",
     )
     flip: bool = setting(
@@ -75,7 +72,7 @@ def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
     yield "", type(probe_of(scene))
     yield "acoustics.", SoundSettings
     for label in scene.imaging.acoustics.tissues:
-        yield f"acoustics.tissues.{label}.", TissueAcoustics
+        yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
     yield "m_mode.", type(scene.m_mode)
     if scene.tissue is not None:
         yield "strain.", type(scene.strain)

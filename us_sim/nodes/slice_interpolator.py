@@ -34,9 +34,7 @@ from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.settings import Imaging
-
-_TISSUES = "acoustics.tissues."
+from us_sim.slicing.settings import TISSUE_PARAMETERS, Imaging
 
 Console = Callable[[Probe, Imaging, Acoustics], None]
 
@@ -59,7 +57,8 @@ class ScannerConsole:
             "acoustics": Group(imaging.acoustics, "acoustics.", rules_of(SoundSettings)),
         }
         for label, tissue in imaging.acoustics.tissues.items():
-            groups[_TISSUES + label] = Group(tissue, f"{_TISSUES}{label}.")
+            prefix = f"{TISSUE_PARAMETERS}{label}."
+            groups[prefix] = Group(tissue, prefix)
         console = LiveSettings(
             node, groups, lambda to: prepare(*_together(to)), lambda to: use(*_together(to))
         )
@@ -68,9 +67,9 @@ class ScannerConsole:
 
 def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
     tissues = {
-        key.removeprefix(_TISSUES): value
+        key.removeprefix(TISSUE_PARAMETERS)[:-1]: value
         for key, value in values.items()
-        if key.startswith(_TISSUES)
+        if key.startswith(TISSUE_PARAMETERS)
     }
     acoustics = dataclasses.replace(values["acoustics"], tissues=tissues)
     return values["probe"], values["imaging"], acoustics

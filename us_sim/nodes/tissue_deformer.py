@@ -34,8 +34,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings, TissueDeformerSettings
 from us_sim.progress import late_progress
-from us_sim.scene.building import materials_of, tissue_model_of, volume_of
-from us_sim.scene.structures import Structure, structures_of
+from us_sim.scene.building import Structure, materials_of, structures_of, tissue_model_of, volume_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.material import Material

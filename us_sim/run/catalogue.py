@@ -11,9 +11,8 @@ from collections.abc import Sequence
 
 from us_sim.errors import UsSimError
 from us_sim.run.background import tell
-from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
+from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
 from us_sim.scene.reading import load_scene
-from us_sim.scene.thumbnail import thumbnail_file
 
 
 def main(names: Sequence[str]) -> int:

@@ -289,7 +289,8 @@ def main() -> int:
     request = _serve(socket.socket(fileno=os.dup(0)))
     if request is None:
         return 0
-    runpy.run_module(f"us_sim.nodes.{request.node}", run_name="__main__", alter_sys=True)
+    module = request.command[request.command.index("-m") + 1]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
     return 0
 
 

@@ -25,8 +25,8 @@ from us_sim.run.watch import SupervisionSettings, Watch
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
+from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import full_path
-from us_sim.viewer.viewer_settings import ViewerSettings
 
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
@@ -419,7 +419,7 @@ def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = N
     try:
         volume = volume_of(scene, show)
         if path is not None:
-            from us_sim.scene.image_in_volume import check_path_in_volume
+            from us_sim.scene.placement import check_path_in_volume
 
             check_path_in_volume(scene, path, volume, topic)
         if scene.volume.case is not None:

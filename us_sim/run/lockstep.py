@@ -18,6 +18,7 @@ from us_sim.run.monitored import refuse_unknown
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
+    module_of,
     parameters_file,
     player_settings,
     recorder_of,
@@ -44,7 +45,7 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
 
     require_texts(parameters)
     kind = "".join(word.capitalize() for word in name.split("_"))
-    make = getattr(importlib.import_module(f"us_sim.nodes.{name}"), kind)
+    make = getattr(importlib.import_module(module_of(name)), kind)
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]
     try:
         return make(context=context, parameter_overrides=overrides)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from us_sim.errors import MeshError
+from us_sim.scene.case_tissue import box_planes, counts, footprint
 from us_sim.scene.scene import Scene
-from us_sim.scene.tissue_box import box_planes, counts, footprint
 from us_sim.settings.registry import COLLIDERS
 from us_sim.tissue.elasticity.materials import LabelFractions, label_fractions
 from us_sim.tissue.mesh.conforming import (

@@ -43,9 +43,9 @@ from us_sim.kernels import njit
 from us_sim.skin.settings import MembraneSettings
 from us_sim.skin.surface import TriangleSurface
 
+# Fraction of its natural length below which a spring's force falls to zero with its length. The
+# force of a spring that turns over would otherwise jump, and no step would be stable.
 SHORTEST = 0.5
-"""Fraction of its natural length below which a spring's force falls to zero with its length. The
-force of a spring that turns over would otherwise jump, and no step would be stable."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -99,7 +99,6 @@ def spring_energy(x, v, rest, edges, natural_length, rest_tension, stiffness, an
 
 @njit(inline="always", error_model="numpy")
 def _stored(length, natural_length):
-    """m², energy of a spring over its stiffness."""
     if length >= SHORTEST * natural_length:
         return 0.5 * (length - natural_length) ** 2
     slope = 1.0 / SHORTEST - 1.0
@@ -246,26 +245,17 @@ def _push_part(x, way, corners, gaps, mass, weight, box, r, p):
     return 1
 
 
-CONTACT_TOLERANCE = 1e-9
-"""No vertex is deeper inside the collider than this, m."""
-
+CONTACT_TOLERANCE = 1e-9  # No vertex is deeper inside the collider than this, m
+# Fraction of the linear system's longest stable step that is used. Near 1, folded skin with
+# hardly any damping was seen to gain energy from frame to frame.
 _SAFETY = 0.7
-"""Fraction of the linear system's longest stable step that is used. Near 1, folded skin with
-hardly any damping was seen to gain energy from frame to frame."""
-
-_SETTLED = 1e-7
-"""A frame that moves no vertex farther than this leaves the membrane settled, m."""
-
+_SETTLED = 1e-7  # A frame that moves no vertex farther than this leaves the membrane settled, m
+# A settled membrane without contact that is this close to its rest shape is put there, m.
 _AT_REST = 1e-6
-"""A settled membrane without contact that is this close to its rest shape is put there, m."""
-
+# A probe that moves farther than this between frames was lifted and set down elsewhere, m.
 _JUMP = 0.03
-"""A probe that moves farther than this between frames was lifted and set down elsewhere, m."""
-
 _MOST_STEPS = 400  # in a frame
-
-_STRETCHED = 1.5
-"""Length that an edge may reach in a frame, over the longest at its beginning."""
+_STRETCHED = 1.5  # Length that an edge may reach in a frame, over the longest at its beginning
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,10 +279,7 @@ class SkinMembrane:
     """
 
     def __init__(
-        self,
-        surface: TriangleSurface,
-        collider: Collider,
-        settings: MembraneSettings | None = None,
+        self, surface: TriangleSurface, collider: Collider, settings: MembraneSettings | None = None
     ) -> None:
         self.settings = settings = settings or MembraneSettings()
         self.surface = surface
@@ -457,7 +444,6 @@ class SkinMembrane:
         return start, steps, f"{steps} steps for a probe that moved {1e3 * travel:.3g} mm"
 
     def _lifted(self, pose: Pose) -> Pose:
-        """The pose, lifted along the probe's axis until it touches nothing (100 mm at most)."""
         axis = pose.rotation[:, 2]
         for lift in np.arange(0.0, 0.1, 2.5e-3):
             lifted = Pose(pose.position - lift * axis, pose.orientation)
@@ -474,7 +460,6 @@ def _same(a: Pose | None, b: Pose | None) -> bool:
 
 
 def _placement(pose: Pose | None) -> NDArray[np.float64]:
-    """(7,) position and orientation, as the kernels take them."""
     if pose is None:
         return np.array([0.0, 0, 0, 0, 0, 0, 1])
     return np.concatenate([pose.position, pose.orientation])
@@ -564,7 +549,6 @@ def _follow(now, last, time_step, velocity):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _longest(x, edges):
-    """m, the length of the longest edge."""
     square = 0.0
     for e in range(len(edges)):
         i, j = edges[e]

@@ -1,7 +1,8 @@
 """Triangle surfaces of the skin: sheets made here, or read from a file.
 
-Of Wavefront OBJ files only positions and faces are read here. meshio stumbles over texture
-coordinates and normals, which have counts of their own.
+Of Wavefront OBJ files only positions and faces are read here: meshio 5.3 refuses three of six real
+organs, whose texture coordinates and normals have counts of their own, and trimesh 4 takes vertex
+0, which no file has, for the first one.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 
 _CORNERS = {"triangle": 3, "quad": 4}
 
@@ -176,7 +177,6 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
 
 
 def _faces_by_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (N, 3) and triangles (T, 3) of a file."""
     mesh = read_with_meshio(
         path, "this is not a surface that can be read: give an OBJ, STL, PLY or VTK file"
     )
@@ -256,7 +256,6 @@ def parse_wavefront(text: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
 
 
 def _index(word: str, count: int) -> int:
-    """A vertex's index from 0; in the file it counts from 1, or backwards from the latest."""
     index = int(word)
     if not (1 <= index <= count or -count <= index <= -1):
         raise ValueError(f"there is no vertex {index} among the {count} so far")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Flag, auto
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +24,8 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import LabelFractions, TissueMaterials, uniform_material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
+# Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
+# that the skin is the face of smallest z.
 FACES = {
     "top": ((2, False),),
     "bottom": ((2, True),),
@@ -32,19 +35,15 @@ FACES = {
     "back": ((1, True),),
     "sides": ((0, False), (0, True), (1, False), (1, True)),
 }
-"""Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
-that the skin is the face of smallest z."""
 
 
+# Distance from a bounding box's face, over the box's size, up to which nodes count as on the
+# face; for meshes that are no box.
 _MARGIN = 0.05
-"""Distance from a bounding box's face, over the box's size, up to which nodes count as on the face;
-for meshes that are no box."""
-
+# Nodes, also as a part of all, below which what is held is remarked on as little.
 _FEW, _FEW_PART = 10, 0.01
-"""Nodes, also as a part of all, below which what is held is remarked on as little."""
-
+# The cosine to -z below which a probe that comes along +z would only graze the surface.
 _GRAZING = 0.1
-"""The cosine to -z below which a probe that comes along +z would only graze the surface."""
 
 
 def held_remark(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:
@@ -115,6 +114,17 @@ def nodes_in_label(
     return np.flatnonzero(inside > 0.5 * volume).astype(np.int32)
 
 
+class Intervention(Flag):
+    """A solver's remedies in a frame that went wrong; `Deformation.action` says it to a person."""
+
+    NONE = 0
+    FRAME_FAILED = auto()  # what came out was not finite or far away
+    KEPT_STATE = auto()  # the last good state is returned in its place
+    PUT_TO_REST = auto()  # the tissue is undeformed again
+    SHOWED_UPRIGHT = auto()  # tissue is inside out, and its last upright state is returned
+    RESTARTED = auto()  # the next frame begins from rest
+
+
 @dataclass(frozen=True, eq=False)
 class Deformation:
     """The deformed tissue and what it does to the probe."""
@@ -127,7 +137,7 @@ class Deformation:
     action: str = ""  # what the solver did to stay stable, in words; '' when nothing
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
     is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
-    has_failed: bool = False  # whether it stands in place of a frame that came out wrong
+    interventions: Intervention = Intervention.NONE  # `action` as a code
 
 
 @dataclass(frozen=True, eq=False)

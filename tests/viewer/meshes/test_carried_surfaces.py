@@ -8,9 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from us_sim.errors import MeshError
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces
-from us_sim.viewer.meshes.coloured_surface import ColouredSurface
-from us_sim.viewer.meshes.welded import welded
+from us_sim.viewer.surfaces import CarriedSurfaces, ColouredSurface, welded
 
 PLANES = uniform_planes(-0.03, 0.03, 4)
 MESH = box_mesh(PLANES, PLANES, PLANES)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.viewer.meshes.clustering import at_most, clustered
+from us_sim.viewer.surfaces import at_most, clustered
 
 
 def sphere(rings: int = 24, around: int = 48) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.viewer.meshes.equivalent_strain import EquivalentStrain
+from us_sim.viewer.surfaces import EquivalentStrain
 
 PLANES = uniform_planes(-0.02, 0.02, 4)
 MESH = box_mesh(PLANES, PLANES, PLANES)

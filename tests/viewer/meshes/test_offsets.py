@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from us_sim.viewer.meshes.offsets import FINEST, Offsets
+from us_sim.viewer.surfaces import FINEST, Offsets
 
 quick = settings(max_examples=50, deadline=None)
 points = arrays(np.float64, (7, 3), elements=st.floats(-0.3, 0.3))

@@ -5,7 +5,7 @@ import pytest
 
 from us_sim.errors import MeshError
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
-from us_sim.viewer.meshes.rest_surface import RestSurface
+from us_sim.viewer.surfaces import RestSurface
 
 SQUARE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])

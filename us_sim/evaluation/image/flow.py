@@ -20,10 +20,8 @@ from numpy.typing import NDArray
 from us_sim.evaluation.image.measure import PROBES, Artefact, Point
 from us_sim.evaluation.report import ReportFolder, Target, key_beside, new_figure, plain, save
 from us_sim.geometry.pose import Pose
-from us_sim.scene.blood import blood_of
-from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
+from us_sim.scene.building import blood_of, colour_of, scanner_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay

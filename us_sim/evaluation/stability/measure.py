@@ -55,11 +55,8 @@ from us_sim.settings.setting import rules_of
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import springs_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
-from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
-
-_FAILED, _KEPT = "came out not finite or far away", "so the last good state was kept"
-"""What a solver says of a frame that failed, and where it kept the last good state after that."""
 
 _NEGLIGIBLE, _FACTOR = 1e-5, 2.0
 """Residuals below the first are the same; above it they agree within the second."""
@@ -228,8 +225,8 @@ def run_trial(
             trial.held.append(float(deformation.residual))
             volumes = signed_volumes(deformation.nodes, model.mesh.tetrahedra)
             trial.held_inverted = int((volumes <= 0).sum())
-        failed = _FAILED in deformation.action
-        kept = _KEPT in deformation.action
+        failed = Intervention.FRAME_FAILED in deformation.interventions
+        kept = Intervention.KEPT_STATE in deformation.interventions
         if failed:
             trial.kept += 1
             residual.forget()
@@ -512,7 +509,8 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
         with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
             ended = solver.deform(None)
         moved = np.abs(ended.nodes - nodes).max()
-        return bool(ended.has_failed or moved > _SWELLING * np.abs(shape).max())
+        failed = Intervention.FRAME_FAILED in ended.interventions
+        return bool(failed or moved > _SWELLING * np.abs(shape).max())
 
     if model.fixed.all():
         return math.inf, math.inf

@@ -19,12 +19,13 @@ from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.nodes.streams.stream import FrameStream
-from us_sim.scene.structures import colour_of
+from us_sim.scene.building import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
 from us_sim.slicing.drawing.label_outlines import onto_border
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import OVERLAYS
 
 REMEMBERED = 256
 """Poses whose arrival is kept for the images at them."""
@@ -127,7 +128,10 @@ class AnnotatedImage:
     ) -> None:
         self._node = node
         self._streams = streams
-        self._overlays = {each.overlay_name: each for each in streams if each.overlay_name}
+        by_topic = {each.topic: each for each in streams}
+        self._overlays = {
+            name: by_topic[mode.topic] for name, mode in OVERLAYS.items() if mode.topic in by_topic
+        }
         self._settings = LiveSettings(
             node, {"shown": Group(AnnotatedImageSettings())}, self._require_overlay
         )

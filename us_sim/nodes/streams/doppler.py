@@ -15,7 +15,7 @@ from us_sim.nodes.messages import colour_image_message, field_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.stream import FrameStream, SettableStream
-from us_sim.scene.blood import blood_of
+from us_sim.scene.building import blood_of
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum, nearest_vessel, warm_up
@@ -61,7 +61,6 @@ class ColourStream(SettableStream[ColourDoppler]):
     """``ultrasound/velocity_estimate``, and the colours of the same; parameters ``colour.…``."""
 
     topic = "ultrasound/velocity_estimate"
-    overlay_name = "velocity"
 
     def __init__(self, node: SceneNode, blood: Blood) -> None:
         super().__init__(node, node.scene.colour, "colour.")

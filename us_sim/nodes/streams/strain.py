@@ -64,7 +64,7 @@ class _StrainImages(FrameStream):
         if values is None:
             return None
         most = self._settings.colours or self._end.of(values)
-        scale = strain_scale(self.overlay_name, most)
+        scale = strain_scale(self.topic.rpartition("/")[2], most)
         return Overlay(values, scale, note=self._note(values))
 
     def _of(self, frame: Frame) -> NDArray[np.float32] | None:
@@ -87,7 +87,6 @@ class StrainStream(_StrainImages):
     """``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
 
     topic = "ultrasound/strain"
-    overlay_name = "strain"
 
     def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
         super().__init__(node, parameters)
@@ -125,7 +124,6 @@ class StrainEstimateStream(_StrainImages):
     """
 
     topic = "ultrasound/strain_estimate"
-    overlay_name = "strain_estimate"
 
     def __init__(self, node: SceneNode, parameters: LiveSettings, probes: list[Probe]) -> None:
         super().__init__(node, parameters)

@@ -35,8 +35,6 @@ class FrameStream(ABC):
 
     topic: ClassVar[str]
     """Its name."""
-    overlay_name: ClassVar[str] = ""
-    """What chooses it as the colours over the annotated image; empty where it has none."""
 
     def __init__(self, node: SceneNode) -> None:
         self._node = node

@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.scene.tracker_building import camera_body_of
+from us_sim.scene.building import camera_body_of
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.source import CameraSource, practice
 from us_sim.tracking.settings import CameraSettings

@@ -76,12 +76,12 @@ class IncrementalPotential:
 
     def _value(
         self,
-        lengths: NDArray[np.float64],
-        volumes: NDArray[np.float64],
-        positions: NDArray[np.float64],
+        lengths: NDArray,
+        volumes: NDArray,
+        positions: NDArray,
         stiffening: float,
-        inertia: NDArray[np.float64],
-    ) -> tuple[float, NDArray[np.float64]]:
+        inertia: NDArray,
+    ) -> tuple[float, NDArray]:
         force = np.zeros_like(positions)
         value = _add_spring_forces(*self._springs, lengths, positions, force)
         value += _add_volume_forces(self._volume, volumes, positions, force)

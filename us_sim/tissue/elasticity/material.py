@@ -32,8 +32,8 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
 YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
+# Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness.
 POISSON_RATIO = Quantity("number", -0.99, 0.49999)
-"""Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness."""
 DENSITY = Quantity("density", 1e-3, 1e6)
 LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e5)
 
@@ -70,6 +70,7 @@ def _soft(young_modulus: float, density: float = 1060.0) -> Material:
     return Material(young_modulus, 0.45, density)
 
 
+# By name. The first is for whatever has no name that is known.
 KINDS: Mapping[str, Material] = {
     "tissue": _soft(6e3),
     "skin": _soft(30e3, 1100.0),
@@ -88,11 +89,9 @@ KINDS: Mapping[str, Material] = {
     "cartilage": Material(500e3, 0.45, 1100.0),
     "bone": Material(10e6, 0.3, 1900.0),
 }
-"""By name. The first is for whatever has no name that is known."""
 
+# Kinds that lie in layers and fill what is between organs: they move with what is beside them.
 LAYERS = ("tissue", "skin", "fat", "muscle")
-"""Kinds that lie in layers and fill what is between organs: they move with what is beside them."""
-
 _WORDS = {
     **{kind: kind for kind in KINDS},
     "aorta": "artery",

@@ -14,12 +14,11 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+# Samples of each tetrahedron: enough to measure a volume fraction to about one percent.
 _SAMPLES = 1024
-"""Samples of each tetrahedron: enough to measure a volume fraction to about one percent."""
 
 
 def _none() -> NDArray[np.float64]:
-    """As long as it has to be, of zeros."""
     return np.zeros(0)
 
 
@@ -96,9 +95,7 @@ class LabelFractions(NamedTuple):
 
 
 def label_fractions(
-    mesh: TetrahedralMesh,
-    labels: NDArray[np.uint8],
-    index_from_patient: NDArray[np.float64],
+    mesh: TetrahedralMesh, labels: NDArray[np.uint8], index_from_patient: NDArray[np.float64]
 ) -> LabelFractions:
     """The volume fraction of each label in each tetrahedron.
 
@@ -205,8 +202,8 @@ def _count_labels(indices, tetrahedra, labels, points):
     return counts
 
 
+# lambda + mu over mu at Poisson's ratio 0.4: up to there linear tetrahedra do not lock.
 _ELEMENT_LIMIT = 5.0
-"""lambda + mu over mu at Poisson's ratio 0.4: up to there linear tetrahedra do not lock."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,9 +156,7 @@ class NeoHookean:
         return self._nodal
 
 
-def _nodal_blocks(
-    mesh: TetrahedralMesh, weight: NDArray[np.float64], total: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _nodal_blocks(mesh: TetrahedralMesh, weight: NDArray, total: NDArray) -> NDArray:
     """(6, N) N/m, the diagonal blocks at rest of the nodal part of the bulk stiffness.
 
     Node n meets the average of each neighbour a, and its own, through s(a, n), the sum of c g over

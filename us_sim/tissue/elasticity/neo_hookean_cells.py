@@ -50,26 +50,17 @@ from us_sim.tissue.elasticity.nodal_sums import (
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+# Row of the constants: one over the width along x (negative where mirrored), then y and z.
 PER_WIDTH = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
-"""Row of the constants: one over the width along x (negative where mirrored), then y and z."""
-
-FIELD = np.int64(0)
-"""First row of a buffer's field, row 3 corner + axis of it."""
-
-SUMS = FIELD + 24
-"""First row of a buffer's nodal sums, one a corner."""
-
+FIELD = np.int64(0)  # First row of a buffer's field, row 3 corner + axis of it
+SUMS = FIELD + 24  # First row of a buffer's nodal sums, one a corner
+# First row of a buffer's pressures in the five tetrahedra, which the nodal sums make.
 PRESSURES = SUMS + 8
-"""First row of a buffer's pressures in the five tetrahedra, which the nodal sums make."""
-
+# First row of a buffer's result: a field of 3 corner + axis, 6 rows a corner, or fewer.
 OUT = PRESSURES + 5
-"""First row of a buffer's result: a field of 3 corner + axis, 6 rows a corner, or fewer."""
-
-ROWS = OUT + 48
-"""Number of rows of a buffer."""
-
+ROWS = OUT + 48  # Number of rows of a buffer
+# Rows a corner, of a number, a vector and a symmetric matrix.
 SCALAR, _VECTOR, SYMMETRIC = np.int64(1), np.int64(3), np.int64(6)
-"""Rows a corner, of a number, a vector and a symmetric matrix."""
 
 
 @njit(**INLINED)
@@ -129,7 +120,6 @@ def add_field(lanes, grid, first, rows, field):
 
 @njit(**INLINED)
 def _corners(field, w):
-    """The field at each of the eight corners."""
     return (
         three(field, FIELD, w),
         three(field, FIELD + 3, w),
@@ -264,18 +254,15 @@ def put_sum(a, b, c, d, lanes, row, w):
 
 
 _SHEAR, _ELEMENT, _NODAL = PER_WIDTH + 3, PER_WIDTH + 8, PER_WIDTH + 13
+# First rows of the constants behind the widths: V mu, V element, V nodal / 4 and V wall of each
+# of the five tetrahedra; and the number of rows.
 _WALL, _CONSTANTS = PER_WIDTH + 18, PER_WIDTH + 23
-"""First rows of the constants behind the widths: V mu, V element, V nodal / 4 and V wall of each of
-the five tetrahedra; and the number of rows."""
-
+# First rows of V (p - mu) and of V times the slope of p by J, which the tangent needs, behind the
+# displacement; and the number of rows.
 _K, _BULK, _TANGENT = FIELD + 24, FIELD + 29, FIELD + 34
-"""First rows of V (p - mu) and of V times the slope of p by J, which the tangent needs, behind the
-displacement; and the number of rows."""
-
-
+# First row of energies, behind those of forces: all but the lumens', then those of each of the
+# five tetrahedra's.
 _ENERGY = OUT + 24
-"""First row of energies, behind those of forces: all but the lumens', then those of each of the
-five tetrahedra's."""
 
 
 class CellSums(NodalSums):

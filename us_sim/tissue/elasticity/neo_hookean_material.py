@@ -63,23 +63,21 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials, volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+# How loops are compiled: with fused multiply-adds, but NaN stays NaN.
 LOOP: dict[str, Any] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "nsz"},
 }
-"""How loops are compiled: with fused multiply-adds, but NaN stays NaN."""
 
+# How the functions that these loops call are compiled.
 INLINED: dict[str, Any] = {**LOOP, "forceinline": True}
-"""How the functions that these loops call are compiled."""
-
 ONE, HALF = np.float32(1.0), np.float32(0.5)
+# Numbers that are exact in any precision. Literals would turn single precision into double.
 _THREE = np.float32(3.0)
-"""Numbers that are exact in any precision. Literals would turn single precision into double."""
-
+# Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed.
 _CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.02)
-"""Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed."""
 
 
 @njit(**INLINED)
@@ -300,36 +298,25 @@ def withstood_force(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArra
     return total
 
 
-def _mean_with_stiffest(
-    tetrahedra: NDArray[np.integer], shear: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
+def _mean_with_stiffest(tetrahedra: NDArray, shear: NDArray, count: int) -> NDArray:
     """(M,) Pa, geometric mean of a tetrahedron's shear modulus and the largest around it."""
     around = np.zeros(count)
     np.maximum.at(around, tetrahedra, np.broadcast_to(shear[:, None], tetrahedra.shape))
     return np.asarray(np.sqrt(shear * around[tetrahedra].max(axis=1)))
 
 
-CONSTANTS = 6
-"""Numbers that the law of a lumen needs, see `lumen_table`."""
-
-_SLACK = 0.2
-"""Fraction of its volume, e above, that a vein has lost when its wall is slack."""
-
+CONSTANTS = 6  # Numbers that the law of a lumen needs, see `lumen_table`
+_SLACK = 0.2  # Fraction of its volume, e above, that a vein has lost when its wall is slack
+# Shear modulus of a lumen over that of the solid that stands in for it. Blood has none; this one
+# keeps the mesh inside in shape. In the arm it is a tenth of the pressure, so that flattening the
+# mesh takes a tenth of what emptying takes.
 _SOFTNESS = 0.05
-"""Shear modulus of a lumen over that of the solid that stands in for it. Blood has none; this one
-keeps the mesh inside in shape. In the arm it is a tenth of the pressure, so that flattening the
-mesh takes a tenth of what emptying takes."""
-
+# Volume ratio at which the walls of an empty lumen begin to touch: they have a thickness.
 _TOUCHING = 0.2
-"""Volume ratio at which the walls of an empty lumen begin to touch: they have a thickness."""
-
+# Modulus of the wall of a tetrahedron with an empty lumen, over the bulk modulus of the solid in
+# it: pressed by a tenth of its volume it then resists about as the solid does.
 _PRESSED = 5.0
-"""Modulus of the wall of a tetrahedron with an empty lumen, over the bulk modulus of the solid in
-it: pressed by a tenth of its volume it then resists about as the solid does."""
-
-_ALL = 0.99
-"""Fraction of lumen from which a tetrahedron is no solid at all."""
-
+_ALL = 0.99  # Fraction of lumen from which a tetrahedron is no solid at all
 _TWO, _FOUR = np.float32(2.0), np.float32(4.0)
 _LEAST = np.float32(1e-12)
 

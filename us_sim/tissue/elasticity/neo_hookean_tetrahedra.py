@@ -41,20 +41,12 @@ from us_sim.tissue.elasticity.nodal_sums import (
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+# First row of the constants' gradients of the shape functions of nodes 1, 2 and 3.
 SHAPE = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
-"""First row of the constants' gradients of the shape functions of nodes 1, 2 and 3."""
-
-FIELD = np.int64(0)
-"""First row of a buffer's field, row 3 b + axis of it at the b-th node."""
-
-SUMS = FIELD + 12
-"""First row of a buffer's nodal sums, one a node."""
-
-OUT = SUMS + 4
-"""First row of a buffer's result: a field of 3 b + axis, 6 rows a node, or fewer."""
-
-ROWS = OUT + 24
-"""Number of rows of a buffer."""
+FIELD = np.int64(0)  # First row of a buffer's field, row 3 b + axis of it at the b-th node
+SUMS = FIELD + 12  # First row of a buffer's nodal sums, one a node
+OUT = SUMS + 4  # First row of a buffer's result: a field of 3 b + axis, 6 rows a node, or fewer
+ROWS = OUT + 24  # Number of rows of a buffer
 
 
 @njit(**INLINED)
@@ -144,7 +136,8 @@ def put_forces(p, constants, w, lanes):
 
 
 _ROW = np.int64(LANES)  # no literal, for which numba would compile `emptied` again
-
+# Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
+# number.
 _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
     SHAPE + 9,
     SHAPE + 10,
@@ -152,16 +145,11 @@ _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
     SHAPE + 12,
     SHAPE + 13,
 )
-"""Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
-number."""
 
+# Rows that the tangent needs: the displacement's gradient, V (p - mu), V times the slope of p by
+# J; and their number.
 _GRADIENT, _K, _BULK, _TANGENT = np.int64(0), 9, 10, 11
-"""Rows that the tangent needs: the displacement's gradient, V (p - mu), V times the slope of p by
-J; and their number."""
-
-
-_ENERGY = OUT + 12
-"""Row of energies, behind those of forces."""
+_ENERGY = OUT + 12  # Row of energies, behind those of forces
 
 
 class TetrahedraSums(NodalSums):

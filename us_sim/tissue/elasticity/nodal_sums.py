@@ -18,8 +18,8 @@ from numpy.typing import DTypeLike, NDArray
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.neo_hookean_material import INLINED, emptying, volume_change
 
+# Numbers in a row: a few vectors of the widest kind, so that all rows stay in the L1 cache.
 LANES = 64
-"""Numbers in a row: a few vectors of the widest kind, so that all rows stay in the L1 cache."""
 
 
 def in_lanes(table: NDArray) -> NDArray:
@@ -42,13 +42,7 @@ def three(rows, row, w):
 def five(rows, row, w):
     """Five rows from ``row`` on, of the five tetrahedra of a cell."""
     v = row * LANES + w
-    return (
-        rows[v],
-        rows[v + LANES],
-        rows[v + 2 * LANES],
-        rows[v + 3 * LANES],
-        rows[v + 4 * LANES],
-    )
+    return (rows[v], rows[v + LANES], rows[v + 2 * LANES], rows[v + 3 * LANES], rows[v + 4 * LANES])
 
 
 @njit(**INLINED)

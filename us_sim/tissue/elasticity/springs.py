@@ -23,8 +23,8 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.materials import TissueMaterials, volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+# The six edges of a tetrahedron.
 _CORNERS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-"""The six edges of a tetrahedron."""
 
 
 class SpringArrays(NamedTuple):
@@ -130,9 +130,7 @@ def fitted_springs(
     return _network(mesh, 15 * shear * mesh.volumes / _squares(mesh), damping_factor)
 
 
-def _network(
-    mesh: TetrahedralMesh, stiffness: NDArray[np.float64], damping_factor: float
-) -> SpringNetwork:
+def _network(mesh: TetrahedralMesh, stiffness: NDArray, damping_factor: float) -> SpringNetwork:
     """Six equal springs of stiffness (M,) N/m in each tetrahedron; duplicates merge."""
     merged = np.zeros(len(mesh.edges))
     np.add.at(merged, _edges_of_tetrahedra(mesh), stiffness[:, None])
@@ -149,7 +147,6 @@ def _squares(mesh: TetrahedralMesh) -> NDArray[np.float64]:
 
 
 def _edges_of_tetrahedra(mesh: TetrahedralMesh) -> NDArray[np.intp]:
-    """(M, 6) indices into the mesh's edges."""
     ends = np.sort(mesh.tetrahedra[:, _CORNERS].astype(np.int64), axis=2)
     count = len(mesh.nodes)
     known = mesh.edges[:, 0].astype(np.int64) * count + mesh.edges[:, 1]
@@ -211,11 +208,9 @@ def spring_forces(springs, positions, velocity, force):
         force[i, 2] += fz
 
 
+# A tetrahedron yields when the sum of its squared face areas over that at rest exceeds this.
 _YIELD = 1.5
-"""A tetrahedron yields when the sum of its squared face areas over that at rest exceeds this."""
-
-_ROUNDING = 1e-9
-"""Fraction of the shear modulus below which a nodal part is rounding."""
+_ROUNDING = 1e-9  # Fraction of the shear modulus below which a nodal part is rounding
 
 
 class VolumeArrays(NamedTuple):
@@ -399,7 +394,6 @@ def _yielded(yield_area, px, py, pz, qx, qy, qz, rx, ry, rz):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _measure(tetrahedra, nodes, volume):
-    """Fills volume (M,) m3."""
     for t in range(len(tetrahedra)):
         volume[t] = area_vectors(nodes, tetrahedra, t)[0]
 

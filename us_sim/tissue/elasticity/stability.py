@@ -25,9 +25,7 @@ from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm, area_vectors
 from us_sim.tissue.model import TissueModel
 
-_MARGIN = 1.05
-"""Safety factor of masses and sub-steps on Gershgorin's bound of stability."""
-
+_MARGIN = 1.05  # Safety factor of masses and sub-steps on Gershgorin's bound of stability
 _TOLERANCE = 1e-4  # relative, of the square of the highest frequency
 
 
@@ -138,12 +136,10 @@ def stabilised(
     return mass, substeps, f"{substeps} sub-steps a step: undivided, {unstable}"
 
 
+# Tetrahedra up to which all are watched, which takes less than a millisecond; and how many layers
+# under the surface are watched otherwise.
 _WATCHED, _LAYERS = 50_000, 2
-"""Tetrahedra up to which all are watched, which takes less than a millisecond; and how many layers
-under the surface are watched otherwise."""
-
-_PATIENCE = 10
-"""Frames in which a released tissue may untangle by itself."""
+_PATIENCE = 10  # Frames in which a released tissue may untangle by itself
 
 
 class Tangling:

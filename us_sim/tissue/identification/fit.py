@@ -30,27 +30,17 @@ from scipy.stats import t as student
 
 from us_sim.errors import SolverError, StiffnessError
 
-FARTHEST = 100.0
-"""Factor by which a modulus may differ from the one that the fit begins with."""
-
-_LONGEST_STEP = np.log(3.0)
-"""Of a modulus' logarithm."""
-
+FARTHEST = 100.0  # Factor by which a modulus may differ from the one that the fit begins with
+_LONGEST_STEP = np.log(3.0)  # Of a modulus' logarithm
 _MOST_STEPS = 60
 _DAMPING, _MOST_DAMPING = 1e-3, 1e8
+# Decrease of the sum of squares, in units of the noise's variance, that is worth no step: the
+# least is then within a tenth of a standard deviation.
 _SMALL_GAIN = 0.01
-"""Decrease of the sum of squares, in units of the noise's variance, that is worth no step: the
-least is then within a tenth of a standard deviation."""
-
-_SMALL_STEP = 1e-5
-"""Of a modulus' logarithm, likewise."""
-
-_SAME_NOISE = 0.05
-"""Relative change of the noise that needs no new weights."""
-
+_SMALL_STEP = 1e-5  # Of a modulus' logarithm, likewise
+_SAME_NOISE = 0.05  # Relative change of the noise that needs no new weights
+# Noise of a kind of measurements over their size, below which the model's own accuracy lies.
 _EXACT = 1e-5
-"""Noise of a kind of measurements over their size, below which the model's own accuracy lies."""
-
 Model = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 Progress = Callable[[float, str], None]
 
@@ -70,8 +60,6 @@ class Fitted:
 
 @dataclass(eq=False)
 class _State:
-    """A point and its model."""
-
     at: NDArray[np.float64]
     values: NDArray[np.float64]
     slopes: NDArray[np.float64]
@@ -160,21 +148,14 @@ def basis(columns: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vectors[:, values > 1e-10 * values.max(initial=0.0)])
 
 
-def _others(
-    residual: NDArray[np.float64], nuisance: NDArray[np.float64], noise: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(Q,) the other unknowns that leave least."""
+def _others(residual: NDArray, nuisance: NDArray, noise: NDArray) -> NDArray:
     weighted = nuisance / noise[:, None]
     return np.asarray(np.linalg.lstsq(weighted, residual / noise, rcond=None)[0])
 
 
 def _noise(
-    residual: NDArray[np.float64],
-    groups: NDArray[np.intp],
-    nuisance: NDArray[np.float64],
-    measured: NDArray[np.float64],
-    moduli: int,
-) -> NDArray[np.float64]:
+    residual: NDArray, groups: NDArray, nuisance: NDArray, measured: NDArray, moduli: int
+) -> NDArray:
     """(n,) scatter of each kind of measurements, of what the other unknowns leave."""
     noise = np.empty(len(residual))
     free = (len(residual) - nuisance.shape[1] - moduli) / len(residual)
@@ -189,12 +170,8 @@ def _noise(
 
 
 def _step(
-    misfit: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    damping: float,
-    at: NDArray[np.float64],
-    bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], float]:
+    misfit: NDArray, slopes: NDArray, damping: float, at: NDArray, bounds: tuple[NDArray, NDArray]
+) -> tuple[NDArray, float]:
     """(P,) the next step, and how much the sum of squares would fall by it if all were linear."""
     curvature, slope = slopes.T @ slopes, slopes.T @ misfit
     damped = curvature + np.diag(damping * np.diag(curvature) + np.finfo(np.float64).tiny)
@@ -204,9 +181,9 @@ def _step(
     return change, float(2 * slope @ change - change @ curvature @ change)
 
 
+# Parts of a press, one of which is left out at a time. With fewer the intervals are wider, with
+# more they miss correlations that last: with 8 they hold up to about 0.8 from pose to pose.
 BLOCKS = 8
-"""Parts of a press, one of which is left out at a time. With fewer the intervals are wider, with
-more they miss correlations that last: with 8 they hold up to about 0.8 from pose to pose."""
 
 
 def blocks(order: NDArray[np.float64], count: int) -> NDArray[np.intp]:
@@ -265,11 +242,8 @@ def quantile(confidence: float) -> float:
     return float(student.ppf(0.5 + confidence / 2, BLOCKS - 1))
 
 
-_SINGULAR = 1e-9
-"""Eigenvalue of the slopes' products over the largest, below which moduli are one."""
-
-_LIKE = 0.3
-"""Part of what a modulus does to the measurements that another one must do to be named."""
+_SINGULAR = 1e-9  # Eigenvalue of the slopes' products over the largest, below which moduli are one
+_LIKE = 0.3  # Part of what a modulus does to the measurements that another one must do to be named
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,15 +38,11 @@ from us_sim.tissue.linear_algebra.two_level import (
 )
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
+from us_sim.tissue.solvers.tuning import TUNING
 
-_LOCAL_WEIGHT = 12.0
-"""As in `newton`."""
-
-_TOLERANCE = 1e-6
-"""Unbalanced force of a sensitivity, over the force that a modulus changes."""
-
+_TOLERANCE = 1e-6  # Unbalanced force of a sensitivity, over the force that a modulus changes
+# Iterations, and the same fraction with which no answer counts as one.
 _MOST_ITERATIONS, _UNSOLVED = 3000, 1e-3
-"""Iterations, and the same fraction with which no answer counts as one."""
 
 
 class Slopes(NamedTuple):
@@ -80,8 +76,8 @@ class PressedTissue:
         """Put the probe at a pose and the nodes at a displacement (3, N) m."""
         self._pose, self._displacement = pose, displacement
         at = self._points.rest + self._points.moved(displacement)
-        self._contact.aim(pose, at)
-        self._contact.release(at)
+        self._contact.set_pose(pose, at)
+        self._contact.drop_planes(at)
 
     @property
     def _pushes(self) -> NDArray[np.float64]:
@@ -116,7 +112,7 @@ class PressedTissue:
         active, directions, stiffness = contact.springs_after(still)
         springs = points.nodes[active], points.weights[active], directions, stiffness
         at = points.rest + points.moved(self._displacement)
-        turned, turn = contact.turns(at, contact.push)
+        turned, turn = contact.geometric_stiffness(at, contact.normal_force)
         bend = points.nodes[turned], points.weights[turned], -turn
 
         def product(change: NDArray, image: NDArray) -> None:
@@ -152,7 +148,7 @@ class PressedTissue:
             most = largest_local_eigenvalue(
                 tissue.diagonal_blocks(), tissue.tangent_product, self._fixed
             )
-            self._preconditioner = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / most)
+            self._preconditioner = TwoLevel(grid, self._fixed, TUNING.local_weight / most)
             tissue.linearise(self._displacement)
         return self._preconditioner
 
@@ -184,15 +180,10 @@ def slopes(
     return Slopes(found, moved)
 
 
+# The constants of all tetrahedra, from Young's moduli (Pa) by structure.
 MaterialsFor = Callable[[Mapping[str, float]], TissueMaterials]
-"""The constants of all tetrahedra, from Young's moduli (Pa) by structure."""
-
-_STEP = 1e-5
-"""Change of a modulus' logarithm by which forces are compared."""
-
-_FRAMES, _BALANCED = 200, 1e-3
-"""Frames for a pose at most, and the residual with which it must end."""
-
+_STEP = 1e-5  # Change of a modulus' logarithm by which forces are compared
+_FRAMES, _BALANCED = 200, 1e-3  # Frames for a pose at most, and the residual with which it must end
 Progress = Callable[[float, str], None]
 
 

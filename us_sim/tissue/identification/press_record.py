@@ -21,20 +21,12 @@ from us_sim.errors import StiffnessError
 from us_sim.geometry.pose import Pose
 
 CHANNELS = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
-
-_FEWEST = 12
-"""Pairs of a pose and a wrench."""
-
+_FEWEST = 12  # Pairs of a pose and a wrench
+# Of the largest force's change, and of that at a lever of so many m: a channel that changes less
+# says nothing.
 _SILENT, _LEVER = 1e-4, 0.01
-"""Of the largest force's change, and of that at a lever of so many m: a channel that changes less
-says nothing."""
-
-_ALIKE = 0.5
-"""Part of the poses whose stamps must be those of wrenches: both then have one clock."""
-
-_SLOPE_SPAN = 3
-"""Wrenches on each side over which its change with time is measured."""
-
+_ALIKE = 0.5  # Part of the poses whose stamps must be those of wrenches: both then have one clock
+_SLOPE_SPAN = 3  # Wrenches on each side over which its change with time is measured
 Poses = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 Wrenches = tuple[NDArray[np.int64], NDArray[np.float64]]
 
@@ -151,7 +143,6 @@ def nearest_stamp(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArr
 
 
 def _measured(felt: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(6,) which channels change."""
     largest = np.ptp(felt, axis=0)
     force = float(largest[:3].max())
     least = np.repeat([_SILENT * force, _SILENT * _LEVER * force], 3)
@@ -178,18 +169,12 @@ def _rates(stamps: NDArray[np.int64], felt: NDArray[np.float64]) -> NDArray[np.f
     return np.asarray(np.einsum("wk,wck->wc", since, around) / spread[:, None])
 
 
-_STEP = 0.01
-"""s, between delays that are tried; a parabola finds the least between them."""
-
-_DEGREE = 4
-"""Of the polynomial that force is of depth."""
-
+_STEP = 0.01  # s, between delays that are tried; a parabola finds the least between them
+_DEGREE = 4  # Of the polynomial that force is of depth
+# Width of the loop at the largest delays over the narrowest, at least; and the width, over the
+# force's variance, that is none.
 _CLEAREST, _EXACT = 1.5, 1e-6
-"""Width of the loop at the largest delays over the narrowest, at least; and the width, over the
-force's variance, that is none."""
-
-_FEWEST_COMPARED = 30
-"""Poses that are compared."""
+_FEWEST_COMPARED = 30  # Poses that are compared
 
 
 def find_delay(
@@ -264,23 +249,16 @@ def narrowest_loop(
     return float(tried[least] + (0.5 * step * (left - right) / bend if bend > 0.0 else 0.0))
 
 
+# m, clearance below which a probe presses, and above which it touches nothing; a pose between
+# says little and costs as much.
 _PRESSED, _FREE = -2e-4, 5e-4
-"""m, clearance below which a probe presses, and above which it touches nothing; a pose between says
-little and costs as much."""
-
-
+# m, greatest depth of a press below which it is no more than the errors of a tracker.
 _SHALLOWEST = 5e-4
-"""m, greatest depth of a press below which it is no more than the errors of a tracker."""
-
-_ARM = 0.02
-"""m, that a turn of the probe by one radian counts for."""
-
+_ARM = 0.02  # m, that a turn of the probe by one radian counts for
+# Force without contact, over that with contact, which says that the two do not go together.
 _STRAYING = 0.25
-"""Force without contact, over that with contact, which says that the two do not go together."""
-
-
+# Equal wrenches in a row, and the way (m) of the probe meanwhile, that no free sensor shows.
 _SATURATED, _MOVED = 5, 2e-4
-"""Equal wrenches in a row, and the way (m) of the probe meanwhile, that no free sensor shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,10 +334,7 @@ def _way(record: PressRecord, chosen: NDArray[np.intp]) -> NDArray[np.float64]:
 
 
 def _require_agreement(
-    record: PressRecord,
-    pressed: NDArray[np.intp],
-    free: NDArray[np.intp],
-    apart: NDArray[np.float64],
+    record: PressRecord, pressed: NDArray, free: NDArray, apart: NDArray
 ) -> None:
     """Refuse forces that are felt where the tissue is not touched."""
     if len(free) < _FEWEST or not record.channels[:3].any():
@@ -377,7 +352,6 @@ def _require_agreement(
 
 
 def _require_unsaturated(record: PressRecord, pressed: NDArray[np.intp]) -> None:
-    """Refuse a channel that stays at its extreme while the probe goes on in the tissue."""
     pressing = np.zeros(len(record.times) + 2, dtype=np.bool_)
     pressing[pressed + 1] = True
     for channel in np.flatnonzero(record.channels):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import StiffnessError
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 from us_sim.tissue.identification.fit import FARTHEST, Fitted, Verdict, fit, judge
 from us_sim.tissue.identification.press_model import (
     Felt,
@@ -42,8 +42,8 @@ from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
+# Kinds of measurements, each with a noise of its own: N, N m, m.
 GROUPS = ("force", "torque", "landmark")
-"""Kinds of measurements, each with a noise of its own: N, N m, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +127,7 @@ def observations_of(
 
 _COLUMNS = ("name", "time", "x", "y", "z")
 _TIME, _LENGTH = Quantity("time", -1e6, 1e6), Quantity("length", -10.0, 10.0)
-_OUTSIDE = 1e-3
-"""m, that a point may lie outside the mesh."""
+_OUTSIDE = 1e-3  # m, that a point may lie outside the mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,11 +368,7 @@ def fit_stiffness(
         record, chosen, seen, late=settings.time_offset is None and not record.same_stamps
     )
     press = PressModel(
-        tissue.model,
-        tissue.materials_for,
-        names,
-        [record.pose(k) for k in chosen.pressed],
-        points,
+        tissue.model, tissue.materials_for, names, [record.pose(k) for k in chosen.pressed], points
     )
     start = np.log([tissue.moduli[name] for name in names])
     step = ""
@@ -397,7 +392,6 @@ def fit_stiffness(
 
 
 def _fitted_names(tissue: Tissue, record: PressRecord, settings: StiffnessSettings) -> list[str]:
-    """The structures whose moduli are looked for."""
     for name in settings.keep:
         if name not in tissue.moduli:
             raise StiffnessError(

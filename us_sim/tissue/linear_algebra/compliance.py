@@ -26,7 +26,6 @@ from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.model import TissueModel
 
 _CHUNK = 64  # nodes for whose forces the fields are made at once
-
 Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 
@@ -70,7 +69,6 @@ class DenseFields:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _add_rows(fields, rows, weights, nodes, displacement):
-    """Adds the weighted rows of fields (R, 3, F) to displacement (N, 3) of nodes (F,)."""
     width = 1024  # nodes of a piece that stays in the fastest cache
     four = len(rows) // 4 * 4
     whole = np.empty((3, width))
@@ -97,26 +95,19 @@ def _add_rows(fields, rows, weights, nodes, displacement):
                 displacement[nodes[begin + i], axis] += whole[axis, i]
 
 
-_VERSION = 4
-"""Part of the cache's key: raise it when the bytes change."""
-
+_VERSION = 4  # Part of the cache's key: raise it when the bytes change
+# Numbers in the fields below which they are in double precision, as single would save little
+# time.
 _DOUBLE = 4_000_000
-"""Numbers in the fields below which they are in double precision, as single would save little
-time."""
-
+# Numbers in the fields from which on they are cached, as making them takes a second.
 _KEPT = 12_000_000
-"""Numbers in the fields from which on they are cached, as making them takes a second."""
-
+# Numbers in the fields from which on they are compressed, and made in single precision.
 _COMPRESSED = 100_000_000
-"""Numbers in the fields from which on they are compressed, and made in single precision."""
-
+# Singular values that compression leaves out, over the largest displacement by each force: a
+# whole press is then off by about a tenth of that.
 _TOLERANCE = 1e-4
-"""Singular values that compression leaves out, over the largest displacement by each force: a
-whole press is then off by about a tenth of that."""
-
+# Number of single forces, and of presses, by which the fields' rounding error is measured.
 _SAMPLES = 12
-"""Number of single forces, and of presses, by which the fields' rounding error is measured."""
-
 _PRESSED = 16  # nodes of the surface over those that such a press is on
 
 
@@ -221,7 +212,6 @@ def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> 
 
 
 def _scratch(needed: bool) -> AbstractContextManager[Any]:
-    """A file that vanishes when it is closed; None if it is not needed or there is no place."""
     with contextlib.suppress(OSError):
         if needed:
             return tempfile.TemporaryFile(buffering=0)
@@ -229,10 +219,7 @@ def _scratch(needed: bool) -> AbstractContextManager[Any]:
 
 
 def _rounding(
-    made: SurfaceCompliance,
-    points: NDArray[np.float64],
-    system: AveragedPressure,
-    fixed: NDArray[np.bool_],
+    made: SurfaceCompliance, points: NDArray, system: AveragedPressure, fixed: NDArray
 ) -> float:
     """The unbalanced force over the norm of the forces: the median of single ones and of presses,
     whichever is larger.

@@ -22,23 +22,17 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.kernels import njit
 
 _BLOCK = 512  # nodes at most of a block
-
 _CHUNK = 64  # nodes at most for whose forces the fields are made at once
-
 _PATCH = 32  # nodes at most of the smallest patches
-
+# Two patches are joined if together they need this many vectors over those one by one, or fewer:
+# a block next to one of them that is not loaded need not be read.
 _GAIN = 0.75
-"""Two patches are joined if together they need this many vectors over those one by one, or fewer:
-a block next to one of them that is not loaded need not be read."""
-
+# Numbers of a vector beside each other, those of the next one after them: read in line, and added
+# up in registers.
 _TILE = 64
-"""Numbers of a vector beside each other, those of the next one after them: read in line, and added
-up in registers."""
-
+# Singular values up to this many times the tolerance are of vectors of 8 bits, whose rounding is
+# then below the tolerance.
 _MINOR = 100
-"""Singular values up to this many times the tolerance are of vectors of 8 bits, whose rounding is
-then below the tolerance."""
-
 Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 
@@ -129,14 +123,8 @@ class _Product:
 
 
 class _Compression:
-    """Fields on their way into products."""
-
     def __init__(
-        self,
-        nodes: NDArray[np.integer],
-        order: NDArray[np.int64],
-        solve: Solve,
-        tolerance: float,
+        self, nodes: NDArray[np.integer], order: NDArray[np.int64], solve: Solve, tolerance: float
     ) -> None:
         self._nodes, self._order, self._solve = nodes, order, solve
         self._tolerance = tolerance
@@ -168,9 +156,7 @@ class _Compression:
         halves = zip(self._compress(first, middle), self._compress(middle, last), strict=True)
         return [self._joined(block, *pair) for block, pair in enumerate(halves)]
 
-    def _split(
-        self, block: int, fields: NDArray[np.floating], first: int, last: int
-    ) -> _Product | None:
+    def _split(self, block: int, fields: NDArray, first: int, last: int) -> _Product | None:
         if last - first <= _PATCH:
             return _Product(first, last, *self._truncated(fields))
         middle = (first + last) // 2
@@ -194,9 +180,7 @@ class _Compression:
         self._finish(block, two)
         return None
 
-    def _truncated(
-        self, matrix: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _truncated(self, matrix: NDArray) -> tuple[NDArray, NDArray]:
         """Left and right factors, without singular values below the tolerance."""
         exact = matrix.astype(np.float64)
         squares, vectors = np.linalg.eigh(exact.T @ exact)
@@ -262,7 +246,6 @@ def _tiles(vectors: NDArray[np.float32], kind: type) -> tuple[NDArray, NDArray[n
 
 
 def _padded(count: int) -> int:
-    """The numbers in as many whole tiles as are needed."""
     return -(-count // _TILE) * _TILE
 
 

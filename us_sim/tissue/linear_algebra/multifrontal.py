@@ -42,9 +42,7 @@ class Part:
 
 
 def nested_dissection(
-    points: NDArray[np.float64],
-    edges: NDArray[np.integer],
-    largest: int = 60,
+    points: NDArray[np.float64], edges: NDArray[np.integer], largest: int = 60
 ) -> Part:
     """The tree of parts.
 
@@ -61,9 +59,7 @@ def nested_dissection(
     return root
 
 
-def _dissect(
-    points: NDArray[np.float64], graph: csr_array, nodes: NDArray[np.int64], largest: int
-) -> Part:
+def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) -> Part:
     if len(nodes) <= largest:
         return Part(nodes)
     axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
@@ -89,7 +85,6 @@ def _dissect(
 
 
 def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
-    """Fill in the boundaries of a part and those below it."""
     for below in part.parts:
         _bound(below, graph, eliminated)
     near = [below.boundary for below in part.parts]
@@ -99,16 +94,12 @@ def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
     part.boundary = boundary[~eliminated[boundary]].astype(np.int64)
 
 
-_LARGE = 100_000
-"""Numbers in a matrix from which on it may be kept in a file."""
-
+_LARGE = 100_000  # Numbers in a matrix from which on it may be kept in a file
 _Update = tuple[NDArray[np.int64], NDArray[np.float64]]  # unknowns, and what is added to them
 
 
 @dataclass(frozen=True, eq=False)
 class _Stored:
-    """A matrix, in memory or in a file."""
-
     matrix: NDArray[np.floating]  # empty if in a file
     file: FileIO | None
     place: int  # where in the file it begins
@@ -292,8 +283,8 @@ class _Elimination:
         return _Stored.put(matrix.astype(self._precision), self._file)
 
     def _assembled(
-        self, own: NDArray[np.int64], around: NDArray[np.int64], updates: list[_Update]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        self, own: NDArray, around: NDArray, updates: list[_Update]
+    ) -> tuple[NDArray, NDArray, NDArray]:
         """The blocks own-own, own-around and around-around, with the updates from below."""
         stiffness = np.zeros((len(own), len(own)))
         side = np.zeros((len(own), len(around)))
@@ -337,9 +328,7 @@ class _Factor:
         """Own unknowns under forces on them, those around at rest."""
         return self._rest(*self._halves(right))
 
-    def _halves(
-        self, right: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _halves(self, right: NDArray) -> tuple[NDArray, NDArray]:
         upper = _forward(self._factor, right[: self._moves])
         lower = self._side.T @ upper
         lower -= right[self._moves :]

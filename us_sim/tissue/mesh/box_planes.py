@@ -17,15 +17,9 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 
-_GROWTH = 0.35
-"""The most that the wanted spacing changes over a distance, per distance."""
-
-_UNDER_PROBE = 0.5
-"""Spacing under the probe over its half width."""
-
-_FEWEST = 3
-"""Planes along an axis."""
-
+_GROWTH = 0.35  # The most that the wanted spacing changes over a distance, per distance
+_UNDER_PROBE = 0.5  # Spacing under the probe over its half width
+_FEWEST = 3  # Planes along an axis
 _BISECTIONS = 40
 
 
@@ -106,8 +100,8 @@ def _spread(axis: Wanted, count: int) -> NDArray[np.float64]:
     return planes
 
 
+# Cells across a structure: the least with which its wall and its middle move differently.
 _ACROSS = 3.0
-"""Cells across a structure: the least with which its wall and its middle move differently."""
 
 
 def wanted_by_labels(
@@ -149,11 +143,7 @@ def wanted_by_labels(
     return x, y, z
 
 
-def _sampled(
-    labels: NDArray[np.uint8],
-    index_from_patient: NDArray[np.float64],
-    centres: list[NDArray[np.float64]],
-) -> NDArray[np.uint8]:
+def _sampled(labels: NDArray, index_from_patient: NDArray, centres: list[NDArray]) -> NDArray:
     """Labels at a grid of points in ``patient``; 0 beyond the volume."""
     x, y, z = np.meshgrid(*centres, indexing="ij", sparse=True)
     inside = np.ones([len(c) for c in centres], dtype=bool)
@@ -167,9 +157,7 @@ def _sampled(
     return np.where(inside, labels.reshape(-1)[flat], 0).astype(np.uint8)
 
 
-def _thickness(
-    grid: NDArray[np.uint8], axis: int, edges: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _thickness(grid: NDArray, axis: int, edges: NDArray) -> NDArray:
     """(S,) m, of the thinnest structure at each place along an axis of a label grid."""
     lines = np.moveaxis(grid, axis, 0).reshape(grid.shape[axis], -1)
     ends = np.ones((len(lines) + 1, lines.shape[1]), dtype=bool)

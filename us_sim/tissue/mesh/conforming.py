@@ -25,13 +25,11 @@ from us_sim.geometry.triangles import vertex_normals
 from us_sim.tissue.mesh import wild_mesher
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, repair, signed_volumes
 
-_SECONDS = 300.0
-"""After which fTetWild is given up; meshes of some thousand nodes take it seconds."""
-
+_SECONDS = 300.0  # After which fTetWild is given up; meshes of some thousand nodes take it seconds
+# Size of all over the longest edge asked for: fTetWild begins with a grid that reaches as far
+# beyond the box as an edge is long, and joins its tetrahedra where they may be longer at the end.
 _LONGEST = 10.0
-"""Size of all over the longest edge asked for: fTetWild begins with a grid that reaches as far
-beyond the box as an edge is long, and joins its tetrahedra where they may be longer at the end."""
-
+# Triangles of a box whose corner is 4 (x is high) + 2 (y is high) + (z is high).
 _BOX = np.array(
     [
         *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
@@ -39,7 +37,6 @@ _BOX = np.array(
     ],
     dtype=np.int32,
 )
-"""Triangles of a box whose corner is 4 (x is high) + 2 (y is high) + (z is high)."""
 
 _GRID = "`mesh: grid` in the case, `kind: grid` in a scene's tissue.mesh"
 
@@ -113,7 +110,6 @@ def conforming_mesh(
 
 
 def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """What fTetWild makes of it, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder).resolve()
         given, made = place / "given.npz", place / "made.npz"
@@ -141,12 +137,7 @@ def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], N
             return stored["nodes"].astype(np.float64), stored["tetrahedra"].astype(np.int32)
 
 
-def _within(
-    box: NDArray[np.float64],
-    nodes: NDArray[np.float64],
-    tetrahedra: NDArray[np.int32],
-    tolerance: float,
-) -> TetrahedralMesh:
+def _within(box: NDArray, nodes: NDArray, tetrahedra: NDArray, tolerance: float) -> TetrahedralMesh:
     """The tetrahedra in the box, with the nodes of its faces moved into them.
 
     Raises:
@@ -181,8 +172,7 @@ def _within(
 
 _STEPS = 3
 _HALVINGS = 4
-_LEFT = 0.2
-"""Part of a tetrahedron's volume that it keeps in one step."""
+_LEFT = 0.2  # Part of a tetrahedron's volume that it keeps in one step
 
 
 def with_inside_volume(

@@ -26,8 +26,7 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-_ROUNDING = 1e-9
-"""A barycentric coordinate this far below zero is rounding."""
+_ROUNDING = 1e-9  # A barycentric coordinate this far below zero is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +209,10 @@ def _distance_to_triangle(p, a, ab, ac):
     return np.sqrt(square)
 
 
+# Distance that a vertex may lie outside the mesh, over the longest edge of the nearest
+# tetrahedron, whose deformation carries it.
 _REACH = 0.5
-"""Distance that a vertex may lie outside the mesh, over the longest edge of the nearest
-tetrahedron, whose deformation carries it."""
-
-_WITHIN = 1e-6
-"""Distance from the mesh up to which a vertex counts as within it, m."""
+_WITHIN = 1e-6  # Distance from the mesh up to which a vertex counts as within it, m
 
 
 class EmbeddedSurface:
@@ -234,10 +231,7 @@ class EmbeddedSurface:
     """
 
     def __init__(
-        self,
-        mesh: TetrahedralMesh,
-        vertices: NDArray[np.float64],
-        triangles: NDArray[np.integer],
+        self, mesh: TetrahedralMesh, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
     ) -> None:
         vertices, triangles = _checked(vertices, triangles)
         location = locate(mesh, vertices)
@@ -253,10 +247,7 @@ class EmbeddedSurface:
 
     @classmethod
     def trimmed(
-        cls,
-        mesh: TetrahedralMesh,
-        vertices: NDArray[np.float64],
-        triangles: NDArray[np.integer],
+        cls, mesh: TetrahedralMesh, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
     ) -> EmbeddedSurface:
         """The part of a surface that the mesh can carry, its vertices renumbered in order.
 
@@ -275,11 +266,7 @@ class EmbeddedSurface:
         return surface
 
     def _keep(
-        self,
-        mesh: TetrahedralMesh,
-        vertices: NDArray[np.float64],
-        triangles: NDArray[np.int32],
-        location: Location,
+        self, mesh: TetrahedralMesh, vertices: NDArray, triangles: NDArray, location: Location
     ) -> None:
         self.triangles = triangles  # (T, 3) int32
         self.vertices = vertices.astype(np.float32)  # (V, 3) m, at rest
@@ -323,9 +310,7 @@ class EmbeddedSurface:
         return vertices
 
 
-def _checked(
-    vertices: NDArray[np.float64], triangles: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _checked(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
     vertices = np.array(vertices, dtype=np.float64, order="C")
     triangles = np.array(triangles, order="C")
     if vertices.ndim != 2 or vertices.shape[1] != 3:

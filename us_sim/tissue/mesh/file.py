@@ -1,7 +1,8 @@
 """Tetrahedral meshes of organs from files, placed in frame ``patient``.
 
 Gmsh's own formats are read here, after its reference manual ("MSH file format", 4.1, and the
-legacy versions 1 and 2): every number is taken from the file or refused.
+legacy versions 1 and 2): meshio 5.3 takes a tetrahedron's node 0 for the last node of the file and
+refuses version 1, which older organ meshes come in. meshio reads all other formats.
 
 >>> import tempfile
 >>> from pathlib import Path
@@ -30,13 +31,10 @@ from us_sim.geometry.pose import Pose
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, repair
 
 VERSIONS = ("2", "2.1", "2.2", "4.1")
-
+# How many nodes an element has: points, lines and triangles, and tetrahedra (4 and 11).
 _NODES_OF = {1: 2, 2: 3, 8: 3, 9: 6, 15: 1, 4: 4, 11: 10}
-"""How many nodes an element has: points, lines and triangles, and tetrahedra (4 and 11)."""
 _TETRAHEDRA = (4, 11)
-
-Rows = list[tuple[int, NDArray[np.int64]]]
-"""Elements by type, and the numbers of their nodes."""
+Rows = list[tuple[int, NDArray[np.int64]]]  # Elements by type, and the numbers of their nodes
 
 
 def parse_gmsh(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
@@ -290,14 +288,10 @@ _NO_MESH = (
     "an unstructured grid"
 )
 
-_SIZES = (1e-3, 2.5)
-"""Sizes of bodies, m: a smaller or larger one is in the wrong unit."""
-
-_USUAL_SIZES = (0.01, 0.8)
-"""Sizes of what is pressed with a probe, m: any other is remarked on."""
-
+_SIZES = (1e-3, 2.5)  # Sizes of bodies, m: a smaller or larger one is in the wrong unit
+_USUAL_SIZES = (0.01, 0.8)  # Sizes of what is pressed with a probe, m: any other is remarked on
+# Cells that a volume mesh may hold beside tetrahedra: their corners, edges and faces.
 _ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygon")
-"""Cells that a volume mesh may hold beside tetrahedra: their corners, edges and faces."""
 
 
 def read_mesh(
@@ -347,7 +341,6 @@ def read_mesh(
 
 
 def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[str, ...]]:
-    """Points (N, 3), tetrahedra (M, 4), and what was left out."""
     with path.open("rb") as file:
         start = file.read(64).lstrip()
     if start.startswith(b"$NOD"):
@@ -378,7 +371,6 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
 
 
 def _version(start: bytes) -> str:
-    """Of Gmsh's format."""
     return b" ".join(start.split()[1:2]).decode("latin-1")
 
 

@@ -27,12 +27,9 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
 
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # the six edges of a tetrahedron
-
-_FARTHEST = 1e6
-"""Largest coordinate of a body, m; beyond it volumes would overflow."""
-
+_FARTHEST = 1e6  # Largest coordinate of a body, m; beyond it volumes would overflow
+# Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise.
 _SMALLEST_VOLUME = 1e-9
-"""Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise."""
 
 
 def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
@@ -186,9 +183,7 @@ def _turn(tetrahedra: NDArray[np.integer], numbers: NDArray[np.intp]) -> NDArray
     return (a < b) ^ (b < c) ^ (a < c)
 
 
-def _check_hinges(
-    tetrahedra: NDArray[np.integer], one: NDArray[np.intp], other: NDArray[np.intp]
-) -> None:
+def _check_hinges(tetrahedra: NDArray, one: NDArray, other: NDArray) -> None:
     """Whether tetrahedra hang together by faces; the pairs (P,) and (P,) have one in common."""
     body = connected_parts(len(tetrahedra), one, other)
     bodies = int(body.max()) + 1
@@ -211,12 +206,11 @@ def _check_hinges(
         )
 
 
-def _with_node(
-    tetrahedra: NDArray[np.integer], among: NDArray[np.bool_], node: np.integer
-) -> np.intp:
+def _with_node(tetrahedra: NDArray, among: NDArray, node: np.integer) -> np.intp:
     return np.flatnonzero(among & (tetrahedra == node).any(axis=1))[0]
 
 
+# Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between.
 _FIVE = np.array(
     [
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -226,7 +220,6 @@ _FIVE = np.array(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]],
     ]
 )
-"""Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,9 +391,8 @@ def _said(verb: str, count: int, thing: str, how: str = "") -> str:
     return f"{verb} {count} {thing if count == 1 else plural} {how}".rstrip()
 
 
+# Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures.
 KINDS = ("grid", "conforming")
-"""Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures."""
-
 _LEAST_NODES = 64
 _MOST_ALONG = 400
 

@@ -36,14 +36,14 @@ from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
-from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
 TOLERANCE = Quantity("number", 1e-15, 1.0)
 """The residual at which a solver stops."""
 
-_PATIENCE = 5
+_FAILURES = 5
 """Frames in a row that may fail before the tissue is put to rest."""
 
 
@@ -126,17 +126,20 @@ class TissueSolver(ABC):
 
     def _recovered(self, good: TissueState) -> Deformation:
         """The result in place of a frame that failed; the next one tries again."""
-        action = "the frame came out not finite or far away, so the last good state was kept"
         self._failures += 1
-        if self._failures < _PATIENCE:
+        if self._failures < _FAILURES:
+            action = "the frame came out not finite or far away, so the last good state was kept"
+            done = Intervention.KEPT_STATE
             self._restore(good)
         else:
-            self.reset()
             action = (
-                f"{_PATIENCE} frames came out not finite or far away, so the tissue was put to rest"
+                f"{_FAILURES} frames came out not finite or far away, so the tissue was put to rest"
             )
+            done = Intervention.PUT_TO_REST
+            self.reset()
         self._settled = False
-        return replace(self._last, action=action, has_failed=True, is_balanced=False)
+        done |= Intervention.FRAME_FAILED
+        return replace(self._last, action=action, interventions=done, is_balanced=False)
 
     def reset(self) -> None:
         """Back to the undeformed tissue, with no probe near."""

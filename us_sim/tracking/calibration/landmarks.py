@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.text_file import read_bytes, read_text
+from us_sim.settings.text_files import read_bytes, read_text
 
 Array = NDArray[np.float64]
 

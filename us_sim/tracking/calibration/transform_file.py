@@ -32,8 +32,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
 from us_sim.volume.sequences.transforms import split_transform_name
 

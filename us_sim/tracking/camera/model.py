@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.kernels import njit
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """ROS's names of the lens models, and how many coefficients each has."""

@@ -28,8 +28,7 @@ from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
 from us_sim.tracking.settings import MARKER_SIZE
 

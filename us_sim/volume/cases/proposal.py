@@ -26,7 +26,7 @@ from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import COLLIDERS, PROBES
-from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
+from us_sim.tissue.elasticity.material import LAYERS, kind_of
 from us_sim.volume.cases.settings import SLIDE, CaseSettings, CaseStart
 from us_sim.volume.volume import Volume
 
