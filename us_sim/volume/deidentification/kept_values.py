@@ -32,7 +32,7 @@ class KeptNumber(NamedTuple):
     low: float
     high: float
     why: str
-    count: int | None = 1  # None: any number of them, up to 16
+    length: int | None = 1  # None: any number of them, up to 16
     within: str = ""  # the sequence whose first item has it
 
 
@@ -125,7 +125,7 @@ def kept_values(header: Any) -> dict[str, str]:
     kept: dict[str, str] = {}
     for one in NUMBERS:
         source = next(iter(items(header, one.within)), None) if one.within else header
-        found = numbers(source, one.keyword, one.count)
+        found = numbers(source, one.keyword, one.length)
         if found and len(found) <= 16 and all(one.low <= each <= one.high for each in found):
             kept[one.name] = " ".join(f"{each:.9g}" for each in found)
     for name, (keyword, terms) in CLOSED_LISTS.items():

@@ -156,7 +156,7 @@ class Watershed(Settings):
         first = np.maximum(np.array(seed) - reach, 0)
         last = np.minimum(np.array(seed) + reach + 1, markers.shape)
         box = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
-        away = np.stack(np.mgrid[box], axis=-1) - np.array(seed)
+        away = np.moveaxis(np.asarray(np.mgrid[box]), 0, -1) - np.array(seed)
         near = np.linalg.norm(away * region.spacing, axis=-1) <= self.marker
         markers[box][near] = mark
 

@@ -68,8 +68,8 @@ def label_surface(
         field = ndimage.affine_transform(field, np.diag(steps), output_shape=shape, order=1)
     if field.max() <= _LEVELS[0]:
         raise VolumeError(
-            f"label {label} ({structure_name(volume, label)}) is too thin for a surface "
-            f"{spacing * 1e3:.2g} mm fine: allow more triangles"
+            f"{_numbered(volume, label)} is too thin for a surface {spacing * 1e3:.2g} mm fine: "
+            f"allow more triangles"
         )
     wanted = np.count_nonzero(mask) / steps.prod()
     one, other = (_enclosed(*marching_cubes(field, level)[:2]) for level in _LEVELS)
@@ -140,6 +140,11 @@ def structure_name(volume: Volume, label: int) -> str:
     return volume.label_names.get(label, f"label {label}")
 
 
+def _numbered(volume: Volume, label: int) -> str:
+    name = volume.label_names.get(label)
+    return f"label {label} ({name})" if name else f"label {label}"
+
+
 def _placed(
     volume: Volume, indices: NDArray[np.float64], triangles: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -180,6 +185,6 @@ def _voxels_of(
             return mask, start
     where = "" if within is None else " within the tissue mesh"
     raise VolumeError(
-        f"label {label} ({structure_name(volume, label)}) occurs nowhere{where}, so it has no "
-        f"surface: name another structure, or segment it again"
+        f"{_numbered(volume, label)} occurs nowhere{where}, so it has no surface: name another "
+        f"structure, or segment it again"
     )
