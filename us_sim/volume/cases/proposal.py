@@ -248,7 +248,6 @@ def _beside(volume: Volume) -> float:
 
 
 def _coarse(volume: Volume) -> tuple[NDArray[np.uint8], int]:
-    """Every so many voxels along each axis, and how many."""
     step = _step(volume, _MOST_POINTS)
     return volume.intensities[::step, ::step, ::step], step
 

@@ -158,7 +158,6 @@ def _step(document: Mapping[str, Any]) -> Step:
 
 
 def _checked(key: str, value: Any, depth: int = 0) -> Any:
-    """A value as YAML holds it, if it may be kept."""
     if isinstance(value, Mapping) and depth < 8:
         for name in value:
             is_key = isinstance(name, str) and re.fullmatch(r"[A-Za-z_][\w .-]{0,60}", name)

@@ -276,7 +276,6 @@ def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
 
 
 def _result(source: Source, part: Rectangle | None) -> str:
-    """The result with its size, in words."""
     columns, rows, count = source.shape
     if part is not None:
         columns, rows = part.size
@@ -307,7 +306,6 @@ def _blanked(
 def _cropped(
     voxels: NDArray[np.uint8], placement: NDArray[np.float64], part: Rectangle | None
 ) -> Volume:
-    """The part of every image, where it was."""
     if part is None:
         return Volume(voxels, placement)
     if min(part.size) < 2:

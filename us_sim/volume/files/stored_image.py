@@ -115,7 +115,6 @@ class StoredVoxels:
             ) from error
 
     def _words(self, file: BinaryIO) -> bytes:
-        """Numbers that are written as words."""
         most = 32 * math.prod(self.size) + _STEP
         text = file.read(most + 1)
         try:

@@ -297,7 +297,6 @@ class UpperArm:
             section.diffuse[squares_x[:, None] + squares_z < 1.0] = _echo(-48.0)
 
     def _bone(self, section: ArmSection) -> None:
-        """Add the humerus, which scatters little."""
         x, y, z = section.x, section.y, section.depth
         distance = self.humerus.distance(x, y, z)
         distance -= 0.35e-3 * self._cloud.plane(x, y, z)  # no shaft is an ellipse

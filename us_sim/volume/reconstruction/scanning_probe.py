@@ -156,7 +156,6 @@ def fitted_part(
 
 
 def _named_fan(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Fan | None:
-    """The fan that a person or a calibration names."""
     if part.fan_origin is None or part.fan_radius is None or part.fan_angles is None:
         return None
     if abs(pixel[0] / pixel[1] - 1.0) > 0.1:  # an arc in pixels is none in metres
@@ -303,7 +302,6 @@ def _lines(edges: _Edges) -> tuple[NDArray[np.float64], float, float] | None:
 
 
 def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
-    """None where there is no such probe."""
     if isinstance(shape, Rectangle):
         kind, depth = "linear", shape.z[1] - shape.z[0]
         values = {"aperture": round(shape.x[1] - shape.x[0], 5)}

@@ -1,7 +1,4 @@
-"""The settings of a freehand reconstruction.
-
-What can be set of a volume that grows while a probe scans.
-"""
+"""Settings of freehand reconstructions: of a sweep, and live while a probe scans."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ METHODS = ("nearest", "linear")
 """How a pixel is inserted: into the nearest voxel, or into the eight around it by their weights."""
 
 COMPOUNDINGS = ("mean", "median", "max", "latest", "plus_mean")
-"""What becomes of several pixels in one voxel; ``plus_mean`` is Plus' running mean, which is made
+"""Combinations of several pixels in one voxel; ``plus_mean`` is Plus' running mean, which is made
 a whole number after every pixel and so comes out 2 grey levels darker."""
 
 _PIXEL = Quantity("image distance", -1e5, 1e5)

@@ -49,7 +49,7 @@ class Threshold(Settings):
 
 @dataclass(frozen=True)
 class SeededGrowing(Threshold):
-    """What hangs together with a seed through grey values in a range (ITK's ConnectedThreshold)."""
+    """The part connected with a seed through grey values in a range (ITK's ConnectedThreshold)."""
 
     def found_in(self, region: Region) -> NDArray[np.bool_]:
         """(i, j, k) where the structure is.
@@ -72,7 +72,7 @@ class SeededGrowing(Threshold):
 
 @dataclass(frozen=True)
 class ConfidenceConnected(Settings):
-    """Growing into what is like what was grown: mean and deviation, several times over.
+    """Growing into voxels like the grown ones by mean and deviation, several times over.
 
     It is ITK's ConfidenceConnected: the first mean is that around the seeds.
     """
@@ -151,7 +151,6 @@ class Watershed(Settings):
         return array_of(flooded) == _INSIDE
 
     def _mark(self, markers: NDArray[np.uint8], region: Region, seed: Index, mark: int) -> None:
-        """Put a ball around a seed into markers."""
         reach = np.floor(self.marker / region.spacing).astype(int)
         first = np.maximum(np.array(seed) - reach, 0)
         last = np.minimum(np.array(seed) + reach + 1, markers.shape)

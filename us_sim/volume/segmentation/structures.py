@@ -126,7 +126,6 @@ def _around(
 
 
 def _finished(mask: NDArray[np.bool_], asked: StructureSeeds, region: Region) -> NDArray[np.bool_]:
-    """The mask opened, closed, filled, and its parts that stay."""
     mask = ball_opened(mask, asked.open, region.spacing)
     mask = ball_closed(mask, asked.close, region.spacing)
     if asked.fill:
@@ -197,7 +196,6 @@ def seeds_of(volume: Volume, name: str, asked: StructureSeeds) -> list[Index]:
 def _indices(
     volume: Volume, name: str, key: str, points: tuple[tuple[float, float, float], ...]
 ) -> list[Index]:
-    """Indices of the voxels that points in mm lie in."""
     found: list[Index] = []
     for number, point in enumerate(points):
         at = volume.patient_to_index @ [*(1e-3 * np.array(point)), 1.0]

@@ -234,7 +234,6 @@ def _stored_images(file: SequenceFile) -> StoredImages | VolumeError:
 
 
 def _is_orientation(code: str) -> bool:
-    """Whether a code says how flat images lie."""
     return re.fullmatch(r"([UM][FN]|[FN][UM])[AD]?", code) is not None
 
 
@@ -317,7 +316,6 @@ def _orientation(keys: Mapping[str, str]) -> str:
 
 
 def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[str, str]]:
-    """The fields of the frames of a sequence."""
     frames = frame_fields(keys)
     if kinds and not is_sequence(kinds, keys):
         raise VolumeError(

@@ -116,7 +116,6 @@ def sweep_of(
 def _sweep(
     sequence: TrackedSequence, placed: FrameTransforms | None, chain: TransformChain
 ) -> Sweep:
-    """The frames that can be used."""
     sequence.require_images()
     faults = sequence.faults(placed, images=True)
     left_out = sequence.left_out(faults)

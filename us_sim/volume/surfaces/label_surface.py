@@ -157,7 +157,6 @@ def _placed(
 
 
 def _enclosed(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> float:
-    """The volume inside a closed surface, by Gauss's theorem."""
     a, b, c = vertices.astype(np.float64)[triangles.T]
     return abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6
 

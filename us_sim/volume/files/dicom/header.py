@@ -247,7 +247,6 @@ class _Bounded(io.BufferedIOBase):
 
 
 def _read(path: Path, data: BinaryIO, size: int, inflated: bytes | None = None) -> DicomFile:
-    """The header before and after the images."""
     from pydicom import dcmread
     from pydicom.filereader import read_dataset
 

@@ -126,7 +126,6 @@ def _number_type(file: DicomFile, element: int) -> tuple[int, np.dtype[np.generi
 
 
 def _check_bytes(file: DicomFile, form: ImageFormat) -> None:
-    """Compare the format with the bytes or fragments that there are."""
     assert file.pixels is not None
     length = file.pixels.length
     if file.compressed != (length is None):
@@ -290,7 +289,6 @@ def decoded_frames(
 
 
 def _failure(file: DicomFile, process: subprocess.Popen[bytes]) -> VolumeError:
-    """Why an image is missing."""
     from pydicom.uid import UID
 
     assert process.stderr
@@ -445,7 +443,6 @@ def stored_frames(
 
 
 def _read(file: DicomFile, form: ImageFormat, frames: Sequence[int]) -> Iterator[NDArray[Any]]:
-    """Images that are not compressed."""
     assert file.pixels is not None
     with file.open() as data:
         for frame in frames:
