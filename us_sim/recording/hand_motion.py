@@ -1,13 +1,6 @@
 """Probe paths as a free hand moves them: smooth, random, as fast as asked, the same for a seed.
 
 ``python -m us_sim.recording.hand_motion FILE.mcap`` writes the one that the project ships.
-
->>> import numpy as np
->>> from us_sim.recording.hand_motion import hand_motion
->>> path = hand_motion("free", "brisk", seed=1)
->>> steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
->>> len(path), f"{60e3 * np.median(steps):.3f} mm/s"
-(300, '60.000 mm/s')
 """
 
 from __future__ import annotations

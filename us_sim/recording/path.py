@@ -36,9 +36,6 @@ from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
 from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, SLICER_TRANSFORMS
 
-__all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]
-
-
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 _TF = "tf2_msgs/msg/TFMessage"

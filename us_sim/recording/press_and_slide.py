@@ -1,11 +1,6 @@
 """The probe path of the demo: come down, press, hold, slide and rock, release, lift.
 
 ``python -m us_sim.recording.press_and_slide FILE.mcap`` writes it as a bag.
-
->>> from us_sim.recording.press_and_slide import press_and_slide
->>> path = press_and_slide()
->>> len(path), float(path.positions[:, 2].min()), float(path.positions[:, 2].max())
-(600, -0.01, 0.012)
 """
 
 from __future__ import annotations

@@ -2,16 +2,6 @@
 
 Where ROS 2 is installed the text is the installed ``.msg`` file, comments and all, exactly as
 rosbag2 writes it; elsewhere the definition of the same fields comes from rosbags.
-
->>> from us_sim.recording.schemas import schema_text, type_hash
->>> print(schema_text("std_msgs/msg/ColorRGBA").replace("float32 ", ""))
-r
-g
-b
-a
-<BLANKLINE>
->>> type_hash("geometry_msgs/msg/PoseStamped")[:19]
-'RIHS01_10f3786d7d40'
 """
 
 from __future__ import annotations

@@ -1,14 +1,4 @@
-"""The wrenches of a bag: forces and torques over time, from a simulated probe or from a sensor.
-
->>> import tempfile
->>> import numpy as np
->>> from us_sim.recording.wrench import WrenchRecord, read_wrenches, write_wrenches
->>> file = tempfile.mkdtemp() + "/press.mcap"
->>> pressed = np.array([[0.0, 0.0, -2.5, 0.0, 0.0, 0.0]])
->>> write_wrenches(file, WrenchRecord("/probe/wrench", "probe", np.array([10**18]), pressed))
->>> read_wrenches(file, "probe/wrench").wrenches
-array([[ 0. ,  0. , -2.5,  0. ,  0. ,  0. ]])
-"""
+"""The wrenches of a bag: forces and torques over time, from a simulated probe or from a sensor."""
 
 from __future__ import annotations
 

@@ -4,13 +4,6 @@ The C library comes with the PyPI package `cyclonedds`. Its Python classes are n
 the interpreter's lock while a write blocks, describe every type by XTypes (which Jazzy does not
 send and need not agree with), and turn each sample into objects. Calls through ctypes release the
 lock.
-
->>> from us_sim.standalone.ddsc import EndpointQos, lib
->>> lib.dds_time() > 0
-True
->>> latched = EndpointQos(depth=1, durability=EndpointQos.TRANSIENT_LOCAL)
->>> latched.reliability == EndpointQos.RELIABLE
-True
 """
 
 from __future__ import annotations

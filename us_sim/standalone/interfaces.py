@@ -2,12 +2,6 @@
 
 The .msg files come from rosbags' type store. Written down here are the services, which it lacks,
 and two events of rosbag2 that are newer than Jazzy.
-
->>> from us_sim.standalone.interfaces import interface, type_hash
->>> [(field.name, field.idl_type) for field in interface("sensor_msgs/msg/Image").fields][-2:]
-[('step', 'uint32'), ('data', 'sequence<uint8>')]
->>> type_hash("sensor_msgs/msg/Image")[:16]
-'RIHS01_d31d41a9a'
 """
 
 from __future__ import annotations

@@ -2,12 +2,6 @@
 
 As in rclpy, SIGINT shuts all contexts down and also does what Python does (KeyboardInterrupt in the
 main thread), while SIGTERM ends nothing by itself: `spin` raises ExternalShutdownException.
-
->>> with Context() as context:
-...     context.ok()
-True
->>> context.ok()
-False
 """
 
 import _thread
