@@ -222,7 +222,10 @@ _LONGEST_BLOCK = 100_000_000  # ns; DDS's own default, where rmw_cyclonedds woul
 
 @dataclass(frozen=True)
 class EndpointQos:
-    """The policies of one endpoint, with the numbers that rclpy's enumerations have."""
+    """The policies of one endpoint, with the numbers that rclpy's enumerations have.
+
+    A duration of 0 is "not specified", which is infinite, as in rmw.
+    """
 
     RELIABLE: ClassVar[int] = 1
     BEST_EFFORT: ClassVar[int] = 2
