@@ -117,6 +117,15 @@ def jazzy_definitions() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+def stamped(type_name: str, stamp: int, frame_id: str, **fields: Any) -> memoryview:
+    """A message of Jazzy with a header and these fields as CDR; ``stamp`` in ns since the epoch."""
+    store = jazzy_definitions()
+    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    header = store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+    message = store.types[type_name](header=header, **fields)
+    return store.serialize_cdr(message, type_name, little_endian=True)
+
+
 @cache
 def _schema_text(type_name: str, prefixes: str) -> str:
     parts: list[str] = []
