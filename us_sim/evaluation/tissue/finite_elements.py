@@ -48,7 +48,7 @@ from scipy.sparse import bsr_array, csr_array, dia_array
 from scipy.sparse.linalg import LinearOperator, splu
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.block import solved
+from us_sim.evaluation.block import conjugate_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.volumetric_split import volumetric_split
 from us_sim.tissue.model import TissueModel
@@ -424,7 +424,7 @@ class LinearEquations:
         right = project(-self._product(prescribed.ravel()))
         diagonal = self._matrix.diagonal() + self._spread.power(2) @ self._nodal
         shape = self._matrix.shape
-        found = solved(
+        found = conjugate_gradients(
             LinearOperator(shape, lambda v: project(self._product(project(v)))),
             right,
             1e-11,

@@ -47,7 +47,7 @@ from scipy.spatial import cKDTree
 
 from us_sim.cache import Form, kept
 from us_sim.errors import SolverError
-from us_sim.evaluation.tissue import finite_elements as hexahedra
+from us_sim.evaluation.tissue import finite_elements
 from us_sim.evaluation.tissue.cases import Scene
 from us_sim.evaluation.tissue.finite_elements import (
     NeoHookeanHexahedra,
@@ -398,7 +398,7 @@ def _approach(scene: Scene) -> list[Pose]:
 def _hash(scene: Scene, planes: tuple[NDArray[np.float64], ...]) -> str:
     """Of everything that decides the solution, the code included."""
     digest = hashlib.sha256()
-    for file in (str(hexahedra.__file__), __file__):
+    for file in (str(finite_elements.__file__), __file__):
         digest.update(Path(file).read_bytes())
     for array in (*planes, *(p.matrix for p in _approach(scene)), scene.collider.offset_box):
         digest.update(np.ascontiguousarray(array).tobytes())
