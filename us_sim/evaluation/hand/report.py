@@ -179,10 +179,7 @@ def _together(points: Sequence[Point], values: Callable[[Point], NDArray]) -> ND
 
 
 def _write_report(
-    folder: ReportFolder,
-    points: Sequence[Point],
-    answers: Mapping[Motion, Converged],
-    table: str,
+    folder: ReportFolder, points: Sequence[Point], answers: Mapping[Motion, Converged], table: str
 ) -> None:
     free = [motion for motion in answers if motion.kind == "free"]
     others = [motion for motion in answers if motion.kind != "free"]

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from us_sim.evaluation.image.acoustics import (
-    Attenuation,
-    Enhancement,
-    Fibres,
-    Shadow,
-    Surfaces,
-)
+from us_sim.evaluation.image.acoustics import Attenuation, Enhancement, Fibres, Shadow, Surfaces
 from us_sim.evaluation.image.arm import ArmTilts, RunTime
 from us_sim.evaluation.image.flow import Flow
 from us_sim.evaluation.image.measure import Artefact, Point

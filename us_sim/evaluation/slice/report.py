@@ -27,14 +27,7 @@ from us_sim.evaluation.report import (
     target_table,
 )
 from us_sim.evaluation.settings import RecordedSweep
-from us_sim.evaluation.slice.cases import (
-    DEPTHS,
-    MAIN,
-    PLANES,
-    cases,
-    exact_slice,
-    voxel_distance,
-)
+from us_sim.evaluation.slice.cases import DEPTHS, MAIN, PLANES, cases, exact_slice, voxel_distance
 from us_sim.evaluation.slice.measure import (
     HOW_TO_GET,
     OURS,

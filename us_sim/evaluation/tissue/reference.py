@@ -49,10 +49,7 @@ from us_sim.cache import Form, kept
 from us_sim.errors import SolverError
 from us_sim.evaluation.tissue import finite_elements
 from us_sim.evaluation.tissue.cases import Scene
-from us_sim.evaluation.tissue.finite_elements import (
-    NeoHookeanHexahedra,
-    TwoLevel,
-)
+from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra, TwoLevel
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -265,11 +262,7 @@ class _Search:
         normal = np.sign(local) * outside / distance[:, None]
         curved = (beyond > 0).astype(float)[:, :, None] * np.eye(3)
         curvature = (curved - normal[:, :, None] * normal[:, None, :]) / distance[:, None, None]
-        return (
-            distance - rounding,
-            normal @ rotation.T,
-            rotation @ curvature @ rotation.T,
-        )
+        return (distance - rounding, normal @ rotation.T, rotation @ curvature @ rotation.T)
 
 
 def _diagonal(entries: NDArray[np.floating]) -> dia_array:

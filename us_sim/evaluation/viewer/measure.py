@@ -221,15 +221,7 @@ class Browser:
         self._tool.stop()
 
 
-STREAMED = (
-    "image",
-    "skin_mesh",
-    "skin",
-    "structures_mesh",
-    "structures",
-    "probe",
-    "hand",
-)
+STREAMED = ("image", "skin_mesh", "skin", "structures_mesh", "structures", "probe", "hand")
 """What the page shows when it is opened."""
 COMMAND_RATE = 60.0
 """Commands a second of a hand that moves."""
