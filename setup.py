@@ -6,20 +6,20 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NODES = [
-    "camera_driver",
-    "haptic_renderer",
-    "image_writer",
-    "openigtlink_bridge",
-    "path_player",
-    "probe_tracker",
-    "session_player",
-    "session_recorder",
-    "skin_deformer",
-    "slice_interpolator",
-    "space_mouse_driver",
-    "tissue_deformer",
-    "viewer",
-    "volume_reconstructor",
+    "nodes.camera_driver",
+    "nodes.haptic_renderer",
+    "nodes.image_writer",
+    "nodes.openigtlink_bridge",
+    "nodes.path_player",
+    "nodes.probe_tracker",
+    "nodes.session_player",
+    "nodes.session_recorder",
+    "nodes.skin_deformer",
+    "nodes.slice_interpolator",
+    "nodes.space_mouse_driver",
+    "nodes.tissue_deformer",
+    "viewer.viewer",
+    "nodes.volume_reconstructor",
 ]
 FOLDER = Path(__file__).resolve().parent
 BY_COLCON = bool({"install", "develop"} & set(sys.argv))
@@ -28,8 +28,8 @@ BY_COLCON = bool({"install", "develop"} & set(sys.argv))
 
 def console_scripts() -> list[str]:
     """`us-sim` alone in a wheel, all of whose scripts land on PATH; every node for `ros2 run`."""
-    nodes = [f"{node} = us_sim.nodes.{node}:main" for node in NODES if BY_COLCON]
-    return ["us-sim = us_sim.command.main:main", *nodes]
+    nodes = [f"{module.rpartition('.')[2]} = us_sim.{module}:main" for module in NODES]
+    return ["us-sim = us_sim.command.main:main", *(nodes if BY_COLCON else [])]
 
 
 def shared_files(folder: str) -> list[tuple[str, list[str]]]:

@@ -15,12 +15,15 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[1] / "us_sim"
 
 LAYERS = (
-    ("compose and measure", (("command",), ("run", "evaluation", "to_rerun"), ("demo", "", ""))),
+    (
+        "compose and measure",
+        (("command",), ("run", "evaluation", "to_rerun"), ("demo", "", "viewer")),
+    ),
     ("nodes", (("nodes",),)),
     (
         "the domain, without ROS",
         (
-            ("scene", "viewer"),
+            ("scene",),
             ("skin", "tissue", "slicing", "tracking"),
             ("", "", "volume", "recording"),
             ("geometry",),

@@ -25,8 +25,8 @@ from us_sim.run.supervision import going_on
 from us_sim.run.watch import Restarts, SupervisionSettings, Watch
 from us_sim.scene.reading import load_scene
 from us_sim.settings.setting import rules_of
+from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import find_bag
-from us_sim.viewer.viewer_settings import ViewerSettings
 
 LOOK_S = 0.1
 COMPILES = {"sigterm_timeout": "2", "sigkill_timeout": "1"}
@@ -134,7 +134,7 @@ class Supervised:
                         for node, action in self.actions.items()
                         if "pid" in (action.process_details or {})
                     }
-                    for node, how in self.hang.look(pids, self.monitor.node.heard).items():
+                    for node, how in self.hang.hung(pids, self.monitor.node.heard).items():
                         self.why[node] = how
                         await self.end(self.actions[node], context)
         except asyncio.CancelledError:

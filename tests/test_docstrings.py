@@ -36,7 +36,6 @@ def test_examples(name):
         "us_sim.tissue.mesh.embedding",
         "us_sim.tissue.mesh.file",
         "us_sim.volume.surfaces.label_surface",
-        "us_sim.scene.structures",
         "us_sim.skin.membrane",
         "us_sim.slicing.formation.image_formation",
         "us_sim.slicing.cutting.row_subdivision",
@@ -47,8 +46,7 @@ def test_examples(name):
         "us_sim.recording.path",
         "us_sim.scene.reading",
         "us_sim.tracking.probe_tracking",
-        "us_sim.geometry.frame_tree",
-        "us_sim.scene.tracker_building",
+        "us_sim.scene.building",
     ],
 )
 def test_main_parts_show_how_they_are_used_without_ros(name):

@@ -120,9 +120,7 @@ def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):
     assert len(error) < 6_000
 
 
-@pytest.mark.parametrize(
-    "module", ["argparse", "us_sim.command.simulation", "us_sim.recording.reader"]
-)
+@pytest.mark.parametrize("module", ["argparse", "us_sim.command.bag", "us_sim.recording.reader"])
 def test_ctrl_c_while_something_is_imported_is_one_sentence(module, tmp_path):
     """The signal comes at the import of a module, as early as the command has any."""
     program = (

@@ -23,10 +23,9 @@ from us_sim.evaluation.stability.cases import StabilityCase, mesh_named, model_o
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.probe_gap import FlaredProbe, push_out
-from us_sim.tissue.deformation import Deformation
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
 RANDOM = np.random.default_rng(2)

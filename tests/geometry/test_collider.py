@@ -18,13 +18,7 @@ BENT = Convex(radius=0.055, length=0.07, width=0.02, height=0.06, rounding=0.005
 # Nearly a half cylinder, with next to no sides.
 MICRO = Convex(radius=0.014, length=0.027, width=0.014, height=0.016, rounding=0.002)
 
-SHAPES = [
-    Sphere(0.03),
-    Capsule(0.01, 0.04),
-    RoundedBox(0.05, 0.015, 0.1, 0.003),
-    BENT,
-    MICRO,
-]
+SHAPES = [Sphere(0.03), Capsule(0.01, 0.04), RoundedBox(0.05, 0.015, 0.1, 0.003), BENT, MICRO]
 
 coordinate = st.floats(-0.2, 0.2)
 point = st.tuples(coordinate, coordinate, coordinate)

@@ -51,10 +51,10 @@ def values(kind):
         return texts
     if WHOLE.fullmatch(kind):
         return whole(kind)
-    return numbers[kind] if kind in numbers else messages(_class(kind))
+    return numbers[kind] if kind in numbers else any_of(_class(kind))
 
 
-def messages(cls):
+def any_of(cls):
     """All messages of a type."""
     return st.builds(cls, **{name: values(kind) for name, kind in _fields(cls).items()})
 

@@ -16,9 +16,9 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
 from us_sim.errors import MeshError, SettingsError
-from us_sim.nodes.annotated_image import AnnotatedImage
 from us_sim.nodes.probe_lead import is_left_by_pages
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of
 from us_sim.slicing.cutting.resampling import Located
 from us_sim.slicing.drawing.overlay import ColourScale, Overlay
@@ -74,7 +74,7 @@ class Asked:
 class Reds:
     """Red over the right half, half opaque."""
 
-    overlay_name = "strain"
+    topic = "ultrasound/strain"
     is_wanted = False
 
     def overlay(self, frame):

@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError, UsSimError
 from us_sim.nodes.camera_driver import CameraDriver
-from us_sim.nodes.camera_images import camera_from, grey_from
+from us_sim.nodes.tracker_inputs.camera_input import camera_from, grey_from
 from us_sim.tracking.camera.model import CameraModel, write_camera_info
 
 

@@ -16,7 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_from,
     affine_message,
     cloud_message,

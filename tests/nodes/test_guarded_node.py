@@ -21,9 +21,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 
 from us_sim.errors import PoseError
-from us_sim.nodes import guarded_node, health, process
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes import guarded_node, process
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.probe_tracker import ProbeTracker
 
 
@@ -104,7 +103,7 @@ def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
 
 def test_a_problem_that_goes_on_is_said_ever_more_rarely(broken, said, monkeypatch):
     def second(number):
-        monkeypatch.setattr(health.time, "monotonic", lambda: 1000.0 + number)
+        monkeypatch.setattr(guarded_node.time, "monotonic", lambda: 1000.0 + number)
         broken.health.problem("deep", str(number))
 
     for number in range(700):

@@ -10,14 +10,14 @@ from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.nodes.haptic_renderer import HapticRenderer
+from us_sim.nodes.messages import (
     contact_model_from,
     contact_model_message,
     pose_from,
     wrench_message,
     wrench_serialized,
 )
-from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.tracking.haptic import ContactModel
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 
-from us_sim.nodes.conversions import image_message
+from us_sim.nodes.messages import image_message
 from us_sim.nodes.qos import STREAM
 
 WATCHER = """
@@ -17,7 +17,7 @@ import us_sim.nodes
 import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-from us_sim.nodes.conversions import pixels_from
+from us_sim.nodes.messages import pixels_from
 from us_sim.nodes.qos import STREAM
 
 sums = []

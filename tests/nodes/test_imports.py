@@ -6,14 +6,14 @@ import sys
 import pytest
 
 UNUSED = [
-    ("us_sim.nodes.viewer, us_sim.viewer.application", {"numba", "scipy"}),
+    ("us_sim.viewer.viewer, us_sim.viewer.page", {"numba", "scipy"}),
     ("us_sim.nodes.probe_tracker", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.session_recorder", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.path_player", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.tissue_deformer", {"scipy.ndimage", "scipy.spatial", "cv2"}),
     (
         "us_sim.nodes.slice_interpolator, us_sim.slicing.acoustics.beam_acoustics, "
-        "us_sim.nodes.frame_streams.doppler_streams, us_sim.slicing.flow.doppler",
+        "us_sim.nodes.streams.doppler, us_sim.slicing.flow.doppler",
         {"scipy.ndimage", "scipy.spatial"},
     ),
 ]

@@ -4,9 +4,9 @@ from bench import pose_at
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 
-from us_sim.nodes.health import Health
-from us_sim.nodes.newest import Newest
+from us_sim.nodes.guarded_node import Health
 from us_sim.nodes.qos import EVERY
+from us_sim.nodes.scene_node import Newest
 
 
 def consumer(bench, publisher_count, *, lockstep):

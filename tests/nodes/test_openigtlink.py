@@ -14,7 +14,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import SettingsError
-from us_sim.nodes.conversions import affine_message, image_message
+from us_sim.nodes.messages import affine_message, image_message
 from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
 from us_sim.nodes.probe_tracker import ProbeTracker
 

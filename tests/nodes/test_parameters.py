@@ -15,8 +15,9 @@ from rclpy.parameter import Parameter
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import NODES, checked_parameters, is_live, parameters_of
 from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.run.plan import module_of
 from us_sim.scene.reading import load_scene
-from us_sim.settings.amount import dial_unit
+from us_sim.settings.quantity import dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import shared_path
 from us_sim.tissue.solvers.switching import SwitchableTissue
@@ -52,7 +53,7 @@ def given_to(node: str, scene: Any, folder: Any) -> dict[str, object]:
 
 def made(bench, node: str, scene: Any, folder: Any) -> Any:
     """A node by its name."""
-    module = importlib.import_module(f"us_sim.nodes.{node}")
+    module = importlib.import_module(module_of(node))
     name = next(n for n in vars(module) if n.lower() == node.replace("_", ""))
     return bench.make(getattr(module, name), **given_to(node, scene, folder))
 

@@ -4,7 +4,7 @@ import itertools
 import threading
 import time
 
-from us_sim.nodes.periodic_thread import PeriodicThread
+from us_sim.nodes.haptic_renderer import PeriodicThread
 
 
 def run(thread, done):

@@ -16,7 +16,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Int32MultiArray, String
 
 from us_sim.errors import BagError
-from us_sim.nodes.conversions import image_message, stamp_message
+from us_sim.nodes.messages import image_message, stamp_message
 from us_sim.nodes.path_player import PathPlayer
 from us_sim.nodes.session_player import SessionPlayer
 from us_sim.nodes.session_recorder import SessionRecorder

@@ -9,11 +9,11 @@ import pytest
 
 from us_sim.nodes import process
 from us_sim.nodes.probe_tracker import ProbeTracker
-from us_sim.nodes.realtime import go_first, scheduling_of
+from us_sim.nodes.process import go_first, scheduling_of
 
 WITH_A_THREAD = """
 import os, threading
-from us_sim.nodes.realtime import go_along, go_first, scheduling_of
+from us_sim.nodes.process import go_along, go_first, scheduling_of
 def policy():
     return os.sched_getscheduler(threading.get_native_id()) & ~os.SCHED_RESET_ON_FORK
 there, asked, policies = threading.Event(), threading.Event(), []

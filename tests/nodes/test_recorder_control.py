@@ -20,9 +20,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from us_sim.errors import BagError
-from us_sim.nodes.message_types import message_type
-from us_sim.nodes.recorded_topic import RecordedTopic
 from us_sim.nodes.session_recorder import SessionRecorder
+from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.recording.mcap_output import McapOutput
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag

@@ -7,10 +7,9 @@ from us_sim.errors import SceneError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.session_control import SessionControl
-from us_sim.nodes.session_settings import SessionControlSettings
-from us_sim.nodes.viewer_session import ViewerSession
+from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.session import NOT_THERE
+from us_sim.viewer.session import NOT_THERE, ViewerSession
 
 
 class Simulation:
@@ -82,7 +81,7 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     control, simulation = controlled(bench)
     page = bench.add(GuardedNode("page", context=bench.context))
     session = ViewerSession(page, Posted(page))
-    board = session.board
+    board = session
     assert board.ask(record="a.mcap").result() == NOT_THERE
     board.watch()
     bench.spin_until(lambda: control.count_subscribers("session/scenes"))
@@ -94,7 +93,7 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     values["record_note"] = "it lies beside another"
     control.tell("starting: 2 of 5 nodes", values, "nothing came")
     bench.spin_until(
-        lambda: board.state.scene == "arm" and board.bags and board.thumbnail("/arm.yaml")
+        lambda: board.state.scene == "arm" and board.bags and "/arm.yaml" in board.thumbnails
     )
     bench.spin_until(lambda: board.scenes)
     assert [(each.description, each.problem) for each in board.scenes] == [

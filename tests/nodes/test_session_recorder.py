@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from us_sim.errors import BagError
-from us_sim.nodes.conversions import image_message
+from us_sim.nodes.messages import image_message
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.recording.reader import read_bag

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Int32MultiArray
 
-from us_sim.nodes.conversions import cloud_message, field_from, pose_from, tetrahedra_message
+from us_sim.nodes.messages import cloud_message, field_from, pose_from, tetrahedra_message
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
@@ -133,7 +133,7 @@ def test_a_gap_begins_anew(bench, pressed):
 
 def test_the_colour_bar_follows_the_strain_unless_its_end_is_given(pressed):
     node = pressed()
-    stream = next(s for s in node.node._streams if s.overlay_name == "strain")
+    stream = next(s for s in node.node._streams if s.topic == "ultrasound/strain")
     assert stream.overlay(node.frame(2)).scale.high == 0.05  # the press compresses by 4 %
     node.node.set_parameters([Parameter("strain.colours", value=0.15)])
     assert stream.overlay(node.frame(2)).scale.high == 0.15

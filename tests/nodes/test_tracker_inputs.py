@@ -18,8 +18,8 @@ from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import SceneError, TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.camera_images import grey_from_compressed
 from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.tracker_inputs.camera_input import grey_from_compressed
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import SHARP, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody

@@ -8,8 +8,8 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image
 
 from us_sim.errors import VolumeError
-from us_sim.nodes.conversions import field_from, field_message, image_message
 from us_sim.nodes.image_writer import ImageWriter
+from us_sim.nodes.messages import field_from, field_message, image_message
 
 STAMP = Time(sec=3, nanosec=7)
 

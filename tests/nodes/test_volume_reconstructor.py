@@ -12,7 +12,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from us_sim.errors import VolumeError
-from us_sim.nodes.conversions import affine_message, image_message
+from us_sim.nodes.messages import affine_message, image_message
 from us_sim.nodes.volume_reconstructor import VolumeReconstructor
 from us_sim.volume.files.readers import read_volume
 

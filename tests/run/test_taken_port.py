@@ -8,7 +8,7 @@ from us_sim.errors import UsSimError
 from us_sim.run import live
 from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene
-from us_sim.viewer.viewer_settings import ViewerSettings
+from us_sim.settings.viewer import ViewerSettings
 
 
 @pytest.fixture

@@ -4,8 +4,7 @@ import pytest
 import yaml
 
 from us_sim.errors import SceneError
-from us_sim.scene.blood import blood_of
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import blood_of, volume_of
 from us_sim.scene.reading import load_scene
 
 FLOW = {"kind": "venous", "direction": [0, -1, 0], "peak_velocity": 0.2, "mean_velocity": 0.07}

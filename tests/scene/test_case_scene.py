@@ -12,10 +12,16 @@ from us_sim.errors import SceneError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.recording.path import read_path
-from us_sim.scene.building import path_of, scanner_of, tissue_model_of, volume_of
+from us_sim.scene.building import (
+    colour_of,
+    path_of,
+    scanner_of,
+    structures_of,
+    tissue_model_of,
+    volume_of,
+)
 from us_sim.scene.case_tissue import keep_tissue, kept_tissue
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import colour_of, structures_of
 from us_sim.settings.reading import Reader
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.tissue import read_tissue

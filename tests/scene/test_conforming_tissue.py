@@ -11,7 +11,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.scene import building
 from us_sim.scene.conforming_tissue import conforming_tissue
 from us_sim.scene.reading import parse_scene
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 from us_sim.volume.volume import Volume
 

@@ -8,7 +8,7 @@ from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import write_path
 from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.scene.image_in_volume import check_path_in_volume, part_inside
+from us_sim.scene.placement import check_path_in_volume, part_inside
 from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
 from us_sim.volume.files.writing import write_volume

@@ -8,8 +8,7 @@ import yaml
 from us_sim.command.main import main
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.scene.readable_files import check_files
-from us_sim.scene.reading import load_scene, parse_scene
+from us_sim.scene.reading import check_files, load_scene, parse_scene
 from us_sim.share import shared_path
 from us_sim.tracking.calibration.transform_file import write_transform
 

@@ -10,8 +10,8 @@ from us_sim.command.main import main
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import probe_of, tissue_model_of, volume_of
+from us_sim.scene.placement import probe_pose, rest_placement
 from us_sim.scene.reading import load_scene
-from us_sim.scene.rest_placement import probe_pose, rest_placement
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.tissue.solvers.solver import create_solver
 from us_sim.volume.files.readers import read_volume

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from us_sim.errors import MeshError, SceneError
-from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.building import (
+    colour_of,
+    require_labels,
+    structures_of,
+    tissue_model_of,
+    volume_of,
+)
 from us_sim.scene.reading import load_scene, parse_scene
-from us_sim.scene.structures import colour_of, require_labels, structures_of
-from us_sim.tissue.mesh.node_selection import face_nodes
+from us_sim.tissue.model import face_nodes
 
 DOCUMENT = {
     "name": "cylinder",

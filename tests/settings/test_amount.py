@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.settings.amount import amount, span
-from us_sim.settings.quantity import Quantity
+from us_sim.settings.quantity import Quantity, amount, span
 
 
 @given(

@@ -7,7 +7,7 @@ import pytest
 
 from us_sim.errors import CalibrationError, SceneError, TrackingError
 from us_sim.scene.document import read_document
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 from us_sim.tracking.calibration.landmarks import read_landmarks, read_wires
 from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.tracking.camera.model import read_camera_info

@@ -2,7 +2,7 @@
 
 import pytest
 
-from us_sim.settings.yaml_text import LARGEST_YAML, MOST_NODES, YamlError, load_yaml
+from us_sim.settings.text_files import LARGEST_YAML, MOST_NODES, YamlError, load_yaml
 
 
 def bomb():

@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 
 from us_sim.errors import MeshError
-from us_sim.geometry.normals import vertex_normals
-from us_sim.skin.surface import (
-    TriangleSurface,
-    bent_surface,
-    plane_surface,
-    read_surface,
-)
+from us_sim.geometry.triangles import vertex_normals
+from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface, read_surface
 
 
 def sphere(radius, rings=40, sectors=80):

@@ -77,7 +77,7 @@ def test_it_is_where_the_method_that_tries_every_tetrahedron_says(kind):
             create_slicer(method, volume, rest, tetrahedra)
             for method in ("scan_conversion", "per_pixel")
         )
-        frame = Frame(Pose(), nodes, PROBES[0], volume, slicer, lambda _: None)
+        frame = Frame(Pose(), nodes, PROBES[0], volume, slicer)
         frame.plane = plane
         found = displacement(frame)
         expected = plane.pixels() - oracle.rest_coordinates(nodes, plane)

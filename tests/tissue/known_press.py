@@ -23,9 +23,8 @@ from us_sim.tissue.elasticity.materials import LabelFractions, average_over_labe
 from us_sim.tissue.identification.press_model import PressModel
 from us_sim.tissue.identification.press_record import PressRecord, paired
 from us_sim.tissue.identification.stiffness import Tissue
-from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 
 LAYERS = ("fat", "muscle")
 TRUE = {"fat": 6e3, "muscle": 18e3}  # Pa

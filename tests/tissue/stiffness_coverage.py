@@ -13,8 +13,8 @@ import time
 import numpy as np
 from known_press import arm, arm_press, block_press, layered_block
 
-from us_sim.tissue.identification.pose_choice import choose_poses
-from us_sim.tissue.identification.pressed_tissue import PressedTissue
+from us_sim.tissue.identification.press_model import PressedTissue
+from us_sim.tissue.identification.press_record import choose_poses
 from us_sim.tissue.identification.settings import StiffnessSettings
 from us_sim.tissue.identification.stiffness import Tissue, fit_stiffness
 

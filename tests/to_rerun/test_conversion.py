@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_message,
     cloud_message,
     colour_image_message,
@@ -27,8 +27,8 @@ from us_sim.nodes.conversions import (
     transform_message,
     wrench_message,
 )
-from us_sim.nodes.session_attachments import session_attachments
-from us_sim.nodes.session_settings import SessionRecorderSettings
+from us_sim.nodes.sessions.attachments import session_attachments
+from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene

@@ -6,12 +6,8 @@ from typing import Any
 import numpy as np
 
 from us_sim.skin.surface import plane_surface
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.meshes.coloured_surface import ColouredSurface
-from us_sim.viewer.meshes.rest_surface import RestSurface
-from us_sim.viewer.meshes.transducer import transducer_packet
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.surfaces import ColouredSurface, RestSurface, transducer_packet
 
 PIXEL = 8e-5  # m
 FACE = [0.005, 0.01, 0.001]  # m, where the probe's face is

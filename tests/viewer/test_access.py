@@ -9,7 +9,7 @@ import pytest
 from us_sim.errors import UsSimError
 from us_sim.viewer.access import Access, is_loopback
 from us_sim.viewer.server import WebServer
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 
 def asked(

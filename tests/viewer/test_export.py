@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 
 from us_sim.errors import UsSimError
 from us_sim.viewer.export import exported, frames_of
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.stream import Packet
 
 MATRIX = [1e-4, 0, 0, -0.002, 0, 0, 0, 0, 0, 2e-4, 0, 1e-4, 0, 0, 0, 1]
 TYPES_1_AND_2 = """PatientName PatientID PatientBirthDate PatientSex StudyInstanceUID StudyDate

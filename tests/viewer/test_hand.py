@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from fake_hand import MATRIX, PIXEL, STANCE, FakeHand
 
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 
 @pytest.fixture

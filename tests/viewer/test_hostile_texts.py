@@ -22,10 +22,10 @@ from rclpy.node import Node
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
-from us_sim.nodes.remote_parameters import RemoteParameters
-from us_sim.nodes.status_listener import StatusListener
-from us_sim.nodes.viewer_session import ViewerSession
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.remote_parameters import RemoteParameters
+from us_sim.viewer.session import ViewerSession
+from us_sim.viewer.status import StatusListener
+from us_sim.viewer.stream import Simulator
 
 EVIL = " ".join(
     (
@@ -53,9 +53,9 @@ def stranger(simulator: Simulator) -> Iterator[None]:
     bench = Bench()
     viewer = bench.add(GuardedNode("viewer", context=bench.context))
     post = Posted(viewer)
-    simulator.session = ViewerSession(viewer, post).board
-    simulator.nodes = RemoteParameters(viewer, post).board
-    simulator.status = StatusListener(viewer, post).board
+    simulator.session = ViewerSession(viewer, post)
+    simulator.nodes = RemoteParameters(viewer, post)
+    simulator.status = StatusListener(viewer, post)
     for name in NODES:
         node = bench.add(Node(name, context=bench.context))
         about = ParameterDescriptor(

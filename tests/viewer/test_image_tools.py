@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from awaiting import until
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 COLUMNS, ROWS = 400, 300
 ACROSS, DOWN = 1e-4, 1.4e-4  # m a pixel: not square
@@ -331,7 +329,7 @@ def test_of_another_scene_no_image_is_kept_frozen_or_on_the_plane(
     page: Any, images: Images, simulator: Simulator
 ) -> None:
     def scene(name: str) -> None:
-        simulator.session.tell_state(SessionState(is_there=True, scene=name))
+        simulator.session.state = SessionState(is_there=True, scene=name)
         page.locator(f"#us-scene[data-scene={name}]").wait_for(state="attached")
 
     plane = "import('/us_sim/assets/scene/probe.js').then(m => m.probe.image.visible)"

@@ -9,11 +9,10 @@ from awaiting import until
 from chromium import watched
 from fake_hand import FACE, FakeHand, show_patient
 
-from us_sim.viewer.parameter_board import ParameterBoard
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
 from us_sim.viewer.session import LoadableScene, SessionState
-from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.stream import Simulator
 
 PHONE, TURNED = (390, 844), (844, 390)
 TWICE, FOUR_TIMES = (640, 360), (320, 180)  # what a window of 1280 × 720 holds when magnified
@@ -38,12 +37,10 @@ def hand(simulator: Simulator) -> FakeHand:
     simulator.nodes = ParameterBoard()
     known = {parameter.name: parameter for parameter in PARAMETERS}
     simulator.nodes.tell(NodeParameters(NODE, State.THERE, known))
-    simulator.session.tell_state(SessionState(True, "running", "upper_arm", "/arm.yaml"))
-    simulator.session.tell_scenes(
-        (
-            LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
-            LoadableScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
-        )
+    simulator.session.state = SessionState(True, "running", "upper_arm", "/arm.yaml")
+    simulator.session.scenes = (
+        LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+        LoadableScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
     )
     now = time.monotonic()
     simulator.status.tell(NodeStatus(NODE, Level.WELL, "runs"), now)

@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from awaiting import until
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.parameter_board import ParameterBoard
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
 from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 NODE = "slice_interpolator"
 PIXEL = "() => {{ const c = document.querySelector('{}'); return c ? Array.from("

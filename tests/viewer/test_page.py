@@ -13,12 +13,10 @@ import pytest
 from awaiting import until
 
 from us_sim.errors import UsSimError
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.listening import listening
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.server import listening
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.simulator import Simulator
 from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 PIXEL = 1e-4  # m
 MATRIX = [PIXEL, 0, 0, -0.0256, 0, 0, 0, 0, 0, PIXEL, 0, PIXEL / 2, 0, 0, 0, 1]
@@ -176,13 +174,13 @@ def test_the_header_says_what_runs_and_what_is_done_with_it(
     page: Any, simulator: Simulator
 ) -> None:
     loading = SessionState(is_there=True, scene="upper_arm", state="loading liver", fraction=0.25)
-    simulator.session.tell_state(loading)
+    simulator.session.state = loading
     page.goto(page.address)
     page.get_by_text("loading liver, 25 %").wait_for()
     done = SessionState(is_there=True, scene="liver", state="running", record="press.mcap")
-    simulator.session.tell_state(done)
+    simulator.session.state = done
     page.get_by_text("recording press.mcap").wait_for()
-    simulator.session.tell_state(dataclasses.replace(done, problem="the gain is lost"))
+    simulator.session.state = dataclasses.replace(done, problem="the gain is lost")
     lost = page.get_by_role("alert").filter(has_text="the gain is lost")
     lost.wait_for()
     assert lost.evaluate("each => getComputedStyle(each).color") == "rgb(229, 115, 92)"

@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 from awaiting import until
 
-from us_sim.viewer.parameter_board import ParameterBoard
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
 from us_sim.viewer.status import Level, NodeStatus
+from us_sim.viewer.stream import Simulator
 
 NODE = "slice_interpolator"
 

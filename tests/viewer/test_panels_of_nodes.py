@@ -16,8 +16,8 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.remote_parameters import RemoteParameters
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.remote_parameters import RemoteParameters
+from us_sim.viewer.stream import Simulator
 
 NODE = "slice_interpolator"
 
@@ -28,7 +28,7 @@ def graph(simulator: Simulator) -> Iterator[Node]:
     bench = Bench()
     node = bench.add(Node(NODE, context=bench.context))
     asking = bench.add(GuardedNode("viewer", context=bench.context))
-    simulator.nodes = RemoteParameters(asking, Posted(asking)).board
+    simulator.nodes = RemoteParameters(asking, Posted(asking))
     ended = threading.Event()
 
     def spin() -> None:

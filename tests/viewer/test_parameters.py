@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from us_sim.errors import SettingsError
-from us_sim.settings.amount import dial_unit
-from us_sim.settings.quantity import Quantity, units_of
+from us_sim.settings.quantity import Quantity, dial_unit, units_of
 from us_sim.viewer.parameters import Kind, Parameter, in_words
 
 QUANTITIES = [

@@ -9,12 +9,9 @@ from awaiting import until
 
 from us_sim.slicing.probe.beams import pixels_of
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, image_outline
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.meshes.transducer import transducer_packet
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.parameter_board import ParameterBoard
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.surfaces import transducer_packet
 
 NODE = "slice_interpolator"
 LINEAR = LinearProbe(aperture=0.04, depth=0.04, columns=200, rows=200)

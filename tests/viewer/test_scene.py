@@ -12,17 +12,12 @@ import pytest
 from PIL import Image
 
 from us_sim.geometry.collider import RoundedBox
-from us_sim.geometry.transducer_mesh import transducer_mesh
+from us_sim.geometry.transducer import transducer_mesh
 from us_sim.skin.surface import plane_surface
 from us_sim.slicing.probe.probe import LinearProbe, image_outline
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.meshes.carried_surfaces import CarriedSurfaces
-from us_sim.viewer.meshes.coloured_surface import ColouredSurface
-from us_sim.viewer.meshes.rest_surface import RestSurface
-from us_sim.viewer.meshes.transducer import transducer_packet
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.surfaces import CarriedSurfaces, ColouredSurface, RestSurface, transducer_packet
 
 LIMIT_MS = 60_000
 SCENE = "import('/us_sim/assets/scene/scene.js')"

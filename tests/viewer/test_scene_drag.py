@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fake_hand import FACE, FakeHand, show_patient
 
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 SCENE = "import('/us_sim/assets/scene/scene.js')"
 CAMERA = f"() => {SCENE}.then(m => m.stage.camera.position.toArray())"

@@ -16,9 +16,7 @@ from us_sim.evaluation.viewer.measure import (
     run_case,  # noqa: F401 - it must be importable
 )
 from us_sim.evaluation.viewer.report import targets
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.packet import Packet
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Feed, Packet, Simulator
 
 DELAY_S = 0.05
 

@@ -1,15 +1,12 @@
-"""The command `us-sim bag`: what is in a recording, its attached files, its repair, rerun."""
+"""The command `us-sim bag`: list, extract, repair and convert recordings."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 
-def add_bag(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    bag = commands.add_parser("bag", help="look at recordings")
+def bag_options(bag: argparse.ArgumentParser) -> None:
     bag_commands = bag.add_subparsers(required=True, metavar="COMMAND")
     info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
     info.add_argument("file", type=Path)

@@ -21,16 +21,7 @@ if TYPE_CHECKING:
     from us_sim.tissue.identification.stiffness import StiffnessFit, Tissue
 
 
-def add_fit_stiffness(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "fit-stiffness",
-        help="Young's moduli of a scene's structures, from a recorded press with force",
-        add_options=_add_options,
-    )
-
-
-def _add_options(parser: argparse.ArgumentParser) -> None:
+def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scene", nargs="?", help="scene file, name of an installed one, or folder of a case"
     )
@@ -49,12 +40,10 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(args: argparse.Namespace) -> int:
+    from us_sim.command.stiffness_report import draw_fit, table, write_moduli
     from us_sim.progress import late_progress
     from us_sim.scene.reading import load_scene
-    from us_sim.tissue.identification.landmarks import read_landmarks
-    from us_sim.tissue.identification.report import table, write_moduli
-    from us_sim.tissue.identification.report_picture import draw_fit
-    from us_sim.tissue.identification.stiffness import fit_stiffness
+    from us_sim.tissue.identification.stiffness import fit_stiffness, read_landmarks
     from us_sim.volume.cases.case import is_case
 
     settings = read_settings(args, StiffnessSettings)
@@ -82,7 +71,7 @@ def _fit(args: argparse.Namespace) -> int:
 
 
 def _base(asked: str, scene: Scene) -> dict[str, str]:
-    """What a scene in another folder names this one by."""
+    """The key and value by which a scene in another folder is based on this one."""
     from us_sim.scene.scene import CASE_PREFIX
 
     if scene.origin.startswith(CASE_PREFIX):
@@ -116,7 +105,7 @@ def _write_into_case(
 
 
 def _tissue(scene: Scene, progress: Callable[[float, str], None]) -> tuple[Tissue, tuple[str, ...]]:
-    """What is pressed, and what there is to say about it."""
+    """The tissue that is pressed, and remarks on it."""
     from us_sim.scene.building import materials_of, tissue_model_of, volume_of
     from us_sim.tissue.identification.stiffness import Tissue
     from us_sim.tissue.solvers.fem_nonlinear import FemNonlinearSettings
@@ -153,13 +142,17 @@ def _tissue(scene: Scene, progress: Callable[[float, str], None]) -> tuple[Tissu
 def _record(
     session: Path, tissue: Tissue, settings: StiffnessSettings
 ) -> tuple[PressRecord, tuple[str, ...]]:
-    """The press, and what there is to say about it."""
+    """The recorded press, and remarks on it."""
     from us_sim.recording.path import read_path
     from us_sim.recording.reader import read_bag
     from us_sim.recording.wrench import read_wrenches
-    from us_sim.tissue.identification.press_record import paired, stamped_alike, without_wrench
-    from us_sim.tissue.identification.pressed_tissue import PressedTissue
-    from us_sim.tissue.identification.wrench_delay import find_delay
+    from us_sim.tissue.identification.press_model import PressedTissue
+    from us_sim.tissue.identification.press_record import (
+        find_delay,
+        paired,
+        stamped_alike,
+        without_wrench,
+    )
 
     bag = read_bag(session)
     path = read_path(session, bag.topic(settings.pose).name)

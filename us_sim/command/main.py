@@ -3,18 +3,63 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import signal
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from us_sim.errors import UsSimError, memory_limit, printable
 
 if TYPE_CHECKING:
+    import argparse
+
     from us_sim.command.options import ChosenParser
 
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+_COMMANDS = (
+    ("view", "simulation", "take the probe in a browser, and see what it images"),
+    ("demo", "simulation", "press on the virtual arm; images, summary, recording"),
+    ("run", "simulation", "run the nodes of a scene until Ctrl-C"),
+    ("render", "simulation", "one image for every pose of a path, repeatably"),
+    ("play", "simulation", "play a bag's probe path into a running simulation"),
+    ("bag", "bag", "look at recordings"),
+    ("cases", "volumes", "list cases: what they are of, and how to scan them"),
+    (
+        "import",
+        "volumes",
+        "de-identify files of scanners into a volume, a case or a sequence of images",
+    ),
+    ("calibrate", "measuring", "find out where trackers and tools are"),
+    (
+        "fit-stiffness",
+        "fit_stiffness",
+        "Young's moduli of a scene's structures, from a recorded press with force",
+    ),
+    ("reconstruct", "volumes", "make a volume or a case of a tracked sweep"),
+    (
+        "segment",
+        "volumes",
+        "structures of a case from labels, seeds or a search, and their surfaces",
+    ),
+    ("print-marker", "measuring", "PDF or PNG of markers, at true scale"),
+    ("evaluate", "measuring", "measure: CSV, pictures and a report"),
+    (
+        "reference",
+        "reference",
+        "topics, node parameters and scene settings, with ranges and defaults",
+    ),
+    (
+        "compile",
+        "measuring",
+        "compile all numerical kernels now, so that no first run waits for it",
+    ),
+)
+"""Each command, the module in which NAME_options adds its options, and its help."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -84,34 +129,21 @@ class _Lasting:
 def _parser() -> ChosenParser:
     """All commands; imported here, where an interruption is one sentence already."""
     from us_sim import __version__
-    from us_sim.command.bag import add_bag
-    from us_sim.command.fit_stiffness import add_fit_stiffness
-    from us_sim.command.measuring import add_calibrate, add_compile, add_evaluate, add_print_marker
     from us_sim.command.options import ChosenParser
-    from us_sim.command.reference import add_reference
-    from us_sim.command.simulation import add_demo, add_play, add_render, add_run, add_view
-    from us_sim.command.volumes import add_cases, add_import, add_reconstruct, add_segment
 
     parser = ChosenParser(
         prog="us-sim", description="Interactive simulation of compression ultrasonography."
     )
     parser.add_argument("--version", action="version", version=f"us-sim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (add_view, add_demo, add_run, add_render, add_play, add_bag, add_cases):
-        add(commands)
-    for add in (
-        add_import,
-        add_calibrate,
-        add_fit_stiffness,
-        add_reconstruct,
-        add_segment,
-        add_print_marker,
-        add_evaluate,
-        add_reference,
-        add_compile,
-    ):
-        add(commands)
+    for name, module, text in _COMMANDS:
+        commands.add_parser(name, help=text, add_options=partial(_add_options, name, module))
     return parser
+
+
+def _add_options(name: str, module: str, parser: argparse.ArgumentParser) -> None:
+    commands = importlib.import_module(f"us_sim.command.{module}")
+    getattr(commands, f"{name.replace('-', '_')}_options")(parser)
 
 
 def _interrupted() -> int:

@@ -6,31 +6,22 @@ import argparse
 import importlib
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from us_sim.command.options import add_setting_options, read_settings
+from us_sim.progress import late_progress
 from us_sim.settings.registry import CALIBRATIONS, EVALUATIONS
 from us_sim.settings.setting import Settings
 from us_sim.settings.spelling import counted
 
 
-def add_evaluate(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "evaluate", help="measure: CSV, pictures and a report", add_options=_add_subjects
-    )
-
-
-def _add_subjects(parser: argparse.ArgumentParser) -> None:
+def evaluate_options(parser: argparse.ArgumentParser) -> None:
     subjects = parser.add_subparsers(required=True, metavar="|".join(EVALUATIONS))
     for name, option in EVALUATIONS.options.items():
         package = importlib.import_module(option.target.partition(":")[0].rpartition(".")[0])
-        subjects.add_parser(
-            name, help=package.__doc__, add_options=partial(_add_evaluate_options, name)
-        )
+        subjects.add_parser(name, help=package.__doc__, add_options=partial(_subject_options, name))
 
 
-def _add_evaluate_options(name: str, parser: argparse.ArgumentParser) -> None:
+def _subject_options(name: str, parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="a part of it, in a few minutes")
     parser.add_argument(
         "--out",
@@ -48,14 +39,7 @@ def _evaluate(name: str, args: argparse.Namespace) -> int:
     return int(EVALUATIONS.load(name)(args.out, args.quick, *more))
 
 
-def add_calibrate(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "calibrate", help="find out where trackers and tools are", add_options=_add_calibrations
-    )
-
-
-def _add_calibrations(parser: argparse.ArgumentParser) -> None:
+def calibrate_options(parser: argparse.ArgumentParser) -> None:
     calibrations = parser.add_subparsers(required=True, metavar="|".join(CALIBRATIONS))
     for name in CALIBRATIONS:
         settings = CALIBRATIONS.settings(name)
@@ -65,23 +49,12 @@ def _add_calibrations(parser: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(name: str, args: argparse.Namespace) -> int:
-    from us_sim.progress import late_progress
-
     settings = read_settings(args, CALIBRATIONS.settings(name))
     print(CALIBRATIONS.load(name)(settings, late_progress(f"calibrate {name}")))
     return 0
 
 
-def add_print_marker(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "print-marker",
-        help="PDF or PNG of markers, at true scale",
-        add_options=_add_print_marker_options,
-    )
-
-
-def _add_print_marker_options(parser: argparse.ArgumentParser) -> None:
+def print_marker_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.tracking.camera.marker_print import PrintSettings
 
     parser.add_argument(
@@ -106,12 +79,8 @@ def _print_marker(args: argparse.Namespace) -> int:
     return 0
 
 
-def add_compile(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    compiling = commands.add_parser(
-        "compile", help="compile all numerical kernels now, so that no first run waits for it"
-    )
-    compiling.set_defaults(command=_compile)
+def compile_options(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_compile)
 
 
 def _compile(_: argparse.Namespace) -> int:

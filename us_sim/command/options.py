@@ -28,15 +28,11 @@ from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
 
 class ChosenParser(argparse.ArgumentParser):
-    """A parser that has its options added when it is used for the first time.
-
-    Args:
-        add_options: adds them to the parser that it is called with.
-    """
+    """A parser to which ``add_options`` adds the options when it is first used."""
 
     def __init__(
         self,
@@ -186,17 +182,13 @@ def add_supervision_options(parser: argparse.ArgumentParser) -> None:
 
 
 def supervision(args: argparse.Namespace) -> SupervisionSettings:
-    """What these options say.
-
-    Raises:
-        UsSimError: a value will not do.
-    """
+    """Settings of the supervision; a wrong value raises a UsSimError."""
     return read_settings(args, SupervisionSettings)
 
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
     """Where the page is served."""
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    from us_sim.settings.viewer import ViewerSettings
 
     add_setting_options(parser, ViewerSettings, _OF_THE_VIEWER)
 
@@ -208,21 +200,17 @@ def add_view_option(parser: argparse.ArgumentParser) -> None:
 
 
 def viewer(args: argparse.Namespace) -> ViewerSettings:
-    """What these options say.
-
-    Raises:
-        UsSimError: a value will not do.
-    """
-    from us_sim.viewer.viewer_settings import ViewerSettings
+    """Settings of the viewer; a wrong value raises a UsSimError."""
+    from us_sim.settings.viewer import ViewerSettings
 
     return read_settings(args, ViewerSettings, _OF_THE_VIEWER)
 
 
 def viewed(args: argparse.Namespace) -> ViewerSettings | None:
-    """Likewise, where the simulation is to be shown.
+    """Settings of the viewer; None without ``--view``.
 
     Raises:
-        UsSimError: a value will not do, or it is not to be shown at all.
+        UsSimError: a value is wrong, or given without ``--view``.
     """
     if args.view:
         return viewer(args)
@@ -232,7 +220,7 @@ def viewed(args: argparse.Namespace) -> ViewerSettings | None:
 
 
 def node_parameters(texts: Sequence[str]) -> dict[str, dict[str, str]]:
-    """What ``--param`` sets: values by name, by node.
+    """Values that ``--param`` sets, by name, by node.
 
     Raises:
         UsSimError: a text is not written ``node.name=value``.

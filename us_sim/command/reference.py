@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from us_sim.errors import UsSimError
 from us_sim.settings.registry import PROBES
@@ -67,11 +66,7 @@ in `tissue`; `NAME` stands for a name of your choice."""
 POSE = "A pose"
 
 
-def add_reference(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    parser = commands.add_parser(
-        "reference", help="topics, node parameters and scene settings, with ranges and defaults"
-    )
+def reference_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "part", nargs="?", help="topics, a node, or a key of a scene such as tissue; default: all"
     )
@@ -211,7 +206,7 @@ def _nodes() -> Iterator[Section]:
 
 
 def _of_probe() -> str:
-    """What may be set of every kind of probe while images are made."""
+    """Names of the settings that every kind of probe lets change while images are made."""
     from us_sim.nodes.settings import is_live
 
     kinds = [PROBES.settings(name) for name in PROBES]
@@ -240,7 +235,7 @@ def _parameters(settings: type[Settings]) -> str:
 def _scene_sections() -> Iterator[Section]:
     """The keys of a scene."""
     import us_sim.nodes  # noqa: F401 - provides rclpy, which sources of poses import
-    from us_sim.geometry.placement import Placement
+    from us_sim.geometry.pose import Placement
     from us_sim.scene.scene import Scene
 
     yield from sections_of(Scene, "", {Placement: POSE})

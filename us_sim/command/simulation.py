@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from us_sim.command.options import (
     add_network_option,
@@ -14,27 +13,21 @@ from us_sim.command.options import (
     add_setting_options,
     add_supervision_options,
     add_view_option,
+    add_viewer_options,
     node_parameters,
     read_settings,
     scene_name,
     supervision,
     viewed,
+    viewer,
 )
+from us_sim.errors import UsSimError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
 
 
-def add_demo(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "demo",
-        help="press on the virtual arm; images, summary, recording",
-        add_options=_add_demo_options,
-    )
-
-
-def _add_demo_options(demo: argparse.ArgumentParser) -> None:
+def demo_options(demo: argparse.ArgumentParser) -> None:
     demo.add_argument(
         "scene",
         nargs="?",
@@ -85,7 +78,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class RunSettings(Settings):
-    """What becomes of a run."""
+    """The recording and the end of a run."""
 
     record: Path | None = setting(description="record the session to this MCAP", default=None)
     duration: float | None = setting(Quantity("time", 1e-3, 1e7), "end after so long", default=None)
@@ -98,14 +91,7 @@ class RunSettings(Settings):
             raise self.refused("record", f"{self.record}: exists already; choose another name")
 
 
-def add_run(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "run", help="run the nodes of a scene until Ctrl-C", add_options=_add_run_options
-    )
-
-
-def _add_run_options(run: argparse.ArgumentParser) -> None:
+def run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_setting_options(run, RunSettings)
     add_supervision_options(run)
@@ -143,17 +129,16 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
-    """Say what would run, having looked into the files that it names."""
+    """Print the nodes that would run, having checked the files of the scene."""
     from us_sim.run.live import dry_run
-    from us_sim.scene.readable_files import check_files
-    from us_sim.scene.reading import load_scene
+    from us_sim.scene.reading import check_files, load_scene
 
     scene = load_scene(scene_name(args), volume=args.volume)
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
     if path is not None and not scene.volume.phantom:
         from us_sim.scene.building import volume_of
-        from us_sim.scene.image_in_volume import check_path_in_volume
+        from us_sim.scene.placement import check_path_in_volume
 
         check_path_in_volume(scene, path, volume_of(scene), args.topic if args.path else None)
     parameters = node_parameters(args.param)
@@ -164,9 +149,7 @@ def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
     return 0
 
 
-def add_render(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    render = commands.add_parser("render", help="one image for every pose of a path, repeatably")
+def render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_path_option(render, "bag with the probe path; default: the scene's")
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
@@ -188,26 +171,7 @@ def _render(args: argparse.Namespace) -> int:
     return render_scene(scene, args.path, args.out, parameters, topic=args.topic, truth=args.truth)
 
 
-def add_view(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "view",
-        help="take the probe in a browser, and see what it images",
-        add_options=_add_view_options,
-    )
-
-
-def _add_view_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.command.options import (
-        add_network_option,
-        add_path_option,
-        add_scene_options,
-        add_setting_options,
-        add_supervision_options,
-        add_viewer_options,
-    )
-    from us_sim.command.simulation import RunSettings
-
+def view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scene", nargs="?", help="scene file, or name of an installed one; default: upper_arm"
     )
@@ -233,15 +197,6 @@ def _add_view_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from us_sim.command.options import (
-        node_parameters,
-        read_settings,
-        scene_name,
-        supervision,
-        viewer,
-    )
-    from us_sim.command.simulation import RunSettings
-    from us_sim.errors import UsSimError
     from us_sim.run.fork_server import ForkServer
 
     parameters = node_parameters(args.param)
@@ -282,17 +237,8 @@ def _view(args: argparse.Namespace) -> int:
 _OF_THE_PLAYER = ("rate", "loop")
 
 
-def add_play(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "play",
-        help="play a bag's probe path into a running simulation",
-        add_options=_add_play_options,
-    )
-
-
-def _add_play_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.nodes.session_settings import SessionPlayerSettings
+def play_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.nodes.settings import SessionPlayerSettings
 
     parser.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")
     parser.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
@@ -303,7 +249,7 @@ def _add_play_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _play(args: argparse.Namespace) -> int:
-    from us_sim.nodes.session_settings import SessionPlayerSettings
+    from us_sim.nodes.settings import SessionPlayerSettings
     from us_sim.run.live import play
 
     player = read_settings(args, SessionPlayerSettings, _OF_THE_PLAYER)

@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from us_sim.command.options import add_setting_options, read_settings
+from us_sim.errors import UsSimError
 from us_sim.progress import late_progress
-
-if TYPE_CHECKING:
-    from us_sim.volume.reconstruction.reconstruction import Rest
-    from us_sim.volume.reconstruction.settings import ImagePart
-    from us_sim.volume.sequences.sweep import Sweep
-
 
 _REPORT = Path("us_sim_import")
 
 
-def add_import(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "import",
-        help="de-identify files of scanners into a volume, a case or a sequence of images",
-        add_options=_add_import_files_options,
-    )
-
-
-def _add_import_files_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.command.options import add_setting_options
+def import_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.volume.deidentification.settings import ImportSettings
 
     parser.add_argument(
@@ -56,9 +41,6 @@ def _add_import_files_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(args: argparse.Namespace) -> int:
-    from us_sim.command.options import read_settings
-    from us_sim.errors import UsSimError
-    from us_sim.progress import late_progress
     from us_sim.volume.deidentification.importing import look_at
     from us_sim.volume.deidentification.report import (
         refuse_report,
@@ -84,16 +66,7 @@ def _import(args: argparse.Namespace) -> int:
     return 0
 
 
-def add_reconstruct(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "reconstruct",
-        help="make a volume or a case of a tracked sweep",
-        add_options=_add_reconstruct_options,
-    )
-
-
-def _add_reconstruct_options(parser: argparse.ArgumentParser) -> None:
+def reconstruct_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.volume.reconstruction.settings import Compounding, ImagePart
     from us_sim.volume.reconstruction.sweep_command import SweepSettings
 
@@ -116,29 +89,17 @@ def _reconstruct(args: argparse.Namespace) -> int:
     compounding, part = read_settings(args, Compounding), read_settings(args, ImagePart)
     rest_of = None
     if args.undo_pressure is not None:
+        from us_sim.scene.placement import rest_placement
+        from us_sim.scene.reading import load_scene
 
-        def rest_of(sweep: Sweep, part: ImagePart) -> Rest:
-            from us_sim.scene.reading import load_scene
-            from us_sim.scene.rest_placement import rest_placement
-
-            scene = load_scene(args.undo_pressure)
-            return rest_placement(scene, sweep, part)
+        rest_of = partial(rest_placement, load_scene(args.undo_pressure))
 
     progress = late_progress(f"reconstruct {Path(settings.sweep).name}")
     print(reconstruct_sweep(settings, compounding, part, rest_of=rest_of, progress=progress))
     return 0
 
 
-def add_segment(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    commands.add_parser(
-        "segment",
-        help="structures of a case from labels, seeds or a search, and their surfaces",
-        add_options=_add_segment_options,
-    )
-
-
-def _add_segment_options(parser: argparse.ArgumentParser) -> None:
+def segment_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 
@@ -158,9 +119,7 @@ def _segment(args: argparse.Namespace) -> int:
     return 0
 
 
-def add_cases(commands: Any) -> None:
-    """Add the command to `us-sim`'s."""
-    cases = commands.add_parser("cases", help="list cases: what they are of, and how to scan them")
+def cases_options(cases: argparse.ArgumentParser) -> None:
     cases.add_argument(
         "folders",
         nargs="*",
@@ -176,7 +135,6 @@ def add_cases(commands: Any) -> None:
 
 
 def _cases(args: argparse.Namespace) -> int:
-    from us_sim.errors import UsSimError
     from us_sim.volume.cases.case import case_roots, cases_in, listed, table
 
     if args.picture is not None and args.picture.suffix.lower() != ".png":

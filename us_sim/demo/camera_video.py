@@ -1,7 +1,7 @@
 """A video of a probe's path, as the camera of a scene would take it: rendered once, and kept.
 
-The camera stands still where the scene's registration says; the markers on the grip are those of
-the scene's body, where the calibration says. So where the probe truly is in each image is known.
+The camera stands where the scene's registration says, and the markers on the grip are those of the
+scene's body; so the true pose in each image is known.
 """
 
 from __future__ import annotations
@@ -24,16 +24,14 @@ from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate, rotation_between
 from us_sim.recording.path import ProbePath
+from us_sim.scene.building import camera_body_of, tracker_poses_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.tracker_building import camera_body_of, tracker_poses_of
 from us_sim.tracking.camera.model import write_camera_info
 from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 CAMERA = WEBCAMS["640x480"]
-RATE = 30.0
-"""Images per second."""
-
+RATE = 30.0  # images per second
 _EXPOSURE = 0.008  # s
 _CODEC = "FFV1"  # lossless
 _FORM = 1  # of what is kept: another number for whatever changes the images
@@ -102,7 +100,6 @@ def video_poses(path: ProbePath) -> list[Pose]:
 
 
 def _moments(path: ProbePath) -> NDArray[np.float64]:
-    """(N,) s since the path's begin, in the middle of each image's exposure."""
     return np.arange(int(path.duration * RATE + 1e-6) + 1) / RATE
 
 
@@ -117,7 +114,6 @@ def _pose_at(path: ProbePath, moment: float) -> Pose:
 
 
 def _motions(path: ProbePath, registration: Pose, calibration: Pose) -> list[NDArray[np.float64]]:
-    """(6,) each: how the body moves during each exposure, along the camera's axes."""
     motions = []
     for moment in _moments(path):
         begin, end = (
@@ -132,7 +128,6 @@ def _motions(path: ProbePath, registration: Pose, calibration: Pose) -> list[NDA
 
 
 def _require_in_view(scene: Scene, body: RigidBody, seen: list[Pose]) -> None:
-    """Raise UsSimError where the body is not in most of the images."""
     middle = body.centres.mean(axis=0)
     pixels = np.array([CAMERA.project(pose.apply(middle[None]))[0] for pose in seen])
     facing = np.array(
@@ -152,7 +147,6 @@ def _require_in_view(scene: Scene, body: RigidBody, seen: list[Pose]) -> None:
 
 
 def _is_whole(entry: Path) -> bool:
-    """Whether a video is there as it was written."""
     try:
         notes = yaml.safe_load((entry / _NAMES[1]).read_text(encoding="utf-8"))
         return bool((entry / _NAMES[0]).stat().st_size == notes["video_bytes"])
@@ -167,7 +161,6 @@ def _make(
     seen: list[Pose],
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Render into a folder beside the entry, and rename that."""
     for left_over in entry.parent.glob(f"{entry.name}.partial-*"):
         shutil.rmtree(left_over, ignore_errors=True)
     partial = Path(tempfile.mkdtemp(prefix=f"{entry.name}.partial-", dir=entry.parent))

@@ -1,4 +1,4 @@
-"""One picture of several cases: what the probe sees in each where it starts."""
+"""One picture of several cases: the probe's first image of each."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from matplotlib.figure import Figure
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.building import colour_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 
 _COLUMNS = 4
@@ -48,7 +47,6 @@ def picture_cases(folders: Sequence[Path], file: Path) -> None:
 
 
 def _draw(axes: Any, scene: Scene, name: str) -> None:
-    """What the probe sees at the start, with the outlines of structures."""
     touching = dataclasses.replace(scene.imaging, contact=False)
     scene = dataclasses.replace(scene, imaging=touching)
     volume = volume_of(scene)

@@ -1,12 +1,8 @@
-"""Strain in a session while it is pressed fastest: of the tissue itself, and as it is estimated.
+"""Pictures of a session: around the press, lumen areas, strain and colour Doppler.
 
-Colour Doppler of a session's vessels: touched, under the full press, and let go.
-
-A press across vessels meets their flow at right angles, where no beam sees it. So these pictures
-are of the tissue as it was recorded, on a plane that is tilted along the vessels, as a sonographer
-tilts the probe; and each is of the systole next to its moment.
-
-One picture of a session: images before, during and after the press, and the lumen areas.
+A press across vessels meets their flow at right angles, where no beam sees it. So the pictures of
+colour Doppler are of the recorded tissue on a plane that is tilted along the vessels, each at the
+systole next to its moment.
 """
 
 from __future__ import annotations
@@ -26,10 +22,8 @@ from numpy.typing import NDArray
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.scene.blood import blood_of
-from us_sim.scene.building import probe_of, scanner_of, volume_of
+from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.scene import Scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.drawing.overlay import Overlay
@@ -89,9 +83,7 @@ def _pressing(session: Session, stamps: list[int]) -> tuple[int, int] | None:
     return (stamps[first], stamps[middle]) if first >= 0 else None
 
 
-TILT = 20.0
-"""Degrees of the plane, about the array."""
-
+TILT = 20.0  # degrees of the plane, about the array
 _LET_GO = 0.35  # of the deepest press, from which on the vessels are open again
 
 
@@ -103,8 +95,6 @@ def colour_pictures(
     None of a scene without flows or without tissue, or whose vessels no image shows.
 
     Args:
-        session: that was recorded.
-        scene: of the session.
         areas: of its vessels: moments are chosen among those whose images show the vessels whole.
     """
     if not scene.flows or session.rest is None or session.tetrahedra is None:
@@ -238,13 +228,11 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
 
 
 def _flowing(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, NDArray[np.uint8]]:
-    """Pictures of flow with whole titles."""
     beside = f"plane tilted {TILT:g}° along the vessels"
     return {f"flow, {title}; {beside}": picture for title, picture in pictures.items()}
 
 
 def _moments(session: Session) -> list[tuple[str, int]]:
-    """Six stamps of images that tell the story of a press, be it one of many."""
     stamps = [stamp for stamp in session.images if stamp in session.poses]
     if not stamps:
         raise BagError("the session holds no image with a pose, so there is nothing to show")
@@ -303,7 +291,6 @@ def _outline(
 
 
 def _colour(scene: Scene, name: str) -> Colour:
-    """Of a label: its structure's where it is one."""
     for structure, given in scene.structures.items():
         if (given.label or structure) == name:
             return colour_of(scene, structure)

@@ -161,7 +161,7 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     from rclpy.signals import SignalHandlerOptions
 
     from us_sim.nodes.arrivals import Arrivals
-    from us_sim.nodes.realtime import go_along, go_first
+    from us_sim.nodes.process import go_along, go_first
 
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -286,7 +286,7 @@ def _publish_images(side: str) -> None:
     from rclpy.node import Node
     from sensor_msgs.msg import Image
 
-    from us_sim.nodes.conversions import image_message
+    from us_sim.nodes.messages import image_message
     from us_sim.nodes.qos import STREAM
 
     rclpy.init()

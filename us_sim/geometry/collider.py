@@ -1,11 +1,4 @@
-"""The probe's shape where it touches the patient: one for tissue and skin.
-
-`us_sim.geometry.collider_distance` computes how far points are from it.
-
->>> from us_sim.geometry.collider import RoundedBox
->>> RoundedBox(length="46 mm", width="14 mm", height="40 mm", rounding="4 mm").offset_box
-array([0.019, 0.003, 0.016, 0.004])
-"""
+"""The probe's shape where it touches the patient, shared by tissue and skin."""
 
 from __future__ import annotations
 
@@ -19,8 +12,8 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
+# A curved face is refused when it is steeper than this at its ends, rad.
 _STEEPEST = math.radians(75)
-"""A curved face is refused when it is steeper than this at its ends, rad."""
 _SIZE = Quantity("length", 1e-4, 0.5)
 _ROUNDING = Quantity("length", 1e-5, 0.25)
 

@@ -1,11 +1,10 @@
-"""The signed distance of points to the probe's shape, for contact with tissue and skin.
+"""Signed distance of points to the probe's shape, for contact with tissue and skin.
 
 >>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.geometry.collider_distance import signed_distance
 >>> from us_sim.geometry.pose import Pose
->>> distance, normal = signed_distance(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.01]]))
->>> distance, normal
+>>> signed_distance(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.01]]))
 (array([0.01]), array([[0., 0., 1.]]))
 """
 
@@ -18,8 +17,27 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.turned import turned, turned_back
 from us_sim.kernels import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turned(r, x, y, z):
+    """The matrix r (3, 3) times a vector: from the child's frame to the parent's."""
+    return (
+        r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
+        r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turned_back(r, x, y, z):
+    """Its transpose times a vector: from the parent's frame to the child's."""
+    return (
+        r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
+        r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
+        r[0, 2] * x + r[1, 2] * y + r[2, 2] * z,
+    )
 
 
 def signed_distance(

@@ -1,21 +1,13 @@
-"""Faces of tetrahedra, and which of them are the outer surface: for tissue and slices alike.
-
->>> import numpy as np
->>> from us_sim.geometry.mesh_faces import boundary_triangles
->>> len(boundary_triangles(np.array([[0, 1, 2, 3], [1, 2, 3, 4]])))  # of 8, two are one inside
-6
-"""
+"""Faces of tetrahedra, a mesh's boundary, and connected parts of a graph, by NumPy alone."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+# The four outward faces of a positively oriented tetrahedron.
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-"""The four outward faces of a positively oriented tetrahedron."""
-
-MOST_NODES = 2**21
-"""Most nodes of a mesh, so that the three of a face fit into one 64-bit number."""
+MOST_NODES = 2**21  # Most nodes of a mesh, so that the three of a face fit into one 64-bit number
 
 
 def face_order(
@@ -47,3 +39,23 @@ def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
     """(F,) ascending numbers, as in `face_order`, of the faces of one tetrahedron only."""
     order, starts, counts = face_order(tetrahedra)
     return np.sort(order[starts[counts == 1]])
+
+
+def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.int64]:
+    """(``count``,) the part of each vertex, from 0 in the order of their first vertices.
+
+    Args:
+        count: of vertices.
+        one, other: (E,) the vertices that each edge joins.
+    """
+    ends = np.concatenate([np.asarray(one, np.int64), np.asarray(other, np.int64)])
+    others = np.roll(ends, len(ends) // 2)
+    lowest = np.arange(count)
+    while True:
+        before = lowest.copy()
+        reached = before[others]
+        np.minimum.at(lowest, before[ends], reached)  # the root of a vertex, to its neighbour's
+        np.minimum.at(lowest, ends, reached)
+        lowest = lowest[lowest]
+        if np.array_equal(lowest, before):
+            return np.unique(lowest, return_inverse=True)[1].astype(np.int64)

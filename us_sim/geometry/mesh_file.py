@@ -1,13 +1,4 @@
-"""Mesh files of unknown origin through meshio, which believes what they say of themselves.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.geometry.mesh_file import read_with_meshio
->>> file = Path(tempfile.mkdtemp()) / "triangle.off"
->>> _ = file.write_text("OFF\\n3 1 0\\n0 0 0\\n1 0 0\\n0 1 0\\n3 0 1 2\\n")
->>> read_with_meshio(file, "give a mesh").cells[0].data.tolist()
-[[0, 1, 2]]
-"""
+"""Mesh files of unknown origin, read by meshio within bounded memory and with checked indices."""
 
 from __future__ import annotations
 
@@ -21,8 +12,7 @@ import numpy as np
 
 from us_sim.errors import MeshError
 
-_MEMORY = 1 << 30
-"""Bytes that reading a file may take, and `_MEMORY_PER_BYTE` times its size."""
+_MEMORY = 1 << 30  # Bytes that reading a file may take, and `_MEMORY_PER_BYTE` times its size
 _MEMORY_PER_BYTE = 64
 
 

@@ -1,4 +1,4 @@
-"""Rigid transforms: where the probe is, in metres and unit quaternions (x, y, z, w).
+"""Rigid transforms in metres and unit quaternions (x, y, z, w), and trees of frames.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -9,17 +9,20 @@ array([[0.   , 0.   , 0.042]])
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import PoseError
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
 
+# m: the coordinates of poses are no larger, so that no product of a few of them overflows.
 _FARTHEST = 1e15
-"""m: the coordinates of poses are no larger, so that no product of a few of them overflows."""
-_LONGEST = 1e6
-"""Of a quaternion's components."""
+_LONGEST = 1e6  # Of a quaternion's components
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,3 +149,65 @@ def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
         quaternion[j] = rotation[j, k] + rotation[k, j]
         quaternion[3] = rotation[j, i] - rotation[i, j]
     return quaternion / np.linalg.norm(quaternion)
+
+
+PLACE = Quantity("length", -10.0, 10.0)  # A coordinate of something near the patient
+
+
+@dataclass(frozen=True)
+class Placement(Settings):
+    """A position and an orientation."""
+
+    position: tuple[float, float, float] = setting(PLACE, "x, y, z", default=(0.0, 0.0, 0.0))
+    orientation: tuple[float, float, float, float] = setting(
+        Quantity("number", -1.0, 1.0), "quaternion x, y, z, w", default=(0.0, 0.0, 0.0, 1.0)
+    )
+
+    def check(self) -> None:
+        """Refuse a quaternion that is no rotation."""
+        if math.hypot(*self.orientation) < 1e-6:
+            raise self.refused(
+                "orientation", "is zero, so it is no orientation: give [0, 0, 0, 1] for none"
+            )
+
+    @property
+    def pose(self) -> Pose:
+        """The same as a rigid transform."""
+        return Pose(np.array(self.position), np.array(self.orientation))
+
+
+_MOST = 1000  # Most frames kept; a tree of more is somebody's mistake
+
+
+class FrameTree:
+    """The last known pose of each frame in its parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Pose]] = {}
+
+    def __len__(self) -> int:
+        return len(self._parents)
+
+    def place(self, frame: str, parent: str, pose: Pose) -> bool:
+        """Put a frame at a pose in its parent; False where there are too many frames."""
+        if frame not in self._parents and len(self._parents) >= _MOST:
+            return False
+        self._parents[frame] = parent, pose
+        return True
+
+    def chain(self, frame: str, top: str) -> list[str] | None:
+        """The frames from ``frame`` up to below ``top``; None when they do not meet."""
+        frames: list[str] = []
+        while frame != top:
+            if frame not in self._parents or frame in frames:
+                return None
+            frames.append(frame)
+            frame = self._parents[frame][0]
+        return frames
+
+    def pose(self, chain: Sequence[str]) -> Pose:
+        """The pose of a chain's first frame in the parent of its last frame."""
+        pose = Pose()
+        for frame in chain:
+            pose = self._parents[frame][1] @ pose
+        return pose

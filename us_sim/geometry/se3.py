@@ -1,14 +1,6 @@
 """Rigid motions as vectors: exponential, logarithm, adjoint and interpolation on SE(3).
 
 A twist is (6,): translation (m), then rotation (rad), the order of a measurement's covariance.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.geometry import se3
->>> quarter_turn = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, np.pi / 2]))
->>> middle = se3.interpolate(Pose(), quarter_turn, 0.5)
->>> np.degrees(se3.log(middle)[5]).round(6).item(), middle.position.round(6).tolist()
-(45.0, [0.0, 0.0, 0.05])
 """
 
 from __future__ import annotations

@@ -1,18 +1,21 @@
-"""What a scene or a case says of a transducer: its array, its image, and the shape that presses.
+"""The transducer: its settings in a scene or a case, and a mesh of it to look at.
 
->>> from us_sim.geometry.transducer import ProbeSettings
->>> from us_sim.settings.reading import Reader
->>> given = {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}
->>> probe = Reader("my.yaml").read(ProbeSettings, given, "probe")
->>> probe.geometry, probe.image
-('linear', (400, 300))
+The mesh is made of rings around the probe's z axis. A ring is the outline of a box grown by a
+rounding: along the box's sides and round its corners, always with as many points, so that two
+rings make a band of triangles.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from us_sim.errors import SceneError
+from us_sim.geometry.collider import Collider
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import COLLIDERS, PROBES
@@ -27,10 +30,7 @@ class ProbeSettings(Settings):
     error = SceneError
 
     array: Chosen = setting(
-        description="kind of transducer",
-        choice=PROBES,
-        place="beside",
-        default=Chosen("linear"),
+        description="kind of transducer", choice=PROBES, place="beside", default=Chosen("linear")
     )
     image: tuple[int, int] | int | None = setting(
         Quantity("number", 1, 4096),
@@ -46,3 +46,190 @@ class ProbeSettings(Settings):
     def geometry(self) -> str:
         """The kind of transducer."""
         return self.array.name
+
+
+Colour = tuple[float, float, float]
+# Parts of a ring's long sides, of each of its corners, and of the rounding from front to side.
+_ALONG, _ROUND, _LATITUDES = 16, 6, 6
+_NOSE = 0.006  # m, of the face's part that is straight behind its rounding
+# m, how long the taper is, the grip, what keeps the cable from kinking, and the cable's stub.
+_SHOULDER, _GRIP, _RELIEF, _CABLE = 0.022, 0.058, 0.020, 0.045
+_NARROWEST, _WIDEST = 0.024, 0.034  # m, a grip across its flat, as a hand holds it
+_CABLE_RADIUS, _RELIEF_RADIUS = 0.0028, 0.0055
+_NOTCH = (0.0016, 0.0022, 0.009)  # m, half the orientation notch's height, width and length
+FACE, HOUSING = (0.20, 0.23, 0.26), (0.86, 0.88, 0.89)
+CABLE, NOTCH = (0.13, 0.14, 0.16), (0.31, 0.70, 0.75)
+
+
+@dataclass(frozen=True, eq=False)
+class TransducerPart:
+    """A closed surface in frame ``probe``."""
+
+    name: str
+    colour: Colour  # red, green, blue, 0 to 1
+    vertices: NDArray[np.float64]  # (V, 3) m
+    triangles: NDArray[np.int32]  # (T, 3), counter-clockwise seen from outside
+
+
+def transducer_mesh(collider: Collider) -> list[TransducerPart]:
+    """The parts of a transducer that presses with ``collider``, one beside the other."""
+    box = collider.offset_box
+    half_x, half_y, rounding = float(box[0]), float(box[1]), float(box[3])
+    curvature = float(box[4]) if len(box) > 4 else 0.0
+    front, side = _face_rings(half_x, half_y, rounding, curvature)
+    behind = float(side[:, 2].min())
+    nose = _flat_ring(half_x, half_y, rounding, behind - _NOSE)
+    width, depth = 2 * (half_x + rounding), 2 * (half_y + rounding)
+    grip_x = min(max(0.62 * width, _NARROWEST), _WIDEST) / 2
+    grip_y = min(max(1.15 * depth, 0.018), 0.024) / 2
+    housing = [nose]
+    top = behind - _NOSE
+    # From a box of the face's shape to a rounder one of the grip's.
+    round_grip = 0.9 * min(grip_x, grip_y)
+    for part in np.linspace(0.0, 1.0, 9)[1:]:
+        ease = 0.5 - 0.5 * math.cos(math.pi * part)
+
+        def between(a: float, b: float, ease: float = ease) -> float:
+            return a + (b - a) * ease
+
+        housing.append(
+            _flat_ring(
+                between(half_x, grip_x - round_grip),
+                between(half_y, grip_y - round_grip),
+                between(rounding, round_grip),
+                top - _SHOULDER * part,
+            )
+        )
+    end = top - _SHOULDER - _GRIP
+    housing.append(_flat_ring(grip_x - round_grip, grip_y - round_grip, round_grip, end))
+    # The end is rounded: an ellipse's quarter, from the grip to where the cable leaves it.
+    for angle in np.radians([25.0, 50.0, 70.0, 85.0]):
+        shrink = _RELIEF_RADIUS / grip_y + (1 - _RELIEF_RADIUS / grip_y) * math.cos(angle)
+        housing.append(
+            _flat_ring(
+                (grip_x - round_grip) * math.cos(angle),
+                (grip_y - round_grip) * shrink,
+                round_grip * shrink,
+                end - 0.010 * math.sin(angle),
+            )
+        )
+    last = end - 0.010
+    tube = [
+        _flat_ring(0.0, 0.0, radius, z)
+        for radius, z in (
+            (_RELIEF_RADIUS, last),
+            (0.9 * _RELIEF_RADIUS, last - 0.3 * _RELIEF),
+            (_CABLE_RADIUS, last - _RELIEF),
+            (_CABLE_RADIUS, last - _RELIEF - _CABLE),
+        )
+    ]
+    housing.append(_flat_ring(0.0, 0.0, _RELIEF_RADIUS, last))
+    high, wide, long = _NOTCH
+    middle = top - _SHOULDER - 0.012
+    # At -x, on the side of the image's first column: the mark is at the image's left.
+    half_turn = np.array([-1.0, -1.0, 1.0])
+    notch = [
+        half_turn
+        * (
+            np.array([grip_x + high * scale, 0.0, middle])
+            + _turned(_flat_ring(0, 0, wide, 0), size)
+        )
+        for scale, size in ((-0.8, (1.0, long / wide)), (0.2, (1.0, long / wide)), (1.0, (0.6, 3)))
+    ]
+    return [
+        _part("face", FACE, [*front, side, nose], has_front=False),
+        _part("housing", HOUSING, housing),
+        _part("cable", CABLE, tube),
+        _part("notch", NOTCH, notch),
+    ]
+
+
+def _outline(half_x: float, half_y: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (P, 2) of a box's outline and outward directions (P, 2) there, turning from +y to +x.
+
+    The same number of points for every box, those of a side that has no length at one place.
+    """
+    along = np.linspace(-half_x, half_x, _ALONG + 1)
+    turn = np.linspace(0.0, 0.5 * math.pi, _ROUND + 1)
+    points, directions = [], []
+    for quarter, (x, y) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1))):
+        if quarter in (0, 2):  # along the front and the back before their second corner
+            points.append(np.column_stack([x * along, np.full_like(along, y * half_y)])[:-1])
+            directions.append(np.tile([0.0, float(y)], (_ALONG, 1)))
+        start = (0.5 - 0.5 * quarter) * math.pi
+        angle = start - turn
+        points.append(np.tile([x * half_x, y * half_y], (_ROUND + 1, 1)))
+        directions.append(np.column_stack([np.cos(angle), np.sin(angle)]))
+    return np.concatenate(points), np.concatenate(directions)
+
+
+def _flat_ring(half_x: float, half_y: float, rounding: float, z: float) -> NDArray[np.float64]:
+    """(P, 3) m: the outline of a box, grown by a rounding, at a height z."""
+    points, directions = _outline(half_x, half_y)
+    ring = points + rounding * directions
+    return np.column_stack([ring, np.full(len(ring), z)])
+
+
+def _face_rings(
+    half_x: float, half_y: float, rounding: float, curvature: float
+) -> tuple[list[NDArray], NDArray]:
+    """Rings on the collider: of the front, from its middle line outwards, and the last, its side.
+
+    A point of a ring is one of the core's front, grown by the rounding along a normal there: of
+    those between the front's own and the outline's direction.
+    """
+    middle, directions = _outline(half_x, 0.0)
+    edge, _ = _outline(half_x, half_y)
+    outward = np.column_stack([directions, np.zeros(len(directions))])
+    front = np.column_stack([curvature * edge[:, 0], np.zeros(len(edge)), np.zeros(len(edge))])
+    front[:, 2] = np.sqrt(1.0 - front[:, 0] ** 2)
+    height = -(1.0 - front[:, 2]) / curvature if curvature else np.zeros(len(edge))
+    core = np.column_stack([edge, height - rounding])
+    rings = [np.column_stack([middle, height]) + rounding * (front - [0.0, 0.0, 1.0])]
+    cosine = np.einsum("pa,pa->p", front, outward)
+    between = np.arccos(np.clip(cosine, -1.0, 1.0))[:, None]
+    for part in np.linspace(0.0, 1.0, _LATITUDES + 1):
+        normal = np.sin((1 - part) * between) * front + np.sin(part * between) * outward
+        rings.append(core + rounding * normal / np.sin(between))
+    return rings[:-1], rings[-1]
+
+
+def _turned(ring: NDArray[np.float64], scale: tuple[float, float]) -> NDArray[np.float64]:
+    """A ring around z as one around x, its sizes along y and z scaled."""
+    return np.column_stack([ring[:, 2], -ring[:, 0] * scale[0], ring[:, 1] * scale[1]])
+
+
+def _part(
+    name: str, colour: Colour, rings: Sequence[NDArray], has_front: bool = True
+) -> TransducerPart:
+    """Bands from ring to ring, and flat ends; points that are at the same place are one.
+
+    Args:
+        has_front: whether the first ring gets an end, which one that is a line needs not.
+    """
+    count = len(rings[0])
+    vertices = np.concatenate([*rings, [rings[0].mean(axis=0), rings[-1].mean(axis=0)]])
+    here = np.arange(count)
+    there = np.roll(here, -1)
+    triangles = []
+    for k in range(len(rings) - 1):
+        a, b = k * count, (k + 1) * count
+        triangles.append(np.column_stack([a + here, a + there, b + there]))
+        triangles.append(np.column_stack([a + here, b + there, b + here]))
+    first, last = len(vertices) - 2, len(vertices) - 1
+    if has_front:
+        triangles.append(np.column_stack([np.full(count, first), there, here]))
+    back = (len(rings) - 1) * count
+    triangles.append(np.column_stack([np.full(count, last), back + here, back + there]))
+    return TransducerPart(name, colour, *_joined(vertices, np.concatenate(triangles)))
+
+
+def _joined(vertices: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
+    """The same with points that lie on each other, to a nanometre, as one."""
+    _, first, which = np.unique(
+        np.rint(vertices * 1e9), axis=0, return_index=True, return_inverse=True
+    )
+    corners = which.ravel()[triangles]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    used, corners = np.unique(corners, return_inverse=True)
+    return vertices[first][used], corners.reshape(-1, 3).astype(np.int32)

@@ -1,10 +1,15 @@
-"""Gives a haptic arm what the probe feels, between the tissue's solutions."""
+"""Gives a haptic arm the force on the probe between two solutions of the tissue."""
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import os
 import sys
+import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,26 +18,84 @@ from numpy.typing import NDArray
 from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, StampError, UsSimError
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     contact_model_from,
     nanoseconds_of,
     pose_from,
     wrench_serialized,
 )
-from us_sim.nodes.periodic_thread import PeriodicThread, be_punctual
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.scene.tracker_building import haptic_rendering_of, source_settings
+from us_sim.scene.building import haptic_rendering_of, source_settings
 
-LOOKS, REPORTS = 5.0, 1.0
+_MEASURED = 2000  # ticks of which the jitter is told
+
+TICK_PRIORITY = 20  # among real-time threads: ordinary ones are at 0, the kernel's at 50
+
+
+class PeriodicThread:
+    """Calls ``work`` at absolute times one period apart; those that have passed are skipped.
+
+    Args:
+        rate: Hz.
+        work: what to do, with the time in ns of the monotonic clock; it must not raise.
+    """
+
+    def __init__(self, rate: float, work: Callable[[int], None]) -> None:
+        self._period = round(1e9 / rate)
+        self._work = work
+        self._ending = threading.Event()
+        self._late: deque[int] = deque(maxlen=_MEASURED)  # ns
+        self.skipped = 0
+        self._thread = threading.Thread(target=self._run, name="periodic", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the present tick."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @property
+    def jitter(self) -> float:
+        """s, by which 99 of 100 of the last ticks' work was done later than the period after the
+        one before, or earlier, at most."""
+        late = np.array(self._late)
+        return 1e-9 * float(np.percentile(np.abs(np.diff(late)), 99)) if len(late) > 1 else 0.0
+
+    def _run(self) -> None:
+        be_punctual()
+        due = time.monotonic_ns()
+        while not self._ending.is_set():
+            due += self._period
+            wait = due - time.monotonic_ns()
+            if wait > 0:
+                time.sleep(1e-9 * wait)
+            elif wait < -self._period:
+                passed = -wait // self._period
+                self.skipped += passed
+                due += passed * self._period
+            self._work(time.monotonic_ns())
+            self._late.append(time.monotonic_ns() - due)
+
+
+def be_punctual(priority: int = TICK_PRIORITY) -> None:
+    """Let this thread run before the machine's other ones, where the system allows that."""
+    with contextlib.suppress(AttributeError, OSError):
+        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO, os.sched_param(priority))
+
+
+CHECKS, REPORTS = 5.0, 1.0
 """Times a second that it is seen who listens, and that diagnostics are told how regular it is.
 
 The latter keeps the interpreter from rendering for two ticks.
 """
 
-_PRIORITY = 10
-"""Of the executor, among real-time threads: below the one that renders."""
+_PRIORITY = 10  # of the executor, among real-time threads: below the one that renders
 
 
 class HapticRenderer(SceneNode):
@@ -57,9 +120,9 @@ class HapticRenderer(SceneNode):
         self.listen(Bool, "haptic/clutch", self._take_clutch, FOREIGN)
         self.listen(Float64MultiArray, "tissue/contact_model", self._take_model)
         self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
-        self._look()
+        self._check_doubt()
         self._report()
-        self.create_timer(1.0 / LOOKS, self._look)
+        self.create_timer(1.0 / CHECKS, self._check_doubt)
         self.create_timer(1.0 / REPORTS, self._report)
         self._thread.start()
 
@@ -104,7 +167,6 @@ class HapticRenderer(SceneNode):
         self._stops = 0
 
     def _render(self, now: int) -> None:
-        """One tick, in the thread of its own."""
         rendering = self._rendering
         if not self._is_taken:
             rendering.distrust("nobody takes the wrench")
@@ -127,8 +189,7 @@ class HapticRenderer(SceneNode):
             return  # rclpy was shut down meanwhile, as by a signal
         self.health.published("haptic/wrench")
 
-    def _look(self) -> None:
-        """See who listens, and whether the wrench is as it should be."""
+    def _check_doubt(self) -> None:
         self._is_taken = self._wrenches.get_subscription_count() > 0
         doubt, stops = self._rendering.doubt, self._rendering.stops
         if stops > self._stops:
@@ -137,7 +198,6 @@ class HapticRenderer(SceneNode):
         self.health.state = f"zero: {doubt}" if doubt else "rendering"
 
     def _report(self) -> None:
-        """Tell diagnostics how it goes."""
         self.health.values = {
             "stops": str(self._rendering.stops),
             "stopped": self._rendering.stopped,

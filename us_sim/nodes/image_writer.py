@@ -1,22 +1,83 @@
-"""Writes the images of a session as numbered files, and what is known of them if asked for."""
+"""Writes the images of a session as numbered files, and labels and displacements if asked for."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from sensor_msgs.msg import Image
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import nanoseconds_of, pixels_from
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import field_from, nanoseconds_of, pixels_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, overridable
 from us_sim.nodes.settings import ImageWriterSettings
-from us_sim.nodes.truth_files import TruthFiles
+
+REMEMBERED = 1000
+"""Images whose numbers are kept for what is known of them, and messages that wait for theirs."""
+
+
+class TruthFiles:
+    """Labels as ``000000.png``, displacement as ``000000.npy``: each by the stamp of its image.
+
+    Args:
+        node: that subscribes.
+        folders: where the messages of each topic go; they are there.
+    """
+
+    def __init__(self, node: GuardedNode, folders: dict[str, Path]) -> None:
+        self.count = 0  # of files
+        self._numbers: dict[int, int] = {}  # of images, by their stamps in ns
+        self._early: dict[tuple[str, int], Image] = {}
+        self._folders = folders
+        for topic in folders:
+            node.create_subscription(
+                Image, topic, self._taking(topic), EVERY, qos_overriding_options=overridable()
+            )
+
+    def image_came(self, number: int, stamp: int) -> None:
+        """The image with that stamp (ns) has that number."""
+        if not self._folders:
+            return
+        self._numbers[stamp] = number
+        _forget(self._numbers)
+        for topic in self._folders:
+            message = self._early.pop((topic, stamp), None)
+            if message is not None:
+                self._write(topic, message, number)
+
+    def _taking(self, topic: str) -> Callable[[Image], None]:
+        def take(message: Image) -> None:
+            stamp = nanoseconds_of(message.header.stamp)
+            if stamp in self._numbers:
+                self._write(topic, message, self._numbers[stamp])
+            else:
+                self._early[topic, stamp] = message
+                _forget(self._early)
+
+        return take
+
+    def _write(self, topic: str, message: Image, number: int) -> None:
+        stem = self._folders[topic] / f"{number:06d}"
+        if message.encoding in ("mono8", "8UC1"):
+            file = stem.with_suffix(".png")
+            if not cv2.imwrite(str(file), pixels_from(message)):
+                raise OSError(f"{file} cannot be written; choose another folder")
+        else:
+            np.save(stem.with_suffix(".npy"), field_from(message))
+        self.count += 1
+
+
+def _forget(kept: dict[Any, Any]) -> None:
+    while len(kept) > REMEMBERED:
+        del kept[next(iter(kept))]
 
 
 class ImageWriter(GuardedNode):
@@ -51,7 +112,6 @@ class ImageWriter(GuardedNode):
 
 
 def _made(name: str) -> Path:
-    """The folder, which is there now."""
     folder = Path(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,9 +121,7 @@ def _made(name: str) -> Path:
     return folder
 
 
-def main(args: list[str] | None = None) -> int:
-    """Write until interrupted."""
-    return run_node(ImageWriter, args)
+main = partial(run_node, ImageWriter)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import is_live
-from us_sim.settings.amount import dial_unit
+from us_sim.settings.quantity import dial_unit
 from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
 
 S = TypeVar("S", bound=Settings)

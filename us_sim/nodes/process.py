@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import json
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,14 +17,95 @@ import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from us_sim.errors import UsSimError, memory_limit
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.realtime import go_first
-from us_sim.nodes.standby import STANDBY, stand_by
 
-INTERRUPTED = 130
-"""The exit status of a node that was told to end before its work was done."""
+STANDBY = "US_SIM_STANDBY"  # set in the environment of a process that is to wait
+STANDING_BY = "standing by"  # what it says when it is ready
+
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_NICE = 19
+
+
+def stand_by(create: Callable[[], Node], args: list[str] | None) -> list[str] | None:
+    """Wait for a line on stdin: the arguments to run with, as JSON; None at the end of stdin.
+
+    Meanwhile the node is made once where nobody can discover it, and thrown away: its modules and
+    kernels are loaded then. That is done by a thread of low priority, which the nodes that run do
+    not notice.
+    """
+    rehearsal = threading.Thread(target=_rehearse, args=(create, args), daemon=True)
+    rehearsal.start()
+    rehearsal.join()
+    print(STANDING_BY, flush=True)
+    line = sys.stdin.readline()
+    return list(json.loads(line)) if line else None
+
+
+def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
+    with contextlib.suppress(AttributeError, OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+    before = os.environ.get(_RANGE)
+    os.environ[_RANGE] = "OFF"
+    # What is wrong with the node is said when it is made in earnest.
+    with contextlib.suppress(Exception):
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        create().destroy_node()
+    with contextlib.suppress(Exception):
+        rclpy.try_shutdown()
+    del os.environ[_RANGE]
+    if before is not None:
+        os.environ[_RANGE] = before
+    gc.collect()
+
+
+_PRIORITY = 1  # the lowest of those that go first: drivers of devices may go before
+
+
+def go_first() -> str:
+    """Let all present threads of this process go before ordinary ones, and none that they start.
+
+    Returns:
+        How they run from now on: ``realtime``, or ``ordinary`` where that is not allowed.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        return "ordinary"
+    return "realtime" if _schedule(os.SCHED_RR, _PRIORITY) else "ordinary"
+
+
+def go_along() -> None:
+    """Let all present threads of this process run as ordinary programs again."""
+    if hasattr(os, "sched_setscheduler"):
+        _schedule(os.SCHED_OTHER, 0)
+
+
+def _schedule(policy: int, priority: int) -> bool:
+    policy |= getattr(os, "SCHED_RESET_ON_FORK", 0)
+    try:
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
+    except OSError:
+        return False
+    return True
+
+
+def scheduling_of(pid: int) -> str:
+    """How the main thread of a process runs, in the words of `go_first`."""
+    if not hasattr(os, "sched_getscheduler"):
+        return "ordinary"
+    try:
+        policy = os.sched_getscheduler(pid)
+    except OSError:  # it has ended
+        return "ordinary"
+    return (
+        "realtime" if policy & ~getattr(os, "SCHED_RESET_ON_FORK", 0) == os.SCHED_RR else "ordinary"
+    )
+
+
+INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
 
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""
@@ -138,7 +221,6 @@ class _Executor(SingleThreadedExecutor):
 
 
 def _interrupted(node: Any) -> int:
-    """The exit status of a node that ends without an error, or was told to end."""
     finished = getattr(node, "finished", None)
     return 0 if node is not None and (finished is None or finished.done()) else INTERRUPTED
 
@@ -152,6 +234,5 @@ def _interrupt_once(*_: object) -> None:
 
 
 def _refused(error: Exception) -> int:
-    """One sentence on stderr; the exit status for bad input."""
     print(f"us_sim: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
     return 1

@@ -1,21 +1,63 @@
-"""What the nodes of a scene share: its parameters, its health, and lockstep or live input."""
+"""A node of a scene: its parameters, its health, and lockstep or live input."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from us_sim.nodes.guarded_node import GuardedNode, decoded
-from us_sim.nodes.health import Health
-from us_sim.nodes.newest import Newest
+from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
 from us_sim.nodes.settings import SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
+
+
+class Newest:
+    """A subscription callback that hands ``work`` the newest message once the queue is drained.
+
+    An executor takes one message of a subscription per turn, so working in the callback would
+    fall behind a fast publisher. The callback therefore only stores, and a guard condition works
+    in the first turn that brought nothing new. In lockstep every message is worked on at once.
+    """
+
+    def __init__(
+        self, node: GuardedNode, health: Health, work: Callable[[Any], None], *, lockstep: bool
+    ) -> None:
+        self._node = node
+        self._health = health
+        self._work = work
+        self._lockstep = lockstep
+        self._waiting: Any = None
+        self._arrived = 0  # ns of the monotonic clock
+        self._fresh = False
+        self._guard = node.create_guard_condition(self._turn)
+
+    def __call__(self, message: Any) -> None:
+        """Take a message from the subscription."""
+        self._health.received += 1
+        if self._lockstep:
+            self._work(message)
+            return
+        if self._waiting is not None:
+            self._health.dropped += 1
+        self._waiting, self._arrived = message, time.monotonic_ns()
+        self._fresh = True
+        self._guard.trigger()
+
+    def _turn(self) -> None:
+        if self._fresh:
+            self._fresh = False
+            self._guard.trigger()
+            return
+        message, self._waiting = self._waiting, None
+        if message is not None:
+            self._node.arrived = self._arrived
+            self._work(message)
 
 
 class SceneNode(GuardedNode):

@@ -13,11 +13,10 @@ from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import CompressedImage
 
 from us_sim.errors import SettingsError, UsSimError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import changed, declared, parameters_with
 from us_sim.nodes.qos import CATALOGUE, LATCHED, overridable
-from us_sim.nodes.session_settings import SessionControlSettings
+from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
 _FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_room_bytes")

@@ -2,33 +2,126 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.annotated_image import AnnotatedImage
-from us_sim.nodes.conversions import (
+from us_sim.nodes.messages import (
     affine_message,
     nanoseconds_of,
     pose_from,
     tetrahedra_from,
     vectors_from,
 )
-from us_sim.nodes.frame_streams import frame_streams
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
-from us_sim.nodes.scanner_console import ScannerConsole
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.skin_shapes import SkinShapes
-from us_sim.scene.building import scanner_of, volume_of
-from us_sim.slicing.acoustics.settings import Acoustics
+from us_sim.nodes.settings import is_live
+from us_sim.nodes.streams import frame_streams
+from us_sim.nodes.streams.annotated_image import AnnotatedImage
+from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
+from us_sim.settings.setting import rules_of
+from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
+from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.settings import Imaging
+from us_sim.slicing.settings import TISSUE_PARAMETERS, Imaging
+
+Console = Callable[[Probe, Imaging, Acoustics], None]
+
+
+class ScannerConsole:
+    """The probe's live settings, those of image formation, and those of sound, also by tissue.
+
+    Args:
+        node: that gets the parameters.
+        prepare: called with them before a change is taken; what it raises refuses it.
+        use: called with them when parameters have been set.
+    """
+
+    def __init__(self, node: SceneNode, prepare: Console, use: Console) -> None:
+        probe, imaging = probe_of(node.scene), node.scene.imaging
+        live = [name for name in rules_of(type(probe)) if is_live(type(probe), name)]
+        groups = {
+            "probe": Group(probe, names=live),
+            "imaging": Group(imaging, names=rules_of(Imaging)),
+            "acoustics": Group(imaging.acoustics, "acoustics.", rules_of(SoundSettings)),
+        }
+        for label, tissue in imaging.acoustics.tissues.items():
+            prefix = f"{TISSUE_PARAMETERS}{label}."
+            groups[prefix] = Group(tissue, prefix)
+        console = LiveSettings(
+            node, groups, lambda to: prepare(*_together(to)), lambda to: use(*_together(to))
+        )
+        self.values = _together(console.values)
+
+
+def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
+    tissues = {
+        key.removeprefix(TISSUE_PARAMETERS)[:-1]: value
+        for key, value in values.items()
+        if key.startswith(TISSUE_PARAMETERS)
+    }
+    acoustics = dataclasses.replace(values["acoustics"], tissues=tissues)
+    return values["probe"], values["imaging"], acoustics
+
+
+SKINS_REMEMBERED = 64
+
+
+class SkinShapes:
+    """``skin/nodes``, by their stamps.
+
+    Live, an image does not wait for the skin, which is there before the tissue all but always; in
+    lockstep it does, so that it is the same every time.
+
+    Args:
+        node: that makes the images.
+        scanner: is told of the skin at rest.
+        came: called when there is skin for a pose, in lockstep.
+    """
+
+    def __init__(self, node: SceneNode, scanner: BMode, came: Callable[[], None]) -> None:
+        surface = skin_surface_of(node.scene)
+        scanner.touch(surface.vertices, surface.triangles)
+        self._node, self._came = node, came
+        self._shape = surface.vertices.shape
+        self._shapes: dict[int, NDArray[np.float64]] = {}
+        node.listen(PointCloud2, "skin/nodes", self._take)
+
+    def at(self, stamp: int) -> NDArray[np.float64] | None:
+        """(V, 3) m, of a pose's stamp (ns); None where it has not come."""
+        return self._shapes.get(stamp)
+
+    def is_awaited(self, stamp: int) -> bool:
+        """Whether an image of that stamp has to wait."""
+        return self._node.lockstep and stamp not in self._shapes
+
+    def _take(self, message: PointCloud2) -> None:
+        vertices = vectors_from(message, "patient")
+        if vertices.shape != self._shape:
+            self._node.health.problem(
+                "skin",
+                f"skin/nodes has {len(vertices)} vertices, and the scene's skin {self._shape[0]}: "
+                f"contact is with the tissue; start both with the same scene",
+            )
+            return
+        self._shapes[nanoseconds_of(message.header.stamp)] = vertices
+        while len(self._shapes) > SKINS_REMEMBERED:
+            del self._shapes[next(iter(self._shapes))]
+        if self._node.lockstep:
+            self._came()
+
 
 _BEYOND = 1e-3  # m, by which an image may be too deep before that is said
 
@@ -36,8 +129,7 @@ _NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contac
 _SEEN = ("contact", "no_colour", "no_spectrum")
 """Diagnostics that are sent at once when they change: they say why an image shows nothing."""
 
-REMEMBERED = 256
-"""Poses kept for the deformed nodes that carry their stamps."""
+REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
 
 
 class SliceInterpolator(SceneNode):
@@ -85,13 +177,11 @@ class SliceInterpolator(SceneNode):
         self.get_logger().info("ready")
 
     def _prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
-        """Load what was set at the console, before it is used."""
         self._scanner.prepare(probe, imaging, acoustics)
         for stream in self._streams:
             stream.prepare(probe)
 
     def _use(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
-        """Go on with what was set at the console."""
         changed = probe != self._scanner.probe
         self._scanner.use(probe, imaging, acoustics)
         if changed:
@@ -108,7 +198,6 @@ class SliceInterpolator(SceneNode):
         self._take_mesh()
 
     def _take_mesh(self) -> None:
-        """Once both halves of it are there."""
         if self._rest is None or self._tetrahedra is None:
             return
         nodes = vectors_from(self._rest, "patient")
@@ -116,14 +205,12 @@ class SliceInterpolator(SceneNode):
         self._carried = True
 
     def _remember(self, message: PoseStamped) -> None:
-        """Keep the pose until the nodes deformed by it arrive."""
         self._poses[_nanoseconds(message)] = self._pose(message)
         while len(self._poses) > REMEMBERED:
             del self._poses[next(iter(self._poses))]
         self._image_unpaired()
 
     def _pose(self, message: PoseStamped) -> Pose:
-        """The pose in a message."""
         pose = pose_from(message, "patient")
         self._annotated.pose_came(message.header.stamp)
         return pose
@@ -149,7 +236,6 @@ class SliceInterpolator(SceneNode):
     def _image(
         self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
     ) -> None:
-        """Make and publish what is wanted at ``pose``, under the stamp of what it is made from."""
         self._number += 1
         wanted = [stream for stream in self._streams if stream.is_wanted]
         if not (wanted or self._annotated.is_wanted):
@@ -190,7 +276,6 @@ class SliceInterpolator(SceneNode):
 
 
 def _contact(frame: Frame) -> dict[str, str]:
-    """How the face meets the skin, where that is modelled."""
     if frame.contact is None:
         return {}
     coupling = float(frame.contact[0].mean())
@@ -202,9 +287,7 @@ def _nanoseconds(message: PoseStamped | PointCloud2) -> int:
     return nanoseconds_of(message.header.stamp)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(SliceInterpolator, args)
+main = partial(run_node, SliceInterpolator)
 
 
 if __name__ == "__main__":

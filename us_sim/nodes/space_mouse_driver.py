@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import sys
 import threading
+from functools import partial
 from typing import Any
 
 from rclpy.time import Time
 from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse import SpaceMouse
 
-RETRY_S = 1.0
-"""How long a device that is not there is left alone."""
+RETRY_S = 1.0  # how long a device that is not there is left alone
 
 
 class SpaceMouseDriver(GuardedNode):
@@ -54,7 +53,6 @@ class SpaceMouseDriver(GuardedNode):
         super().destroy_node()
 
     def _run(self) -> None:
-        """In the device's thread: read it, each time that it is there."""
         while not self._closing.is_set():
             try:
                 mouse = SpaceMouse()
@@ -72,7 +70,6 @@ class SpaceMouseDriver(GuardedNode):
                 self._closing.wait(RETRY_S)
 
     def _follow(self, mouse: SpaceMouse) -> None:
-        """Until it is gone; raises TrackingError then."""
         while not self._closing.is_set():
             mouse.wait(self._patience)
             now = self.get_clock().now().nanoseconds
@@ -82,7 +79,6 @@ class SpaceMouseDriver(GuardedNode):
             self._guard.trigger()
 
     def _work(self) -> None:
-        """In the node's thread: pass on the newest."""
         with self._lock:
             newest, self._newest = self._newest, None
             problem, self._problem = self._problem, ""
@@ -99,9 +95,7 @@ class SpaceMouseDriver(GuardedNode):
             self.health.problem("device", problem)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(SpaceMouseDriver, args)
+main = partial(run_node, SpaceMouseDriver)
 
 
 if __name__ == "__main__":

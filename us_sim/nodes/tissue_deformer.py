@@ -1,35 +1,332 @@
-"""Deforms the tissue under the probe."""
+"""Deforms the tissue under the probe, and shows its structures."""
 
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Int32MultiArray
+from std_msgs.msg import Float64MultiArray, Int32MultiArray
+from visualization_msgs.msg import MarkerArray
 
-from us_sim.errors import SceneError
-from us_sim.nodes.conversions import (
+from us_sim.errors import SceneError, TrackingError, UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.messages import (
     cloud_message,
+    contact_model_message,
+    nanoseconds_of,
     pose_from,
+    structure_markers,
     tetrahedra_message,
     wrench_message,
 )
-from us_sim.nodes.live_tissue import LiveTissue
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.tissue.deformation import Deformation
+from us_sim.nodes.settings import StructureMarkersSettings, TissueDeformerSettings
+from us_sim.progress import late_progress
+from us_sim.scene.building import Structure, materials_of, structures_of, tissue_model_of, volume_of
+from us_sim.settings.registry import SOLVERS
+from us_sim.settings.spelling import counted
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.frame_budget import frame_limit, shortest, usable_cores
+from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
+from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
-if TYPE_CHECKING:
-    from us_sim.nodes.contact_model_publisher import ContactModelPublisher
-    from us_sim.nodes.structure_markers import StructureMarkers
+OWN = "tissue_deformer"
+PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready, when no pose comes
 
-ALWAYS = Time()
-"""The stamp of what does not change: zero, which tf takes as the latest."""
+
+class LiveTissue:
+    """A tissue whose method, methods' settings and materials are parameters of a node.
+
+    What is set is made ready in a thread, and the tissue goes on as it was until then; the next
+    frame begins with it. What cannot be made is said, and its parameters are set back. In lockstep
+    a frame waits for it.
+
+    Args:
+        node: that gets the parameters, of a scene with tissue.
+
+    Raises:
+        UsSimError: the scene's tissue cannot be made, or a parameter's value will not do.
+    """
+
+    def __init__(self, node: SceneNode) -> None:
+        scene, tissue = node.scene, node.scene.tissue
+        assert tissue is not None
+        self._node = node
+        groups = {OWN: Group(TissueDeformerSettings(solver=tissue.solver))}
+        for name in SOLVERS.importable:
+            given = tissue.settings.get(name) or SOLVERS.settings(name)()
+            groups[name] = Group(given, prefix=f"{name}.")
+        for label, material in tissue.materials.items():
+            groups[f"materials.{label}"] = Group(material, prefix=f"materials.{label}.")
+        # Before the volume, which may take a minute to make.
+        self._live = LiveSettings(node, groups, use=self._use)
+        values = self._live.values
+        self._volume = volume_of(scene)
+        given_materials = _materials(values)
+        self._scene = replace(scene, tissue=replace(tissue, materials=given_materials))
+        model = tissue_model_of(self._scene, self._volume, node.get_logger().info)
+        node.get_logger().info(
+            f"preparing {values[OWN].solver} for {len(model.mesh.nodes)} nodes, "
+            f"{len(model.mesh.tetrahedra)} tetrahedra"
+        )
+        show = late_progress("preparing the tissue")
+        self.tissue = SwitchableTissue(model, values[OWN].solver, _settings(values), show)
+        if values[OWN].compare_with:
+            self.tissue.compare_with(values[OWN].compare_with, show)
+        self._current = dict(values)  # what the tissue is deformed by
+        self._asked = dict(values)  # what is being made ready
+        self._preparation = Preparation(self.tissue)
+        node.create_timer(PREPARED_CHECK_S, self._tick)
+
+    @property
+    def state(self) -> str:
+        """The method in use, and what is being made ready."""
+        preparing = self._preparation.state
+        return f"{self.tissue.name}, {preparing}" if preparing else self.tissue.name
+
+    def deform(self, pose: Pose) -> Deformation:
+        """One frame, with what is ready of what was set.
+
+        Raises:
+            UsSimError: the pose cannot be used.
+        """
+        self._take_prepared()
+        try:
+            return self.tissue.deform(pose)
+        except UsSimError:
+            raise
+        except Exception:
+            self.tissue.reset()  # it may have been left halfway
+            raise
+
+    def _use(self, values: dict[str, Any]) -> None:
+        if values == self._asked:
+            return
+        self._asked = dict(values)
+        if values == self._current:
+            self._preparation.drop()
+            self._tell_preparing()
+            self._node.get_logger().info(
+                f"set back: {self.tissue.name} goes on as it is, and what was being prepared is "
+                f"dropped"
+            )
+            return
+        plan = self._plan(values)
+        if self._node.lockstep:
+            self._conclude(self._made(plan))
+            return
+        self._node.get_logger().info(
+            f"{plan.reason}: being prepared; {self.tissue.name} goes on until it is ready"
+        )
+        self._preparation.want(plan)
+        self._tell_preparing()
+
+    def _plan(self, values: Mapping[str, Any]) -> Plan:
+        own = values[OWN]
+        changed = [key for key in values if values[key] != self._current[key]]
+        other = any(key.startswith("materials.") for key in changed)
+        materials, model = _materials(values), self.tissue.model
+
+        def with_materials() -> TissueModel:
+            made = materials_of(self._scene, materials, model.mesh, self._volume)
+            return replace(model, materials=made)
+
+        compared = f" compared with {own.compare_with}" if own.compare_with else ""
+        reasons = [f"{own.solver}{compared}" if key == OWN else key for key in changed]
+        return Plan(
+            own.solver,
+            own.compare_with or "",
+            _settings(values),
+            with_materials if other else None,
+            ", ".join(reasons),
+        )
+
+    def _made(self, plan: Plan) -> Prepared | Failed:
+        try:
+            return self.tissue.make(plan, late_progress("preparing the tissue"))
+        except UsSimError as error:
+            return Failed(plan, str(error))
+
+    def _tick(self) -> None:
+        """Look, and tell diagnostics how far it is, also while no pose comes."""
+        if self._preparation.state:
+            self._node.health.state, self._node.health.preparing = (
+                self.state,
+                self._preparation.state,
+            )
+        self._take_prepared()
+
+    def _tell_preparing(self) -> None:
+        self._node.health.state, self._node.health.preparing = self.state, self._preparation.state
+        self._node.health.report()
+
+    def _take_prepared(self) -> None:
+        outcome = self._preparation.take()
+        if outcome is not None:
+            self._conclude(outcome)
+
+    def _conclude(self, outcome: Prepared | Failed) -> None:
+        self._take(outcome)
+        self._node.health.state = self.tissue.name  # also while no pose comes
+        self._node.health.preparing = ""
+        self._node.health.report()
+
+    def _take(self, outcome: Prepared | Failed) -> None:
+        if isinstance(outcome, Failed):
+            self._node.health.problem(
+                "setting", f"{outcome.plan.reason}: {outcome.problem}; it is set back"
+            )
+            self._asked = dict(self._current)
+            self._live.restore(self._current)
+            return
+        before, compared = self.tissue.name, self.tissue.compared
+        self.tissue.adopt(outcome)
+        self._current = dict(self._asked)
+        log = self._node.get_logger()
+        if self.tissue.name != before:
+            log.info(f"switched to {self.tissue.name}")
+        if self.tissue.compared != compared and self.tissue.compared:
+            log.info(f"comparing with {self.tissue.compared}")
+        log.info(f"{outcome.plan.reason}: in use from now on")
+
+
+def _settings(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: values[name] for name in SOLVERS.importable}
+
+
+def _materials(values: Mapping[str, Any]) -> dict[str, Material]:
+    return {
+        key.removeprefix("materials."): value
+        for key, value in values.items()
+        if key.startswith("materials.")
+    }
+
+
+class ContactModelPublisher:
+    """``tissue/contact_model``: the wrench at a pose of the probe and how it changes from there.
+
+    Args:
+        node: that publishes it.
+    """
+
+    def __init__(self, node: SceneNode) -> None:
+        self._node = node
+        self._publisher = node.stream(Float64MultiArray, "tissue/contact_model")
+        self._secant = SecantStiffness()
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody subscribes."""
+        return bool(self._publisher.get_subscription_count())
+
+    def publish(
+        self, tissue: SwitchableTissue, pose: Pose, deformation: Deformation, stamp: TimeMessage
+    ) -> None:
+        """Publish the model at a pose, just solved for, under its stamp."""
+        wrench = wrench_in_patient(pose, deformation.force, deformation.torque)
+        try:
+            stiffness = tissue.contact_stiffness()
+        except np.linalg.LinAlgError:
+            stiffness = None
+        try:
+            if stiffness is None:
+                stiffness = self._secant.at(pose, wrench)
+            model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
+        except TrackingError as error:
+            self._secant.forget()
+            self._node.health.problem("contact_model", f"{error}; it is not published")
+            return
+        self._publisher.publish(contact_model_message(model))
+        self._node.health.published("tissue/contact_model")
+
+
+class StructureMarkers:
+    """``tissue/structures``: a TRIANGLE_LIST of each structure, where the tissue has carried it.
+
+    Their surfaces are made when the first subscriber has come, in a thread, while the tissue goes
+    on being deformed; in lockstep they are made at once, so that no pose is without. How fine they
+    are and how often they are sent are the parameters of `StructureMarkersSettings`.
+
+    Args:
+        node: that publishes them, of a scene that has structures.
+        mesh: of its tissue.
+    """
+
+    def __init__(self, node: SceneNode, mesh: TetrahedralMesh) -> None:
+        self._node = node
+        self._mesh = mesh
+        self._settings = LiveSettings(node, {"markers": Group(StructureMarkersSettings())})
+        self._publisher = node.stream(MarkerArray, "tissue/structures")
+        self._structures: list[Structure] = []
+        self._making: threading.Thread | None = None
+        self._sent: int | None = None  # ns, the stamp of the last
+        self.state = "not made, nobody subscribes"
+
+    def is_due(self, stamp: TimeMessage) -> bool:
+        """Whether somebody subscribes, the surfaces are there, and a marker's time has come."""
+        if self._publisher.get_subscription_count() == 0:
+            return False
+        if self._making is None:
+            self.state = "being made"
+            self._making = threading.Thread(target=self._make, daemon=True)
+            self._making.start()
+        if self._node.lockstep:
+            self._making.join()
+        if self._making.is_alive() or not self._structures:
+            return False
+        if self._sent is None:
+            return True
+        since = nanoseconds_of(stamp) - self._sent
+        return not 0 <= since < 0.99e9 / self._settings.values["markers"].marker_rate
+
+    def publish(self, nodes: NDArray[np.float64], stamp: TimeMessage) -> None:
+        """Send the structures as they are when the tissue's nodes (N, 3) are there, m."""
+        self._sent = nanoseconds_of(stamp)
+        surfaces = [
+            (made.name, (*made.colour, 1.0), made.surface.carry(nodes), made.surface.triangles)
+            for made in self._structures
+        ]
+        self._publisher.publish(structure_markers(surfaces, stamp, "patient"))
+        self._node.health.published("tissue/structures")
+
+    def _make(self) -> None:
+        began = time.monotonic()
+        scene = self._node.scene
+        triangles = self._settings.values["markers"].structure_triangles
+        try:
+            self._structures = list(structures_of(scene, volume_of(scene), self._mesh, triangles))
+        except UsSimError as error:
+            self.state = str(error)
+            self._node.health.problem("structures", f"{error}; no structure is shown")
+            return
+        except Exception as error:  # so that the thread does not end silently
+            self.state = "could not be made"
+            self._node.failed("tissue/structures", error)
+            return
+        count = sum(len(made.surface.triangles) for made in self._structures)
+        names = ", ".join(made.name for made in self._structures)
+        self.state = f"{names}: {counted(count, 'triangle')}"
+        self._node.get_logger().info(
+            f"made the surfaces of {self.state}, in {time.monotonic() - began:.1f} s"
+        )
+
+
+ALWAYS = Time()  # the stamp of what does not change: zero, which tf takes as the latest
 GO_ON_S = 0.05
 """Time without a pose after which an unfinished frame is gone on with. It is longer than a frame:
 an executor serves timers before messages."""
@@ -62,7 +359,7 @@ class TissueDeformer(SceneNode):
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
         self._contact: ContactModelPublisher | None = None
         if self.scene.tracker.source.name == "haptic":
-            from us_sim.nodes.contact_model_publisher import ContactModelPublisher
+            from us_sim.nodes.tissue_deformer import ContactModelPublisher
 
             self._contact = ContactModelPublisher(self)
         rest = self.latched(PointCloud2, "tissue/rest")
@@ -77,7 +374,7 @@ class TissueDeformer(SceneNode):
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
         self._structures: StructureMarkers | None = None
         if self.scene.structures:
-            from us_sim.nodes.structure_markers import StructureMarkers
+            from us_sim.nodes.tissue_deformer import StructureMarkers
 
             self._structures = StructureMarkers(self, mesh)
         self._last: PoseStamped | None = None
@@ -132,7 +429,6 @@ class TissueDeformer(SceneNode):
             self._structures.publish(deformation.nodes, stamp)
 
     def _describe(self, deformation: Deformation) -> None:
-        """What diagnostics say of a frame."""
         if deformation.inverted:
             self.health.problem("inside out", _inside_out(deformation, self._live.tissue.name))
         self.health.warning = ""
@@ -155,7 +451,6 @@ class TissueDeformer(SceneNode):
         }
 
     def _comparison(self) -> dict[str, str]:
-        """What diagnostics say of the solver beside the one in use."""
         tissue = self._live.tissue
         apart = tissue.difference
         if apart is None:
@@ -182,9 +477,7 @@ def _inside_out(deformation: Deformation, name: str) -> str:
     )
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(TissueDeformer, args)
+main = partial(run_node, TissueDeformer)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,8 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.conversions import affine_from, nanoseconds_of, pixels_from, pose_from
-from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.health import Health
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, LATCHED, overridable
@@ -27,8 +27,7 @@ from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 SECONDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Images that wait while the volume is saved."""
-REMEMBERED = 256
-"""Poses, and images, kept for what has the same stamp."""
+REMEMBERED = 256  # poses, and images, kept for what has the same stamp
 
 
 class VolumeReconstructor(GuardedNode):
@@ -116,7 +115,6 @@ class VolumeReconstructor(GuardedNode):
 
 
 def _free(file: Path) -> Path:
-    """The file's name, or with a number where it is taken."""
     if not file.exists():
         return file
     stem, dot, ending = file.name.partition(".")
@@ -124,9 +122,7 @@ def _free(file: Path) -> Path:
     return next(name for name in numbered if not name.exists())
 
 
-def main(args: list[str] | None = None) -> int:
-    """Reconstruct until interrupted."""
-    return run_node(VolumeReconstructor, args)
+main = partial(run_node, VolumeReconstructor)
 
 
 if __name__ == "__main__":

@@ -21,8 +21,7 @@ import yaml
 
 from us_sim.errors import BagError
 from us_sim.recording.topic import QosProfile, qos_from_yaml
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 
 _NEWEST_VERSION = 9
 _NO_TIME = 2**63 - 1  # ns, the starting time that rosbag2 gives a bag without messages

@@ -18,6 +18,7 @@ from us_sim.run.monitored import refuse_unknown
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
+    module_of,
     parameters_file,
     player_settings,
     recorder_of,
@@ -44,7 +45,7 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
 
     require_texts(parameters)
     kind = "".join(word.capitalize() for word in name.split("_"))
-    make = getattr(importlib.import_module(f"us_sim.nodes.{name}"), kind)
+    make = getattr(importlib.import_module(module_of(name)), kind)
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]
     try:
         return make(context=context, parameter_overrides=overrides)
@@ -52,8 +53,7 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
         raise UsSimError(" ".join(str(error).split())) from error
 
 
-QUIET_S = 0.25
-"""Silence after which everything that was sent has been taken."""
+QUIET_S = 0.25  # silence after which everything that was sent has been taken
 
 
 def render_scene(
@@ -218,7 +218,6 @@ def _nodes(
 def _spin(
     executor: Any, nodes: list[Any], progress: Callable[[int, int], None], truth: list[str]
 ) -> int:
-    """Until the path is at its end and nothing more arrives."""
     recorder, writer, player = nodes[0], nodes[1], nodes[-1]
     clock = player.get_clock()
     total = player.pose_count

@@ -18,22 +18,25 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.session_settings import SessionRecorderSettings
-from us_sim.nodes.settings import checked_parameters
+from us_sim.nodes.settings import SessionRecorderSettings, checked_parameters
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
+from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.share import full_path
-from us_sim.viewer.listening import require_free
-from us_sim.viewer.viewer_settings import TOKEN, ViewerSettings
+from us_sim.viewer.server import require_free
 
 if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
 
 RECORDER, VIEWER = "session_recorder", "viewer"
 PLAYERS = ("path_player", "session_player")
-Parameters = dict[str, dict[str, str]]
-"""Parameters given by a person: YAML texts by node and name."""
+Parameters = dict[str, dict[str, str]]  # parameters given by a person: YAML texts by node and name
+
+
+def module_of(node: str) -> str:
+    """The module that runs a node."""
+    return "us_sim.viewer.viewer" if node == "viewer" else f"us_sim.nodes.{node}"
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class NodeProcess:
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
-        return [sys.executable, "-P", "-m", f"us_sim.nodes.{self.node}", *self.arguments()]
+        return [sys.executable, "-P", "-m", module_of(self.node), *self.arguments()]
 
     def arguments(self) -> list[str]:
         """ROS arguments that set its parameters."""

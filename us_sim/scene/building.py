@@ -6,23 +6,48 @@
 ...                      "probe": {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}})
 >>> probe_of(scene).columns
 400
+
+What a scene says of its tracker, made into objects, each only when it is asked for.
+
+>>> from us_sim.scene.reading import load_scene
+>>> from us_sim.scene.building import tracking_of
+>>> tracking_of(load_scene("upper_arm")).filter.lag
+0.0
+
+The vessels, nerves and bones that a scene names, as surfaces that its tissue carries.
+
+>>> from us_sim.scene.reading import parse_scene
+>>> from us_sim.scene.building import colour_of
+>>> scene = parse_scene({
+...     "name": "arm", "volume": {"phantom": "upper_arm"}, "structures": ["vein"],
+...     "probe": {"aperture": "4 cm", "depth": "4 cm",
+...               "collider": {"shape": "sphere", "radius": "2 cm"}},
+...     "tissue": {"mesh": {"lower": [-0.03, -0.03, 0], "upper": [0.03, 0.03, 0.05]},
+...                "materials": {"vein": {"young_modulus": "1 kPa"}}}})
+>>> colour_of(scene, "vein")  # blue
+(0.25, 0.4, 0.85)
+
+The blood in the vessels of a scene: each structure that has a flow, made from its label.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError, ProbeError, SceneError, TrackingError
+from us_sim.errors import BagError, ProbeError, SceneError, TrackingError, UsSimError
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.scene.scene import Scene, TissueSettings
-from us_sim.settings.registry import COLLIDERS, PROBES
+from us_sim.settings.registry import COLLIDERS, PROBES, TRACKERS
 from us_sim.tracking.measurement import PATIENT
+from us_sim.volume.structure_names import Colour, anatomical_colour
 
 if TYPE_CHECKING:
     from us_sim.geometry.collider import Collider
@@ -31,12 +56,19 @@ if TYPE_CHECKING:
     from us_sim.skin.settings import MembraneSettings
     from us_sim.skin.surface import TriangleSurface
     from us_sim.slicing.b_mode import BMode
+    from us_sim.slicing.flow.blood import Blood
     from us_sim.slicing.probe.probe import Probe
     from us_sim.tissue.elasticity.material import Material
     from us_sim.tissue.elasticity.materials import LabelFractions, TissueMaterials
+    from us_sim.tissue.mesh.embedding import EmbeddedSurface
     from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
     from us_sim.tissue.model import TissueModel
+    from us_sim.tracking.camera.rigid_body import RigidBody
+    from us_sim.tracking.filters import PoseFilter
+    from us_sim.tracking.haptic import HapticRendering
+    from us_sim.tracking.probe_tracking import ProbeTracking
     from us_sim.volume.volume import Volume
+
 
 _TAKEN_BACK = "; of what the base of a scene says, `null` takes back a material (`fat: null`)"
 
@@ -174,7 +206,7 @@ def tissue_model_of(
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing")
     if scene.structures:
-        from us_sim.scene.structures import require_labels
+        from us_sim.scene.building import require_labels
 
         require_labels(scene, volume)
     mesh, remarks, fractions = _mesh(scene, section, volume)
@@ -182,7 +214,7 @@ def tissue_model_of(
     if note is not None:
         for remark in (*remarks, *held):
             note(f"tissue mesh: {remark}")
-    from us_sim.tissue.mesh.node_selection import face_nodes, facing_nodes
+    from us_sim.tissue.model import face_nodes, facing_nodes
 
     touched = facing_nodes(mesh) if section.mesh.file else face_nodes(mesh, "top", 0.0)
     contact = np.setdiff1d(touched, np.flatnonzero(fixed)).astype(np.int32)
@@ -314,7 +346,7 @@ def _fixed_nodes(
     fractions: LabelFractions | None,
 ) -> tuple[NDArray[np.bool_], list[str]]:
     """Nodes on the named faces and inside the named labels (the skeleton is rigid), and remarks."""
-    from us_sim.tissue.mesh.node_selection import FACES, face_nodes, held_remark, nodes_in_label
+    from us_sim.tissue.model import FACES, face_nodes, held_remark, nodes_in_label
 
     numbers = {name: label for label, name in volume.label_names.items()}
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
@@ -334,3 +366,208 @@ def _fixed_nodes(
         remark = held_remark(name, held, mesh)
         remarks += [remark] if remark else []
     return fixed, remarks
+
+
+def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
+    """What turns the measurements of the scene's tracker into the probe's poses.
+
+    Args:
+        scene: with the tracker.
+        filter: in place of the scene's.
+
+    Raises:
+        CalibrationError: a file of a registration or calibration cannot be used.
+        TrackingError: the times make no sense.
+    """
+    from us_sim.tracking.filters import create_filter
+    from us_sim.tracking.probe_tracking import ProbeTracking
+
+    tracker = scene.tracker
+    gate = None
+    if tracker.gate is not None:
+        from us_sim.tracking.outlier_gate import OutlierGate
+
+        gate = OutlierGate(tracker.gate)
+    return ProbeTracking(
+        *tracker_poses_of(scene),
+        filter or create_filter(tracker.filter.name, tracker.filter.given),
+        gate,
+        time_offset=tracker.time_offset,
+        coast_for=tracker.coast_for,
+        lost_after=tracker.lost_after,
+    )
+
+
+def source_settings(scene: Scene, source: str) -> Any:
+    """The settings of a source of poses: the scene's where it names that source, else the defaults.
+
+    Raises:
+        TrackingError: there is no such source.
+    """
+    chosen = scene.tracker.source
+    if chosen.name == source and chosen.given is not None:
+        return chosen.given
+    return TRACKERS.settings(source)()
+
+
+def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
+    """Registration (the device in ``patient``) and calibration (the probe in the body).
+
+    Raises:
+        CalibrationError: a file of one of them cannot be used.
+    """
+    tracker = scene.tracker
+    return _pose_or_file(tracker.registration), _pose_or_file(tracker.calibration)
+
+
+def haptic_rendering_of(scene: Scene) -> HapticRendering:
+    """What tells the wrench on the handle of the scene's haptic arm.
+
+    Raises:
+        CalibrationError: a file of a registration or calibration cannot be used.
+    """
+    from us_sim.tracking.haptic import HapticDevice, HapticRendering
+
+    tracker = scene.tracker
+    settings = source_settings(scene, "haptic")
+    device = HapticDevice(settings, *tracker_poses_of(scene))
+    return HapticRendering(settings, device, time_offset=tracker.time_offset)
+
+
+def _pose_or_file(given: Placement | str | None) -> Pose:
+    if isinstance(given, str):
+        from us_sim.tracking.calibration.transform_file import read_transform
+
+        return read_transform(given)
+    return given.pose if given is not None else Pose()
+
+
+def camera_body_of(scene: Scene) -> RigidBody:
+    """The markers on the probe that the scene's camera looks for.
+
+    Raises:
+        TrackingError: their file cannot be used.
+    """
+    from us_sim.tracking.camera.rigid_body import RigidBody
+
+    settings = source_settings(scene, "camera")
+    if settings.body:
+        from us_sim.tracking.camera.rigid_body import read_rigid_body
+
+        return read_rigid_body(settings.body, settings.dictionary)
+    return RigidBody.single(settings.dictionary, settings.marker, settings.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """A surface in the tissue, and how it is shown."""
+
+    name: str
+    colour: Colour  # red, green, blue, 0 to 1
+    surface: EmbeddedSurface
+
+
+def colour_of(scene: Scene, name: str) -> Colour:
+    """Red, green and blue of a structure: the scene's, or what its label's name suggests."""
+    given = scene.structures[name]
+    return given.colour or anatomical_colour(given.label or name)
+
+
+def require_labels(scene: Scene, volume: Volume) -> None:
+    """Check that the volume has the labels that the scene's structures are made from.
+
+    Raises:
+        SceneError: it has not.
+    """
+    known = volume.label_names.values() if volume.labels is not None else ()
+    for name, given in scene.structures.items():
+        label = given.label or name
+        if not given.file and label not in known:
+            key = "label: " if given.label else ""
+            raise SceneError(
+                f"{scene.origin}: structures.{name}: {key}the volume has no label `{label}`; it "
+                f"has {', '.join(known) or 'none'}, or name a surface `file`"
+            )
+
+
+def structures_of(
+    scene: Scene, volume: Volume, mesh: TetrahedralMesh, triangles: int
+) -> Iterator[Structure]:
+    """Each structure of the scene, made and embedded one by one.
+
+    Args:
+        volume: of the scene.
+        mesh: of the scene's tissue. Structures around labels end where it ends.
+        triangles: about so many for all structures around labels together; files are taken as
+            they are. Of a scene that is made from a case, structures that are nowhere in the tissue
+            are left out.
+
+    Raises:
+        SceneError: the volume has no such label, or no surface can be made of it.
+        MeshError: a file cannot be read, or its surface is not in the tissue.
+    """
+    from us_sim.tissue.mesh.embedding import EmbeddedSurface
+
+    require_labels(scene, volume)
+    numbers = {name: label for label, name in volume.label_names.items()}
+    labels = {
+        name: numbers[given.label or name]
+        for name, given in scene.structures.items()
+        if not given.file
+    }
+    box = np.stack([mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)])
+    if scene.case:  # it has structures where the probe is not
+        from us_sim.volume.surfaces.label_surface import occurs
+
+        labels = {name: one for name, one in labels.items() if occurs(volume, one, box)}
+    spacing = 0.0
+    for name, given in scene.structures.items():
+        if not given.file and name not in labels:
+            continue
+        colour = colour_of(scene, name)
+        try:
+            if given.file:
+                yield Structure(name, colour, EmbeddedSurface(mesh, *_surface_of(scene, name)))
+                continue
+            from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
+
+            spacing = spacing or spacing_for(volume, list(labels.values()), triangles, box)
+            around = label_surface(volume, labels[name], spacing, box)
+            yield Structure(name, colour, EmbeddedSurface.trimmed(mesh, *around))
+        except UsSimError as error:
+            raise SceneError(f"{scene.origin}: structures.{name}: {error}") from error
+
+
+def _surface_of(scene: Scene, name: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Vertices in ``patient`` and triangles of a structure's file."""
+    from us_sim.skin.surface import read_surface
+
+    given = scene.structures[name]
+    assert given.file is not None
+    surface = read_surface(Path(given.file), given.unit)
+    return given.pose.pose.apply(surface.vertices), surface.triangles
+
+
+def blood_of(scene: Scene, volume: Volume) -> Blood:
+    """All vessels of a scene that have a flow.
+
+    Args:
+        volume: of the scene.
+
+    Raises:
+        SceneError: a structure with a flow is no tube, its flow leads across it, or the volume has
+            no such label; one sentence with file and key.
+    """
+    from us_sim.slicing.flow.blood import Blood
+    from us_sim.slicing.flow.vessel import Vessel
+
+    require_labels(scene, volume)
+    numbers = {name: label for label, name in volume.label_names.items()}
+    vessels = []
+    for name, flow in scene.flows.items():
+        label = numbers[scene.structures[name].label or name]
+        try:
+            vessels.append(Vessel(f"structures.{name}", volume, label, flow))
+        except SceneError as error:
+            raise SceneError(f"{scene.origin}: {error}") from error
+    return Blood(vessels)

@@ -1,4 +1,24 @@
-"""The tissue of a scene that is made from a case: kept in the case, so that it is made once.
+"""From a case to a scene: what a scene file would say to scan it and press on it.
+
+Frame ``patient`` is the probe's where it touches the skin at the case's start: its origin is the
+middle of the probe's face, and +z goes into the body.
+
+>>> import numpy as np
+>>> from us_sim.geometry.pose import Placement
+>>> from us_sim.scene.case_tissue import patient_from_volume
+>>> start = Placement((0.0, 0.1, 0.0), (1.0, 0.0, 0.0, 0.0))  # on the volume's face, looking back
+>>> pose = patient_from_volume(start).pose
+>>> bool(np.allclose(pose.apply(np.array([[0.0, 0.1, -0.03]])), [[0.0, 0.0, 0.03]]))
+True
+
+The box of tetrahedra of a scene's tissue, with its planes where they count.
+
+>>> from us_sim.geometry.collider import RoundedBox
+>>> from us_sim.scene.case_tissue import footprint
+>>> footprint(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
+(0.023, 0.007)
+
+The tissue of a scene that is made from a case: kept in the case, so that it is made once.
 
 Only what the mesh and its labels follow from counts: the box, the probe's shape, where the volume
 is, and the labels. Materials may change without it.
@@ -13,16 +33,163 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from us_sim.errors import CaseError
+from us_sim.geometry.collider import Capsule, Collider, Sphere
+from us_sim.geometry.pose import Placement, Pose
+from us_sim.geometry.transducer import ProbeSettings
 from us_sim.scene.scene import Scene
-from us_sim.scene.tissue_box import box_planes, counts, footprint
-from us_sim.settings.registry import COLLIDERS
+from us_sim.settings.reading import document_of
+from us_sim.settings.registry import COLLIDERS, PROBES
+from us_sim.tissue.elasticity.material import LAYERS, kind_of
 from us_sim.tissue.elasticity.materials import label_fractions
+from us_sim.tissue.mesh.box_planes import fitted_planes, wanted_by_labels, wanted_under_probe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
-from us_sim.volume.cases.case import LABELS, TISSUE
+from us_sim.volume.cases.case import LABELS, TISSUE, Case, read_case
+from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
 from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
-from us_sim.volume.volume import Volume
+from us_sim.volume.volume import Volume, grid_extent
+
+_BESIDE = 0.013  # m, of tissue beside the probe
+_LEAST_ASIDE = 0.03  # m, along the probe's y: for its slide, and for tissue to give way
+_ASIDE_OVER_DEPTH = 0.25
+_BELOW = 1.05
+"""Depth of the tissue over that of the image: tissue that moves against the volume beside it would
+leave a seam in the image."""
+_PRESS_OVER_DEPTH = 1 / 3
+_DEEPEST_PRESS = 0.022  # m, of a firm press on an abdomen
+_THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
+
+
+def case_document(folder: Path) -> dict[str, Any]:
+    """The keys of a scene made from the case in a folder.
+
+    Raises:
+        CaseError, VolumeError: the case cannot be read.
+    """
+    case = read_case(folder)
+    settings = case.settings
+    if settings.start is None or settings.probe is None or settings.probe.collider is None:
+        from us_sim.volume.cases.proposal import with_proposal
+
+        settings = with_proposal(settings, case.volume())
+    assert settings.start is not None
+    assert settings.probe is not None
+    names = [AROUND, *settings.structures] if case.has_labels else [AROUND]
+    held = [name for name in settings.held if case.has_labels or name not in settings.structures]
+    pose = patient_from_volume(settings.start)
+    document: dict[str, Any] = {
+        "name": settings.name,
+        "volume": {"case": str(case.folder), "pose": document_of(pose)},
+        "probe": document_of(settings.probe),
+        "imaging": {"contact": True},
+        "tissue": {
+            "solver": "fem_nonlinear",
+            "mesh": _mesh(case, settings.probe, pose),
+            "fixed": held,
+            "materials": {name: document_of(settings.material_of(name)) for name in names},
+        },
+        "path": _path(settings),
+    }
+    if settings.description:
+        document["description"] = settings.description
+    if case.has_labels and settings.structures:
+        document["structures"] = {
+            name: {"colour": list(settings.colour_of(name))} for name in settings.structures
+        }
+    return document
+
+
+def _path(settings: CaseSettings) -> str:
+    """The path of a press as deep as the case proposes."""
+    assert settings.probe is not None
+    press = settings.press
+    if press is None:
+        depth = settings.probe.array.settings(PROBES).depth
+        press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
+    from us_sim.recording.press_and_slide import pressing_path
+
+    return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
+
+
+def patient_from_volume(start: Placement) -> Placement:
+    """The pose of the volume's own frame in that of a probe at ``start``."""
+    pose: Pose = start.pose.inverse()
+    return Placement(tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+
+
+def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
+    """The box of tissue: as wide and deep as the image, as far as the volume goes."""
+    matrix, shape = case.placement()
+    volume = grid_extent(pose.pose.matrix @ matrix, shape)
+    array = probe.array.settings(PROBES)
+    length, width = footprint(probe.collider.settings(COLLIDERS)) if probe.collider else (0.0, 0.0)
+    aside = max(array.width / 2, length + _BESIDE)
+    across = max(_LEAST_ASIDE, _ASIDE_OVER_DEPTH * array.depth, 2 * width)
+    box = np.array([[-aside, -across, 0.0], [aside, across, _BELOW * array.depth]])
+    cut = np.stack([np.maximum(box[0], volume[0]), np.minimum(box[1], volume[1])])
+    cut[0, 2] = 0.0
+    thin = cut[1] - cut[0] < _THINNEST
+    box = np.where(thin, box, cut)
+    document: dict[str, Any] = {"lower": _rounded(box[0]), "upper": _rounded(box[1])}
+    if case.settings.mesh != "grid":
+        document["kind"] = case.settings.mesh
+    return document | {"nodes": case.settings.nodes}
+
+
+def _rounded(corner: NDArray[np.float64]) -> list[float]:
+    """To a tenth of a millimetre, for a person who reads the scene."""
+    return [round(float(value), 4) for value in corner]
+
+
+_STEPS = 160
+"""Places along the longest side of the box at which structures are looked for."""
+
+_IN_REACH = 0.015
+"""m: how far from the image's plane at rest structures count; the probe slides and tilts."""
+
+
+def footprint(collider: Collider) -> tuple[float, float]:
+    """Half the length and half the width (m, along the probe's x and y) of what presses."""
+    if isinstance(collider, Sphere):
+        return collider.radius, collider.radius
+    if isinstance(collider, Capsule):
+        return collider.length / 2 + collider.radius, collider.radius
+    return collider.length / 2, collider.width / 2
+
+
+def box_planes(
+    scene: Scene, volume: Volume
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Mesh planes (m) along x, y, z of a box that may have so many nodes as the scene says.
+
+    Raises:
+        MeshError: they are too few.
+    """
+    assert scene.tissue is not None
+    assert scene.probe.collider is not None
+    given = scene.tissue.mesh
+    assert isinstance(given.nodes, int)
+    box = np.array([given.lower, given.upper])
+    step = float((box[1] - box[0]).max()) / _STEPS
+    counted = [label for label, name in volume.label_names.items() if counts(scene, name)]
+    labels = volume.labels
+    if labels is None:
+        labels, counted = np.zeros((1, 1, 1), np.uint8), []
+    wanted = wanted_by_labels(
+        labels, volume.patient_to_index, box, step, counted=counted, aside=_IN_REACH
+    )
+    pressed = footprint(scene.probe.collider.settings(COLLIDERS))
+    return fitted_planes(wanted_under_probe(wanted, *pressed), given.nodes)
+
+
+def counts(scene: Scene, label: str) -> bool:
+    """Whether planes are put close together for a label: not for what is held, nor for layers."""
+    assert scene.tissue is not None
+    named = {given.label or name for name, given in scene.structures.items()}
+    return label in named and label not in scene.tissue.fixed and kind_of(label) not in LAYERS
+
 
 _logger = logging.getLogger(__name__)
 

@@ -16,12 +16,16 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from us_sim.errors import MeshError
+from us_sim.scene.case_tissue import box_planes, counts, footprint
 from us_sim.scene.scene import Scene
-from us_sim.scene.tissue_box import box_planes, counts, footprint
 from us_sim.settings.registry import COLLIDERS
 from us_sim.tissue.elasticity.materials import LabelFractions, label_fractions
-from us_sim.tissue.mesh.conforming import EdgeLengths, conforming_mesh, require_mesher
-from us_sim.tissue.mesh.interface_volume import with_inside_volume
+from us_sim.tissue.mesh.conforming import (
+    EdgeLengths,
+    conforming_mesh,
+    require_mesher,
+    with_inside_volume,
+)
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.structure_surface import coarsened, structure_surface

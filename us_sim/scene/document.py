@@ -18,8 +18,7 @@ from us_sim.errors import SceneError
 from us_sim.scene.scene import Scene
 from us_sim.settings.choice import Choice
 from us_sim.settings.setting import Settings, kinds_of, rules_of
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import LARGEST_YAML, YamlError, load_yaml
+from us_sim.settings.text_files import LARGEST_YAML, YamlError, load_yaml, read_text
 
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""

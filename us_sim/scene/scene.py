@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from us_sim.errors import SceneError
-from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
@@ -29,7 +29,7 @@ from us_sim.slicing.settings import (
     Strain,
 )
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tracking.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
 

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from us_sim.settings.amount import amount, span
 from us_sim.settings.choice import Choice, Chosen
+from us_sim.settings.quantity import amount, span
 from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
 
 NEEDED = "needed"

@@ -1,4 +1,4 @@
-"""The settings of the skin: its surface, and the membrane that the surface is."""
+"""Settings of the skin: its surface and its membrane."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
 """Triangle surfaces of the skin: sheets made here, or read from a file.
 
->>> from us_sim.geometry.normals import vertex_normals
->>> from us_sim.skin.surface import bent_surface
->>> arm = bent_surface((0.1, 0.05), 0.005, flat_width=0.04, radius=0.05)
->>> len(arm.vertices), len(arm.triangles)
-(231, 400)
->>> vertex_normals(arm.vertices, arm.triangles)[115]
-array([ 0.,  0., -1.])
+Of Wavefront OBJ files only positions and faces are read here: meshio 5.3 refuses three of six real
+organs, whose texture coordinates and normals have counts of their own, and trimesh 4 takes vertex
+0, which no file has, for the first one.
 """
 
 from __future__ import annotations
@@ -15,6 +11,7 @@ import math
 import os
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +19,8 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
-from us_sim.settings.text_file import read_text
-from us_sim.skin.wavefront import parse_wavefront
+from us_sim.settings.spelling import shown
+from us_sim.settings.text_files import read_text
 
 _CORNERS = {"triangle": 3, "quad": 4}
 
@@ -180,7 +177,6 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
 
 
 def _faces_by_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (N, 3) and triangles (T, 3) of a file."""
     mesh = read_with_meshio(
         path, "this is not a surface that can be read: give an OBJ, STL, PLY or VTK file"
     )
@@ -228,3 +224,39 @@ def _sheet(profile: NDArray[np.float64], y: NDArray[np.float64]) -> TriangleSurf
     second = np.where(even, np.stack([a, d, c], -1), np.stack([b, d, c], -1))
     triangles = np.stack([first, second], axis=2).reshape(-1, 3)
     return TriangleSurface(vertices.reshape(-1, 3), triangles.astype(np.int32))
+
+
+def parse_wavefront(text: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Points (N, 3), in the file's unit, and triangles (T, 3); polygons are split into fans.
+
+    Raises:
+        MeshError: a vertex without three numbers, a face of fewer than three vertices, or one that
+            names a vertex that is not there; with the line's number.
+    """
+    points: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        try:
+            if words[:1] == ["v"]:
+                points.append([float(word) for word in words[1:4]])
+                if len(points[-1]) != 3:
+                    raise ValueError("a vertex has three coordinates")
+            elif words[:1] == ["f"]:
+                face = [_index(word.split("/")[0], len(points)) for word in words[1:]]
+                if len(face) < 3:
+                    raise ValueError("a face has three vertices or more")
+                triangles += [(face[0], b, c) for b, c in pairwise(face[1:])]
+        except ValueError as error:
+            raise MeshError(f"line {number}: {shown(line.strip())}: {str(error)[:100]}") from error
+    return (
+        np.array(points, dtype=np.float64).reshape(-1, 3),
+        np.array(triangles, dtype=np.int32).reshape(-1, 3),
+    )
+
+
+def _index(word: str, count: int) -> int:
+    index = int(word)
+    if not (1 <= index <= count or -count <= index <= -1):
+        raise ValueError(f"there is no vertex {index} among the {count} so far")
+    return index - 1 if index > 0 else count + index

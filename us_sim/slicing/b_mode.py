@@ -1,4 +1,4 @@
-"""The scanner as a whole: what a probe shows of a volume, with deformed tissue or without.
+"""The scanner as a whole: it shows a volume through a probe, with deformed tissue or without.
 
 >>> from us_sim.scene.building import probe_of, volume_of
 >>> from us_sim.geometry.pose import Pose
@@ -9,21 +9,10 @@
 >>> scanner = BMode(volume_of(scene), probe_of(scene))
 >>> scanner.image(Pose([0, 0, 0.002])).shape
 (30, 40)
-
-How far an image reaches beyond what there is to see.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.b_mode import beyond
->>> arm = np.array([[-0.036, -0.03, 0.0], [0.036, 0.03, 0.054]])
->>> round(beyond(LinearProbe(aperture=0.04, depth=0.1), Pose([0.0, 0.0, 0.004]), arm), 6)
-0.05
 """
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,35 +24,30 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
-from us_sim.slicing.frame import Contact, Frame
+from us_sim.slicing.frame import Frame, Mesh
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import Imaging
 
 if TYPE_CHECKING:
-    from us_sim.slicing.acoustics.beam_acoustics import LiveAcoustics
+    from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
     from us_sim.slicing.acoustics.settings import Acoustics
     from us_sim.slicing.formation.coupling import ContactSurface
     from us_sim.volume.volume import Volume
 
 
-_BOX_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
-"""Corners of the faces of a box, as the bits of x, y and z in the corner's number; outward."""
-
-
 class BMode:
-    """Makes B-mode images: cuts slices and forms the picture as the settings ask.
+    """Makes frames: a probe's images of a volume, cut and formed as the settings ask.
 
     Args:
         volume: in frame ``patient``.
         probe: its geometry; may be set to another one later.
         imaging: the console's settings.
-        method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
-        threads: number of threads that cut a slice.
-        settings: of the method's own class, or None for the defaults.
         acoustics: what sound meets along the beams; None for no more than the volume holds.
+        method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
+        settings: of the method's own class, or None for the defaults.
 
     Raises:
-        ProbeError: the acoustics do not go with volume and probe, see `LiveAcoustics`.
+        ProbeError: the acoustics do not go with volume and probe, see `BeamAcoustics`.
     """
 
     def __init__(
@@ -81,12 +65,12 @@ class BMode:
         self._method = method
         self._threads = threads
         self._settings = settings
-        self._mesh: tuple[NDArray[np.float64], NDArray[np.int32]] | None = None
+        self._mesh: Mesh | None = None
         self._slicer: Slicer | None = None
         self._surface: ContactSurface | None = None
         self._skin: ContactSurface | None = None
-        self._acoustics: LiveAcoustics | None = None
-        self._prepared: tuple[Probe, Acoustics, LiveAcoustics] | None = None
+        self._acoustics: BeamAcoustics | None = None
+        self._prepared: tuple[Probe, Acoustics, BeamAcoustics] | None = None
         self.use(probe, imaging or Imaging(), acoustics)
 
     @property
@@ -105,7 +89,7 @@ class BMode:
         Raises:
             ProbeError: as for the class.
         """
-        self._acoustics = self._live_acoustics(probe, acoustics)
+        self._acoustics = self._acoustics_of(probe, acoustics)
         if self._acoustics is not None:
             imaging = self._acoustics.resolved(imaging)
             if self._mesh is not None:
@@ -120,9 +104,8 @@ class BMode:
             ProbeError: volume, probe and settings do not go together.
         """
         warm_up(self._method, self._threads)
-        live = self._live_acoustics(probe, acoustics)
-        if live is not None:
-            assert acoustics is not None
+        live = self._acoustics_of(probe, acoustics)
+        if live is not None and acoustics is not None:
             live.warm_up()
             self._prepared = probe, acoustics, live
             imaging = live.resolved(imaging)
@@ -144,7 +127,7 @@ class BMode:
         """
         if not (np.size(rest_nodes) and np.size(tetrahedra)):
             raise MeshError("the mesh has no tetrahedra, so it cannot carry a volume")
-        slicer = create_slicer(
+        self._slicer = create_slicer(
             self._method,
             self._volume,
             rest_nodes,
@@ -152,14 +135,13 @@ class BMode:
             threads=self._threads,
             settings=self._settings,
         )
-        self._slicer = slicer
         self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)
         self._surface = None
         if self._acoustics is not None:
             self._acoustics.carry(*self._mesh)
 
     def touch(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
-        """Let the face touch this skin, where a frame says how it lies.
+        """Let the face touch this skin, in frames that know where it lies.
 
         Args:
             vertices: (V, 3) m, at rest.
@@ -182,23 +164,25 @@ class BMode:
         number: int = 0,
         time: float = 0.0,
     ) -> Frame:
-        """What is seen with the probe at ``pose``, as it is asked for.
+        """The image with the probe at ``pose``, made as far as it is asked for.
 
         Args:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
             skin: (V, 3) m, where the vertices given to `touch` are.
-            number: of the poses so far.
             time: s since 1970, of the pose.
         """
+        touches = self._formation.needs_contact
         return Frame(
             pose,
             nodes,
             self._probe,
             self._volume,
-            self._slicer,
-            partial(self._form, self._formation, self._acoustics),
-            meet=self._meet if self._formation.needs_contact else None,
+            slicer=self._slicer,
+            formation=self._formation,
+            acoustics=self._acoustics,
+            surface=self._contact_surface(nodes is not None) if touches else None,
+            skin_surface=self._skin,
             skin=skin,
             mesh=self._mesh if nodes is not None else None,
             number=number,
@@ -207,17 +191,12 @@ class BMode:
         )
 
     def image(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
-        """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
-
-        Args:
-            nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is.
-
-        Raises:
-            MeshError: the nodes are not as many as at rest, or not finite.
-            ProbeError: the pose is nowhere near.
-            VolumeError: the volume has too many voxels.
-        """
+        """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`."""
         return self.frame(pose, nodes).pixels
+
+    def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+        """The volume's label at each pixel (rows, columns): `Frame.labels`."""
+        return self.frame(pose, nodes).labels
 
     def beyond(self, pose: Pose) -> float:
         """m by which the middle beam reaches beyond the mesh at rest, or the volume without one."""
@@ -226,66 +205,35 @@ class BMode:
             extent = np.stack([self._mesh[0].min(axis=0), self._mesh[0].max(axis=0)])
         return beyond(self._probe, pose, extent)
 
-    def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
-        """The volume's label at each pixel (rows, columns), 0 where there is nothing.
-
-        Raises:
-            VolumeError: the volume has no labels.
-            MeshError: as for `image`.
-        """
-        return self.frame(pose, nodes).labels
-
-    def _form(
-        self, formation: ImageFormation, acoustics: LiveAcoustics | None, frame: Frame
-    ) -> NDArray[np.uint8]:
-        """The picture of a frame."""
-        slices = [frame.slice(plane) for plane in formation.planes(frame.pose, frame.plane)]
-        heard = None if acoustics is None else acoustics.heard(frame)
-        coupling, gap = frame.contact or (None, None)
-        return formation.form(slices, coupling, gap, heard)
-
-    def _meet(self, frame: Frame) -> Contact:
-        """How each line of a frame meets the skin, and how far the mesh is under it.
-
-        Without a skin the mesh's own surface stands for it.
-        """
-        surface = self._contact_surface(frame.nodes is not None)
-        where = surface.rest_nodes if frame.nodes is None else frame.nodes
-        coupling, gap = surface.contact(where, frame.probe, frame.pose)
-        if self._skin is not None and frame.skin is not None:
-            coupling, _ = self._skin.contact(frame.skin, frame.probe, frame.pose)
-        return coupling, gap
-
-    def _live_acoustics(self, probe: Probe, acoustics: Acoustics | None) -> LiveAcoustics | None:
-        """What follows the beams; imported only where it is asked for."""
+    def _acoustics_of(self, probe: Probe, acoustics: Acoustics | None) -> BeamAcoustics | None:
         if acoustics is None or not acoustics.is_live:
             return None
         prepared, self._prepared = self._prepared, None
         if prepared is not None and prepared[:2] == (probe, acoustics):
             return prepared[2]
-        from us_sim.slicing.acoustics.beam_acoustics import LiveAcoustics
+        from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
 
-        return LiveAcoustics(self._volume, probe, acoustics)
+        return BeamAcoustics(self._volume, probe, acoustics)
 
     def _contact_surface(self, deformed: bool) -> ContactSurface:
-        """The surface that the face can touch: the tissue's, or a box around a volume without."""
         if self._surface is None:
             from us_sim.slicing.formation.coupling import ContactSurface
 
-            if deformed and self._mesh is not None:
-                rest_nodes, tetrahedra = self._mesh
-                self._surface = ContactSurface(rest_nodes, boundary_triangles(tetrahedra))
-            else:
+            if not deformed or self._mesh is None:
                 return ContactSurface(*_outer_box(self._volume))
+            rest_nodes, tetrahedra = self._mesh
+            self._surface = ContactSurface(rest_nodes, boundary_triangles(tetrahedra))
         return self._surface
 
 
 def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """The outer faces of a volume's voxels: 8 corners (8, 3) m and 12 triangles."""
+    # Corners by the bits of x, y and z in their number; faces outward.
+    faces = (0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)
     bits = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)])
     index = bits * np.array(volume.shape) - 0.5
     to_patient = volume.index_to_patient
-    triangles = [(a, *pair) for a, b, c, d in _BOX_FACES for pair in ((b, c), (c, d))]
+    triangles = [(a, *pair) for a, b, c, d in faces for pair in ((b, c), (c, d))]
     return index @ to_patient[:3, :3].T + to_patient[:3, 3], np.array(triangles, dtype=np.int32)
 
 

@@ -1,33 +1,4 @@
-"""A picture whose columns are moments: it moves to the left as time goes on, with its scales.
-
-Which moments columns stand for depends on the time alone: column k is that of time k times the
-sweep over the number of columns. So the same times give the same picture, and no moment is missed
-or there twice however unevenly frames come.
-
->>> import numpy as np
->>> from us_sim.slicing.m_mode import SweepPicture
->>> picture = SweepPicture(rows=64, columns=100, sweep=1.0, scale=(0.0, 40.0, "mm"))
->>> picture.moments(5.0).tolist()  # the first moment, then those up to the next time
-[5.0]
->>> picture.moments(5.03).round(2).tolist()
-[5.01, 5.02, 5.03]
->>> picture.add(np.full((64, 3), 200, np.uint8))
->>> picture.drawn()[10, 96:100, 0]  # what was there before has moved on
-array([  0, 200, 200, 200], dtype=uint8)
-
-M-mode: the echoes along one beam, over time.
-
->>> import numpy as np
->>> from us_sim.slicing.m_mode import MMode
->>> from us_sim.slicing.settings import MModeSettings
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=64, rows=64)
->>> image = np.zeros((64, 64), np.uint8)
->>> image[32:, 48] = 200
->>> line = MMode(probe, MModeSettings(lateral=16.5 / 64)).line(image)  # column 48
->>> int(line[0]), int(line[-1])
-(0, 200)
-"""
+"""M-mode: the echoes along one beam over time, and pictures whose columns are moments."""
 
 from __future__ import annotations
 
@@ -135,12 +106,7 @@ _ROWS, _COLUMNS = 384, 512
 
 
 class MMode:
-    """The echoes along a line of one probe's images.
-
-    Args:
-        probe: its geometry.
-        settings: of the line.
-    """
+    """The echoes along a line of one probe's images."""
 
     def __init__(self, probe: Probe, settings: MModeSettings) -> None:
         self.settings = settings

@@ -1,57 +1,60 @@
-"""The settings of image formation: what a sonographer sets at the console.
-
->>> from us_sim.slicing.settings import Imaging
->>> Imaging(gain=6.0).gain
-6.0
->>> Imaging(grey_map="purple")
-Traceback (most recent call last):
-...
-us_sim.errors.ProbeError: imaging.grey_map: 'purple' is not one of linear, soft, contrast
-
-The settings of strain images.
-
->>> from us_sim.slicing.settings import Strain
->>> Strain(window="4 mm").window
-0.004
->>> Strain(since="yesterday")
-Traceback (most recent call last):
-...
-us_sim.errors.ProbeError: strain.since: 'yesterday' is not one of rest, image
-
-The settings of M-mode.
-
-The settings of a vessel's flow: what a scene says of the blood in a structure.
-
->>> from us_sim.slicing.settings import FlowSettings
->>> FlowSettings("arterial", (0, 1, 0), peak_velocity="80 cm/s", mean_velocity="9 cm/s").heart_rate
-1.1
->>> FlowSettings("arterial", (0, 1, 0), peak_velocity=0.1, mean_velocity=0.09)
-Traceback (most recent call last):
-...
-us_sim.errors.SceneError: flow.peak_velocity: 0.1 m/s is less than twice mean_velocity, 0.09 m/s: \
-on the axis of a vessel blood flows twice as fast as in its mean
-
-What colour and pulsed-wave Doppler are set with alike.
-
-The settings of colour Doppler.
-
-The settings of pulsed-wave Doppler.
-"""
+"""Settings of the console: image formation, strain, M-mode, flow and Doppler."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from us_sim.errors import ProbeError, SceneError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
+
+class ImageMode(NamedTuple):
+    """A further picture that a page can show: its label, its tooltip, and the topic it is of."""
+
+    label: str
+    title: str
+    topic: str
+
+
+OVERLAYS = {
+    "strain": ImageMode(
+        "Strain",
+        "How much the tissue is shortened along the beams since rest, exactly",
+        "ultrasound/strain",
+    ),
+    "strain_estimate": ImageMode(
+        "Elastography",
+        "Strain between two images, as a scanner estimates it",
+        "ultrasound/strain_estimate",
+    ),
+    "velocity": ImageMode(
+        "Colour",
+        "Velocity of blood along the beams, as colour Doppler shows it",
+        "ultrasound/velocity_estimate",
+    ),
+}
+"""Colours over the annotated image, by the parameter ``overlay``, which may be ``none`` too."""
+
+STRIPS = {
+    "m_mode": ImageMode(
+        "M-mode", "Echoes along one line of the image over time", "ultrasound/m_mode"
+    ),
+    "spectrum": ImageMode(
+        "Spectrum",
+        "Velocities of blood at the gate over time: pulsed-wave Doppler",
+        "ultrasound/spectrum",
+    ),
+}
+"""Pictures that run over time, by the prefix of their parameters."""
+
+TISSUE_PARAMETERS = "acoustics.tissues."  # prefix of the parameters of a label's acoustics
 ECHO_RANGE = 60.0
 """dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
 
 GREY_MAPS = ("linear", "soft", "contrast")
-
 _GAIN = Quantity("level", -60.0, 60.0)
 _RESOLUTION = Quantity("length", 0.0, 0.01)
 
@@ -207,7 +210,6 @@ class MModeSettings(Settings):
 _PRESSURE = Quantity("pressure", 10.0, 40e3)
 _RATE = Quantity("rate", 0.02, 5.0)
 _VENOUS = ("kind", ("venous",))
-
 _ARTERIAL_PRESSURE, _VENOUS_PRESSURE = 12.4e3, 1.0e3
 """Pa, mean pressures in a vessel of the arm at the height of the heart: 93 and 8 mmHg
 (Hall, Guyton and Hall Textbook of Medical Physiology, 13th ed., 2016, chapters 14 and 15)."""

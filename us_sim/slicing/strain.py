@@ -1,50 +1,11 @@
-"""How far the tissue that each pixel shows has moved since it was at rest.
+"""Displacement and strain of the tissue in an image, without error, and the colours of strain.
 
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.b_mode import BMode
->>> from us_sim.slicing.strain import displacement
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> from us_sim.volume.volume import Volume
->>> volume = Volume(np.zeros((41, 41, 41), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
->>> mesh = box_mesh([0.0, 0.04], [0.0, 0.04], [0.0, 0.04])
->>> scanner = BMode(volume, LinearProbe(aperture=0.01, depth=0.02, columns=2, rows=2))
->>> scanner.carry(mesh.nodes, mesh.tetrahedra)
->>> pressed = mesh.nodes * [1, 1, 0.9] + [0, 0, 0.004]  # by 4 mm, on a floor at 40 mm
->>> moved = displacement(scanner.frame(Pose([0.02, 0.02, 0.01]), pressed))
->>> np.round(1e3 * moved[:, 0, 1], 3)  # mm, down the first column
-array([2.778, 1.667], dtype=float32)
-
-Which of a volume's labels fills most of each tetrahedron.
-
->>> import numpy as np
->>> from us_sim.slicing.strain import main_labels
->>> from us_sim.volume.volume import Volume
->>> labels = np.repeat(np.array([1, 1, 4, 4], np.uint8), 16).reshape(4, 4, 4)
->>> volume = Volume(labels, np.eye(4), labels)
->>> nodes = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3], [3, 3, 0], [3, 0, 3]])
->>> main_labels(nodes, np.array([[0, 1, 2, 3], [1, 4, 5, 3]]), volume).tolist()
-[1, 4]
-
-How much tissue is deformed in the plane of an image: of tetrahedra, smoothed to their nodes.
-
-A tissue line that now lies along the unit vector d was 1 / λ times as long in another state, with
-1 / λ² = d · c d. The tensor c = F⁻ᵀ F⁻¹ is Cauchy's deformation tensor (the inverse of the left
-Cauchy–Green tensor; Holzapfel, *Nonlinear Solid Mechanics*, 2000, section 2.5); F maps that state
-to now. It is constant in a linear tetrahedron. What a node has is the mean over the tetrahedra
-around it, weighted by their volumes, as averaged gradients are recovered from finite elements
-(Zienkiewicz and Zhu, Int. J. Numer. Methods Eng. 24:337, 1987); between nodes it is linear, so that
-tetrahedra do not show as steps. Strain does jump from one tissue to another: where the mesh's
-tetrahedra are told apart, only those of one tissue are averaged. A turn of the tissue, even one
-that differs from tetrahedron to tetrahedron, leaves c as it is.
-
-The strain of the tissue along the beams of an image: what an elastogram would be without error.
-
-It is engineering strain of a line of tissue that lies along the beam *now*: its length now over its
-length in the other state, less 1. So a block that is pressed to 95 % of its height shows -0.05
-whatever its size, a turn shows none, and it lies between -1 and ∞. The beam of the image is taken,
-since that is where a scanner measures; for small strains all definitions are one.
+Axial strain is the engineering strain of a line of tissue that lies along the beam *now*: its
+length now over its length in the other state, less 1. A tissue line along the unit vector d was
+1 / λ times as long in another state, with 1 / λ² = d · c d. The tensor c = F⁻ᵀ F⁻¹ is Cauchy's
+deformation tensor (Holzapfel, *Nonlinear Solid Mechanics*, 2000, section 2.5); F maps that state to
+now. It is constant in a linear tetrahedron, averaged at each node over its tetrahedra by their
+volumes (Zienkiewicz and Zhu, Int. J. Numer. Methods Eng. 24:337, 1987), and linear in between.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -60,29 +21,6 @@ since that is where a scanner measures; for small strains all definitions are on
 >>> frame = scanner.frame(Pose([0.02, 0.02, 0.01]), mesh.nodes * [1.02, 1.02, 0.95])
 >>> AxialStrain.of(frame).image(frame)[:, 0].round(4)
 array([-0.05, -0.05, -0.05], dtype=float32)
-
-How much, and how evenly, the tissue in a strain image is compressed.
-
->>> import numpy as np
->>> from us_sim.slicing.strain import compression
->>> compression(np.array([[-0.01, -0.01], [-0.02, np.nan]]))
-Compression(mean=-0.0133..., quality=0.9428...)
->>> compression(np.array([[0.01, -0.01]]))  # as much is stretched as is compressed
-Compression(mean=0.0, quality=0.0)
-
-The colours of strain: red where tissue got shorter, grey where not, blue where it got longer.
-
->>> from us_sim.slicing.strain import strain_scale
->>> strain_scale("strain", 0.05).table[[0, 255]].tolist()
-[[215, 48, 39], [69, 117, 180]]
-
-The ends of the bar may follow the images, as far as they must:
-
->>> import numpy as np
->>> from us_sim.slicing.strain import FollowingEnd
->>> end = FollowingEnd()
->>> [end.of(np.full((8, 8), strain)) for strain in (-0.14, -0.19, -0.24, -0.13, -0.04)]
-[0.2, 0.2, 0.3, 0.3, 0.05]
 """
 
 from __future__ import annotations
@@ -127,8 +65,7 @@ def displacement(frame: Frame) -> NDArray[np.float32]:
     return evaluate(across @ (now - rest), located.elements, threads=frame.threads)
 
 
-_PARTS = 5
-"""Of an edge: the points that are looked up lie evenly, 56 in each tetrahedron."""
+_PARTS = 5  # of an edge: the points that are looked up lie evenly, 56 in each tetrahedron
 
 
 def main_labels(
@@ -362,7 +299,6 @@ class AxialStrain:
         """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
 
         Args:
-            frame: of this mesh.
             before: (N, 3) m, where the nodes were; None for at rest.
 
         Returns:
@@ -484,7 +420,6 @@ def compression(strain: NDArray[np.floating]) -> Compression:
 
 
 _COLOURS = ((215, 48, 39), (253, 174, 97), (48, 48, 48), (116, 173, 209), (69, 117, 180))
-
 _ENDS = tuple(step / power for power in (100, 10, 1) for step in (1, 2, 3, 5))
 """Round values at which a bar may end; strain beyond the last has its colour."""
 _HELD = 95.0  # percent of the pixels that lie within the bar; a vein that collapses need not

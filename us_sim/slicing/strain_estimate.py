@@ -1,58 +1,21 @@
-"""Strain from displacement: the slope of a straight line fitted to it along the beam.
-
-The least-squares strain estimator of Kallel and Ophir (Ultrasonic Imaging 19:195, 1997), with a
-weight for each sample, so that what was not found does not count and windows may end at the image.
-
->>> import numpy as np
->>> from us_sim.slicing.strain_estimate import slope
->>> moved = 0.02 * np.arange(20.0)[:, None] + np.zeros((20, 3))
->>> moved[7] = 9.0  # was not found
->>> weight = np.ones((20, 3))
->>> weight[7] = 0.0
->>> slope(moved, weight, 5)[[0, 8, 19], 0].round(6)
-array([0.02, 0.02, 0.02], dtype=float32)
-
-Displacement along the beams between two images, by the correlation of windows.
+"""Strain as a scanner estimates it, from two images of one probe.
 
 Each window of the later image is looked for along its beam in the earlier one, where the normalised
 cross-correlation is largest (Ophir et al., Ultrasonic Imaging 13:111, 1991), between samples by a
 parabola through the three largest (Céspedes et al., Ultrasonic Imaging 17:142, 1995). Then the
-earlier image is warped by what was found, and what remains is looked for again: windows that were
-compressed themselves correlate better so (Alam and Ophir, Ultrasound Med. Biol. 23:95, 1997), and a
-parabola is exact where nothing remains.
-
->>> import numpy as np
->>> from us_sim.slicing.strain_estimate import track
->>> rng = np.random.default_rng(1)
->>> speckle = 20.0 * np.cumsum(rng.normal(size=(200, 30)), axis=0)
->>> place = np.arange(200.0)
->>> moved = np.stack([np.interp(place - 0.01 * place, place, line) for line in speckle.T], axis=1)
->>> found, correlation = track(speckle, moved, window=(31, 5), search=4)
->>> np.round(found[50:151:50, 15], 1)  # a hundredth of the depth
-array([0.5, 1. , 1.5], dtype=float32)
-
-Strain as a scanner estimates it: from nothing but two images of one probe.
+earlier image is warped by the displacement, and the rest is looked for again (Alam and Ophir,
+Ultrasound Med. Biol. 23:95, 1997). Strain is the slope of a weighted least-squares line through the
+displacement (Kallel and Ophir, Ultrasonic Imaging 19:195, 1997).
 
 >>> import numpy as np
 >>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.strain_estimate import estimate_strain
 >>> from us_sim.slicing.settings import Strain
+>>> from us_sim.slicing.strain_estimate import estimate_strain
 >>> probe = LinearProbe(aperture=0.02, depth=0.03, columns=100, rows=300, lines=100, samples=300)
 >>> speckle = np.random.default_rng(0).integers(0, 256, (300, 100)).astype(np.uint8)
 >>> same = estimate_strain(speckle, speckle, probe, Strain())
 >>> float(abs(np.nan_to_num(same.strain)).max()) < 2e-3, round(same.correlation, 3)
 (True, 1.0)
-
-What is kept of frames for those that are compared with them.
-
->>> from types import SimpleNamespace as Frame
->>> from us_sim.slicing.strain_estimate import Earlier
->>> earlier = Earlier(lambda frame: frame.pixels)
->>> frames = [Frame(number=n, probe="linear", mesh=None, pixels=10 * n) for n in range(4)]
->>> [earlier.before(frame, 2) for frame in frames]
-[None, None, 0, 10]
-
-Compiling what displacement and strain need, or loading it, by way of a tiny image.
 """
 
 from __future__ import annotations
@@ -104,16 +67,14 @@ def slope(values: ArrayLike, weight: ArrayLike, length: int) -> NDArray[np.float
     return found.astype(np.float32)
 
 
-_PASSES = 2
-"""How often the image is warped and what remains is looked for."""
+_PASSES = 2  # how often the image is warped and what remains is looked for
 _FLAT = 6.0**2
 """Variance of grey values (in squared levels) below which a window has nothing to be found by.
 
 Full speckle has four times that deviation where 60 dB are shown; a shadow's noise has less.
 """
 
-Field = NDArray[Any]
-"""float32."""
+Field = NDArray[Any]  # float32
 Window = tuple[Field, Field, Field]
 """An image, and the mean and standard deviation around each of its samples."""
 
@@ -239,7 +200,6 @@ def _warp(image, moved, lag, warped):
 
 
 def _correlation(one: Window, other: Window, size: tuple[int, int]) -> Field:
-    """Of two images in each window."""
     product = cv2.boxFilter(one[0] * other[0], -1, size, borderType=cv2.BORDER_REFLECT_101)
     return np.asarray((product - one[1] * other[1]) / (one[2] * other[2]))
 
@@ -251,7 +211,6 @@ def _tip(before: Field, middle: Field, after: Field, most: float) -> Field:
 
 
 def _moments(image: Field, size: tuple[int, int]) -> tuple[Field, Field]:
-    """Mean and standard deviation of each window; the latter infinite where it is flat."""
     border = cv2.BORDER_REFLECT_101
     mean = cv2.boxFilter(image, -1, size, borderType=border)
     variance = cv2.sqrBoxFilter(image, -1, size, borderType=border) - mean * mean
@@ -276,8 +235,7 @@ def _smoothed(moved: Field, correlation: Field, size: tuple[int, int]) -> Field:
     return np.asarray(cv2.GaussianBlur(weight * moved, small, 0.0) / total, dtype=np.float32)
 
 
-_STEEPEST = 0.5
-"""Of displacement along a beam: what is found steeper than that is not tissue."""
+_STEEPEST = 0.5  # of displacement along a beam: what is found steeper than that is not tissue
 
 
 class Estimate(NamedTuple):
@@ -335,12 +293,10 @@ def require_short_windows(probe: Probe, settings: Strain) -> None:
 
 
 def _odd(count: float) -> int:
-    """The odd whole number nearest to a count, 3 at least."""
     return max(3, 2 * round((count - 1.0) / 2.0) + 1)
 
 
 def _line_spacing(probe: Probe) -> float:
-    """m between beams half way down, on average."""
     if probe.lines < 2:
         return probe.width
     middle = probe.beam_starts + 0.5 * probe.depth * probe.beam_directions
@@ -348,7 +304,6 @@ def _line_spacing(probe: Probe) -> float:
 
 
 def _along_beams(image: NDArray[np.uint8], probe: Probe) -> NDArray[np.float32]:
-    """(samples, lines) of an image (rows, columns)."""
     columns, rows = probe.beam_pixels
     return np.asarray(
         cv2.remap(
@@ -378,11 +333,7 @@ def _to_pixels(values: NDArray[np.float32], probe: Probe) -> NDArray[np.float32]
 
 
 class Earlier:
-    """The last frames of one probe and one mesh, as far as they follow one another.
-
-    Args:
-        kept: what is kept of each.
-    """
+    """The last frames of one probe and one mesh, as far as they follow one another."""
 
     def __init__(self, kept: Callable[[Frame], Any]) -> None:
         self._kept = kept

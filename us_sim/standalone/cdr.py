@@ -34,216 +34,169 @@ import numpy as np
 from .interfaces import Field, interface
 from .messages import ARRAY_TYPES, Message, message_class
 
+M = TypeVar("M", bound=Message)
+
 # Primitive: its character in a `struct` format.
-FORMATS = {"bool": "?", "byte": "c", **{kind: code for kind, (code, _) in ARRAY_TYPES.items()}}
-_PADS = tuple(bytes(n) for n in range(8))
+_FORMATS = {"bool": "?", "byte": "c", **{kind: code for kind, (code, _) in ARRAY_TYPES.items()}}
 
 
-class CdrLayout(ABC):
-    """A function's source as it grows, and what is known of the position at its current end.
+class CdrError(Exception):
+    """Bytes are not the serialized message they should be."""
 
-    ``known`` is (modulus, remainder): the distance from the header's end is ``remainder`` modulo
-    the power of two ``modulus``, at most 8. Nothing is known modulo 1.
+
+def serialize(message: Message) -> bytes:
+    """The message as a four-byte header and little-endian XCDR1, as rclpy serializes it."""
+    return _writer(message.__msgtype__)(message)
+
+
+def deserialize(data: bytes | bytearray | memoryview, cls: type[M]) -> M:
+    """The message of class ``cls`` in ``data``.
+
+    Raises:
+        CdrError: the bytes end too early, hold text that is no UTF-8, or are of another encoding.
     """
+    data = bytes(data)
+    order = {b"\0\1": "<", b"\0\0": ">"}.get(data[:2])
+    if order is None:
+        raise CdrError(
+            f"{len(data)} bytes starting with {data[:4].hex() or 'nothing'} are not the plain CDR "
+            f"of a {cls.__msgtype__}; only XCDR1 (0000 or 0001) can be read"
+        )
+    try:
+        message, end = _reader(cls.__msgtype__, order)(data, memoryview(data))
+        if end > len(data):
+            raise ValueError(f"it needs {end} bytes")
+    except (struct.error, ValueError) as error:
+        raise CdrError(
+            f"{len(data)} bytes do not form a {cls.__msgtype__} ({error}); "
+            f"check that the topic has this type"
+        ) from error
+    return message
+
+
+@cache
+def _writer(type_name: str) -> Callable[[Message], bytes]:
+    return _WriterSource(type_name).compile("write(v0)")
+
+
+@cache
+def _reader(type_name: str, order: str) -> Callable[[bytes, memoryview], tuple[Any, int]]:
+    """A function from (data, view of data) to the message and the position after it.
+
+    The function raises struct.error or ValueError for bad data, and may return a position beyond
+    the end of truncated data.
+    """
+    return _ReaderSource(type_name, order).compile("read(data, view)")
+
+
+class _Source(ABC):
+    """A function's source as it grows; ``pos`` in it is the position, from the header's start."""
+
+    _method: str  # of struct.Struct
 
     def __init__(self, order: str) -> None:
-        self.lines: list[str] = []
-        self.indent = 1
         self.order = order
-        self.known = (8, 0)
-        self.format, self.size = "", 0
-        self.terms: list[str] = []
+        self.lines = ["    pos = 4"]
+        self.indent = "    "
+        self.names: dict[str, Any] = {"array": array, "np": np, "new": object.__new__}
         self.variables = 0
-        self.constants: list[Any] = []
-        self.line("pos = 4")
+        self.codes: list[str] = []  # primitives that the next `struct` call takes,
+        self.terms: list[str] = []  # and where their values are
 
     def compile(self, signature: str) -> Callable[..., Any]:
-        namespace: dict[str, Any] = {"array": array, "np": np, "PADS": _PADS}
-        namespace |= {f"c{index}": value for index, value in enumerate(self.constants)}
-        exec("\n".join([f"def {signature}:", *self.lines]), namespace)
-        return namespace[signature.split("(")[0]]
+        exec("\n".join([f"def {signature}:", *self.lines]), self.names)
+        return self.names[signature.split("(")[0]]
 
     def line(self, text: str) -> None:
-        self.lines.append("    " * self.indent + text)
+        self.lines.append(self.indent + text)
 
     def variable(self) -> str:
         self.variables += 1
         return f"v{self.variables}"
 
     def constant(self, value: Any) -> str:
-        self.constants.append(value)
-        return f"c{len(self.constants) - 1}"
-
-    def advance(self, size: int) -> None:
-        modulus, remainder = self.known
-        self.known = (modulus, (remainder + size) % modulus)
+        name = f"c{len(self.names)}"
+        self.names[name] = value
+        return name
 
     def fields(self, owner: str, type_name: str, placeholder: str) -> None:
         """All fields of a message; an empty one has a byte in their place."""
-        definition = interface(type_name)
-        for field in definition.fields:
+        fields = interface(type_name).fields
+        for field in fields:
             term = f"{owner}._{field.name}"
             if field.shape == "scalar":
                 self.element(field, term)
             else:
                 self.elements(field, term)
-        if not definition.fields:
+        if not fields:
             self.primitive("B", placeholder)
 
     def primitive(self, code: str, term: str) -> None:
-        """Append a primitive to the pending ``struct`` call."""
-        size = struct.calcsize(f"={code}")
-        modulus, remainder = self.known
-        if size > modulus:
-            self.align(size)
-            remainder = 0
-        pad = -remainder % size
-        self.format += "x" * pad + code
-        self.size += pad + size
+        self.codes.append(code)
         self.terms.append(term)
-        self.advance(pad + size)
-
-    def align(self, size: int) -> None:
-        """Move to a multiple of ``size``, computing the padding at run time where it must be."""
-        self.flush()
-        modulus, remainder = self.known
-        if size > modulus:
-            self.pad(f"(4 - pos) & {size - 1}")
-            self.known = (size, 0)
-        elif pad := -remainder % size:
-            self.pad(str(pad))
-            self.advance(pad)
 
     def flush(self) -> None:
-        """Emit the pending ``struct`` call."""
-        if self.size:
-            self.struct_call(struct.Struct(self.order + self.format))
-            self.format, self.size, self.terms = "", 0, []
+        """Emit the `struct` call for the primitives so far."""
+        if self.codes:
+            table = self.constant(_packings(self.order, self.codes, self._method))
+            self.line(f"call, size = {table}[pos & 7]")
+            self.struct_call(", ".join(self.terms))
+            self.codes, self.terms = [], []
 
-    def messages(self, header: str, field: Field, body: Callable[[], None]) -> None:
-        """A loop over a list of messages or strings, laid out for what holds at every turn."""
-        before = self.known
-        size = _first_alignment(field)
-        if field.shape == "array":
-            self.align(size)
-            before = self.known
-        elif size > before[0] or before[1] % size:
-            # Aligned once before the loop, the layout of every element is often known beforehand.
-            self.when_not_empty(lambda: self.align(size))
-        entry = self.known
-        while True:
-            mark = len(self.lines)
-            self.known = entry
-            self.line(header)
-            self.indent += 1
-            body()
-            self.flush()
-            self.indent -= 1
-            met = _meet(entry, self.known)
-            if met == entry:
-                break
-            del self.lines[mark:]
-            entry = met
-        self.known = _meet(before, self.known)
+    def loop(self, header: str, body: Callable[[], None]) -> None:
+        self.line(header)
+        before, self.indent = self.indent, self.indent + "    "
+        body()
+        self.flush()
+        self.indent = before
 
-    def packed(self, size: int, emit: Callable[[], None]) -> None:
-        """A sequence of ``n`` primitives of ``size`` bytes, aligned only if there are any."""
-        before = self.known
-        if size > before[0] or before[1] % size:
-            self.when_not_empty(lambda: self.align(size))
-        emit()
-        self.known = _meet(before, (size, 0))
-
-    def when_not_empty(self, emit: Callable[[], None]) -> None:
-        self.line("if n:")
-        self.indent += 1
-        emit()
-        self.indent -= 1
+    def align(self, field: Field, size: int) -> None:
+        """Emit the padding before the elements of an array or of a sequence that is not empty."""
+        if size > 1:
+            self.pad(f"-(pos - 4) & {size - 1}", "if n: " if field.shape == "sequence" else "")
 
     @abstractmethod
-    def pad(self, amount: str) -> None:
-        """Emit ``amount`` (an expression) bytes of padding."""
+    def pad(self, amount: str, condition: str) -> None: ...
 
     @abstractmethod
-    def element(self, field: Field, term: str) -> None:
-        """Emit what one value of a field's kind takes."""
+    def element(self, field: Field, term: str) -> None: ...
 
     @abstractmethod
-    def elements(self, field: Field, term: str) -> None:
-        """Emit what an array or a sequence takes."""
+    def elements(self, field: Field, term: str) -> None: ...
 
     @abstractmethod
-    def struct_call(self, packing: struct.Struct) -> None:
-        """Emit the call of ``packing`` for the pending terms."""
+    def struct_call(self, terms: str) -> None: ...
 
 
-def _first_alignment(field: Field) -> int:
-    """The alignment of the first primitive of one element of ``field``."""
-    if field.is_message:
-        fields = interface(field.kind).fields
-        if not fields:
-            return 1
-        return 4 if fields[0].shape == "sequence" else _first_alignment(fields[0])
-    return 4 if field.kind == "string" else struct.calcsize(f"={FORMATS[field.kind]}")
+class _WriterSource(_Source):
+    _method = "pack"
 
-
-def _meet(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
-    """What is known of a position of which one or the other is."""
-    modulus = min(first[0], second[0])
-    while (first[1] - second[1]) % modulus:
-        modulus //= 2
-    return modulus, first[1] % modulus
-
-
-@cache
-def compiled_writer(type_name: str) -> Callable[[Message], bytes]:
-    """A function that serializes messages of this type, with the header."""
-    return _Writer(type_name).compile("write(v0)")
-
-
-@cache
-def compiled_reader(type_name: str, order: str) -> Callable[[bytes, memoryview], tuple[Any, int]]:
-    """A function from (data, view of data) to the message and the position after it.
-
-    ``order`` is ``<`` or ``>``. The function raises struct.error or ValueError for bad data, and
-    may return a position beyond the end of truncated data.
-    """
-    return _Reader(type_name, order).compile("read(data, view)")
-
-
-class _Writer(CdrLayout):
     def __init__(self, type_name: str) -> None:
         super().__init__("<")
         self.line('parts = [b"\\0\\1\\0\\0"]; add = parts.append')
-        self.message("v0", type_name)
+        self.fields("v0", type_name, placeholder="0")
         self.flush()
         self.line('return b"".join(parts)')
 
-    def pad(self, amount: str) -> None:
-        self.line(f"p = {amount}")
-        self.line("if p: add(PADS[p]); pos += p")
+    def pad(self, amount: str, condition: str) -> None:
+        self.line(f"{condition}p = {amount}; add(bytes(p)); pos += p")
 
-    def struct_call(self, packing: struct.Struct) -> None:
-        call = self.constant(packing.pack)
-        self.line(f"add({call}({', '.join(self.terms)})); pos += {packing.size}")
-
-    def message(self, owner: str, type_name: str) -> None:
-        self.fields(owner, type_name, placeholder="0")
+    def struct_call(self, terms: str) -> None:
+        self.line(f"add(call({terms})); pos += size")
 
     def element(self, field: Field, term: str) -> None:
         if field.is_message:
             owner = self.variable()
             self.line(f"{owner} = {term}")
-            self.message(owner, field.kind)
+            self.fields(owner, field.kind, placeholder="0")
         elif field.kind == "string":
             text = self.variable()
             self.line(f'{text} = {term}.encode() + b"\\0"')
             self.primitive("I", f"len({text})")
             self.flush()
             self.line(f"add({text}); pos += len({text})")
-            self.known = (1, 0)
         else:
-            self.primitive(FORMATS[field.kind], term)
+            self.primitive(_FORMATS[field.kind], term)
 
     def elements(self, field: Field, term: str) -> None:
         values = self.variable()
@@ -253,24 +206,22 @@ class _Writer(CdrLayout):
         self.flush()
         if field.is_message or field.kind == "string":
             item = self.variable()
-            self.messages(f"for {item} in {values}:", field, lambda: self.element(field, item))
+            self.loop(f"for {item} in {values}:", lambda: self.element(field, item))
             return
-        size = struct.calcsize(f"={FORMATS[field.kind]}")
         if field.kind == "bool":
             values = f"bytes({values})"
         elif field.kind == "byte":
             values = f'b"".join({values})'
         elif field.shape == "array":
             values += ".tobytes()"
-        if field.shape == "array":
-            self.align(size)
-            self.line(f"add({values}); pos += {size * field.size}")
-            self.advance(size * field.size)
-        else:
-            self.packed(size, lambda: self.line(f"add({values}); pos += {size} * n"))
+        size = _size(_FORMATS[field.kind])
+        self.align(field, size)
+        self.line(f"add({values}); pos += {size} * n")
 
 
-class _Reader(CdrLayout):
+class _ReaderSource(_Source):
+    _method = "unpack_from"
+
     def __init__(self, type_name: str, order: str) -> None:
         super().__init__(order)
         self.too_many = self.constant(_too_many)
@@ -278,18 +229,16 @@ class _Reader(CdrLayout):
         self.flush()
         self.line(f"return {owner}, pos")
 
-    def pad(self, amount: str) -> None:
-        self.line(f"pos += {amount}")
+    def pad(self, amount: str, condition: str) -> None:
+        self.line(f"{condition}pos += {amount}")
 
-    def struct_call(self, packing: struct.Struct) -> None:
-        call = self.constant(packing.unpack_from)
-        self.line(f"{', '.join(self.terms)}, = {call}(data, pos); pos += {packing.size}")
+    def struct_call(self, terms: str) -> None:
+        self.line(f"{terms}, = call(data, pos); pos += size")
 
     def message(self, type_name: str) -> str:
         owner = self.variable()
         cls = self.constant(message_class(type_name))
-        new = self.constant(object.__new__)
-        self.line(f"{owner} = {new}({cls})")
+        self.line(f"{owner} = new({cls})")
         self.fields(owner, type_name, placeholder="_")
         return owner
 
@@ -301,9 +250,8 @@ class _Reader(CdrLayout):
             self.primitive("I", "m")
             self.flush()
             self.line(f'{term} = data[pos:pos + m - 1].decode() if m else ""; pos += m')
-            self.known = (1, 0)
         else:
-            self.primitive(FORMATS[field.kind], term)
+            self.primitive(_FORMATS[field.kind], term)
 
     def elements(self, field: Field, term: str) -> None:
         if field.shape == "sequence":
@@ -324,39 +272,51 @@ class _Reader(CdrLayout):
                 self.flush()
                 self.line(f"{values}.append({item})")
 
-            self.messages("for _ in range(n):", field, body)
+            self.loop("for _ in range(n):", body)
             return
-        size = struct.calcsize(f"={FORMATS[field.kind]}")
-        if field.shape == "array" and field.kind in ARRAY_TYPES:
-            dtype = self.constant(np.dtype(ARRAY_TYPES[field.kind][1]).newbyteorder(self.order))
-            native = self.constant(ARRAY_TYPES[field.kind][1])
-            self.align(size)
-            self.line(f"{term} = np.frombuffer(data, {dtype}, n, pos).astype({native})")
-            self.line(f"pos += {size * field.size}")
-            self.advance(size * field.size)
-            return
+        size = _size(_FORMATS[field.kind])
+        self.align(field, size)
+        self.line(f"end = pos + {size} * n")
+        if field.kind == "bool":
+            self.line(f"{term} = [byte != 0 for byte in data[pos:end]]")
+        elif field.kind == "byte":
+            self.line(f"{term} = [data[i:i + 1] for i in range(pos, end)]")
+        elif field.shape == "array":
+            native = ARRAY_TYPES[field.kind][1]
+            stored = self.constant(np.dtype(native).newbyteorder(self.order))
+            native = self.constant(native)
+            self.line(f"{term} = np.frombuffer(data, {stored}, n, pos).astype({native})")
+        else:
+            values = self.variable()
+            self.line(f'{values} = array("{_FORMATS[field.kind]}"); {term} = {values}')
+            self.line(f"{values}.frombytes(view[pos:end])")
+            if self.order == ">" and size > 1:
+                self.line(f"{values}.byteswap()")
+        self.line("pos = end")
 
-        def emit() -> None:
-            self.line(f"end = pos + {size} * n")
-            if field.kind == "bool":
-                self.line(f"{term} = [byte != 0 for byte in data[pos:end]]")
-            elif field.kind == "byte":
-                self.line(f"{term} = [data[i:i + 1] for i in range(pos, end)]")
-            else:
-                values = self.variable()
-                self.line(f'{values} = array("{FORMATS[field.kind]}"); {term} = {values}')
-                self.line(f"{values}.frombytes(view[pos:end])")
-                if self.order == ">" and size > 1:
-                    self.line(f"{values}.byteswap()")
-            self.line("pos = end")
 
-        self.packed(size, emit)
+def _packings(order: str, codes: list[str], method: str) -> tuple[tuple[Any, int], ...]:
+    """How to pack or unpack these primitives, and in how many bytes, by their position modulo 8."""
+    found = []
+    for position in range(8):
+        layout, end = order, position - 4  # the header does not count
+        for code in codes:
+            padding = -end % _size(code)
+            layout += "x" * padding + code
+            end += padding + _size(code)
+        packing = struct.Struct(layout)
+        found.append((getattr(packing, method), packing.size))
+    return tuple(found)
+
+
+def _size(code: str) -> int:
+    return struct.calcsize(f"={code}")
 
 
 def _least_size(field: Field) -> int:
-    """Bytes that one element of a field takes at least, without what aligns it."""
+    """Bytes that one element of a field takes at least, without padding."""
     if not field.is_message:
-        return 4 if field.kind == "string" else struct.calcsize(f"={FORMATS[field.kind]}")
+        return 4 if field.kind == "string" else _size(_FORMATS[field.kind])
     total = 0
     for part in interface(field.kind).fields:
         count = part.size if part.shape == "array" else 1
@@ -366,46 +326,3 @@ def _least_size(field: Field) -> int:
 
 def _too_many(count: int) -> ValueError:
     return ValueError(f"a sequence of {count} elements is too long for it")
-
-
-M = TypeVar("M", bound=Message)
-
-
-class CdrError(Exception):
-    """Bytes are not the serialized message they should be."""
-
-
-def serialize(message: Message) -> bytes:
-    """The message as a four-byte header and little-endian XCDR1, as rclpy serializes it."""
-    return compiled_writer(message.__msgtype__)(message)
-
-
-def deserialize(data: bytes | bytearray | memoryview, cls: type[M]) -> M:
-    """The message of class ``cls`` in ``data``.
-
-    Raises:
-        CdrError: the bytes end too early, hold text that is no UTF-8, or are of another encoding.
-    """
-    data = bytes(data)
-    if data[:2] == b"\x00\x01":
-        order = "<"
-    elif data[:2] == b"\x00\x00":
-        order = ">"
-    else:
-        raise CdrError(
-            f"{len(data)} bytes starting with {data[:4].hex() or 'nothing'} are not the plain CDR "
-            f"of a {cls.__msgtype__}; only XCDR1 (0000 or 0001) can be read"
-        )
-    try:
-        message, end = compiled_reader(cls.__msgtype__, order)(data, memoryview(data))
-    except (struct.error, ValueError) as error:
-        raise CdrError(
-            f"{len(data)} bytes do not form a {cls.__msgtype__} ({error}); "
-            f"check that the topic has this type"
-        ) from error
-    if end > len(data):
-        raise CdrError(
-            f"{len(data)} bytes are too few for a {cls.__msgtype__}, which needs {end}; "
-            f"check that the topic has this type"
-        )
-    return message

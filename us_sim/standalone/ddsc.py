@@ -34,13 +34,12 @@ BUILTIN_PARTICIPANT = 0x7FFF0001
 BUILTIN_PUBLICATION = 0x7FFF0003
 BUILTIN_SUBSCRIPTION = 0x7FFF0004
 
-Entity = ct.c_int32
 InstanceHandle = ct.c_uint64
 Pointer = ct.c_void_p
 
 
 class DdsError(Exception):
-    """The transport refuses what it was asked for."""
+    """The transport refuses a request."""
 
 
 class RawSampleInfo(ct.Structure):
@@ -111,7 +110,6 @@ class _TopicDescriptor(ct.Structure):
 
 
 _OPERATION_OF_ONE_OCTET = (1 << 24) | (1 << 16)  # DDS_OP_ADR | DDS_OP_TYPE_1BY, then its offset
-_XCDR1_ONLY = (1 << 8, 1 << 0)  # DDS_TOPIC_RESTRICT_DATA_REPRESENTATION and the flag for XCDR1
 
 
 def topic_descriptor(type_name: str) -> Any:
@@ -124,18 +122,11 @@ def topic_descriptor(type_name: str) -> Any:
     return _TopicDescriptor(
         size=1,
         align=1,
-        flags=0,
         type_name=type_name.encode(),
         operation_count=2,
         operations=operations,
         meta=b"",
     )
-
-
-def _declare(result: Any, name: str, *arguments: Any) -> None:
-    function = getattr(lib, name)
-    function.restype = result
-    function.argtypes = arguments
 
 
 def _library_path() -> str:
@@ -153,74 +144,72 @@ def _library_path() -> str:
 
 
 lib: Any = ct.CDLL(_library_path())
-_INT, _BOOL, _OUT = ct.c_int32, ct.c_bool, ct.c_void_p
-_DURATION = ct.c_int64
 
-_declare(ct.c_int64, "dds_time")
-_declare(ct.c_char_p, "dds_strretcode", _INT)
-_declare(None, "dds_free", Pointer)
-
-_declare(_INT, "dds_create_domain", ct.c_uint32, ct.c_char_p)
-_declare(_INT, "dds_create_participant", ct.c_uint32, Pointer, Pointer)
-_declare(_INT, "dds_create_topic", Entity, Pointer, ct.c_char_p, Pointer, Pointer)
-_declare(_INT, "dds_create_reader", Entity, Entity, Pointer, Pointer)
-_declare(_INT, "dds_create_writer", Entity, Entity, Pointer, Pointer)
-_declare(_INT, "dds_delete", Entity)
-_declare(_INT, "dds_get_guid", Entity, _OUT)
-_declare(_INT, "dds_get_instance_handle", Entity, _OUT)
-_declare(_INT, "dds_get_entity_sertype", Entity, _OUT)
-
-_declare(_INT, "dds_create_waitset", Entity)
-_declare(_INT, "dds_create_guardcondition", Entity)
-_declare(_INT, "dds_set_guardcondition", Entity, _BOOL)
-_declare(_INT, "dds_take_guardcondition", Entity, _OUT)
-_declare(_INT, "dds_waitset_attach", Entity, Entity, ct.c_ssize_t)
-_declare(_INT, "dds_waitset_wait", Entity, _OUT, ct.c_size_t, _DURATION)
-_declare(_INT, "dds_set_status_mask", Entity, ct.c_uint32)
-_declare(_INT, "dds_take_status", Entity, _OUT, ct.c_uint32)
-
-_declare(Pointer, "ddsi_serdata_from_ser_iov", Pointer, ct.c_int, ct.c_size_t, _OUT, ct.c_size_t)
-_declare(ct.c_uint32, "ddsi_serdata_size", Pointer)
-_declare(Pointer, "ddsi_serdata_to_ser_ref", Pointer, ct.c_size_t, ct.c_size_t, _OUT)
-_declare(None, "ddsi_serdata_to_ser_unref", Pointer, _OUT)
-_declare(None, "ddsi_serdata_unref", Pointer)
-_declare(_INT, "dds_writecdr", Entity, Pointer)
-_declare(_INT, "dds_takecdr", Entity, _OUT, ct.c_uint32, _OUT, ct.c_uint32)
-_declare(_INT, "dds_take", Entity, _OUT, _OUT, ct.c_size_t, ct.c_uint32)
-_declare(_INT, "dds_return_loan", Entity, _OUT, ct.c_int32)
-
-_declare(_INT, "dds_get_matched_subscriptions", Entity, _OUT, ct.c_size_t)
-_declare(_INT, "dds_get_matched_publications", Entity, _OUT, ct.c_size_t)
-for _side in ("publication", "subscription"):
-    _declare(ct.POINTER(BuiltinEndpoint), f"dds_get_matched_{_side}_data", Entity, InstanceHandle)
-_declare(None, "dds_builtintopic_free_endpoint", ct.POINTER(BuiltinEndpoint))
-_declare(_INT, "dds_get_offered_incompatible_qos_status", Entity, _OUT)
-_declare(_INT, "dds_get_requested_incompatible_qos_status", Entity, _OUT)
-
-_declare(Pointer, "dds_create_qos")
-_declare(None, "dds_delete_qos", Pointer)
-_declare(None, "dds_qset_data_representation", Pointer, ct.c_uint32, _OUT)
-_declare(None, "dds_qset_deadline", Pointer, _DURATION)
-_declare(None, "dds_qset_durability", Pointer, ct.c_int)
-_declare(None, "dds_qset_durability_service", Pointer, _DURATION, ct.c_int, *(ct.c_int32,) * 4)
-_declare(None, "dds_qset_history", Pointer, ct.c_int, ct.c_int32)
-_declare(None, "dds_qset_ignorelocal", Pointer, ct.c_int)
-_declare(None, "dds_qset_lifespan", Pointer, _DURATION)
-_declare(None, "dds_qset_liveliness", Pointer, ct.c_int, _DURATION)
-_declare(None, "dds_qset_reliability", Pointer, ct.c_int, _DURATION)
-_declare(None, "dds_qset_userdata", Pointer, ct.c_char_p, ct.c_size_t)
-_declare(None, "dds_qset_writer_data_lifecycle", Pointer, _BOOL)
-_declare(_BOOL, "dds_qget_deadline", Pointer, _OUT)
-_declare(_BOOL, "dds_qget_durability", Pointer, _OUT)
-_declare(_BOOL, "dds_qget_history", Pointer, _OUT, _OUT)
-_declare(_BOOL, "dds_qget_lifespan", Pointer, _OUT)
-_declare(_BOOL, "dds_qget_liveliness", Pointer, _OUT, _OUT)
-_declare(_BOOL, "dds_qget_reliability", Pointer, _OUT, _OUT)
-_declare(_BOOL, "dds_qget_userdata", Pointer, _OUT, _OUT)
+# The functions that are called, by the types of what they return and take:
+# i int32 (entities too), u uint32, n size_t, l int64, h uint64, b bool, s text, p pointer,
+# E a pointer to an endpoint, - nothing.
+_C_TYPES = {
+    "i": ct.c_int32,
+    "u": ct.c_uint32,
+    "n": ct.c_size_t,
+    "l": ct.c_int64,
+    "h": ct.c_uint64,
+    "b": ct.c_bool,
+    "s": ct.c_char_p,
+    "p": ct.c_void_p,
+    "E": ct.POINTER(BuiltinEndpoint),
+    "-": None,
+}
+_SIGNATURES = """
+    l: dds_time
+    s i: dds_strretcode
+    - p: dds_free dds_delete_qos ddsi_serdata_unref
+    - E: dds_builtintopic_free_endpoint
+    - pp: ddsi_serdata_to_ser_unref
+    p: dds_create_qos
+    i us: dds_create_domain
+    i upp: dds_create_participant
+    i ipspp: dds_create_topic
+    i iipp: dds_create_reader dds_create_writer
+    i i: dds_delete dds_create_waitset dds_create_guardcondition
+    i ip: dds_get_guid dds_get_instance_handle dds_get_entity_sertype dds_take_guardcondition
+    i ip: dds_get_offered_incompatible_qos_status dds_get_requested_incompatible_qos_status
+    i ip: dds_writecdr
+    i ib: dds_set_guardcondition
+    i iin: dds_waitset_attach
+    i ipnl: dds_waitset_wait
+    i iu: dds_set_status_mask
+    i ipu: dds_take_status
+    i ipupu: dds_takecdr
+    i ippnu: dds_take
+    i ipi: dds_return_loan
+    i ipn: dds_get_matched_subscriptions dds_get_matched_publications
+    E ih: dds_get_matched_subscription_data dds_get_matched_publication_data
+    p pinpn: ddsi_serdata_from_ser_iov
+    p pnnp: ddsi_serdata_to_ser_ref
+    u p: ddsi_serdata_size
+    - pup: dds_qset_data_representation
+    - pl: dds_qset_deadline dds_qset_lifespan
+    - pi: dds_qset_durability dds_qset_ignorelocal
+    - pliiiii: dds_qset_durability_service
+    - pii: dds_qset_history
+    - pil: dds_qset_liveliness dds_qset_reliability
+    - psn: dds_qset_userdata
+    - pb: dds_qset_writer_data_lifecycle
+    b pp: dds_qget_deadline dds_qget_durability dds_qget_lifespan
+    b ppp: dds_qget_history dds_qget_liveliness dds_qget_reliability dds_qget_userdata
+"""
+for _line in _SIGNATURES.strip().splitlines():
+    _types, _, _functions = _line.partition(": ")
+    _result, *_arguments = list(_types.replace(" ", ""))
+    for _name in _functions.split():
+        _function = getattr(lib, _name)
+        _function.restype = _C_TYPES[_result]
+        _function.argtypes = [_C_TYPES[_argument] for _argument in _arguments]
 
 
 def check(returned: int, sentence: str) -> int:
-    """What a C function returned, or a DdsError with this sentence if it was an error."""
+    """The returned number; raises a DdsError with this sentence if it is an error code."""
     if returned < 0:
         reason = lib.dds_strretcode(returned).decode()
         raise DdsError(f"{sentence} (Cyclone DDS says: {reason})")

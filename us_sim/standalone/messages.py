@@ -19,7 +19,7 @@ import math
 import sys
 from array import array
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from operator import attrgetter
 from types import ModuleType
 from typing import Any, ClassVar
@@ -49,175 +49,118 @@ ARRAY_TYPES: dict[str, tuple[str, Any]] = {
     "uint64": ("Q", np.uint64),
 }
 
-_INTEGERS = {
-    **{f"int{bits}": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in (8, 16, 32, 64)},
-    **{f"uint{bits}": (0, 2**bits - 1) for bits in (8, 16, 32, 64)},
-}
+_IDL_NAMES = {"float32": "float", "float64": "double"}
 _FLOAT_LIMITS = {"float32": 3.402823466e38, "float64": 1.7976931348623157e308}
 
-Setter = Callable[[Any, Any], None]
-Check = Callable[[Any], None]
+Setter = Callable[[Any, Any], None]  # of a message and a value
+Rule = tuple[Callable[[Any], bool], str]  # for a value, and rosidl's words for one that breaks it
 
 
-def field_setter(field: Field, store: Setter, message_class: type | None) -> Setter:
-    """A function (message, value) that checks the value and stores it.
+def _field_setter(field: Field, store: Setter, message_class: type | None) -> Setter:
+    """A function that checks a value and stores it, with an AssertionError in rosidl's words.
 
     Args:
         store: stores without checking; the slot's own setter.
         message_class: the class of the elements, where they are messages.
     """
-    check = _element_check(field, message_class)
+    check = partial(_check, field.name, _element_rules(field, message_class))
     if field.shape == "scalar":
-
-        def set_scalar(message: Any, value: Any) -> None:
-            check(value)
-            store(message, value)
-
-        return set_scalar
-    if field.kind not in ARRAY_TYPES:
-        return _list_setter(field, store, check)
-    if field.shape == "sequence":
-        return _packed_sequence_setter(field, store, check)
-    return _packed_array_setter(field, store, check)
+        convert = check
+    elif field.kind not in ARRAY_TYPES:
+        convert = partial(_checked_collection, field, check)
+    elif field.shape == "sequence":
+        convert = partial(_packed_sequence, field, *ARRAY_TYPES[field.kind], check)
+    else:
+        convert = partial(_packed_array, field, ARRAY_TYPES[field.kind][1], check)
+    return lambda message, value: store(message, convert(value))
 
 
-def _element_check(field: Field, message_class: type | None) -> Check:
-    """A function that raises AssertionError, in rosidl's words, for what is no such element."""
-    name = field.name
+def _element_rules(field: Field, message_class: type | None) -> list[Rule]:
+    kind, bound = field.kind, field.string_bound
     if message_class is not None:
-        sentence = f"The '{name}' field must be a sub message of type '{message_class.__name__}'"
-        return _instance_check(message_class, sentence)
-    if field.kind == "string":
-        if not field.string_bound:
-            return _instance_check(str, f"The '{name}' field must be of type 'str'")
-        bound = field.string_bound
-
-        def check_bounded(value: Any) -> None:
-            if not isinstance(value, str) or len(value) > bound:
-                raise AssertionError(
-                    f"The '{name}' field must be string value not longer than {bound}"
-                )
-
-        return check_bounded
-    if field.kind == "bool":
-        return _instance_check(bool, f"The '{name}' field must be of type 'bool'")
-    if field.kind == "byte":
-
-        def check_byte(value: Any) -> None:
-            if not isinstance(value, (bytes, bytearray)) or len(value) != 1:
-                raise AssertionError(
-                    f"The '{name}' field must be of type 'bytes' or 'ByteString' with length 1"
-                )
-
-        return check_byte
-    if field.kind in _FLOAT_LIMITS:
-        limit = _FLOAT_LIMITS[field.kind]
-        idl_type = "float" if field.kind == "float32" else "double"
-
-        def check_float(value: Any) -> None:
-            if not isinstance(value, float):
-                raise AssertionError(f"The '{name}' field must be of type 'float'")
-            if not -limit <= value <= limit and math.isfinite(value):
-                raise AssertionError(
-                    f"The '{name}' field must be a {idl_type} in [{-limit}, {limit}]"
-                )
-
-        return check_float
-    low, high = _INTEGERS[field.kind]
-
-    def check_integer(value: Any) -> None:
-        if not isinstance(value, int):
-            raise AssertionError(f"The '{name}' field must be of type 'int'")
-        if not low <= value <= high:
-            sign = "an integer" if low else "an unsigned integer"
-            raise AssertionError(f"The '{name}' field must be {sign} in [{low}, {high}]")
-
-    return check_integer
+        words = f"be a sub message of type '{message_class.__name__}'"
+        return [(lambda value: isinstance(value, message_class), words)]
+    if kind == "string" and bound:
+        words = f"be string value not longer than {bound}"
+        return [(lambda value: isinstance(value, str) and len(value) <= bound, words)]
+    if kind == "string":
+        return [(lambda value: isinstance(value, str), "be of type 'str'")]
+    if kind == "bool":
+        return [(lambda value: isinstance(value, bool), "be of type 'bool'")]
+    if kind == "byte":
+        words = "be of type 'bytes' or 'ByteString' with length 1"
+        return [(lambda value: isinstance(value, bytes | bytearray) and len(value) == 1, words)]
+    if kind in _FLOAT_LIMITS:
+        limit = _FLOAT_LIMITS[kind]
+        words = f"be a {_IDL_NAMES[kind]} in [{-limit}, {limit}]"
+        return [
+            (lambda value: isinstance(value, float), "be of type 'float'"),
+            (lambda value: -limit <= value <= limit or not math.isfinite(value), words),
+        ]
+    bits = int(kind.lstrip("uint"))
+    low, high = (0, 2**bits - 1) if kind[0] == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    words = f"be {'an integer' if low else 'an unsigned integer'} in [{low}, {high}]"
+    return [
+        (lambda value: isinstance(value, int), "be of type 'int'"),
+        (lambda value: low <= value <= high, words),
+    ]
 
 
-def _instance_check(expected: type, sentence: str) -> Check:
-    def check(value: Any) -> None:
-        if not isinstance(value, expected):
-            raise AssertionError(sentence)
-
-    return check
-
-
-def _packed_sequence_setter(field: Field, store: Setter, check: Check) -> Setter:
-    """A setter that stores an array.array, the very one it is given where the type code fits."""
-    name, bound = field.name, field.size
-    code, dtype = ARRAY_TYPES[field.kind]
-
-    def convert(value: Any) -> array[Any]:
-        if isinstance(value, array):
-            raise AssertionError(f"The '{name}' array.array() must have the type code of '{code}'")
-        if isinstance(value, np.ndarray):
-            if value.dtype != dtype or value.ndim != 1:
-                raise AssertionError(
-                    f"The '{name}' field must be a one-dimensional ndarray of {dtype.__name__}, "
-                    f"not of {value.dtype} with shape {value.shape}"
-                )
-            return array(code, value.tobytes())
-        if isinstance(value, (bytes, bytearray, memoryview)) and code == "B":
-            return array(code, bytes(value))
-        _check_collection(field, value, check)
-        return array(code, value)
-
-    def set_sequence(message: Any, value: Any) -> None:
-        if not (type(value) is array and value.typecode == code):
-            value = convert(value)
-        if bound and len(value) > bound:
-            raise AssertionError(f"The '{name}' array.array() must have a size <= {bound}")
-        store(message, value)
-
-    return set_sequence
+def _check(name: str, rules: list[Rule], value: Any) -> Any:
+    for holds, words in rules:
+        if not holds(value):
+            raise AssertionError(f"The '{name}' field must {words}")
+    return value
 
 
-def _packed_array_setter(field: Field, store: Setter, check: Check) -> Setter:
-    """A setter that stores a NumPy array of the field's type and size."""
-    name, size = field.name, field.size
-    dtype = ARRAY_TYPES[field.kind][1]
-
-    def set_array(message: Any, value: Any) -> None:
-        if isinstance(value, np.ndarray):
-            if value.dtype != dtype:
-                raise AssertionError(
-                    f"The '{name}' numpy.ndarray() must have the dtype of 'numpy.{dtype.__name__}'"
-                )
-            if value.shape != (size,):
-                raise AssertionError(f"The '{name}' numpy.ndarray() must have a size of {size}")
-        else:
-            _check_collection(field, value, check)
-            value = np.array(list(value), dtype)
-        store(message, value)
-
-    return set_array
-
-
-def _list_setter(field: Field, store: Setter, check: Check) -> Setter:
-    """A setter for lists of strings, booleans, bytes and messages."""
-
-    def set_list(message: Any, value: Any) -> None:
-        _check_collection(field, value, check)
-        store(message, value)
-
-    return set_list
-
-
-def _check_collection(field: Field, value: Any, check: Check) -> None:
+def _checked_collection(field: Field, check: Callable[[Any], Any], value: Any) -> Any:
+    words = "be a set or sequence"
     if isinstance(value, str) or not hasattr(value, "__len__") or not hasattr(value, "__iter__"):
-        raise AssertionError(f"The '{field.name}' field must be a set or sequence")
-    length = len(value)
-    if field.shape == "array" and length != field.size:
-        raise AssertionError(
-            f"The '{field.name}' field must be a set or sequence with length {field.size}"
-        )
-    if field.shape == "sequence" and field.size and length > field.size:
-        raise AssertionError(
-            f"The '{field.name}' field must be a set or sequence with length <= {field.size}"
-        )
+        raise AssertionError(f"The '{field.name}' field must {words}")
+    if field.shape == "array" and len(value) != field.size:
+        raise AssertionError(f"The '{field.name}' field must {words} with length {field.size}")
+    if field.shape == "sequence" and field.size and len(value) > field.size:
+        raise AssertionError(f"The '{field.name}' field must {words} with length <= {field.size}")
     for element in value:
         check(element)
+    return value
+
+
+def _packed_sequence(
+    field: Field, code: str, dtype: Any, check: Callable[[Any], Any], value: Any
+) -> array[Any]:
+    """The value as an array.array: the very one that was given, where its type code fits."""
+    name, bound = field.name, field.size
+    if isinstance(value, array):
+        if value.typecode != code:
+            raise AssertionError(f"The '{name}' array.array() must have the type code of '{code}'")
+    elif isinstance(value, np.ndarray):
+        if value.dtype != dtype or value.ndim != 1:
+            raise AssertionError(
+                f"The '{name}' field must be a one-dimensional ndarray of {dtype.__name__}, "
+                f"not of {value.dtype} with shape {value.shape}"
+            )
+        value = array(code, value.tobytes())
+    elif isinstance(value, bytes | bytearray | memoryview) and code == "B":
+        value = array(code, bytes(value))
+    else:
+        value = array(code, _checked_collection(field, check, value))
+    if bound and len(value) > bound:
+        raise AssertionError(f"The '{name}' array.array() must have a size <= {bound}")
+    return value
+
+
+def _packed_array(field: Field, dtype: Any, check: Callable[[Any], Any], value: Any) -> Any:
+    name, size = field.name, field.size
+    if not isinstance(value, np.ndarray):
+        return np.array(list(_checked_collection(field, check, value)), dtype)
+    if value.dtype != dtype:
+        raise AssertionError(
+            f"The '{name}' numpy.ndarray() must have the dtype of 'numpy.{dtype.__name__}'"
+        )
+    if value.shape != (size,):
+        raise AssertionError(f"The '{name}' numpy.ndarray() must have a size of {size}")
+    return value
 
 
 _ZEROS: dict[str, Any] = {"bool": False, "byte": b"\x00", "string": ""}
@@ -245,7 +188,6 @@ class Message:
 
     @classmethod
     def get_fields_and_field_types(cls) -> dict[str, str]:
-        """Names of the fields and their types as rosidl writes them."""
         return dict(cls._fields_and_field_types)
 
     def __repr__(self) -> str:
@@ -299,7 +241,7 @@ def message_class(name: str) -> type[Message]:
     for field in definition.fields:
         store = getattr(cls, f"_{field.name}").__set__
         element_class = message_class(field.kind) if field.is_message else None
-        setter = field_setter(field, store, element_class)
+        setter = _field_setter(field, store, element_class)
         documentation = f"Message field '{field.name}'."
         setattr(
             cls, field.name, property(attrgetter(f"_{field.name}"), setter, None, documentation)

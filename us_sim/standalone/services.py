@@ -65,11 +65,9 @@ class _ServiceEndpoint:
         self.gids = [self._reader.gid], [self._writer.gid]
 
     def set_on_data(self, callback: Callable[[], None] | None) -> None:
-        """Have a function called from another thread when a request or response may be waiting."""
         self._reader.set_on_data(callback)
 
     def close(self) -> None:
-        """Leave both topics."""
         self._reader.close()
         self._writer.close()
 

@@ -1,4 +1,4 @@
-"""The tissue that solvers deform: mesh, materials, fixed nodes, and nodes the probe can touch.
+"""The tissue that solvers deform, and the deformation that they find.
 
 >>> from us_sim.tissue.model import TissueModel
 >>> model = TissueModel.block()
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Flag, auto
 from functools import cached_property
 
 import numpy as np
@@ -20,9 +21,137 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.collider import Collider, Sphere
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
+from us_sim.tissue.elasticity.materials import LabelFractions, TissueMaterials, uniform_material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
+
+# Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
+# that the skin is the face of smallest z.
+FACES = {
+    "top": ((2, False),),
+    "bottom": ((2, True),),
+    "left": ((0, False),),
+    "right": ((0, True),),
+    "front": ((1, False),),
+    "back": ((1, True),),
+    "sides": ((0, False), (0, True), (1, False), (1, True)),
+}
+
+
+# Distance from a bounding box's face, over the box's size, up to which nodes count as on the
+# face; for meshes that are no box.
+_MARGIN = 0.05
+# Nodes, also as a part of all, below which what is held is remarked on as little.
+_FEW, _FEW_PART = 10, 0.01
+# The cosine to -z below which a probe that comes along +z would only graze the surface.
+_GRAZING = 0.1
+
+
+def held_remark(name: str, nodes: NDArray[np.integer], mesh: TetrahedralMesh) -> str | None:
+    """How many nodes a name in a scene's ``fixed`` holds, for a person.
+
+    Of a mesh from a file, which may touch its bounding box at single nodes, and where they are few.
+    """
+    count, of = len(nodes), len(mesh.nodes)
+    said = f"fixed: `{name}` holds {count} of {of} nodes"
+    if count < max(_FEW, _FEW_PART * of):
+        return f"{said}, which is little; see tissue.fixed and tissue.mesh.margin"
+    return None if mesh.planes is not None else said
+
+
+def face_nodes(mesh: TetrahedralMesh, face: str, margin: float | None = None) -> NDArray[np.int32]:
+    """(K,) nodes at a face of the mesh's bounding box, ascending.
+
+    Of a box mesh, those in the plane of the face; of any other, those of its boundary that are
+    near to it, since an organ touches its bounding box at single nodes.
+
+    Args:
+        face: a name from `FACES`; ``top`` is the skin, ``sides`` are the four that stand on it.
+        margin: m, how near, for a mesh that is no box; by default a twentieth of its size along
+            that axis.
+
+    Raises:
+        MeshError: there is no such face.
+    """
+    if face not in FACES:
+        raise MeshError(f"a box has no face {face!r}: its faces are {', '.join(FACES)}")
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    rounding = 1e-9 * float((high - low).max())
+    eligible = np.ones(len(mesh.nodes), dtype=bool)
+    near = np.zeros(3)
+    if mesh.planes is None:
+        eligible[:] = False
+        eligible[mesh.boundary] = True
+        near[:] = _MARGIN * (high - low) if margin is None else margin
+    chosen = np.zeros(len(mesh.nodes), dtype=bool)
+    for axis, at_maximum in FACES[face]:
+        plane = (high if at_maximum else low)[axis]
+        chosen |= np.abs(mesh.nodes[:, axis] - plane) <= near[axis] + rounding
+    return np.flatnonzero(chosen & eligible).astype(np.int32)
+
+
+def facing_nodes(mesh: TetrahedralMesh) -> NDArray[np.int32]:
+    """(K,) nodes of the boundary that look towards the probe, which comes along +z, ascending.
+
+    Those whose normal, of the adjacent triangles weighted by area, is less than 84 degrees off -z.
+    """
+    a, b, c = (mesh.nodes[mesh.boundary[:, corner]] for corner in range(3))
+    areas = np.cross(b - a, c - a)
+    normals = np.zeros_like(mesh.nodes)
+    for corner in range(3):
+        np.add.at(normals, mesh.boundary[:, corner], areas)
+    lengths = np.linalg.norm(normals, axis=1)
+    return np.flatnonzero(-normals[:, 2] > _GRAZING * lengths).astype(np.int32)
+
+
+def nodes_in_label(
+    mesh: TetrahedralMesh, fractions: LabelFractions, label: int
+) -> NDArray[np.int32]:
+    """(K,) nodes whose tetrahedra are mostly filled by a label, such as bone, ascending."""
+    filled = fractions.of(label)
+    around = mesh.tetrahedra.ravel()
+    volume = np.bincount(around, np.repeat(mesh.volumes, 4), len(mesh.nodes))
+    inside = np.bincount(around, np.repeat(mesh.volumes * filled, 4), len(mesh.nodes))
+    return np.flatnonzero(inside > 0.5 * volume).astype(np.int32)
+
+
+class Intervention(Flag):
+    """A solver's remedies in a frame that went wrong; `Deformation.action` says it to a person."""
+
+    NONE = 0
+    FRAME_FAILED = auto()  # what came out was not finite or far away
+    KEPT_STATE = auto()  # the last good state is returned in its place
+    PUT_TO_REST = auto()  # the tissue is undeformed again
+    SHOWED_UPRIGHT = auto()  # tissue is inside out, and its last upright state is returned
+    RESTARTED = auto()  # the next frame begins from rest
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """The deformed tissue and what it does to the probe."""
+
+    nodes: NDArray[np.float64]  # (N, 3), m, frame patient, in mesh order
+    contact_nodes: NDArray[np.int32]  # (K,), nodes that the probe pushes
+    force: NDArray[np.float64]  # (3,), N, of the tissue on the probe, frame probe
+    torque: NDArray[np.float64]  # (3,), N m, likewise, about the origin of frame probe
+    residual: float  # unbalanced force over contact force, of the solver's own equations
+    action: str = ""  # what the solver did to stay stable, in words; '' when nothing
+    inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
+    is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
+    interventions: Intervention = Intervention.NONE  # `action` as a code
+
+
+@dataclass(frozen=True, eq=False)
+class TissueState:
+    """What a solver needs to go on from where another one is."""
+
+    displacement: NDArray[np.float64]  # (N, 3), m
+    velocity: NDArray[np.float64]  # (N, 3), m/s
+
+    @classmethod
+    def at_rest(cls, count: int) -> TissueState:
+        """Undeformed and still, for ``count`` nodes."""
+        return cls(np.zeros((count, 3)), np.zeros((count, 3)))
+
 
 _SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
 

@@ -1,23 +1,4 @@
-"""A recording of rerun that is being written: a file that is there when it is whole.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.to_rerun.conversion import RerunFile, require_rerun
->>> require_rerun()  # doctest: +SKIP
->>> file = Path(tempfile.mkdtemp()) / "session.rrd"
->>> with RerunFile(file, "session") as recording:  # doctest: +SKIP
-...     recording.at(stamp=1_700_000_000_000_000_000, recorded=1_700_000_000_004_000_000)
-...     recording.log("probe/force", rerun.Scalars([0.0, 0.0, -2.5]))
-
-A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out.
-
->>> from pathlib import Path
->>> from us_sim.progress import late_progress
->>> from us_sim.to_rerun.conversion import to_rerun
->>> progress = late_progress("to rerun")
->>> to_rerun(Path("demo/session.mcap"), Path("demo/session.rrd"), progress)  # doctest: +SKIP
-[]
-"""
+"""A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out."""
 
 from __future__ import annotations
 
@@ -29,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from us_sim.errors import BagError, UsSimError
-from us_sim.nodes.conversions import nanoseconds_of
+from us_sim.nodes.messages import nanoseconds_of
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.topic import BagTopic
 from us_sim.settings.spelling import counted
@@ -38,12 +19,9 @@ if TYPE_CHECKING:
     from us_sim.to_rerun.converters import Shown
 
 
-OLDEST = "0.41"
-"""Of the versions of rerun, the oldest with which this works."""
-STAMP = "stamp"
-"""Timeline of the poses that messages come from."""
-RECORDED = "recorded"
-"""Timeline of when messages came to the recorder."""
+OLDEST = "0.41"  # of the versions of rerun, the oldest with which this works
+STAMP = "stamp"  # timeline of the poses that messages come from
+RECORDED = "recorded"  # timeline of when messages came to the recorder
 
 
 def require_rerun() -> None:
@@ -166,8 +144,6 @@ def to_rerun(session: Path, file: Path, progress: Callable[[float, str], None]) 
 
 
 class _Conversion:
-    """Which messages of a bag are logged by whom."""
-
     def __init__(self, bag: Bag, tell: Callable[[float, str], None]) -> None:
         from us_sim.to_rerun.converters import (
             Clouds,
@@ -209,7 +185,6 @@ class _Conversion:
         self._there = there
 
     def _carry_structures(self, there: dict[str, BagTopic]) -> None:
-        """Make the structures from the scene where they were not recorded."""
         from us_sim.to_rerun.converters import REST, TETRAHEDRA, Structures
 
         if "/tissue/structures" in there or not {REST, TETRAHEDRA} <= there.keys():

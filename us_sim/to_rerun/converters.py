@@ -1,25 +1,4 @@
-"""What a kind of message becomes in a recording of rerun.
-
-Texts: a person's marks of moments.
-
-Frames: each transform of tf, between the frames that it names.
-
-Points of clouds, such as the tissue's nodes.
-
-The skin: a mesh at rest, whose vertices move.
-
-Vessels, nerves and bone of a session in which nobody recorded them.
-
-They follow from what is recorded: the scene names them, and the tissue's nodes carry them.
-
-Forces: an arrow where they act, and three curves.
-
-How the nodes are: their states as text, what they measure as curves.
-
-Images: in two dimensions as they are, and the ultrasound image in the plane that it shows.
-
-Markers: the shapes that nodes draw for RViz.
-"""
+"""Messages of a session as entities of a rerun recording, and the views that the viewer opens."""
 
 from __future__ import annotations
 
@@ -38,9 +17,9 @@ from numpy.typing import NDArray
 from rerun.encodings import AbsoluteTimeRange
 
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
-from us_sim.geometry.normals import vertex_normals
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.conversions import (
+from us_sim.geometry.triangles import vertex_normals
+from us_sim.nodes.messages import (
     affine_from,
     colour_pixels_from,
     field_from,
@@ -53,9 +32,8 @@ from us_sim.nodes.conversions import (
 )
 from us_sim.recording.reader import Bag
 from us_sim.recording.repair import extract
-from us_sim.scene.building import volume_of
+from us_sim.scene.building import structures_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import structures_of
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.to_rerun.conversion import STAMP, RerunFile
 
@@ -115,8 +93,7 @@ class Clouds:
         file.log(entity, rerun.Points3D(vectors_from(message), radii=_RADIUS, colors=_COLOUR))
 
 
-SKIN = "skin"
-"""Its entity."""
+SKIN = "skin"  # its entity
 _SKIN_COLOUR = (217, 166, 140, 90)
 
 
@@ -152,8 +129,7 @@ class Skin:
 
 
 REST, TETRAHEDRA = "/tissue/rest", "/tissue/tetrahedra"
-STRUCTURES = "tissue/structures"
-"""The entity that holds one for each."""
+STRUCTURES = "tissue/structures"  # the entity that holds one for each
 _TRIANGLES = 6_000
 
 
@@ -201,12 +177,9 @@ class Structures:
         self._shown = True
 
 
-FORCE = "force"
-"""What a topic's name is followed by in the entity of the curves."""
-METRES_A_NEWTON = 0.002
-"""Of the arrow's length."""
-_ARROW_RADIUS = 0.0008
-"""m, of the arrow's shaft."""
+FORCE = "force"  # what a topic's name is followed by in the entity of the curves
+METRES_A_NEWTON = 0.002  # of the arrow's length
+_ARROW_RADIUS = 0.0008  # m, of the arrow's shaft
 _AXES = ("x", "y", "z")
 _COLOURS = ((224, 108, 117), (152, 195, 121), (97, 175, 239))
 
@@ -272,11 +245,9 @@ def _number(text: str) -> float | None:
 
 
 IMAGE = "ultrasound/image"
-PLANE = "ultrasound/plane"
-"""Entity of the image in three dimensions."""
+PLANE = "ultrasound/plane"  # entity of the image in three dimensions
 _WHERE = "ultrasound/image_to_probe"
-_FINEST = 256
-"""Pixels across the texture in three dimensions, where the image itself is beside it."""
+_FINEST = 256  # pixels across the texture in three dimensions, where the image itself is beside it
 
 
 class Images:

@@ -1,28 +1,8 @@
-"""The interface of filters of poses.
+"""Filters of poses: none, the One-Euro filter, and a constant-velocity Kalman filter on SE(3).
 
->>> from us_sim.tracking.filters import Unfiltered
->>> Unfiltered().lag
-0.0
-
-The One-Euro filter on SE(3): steady where the probe rests, quick where it moves.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.settings import OneEuroSettings
+>>> from us_sim.tracking.filters import create_filter
 >>> from us_sim.tracking.measurement import Measurement
->>> from us_sim.tracking.filters import OneEuro
->>> still = OneEuro(OneEuroSettings(minimum_cutoff=1.0, speed_coefficient=0.0))
->>> for k in range(3):
-...     filtered = still.update(Measurement(k * 10_000_000, Pose([0.001 * (k == 1), 0.0, 0.0])))
->>> round(1e6 * filtered.pose.position[0].item())  # µm, of a spike of 1 mm a moment ago
-56
-
-A constant-velocity Kalman filter on SE(3): no lag behind a uniform motion.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.settings import KalmanSettings
->>> from us_sim.tracking.filters import ConstantVelocityKalman
->>> from us_sim.tracking.measurement import Measurement
->>> kalman = ConstantVelocityKalman(KalmanSettings())
+>>> kalman = create_filter("kalman")
 >>> for k in range(100):  # 0.1 m/s
 ...     filtered = kalman.update(Measurement(k * 10_000_000, Pose([0.001 * k, 0.0, 0.0])))
 >>> round(1e6 * (filtered.pose.position[0] - 0.099).item())  # µm behind
@@ -99,7 +79,7 @@ class Unfiltered(PoseFilter):
 
 
 def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
-    """The filter of that name, with its settings; what is not named is not imported.
+    """Create the filter of that name; no other one is imported.
 
     Raises:
         TrackingError: there is no filter of that name.

@@ -1,18 +1,10 @@
-"""One pose of a tracked body as a device measured it.
+"""A body's pose as a device measured it, and the state of tracking by the age of the last one.
 
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.measurement import Measurement
+>>> from us_sim.tracking.measurement import Measurement, TrackingClock
 >>> seen = Measurement(1_000_000_000, Pose([0.0, 0.0, 0.4]), np.diag([1e-8] * 3 + [1e-5] * 3))
 >>> round(1e3 * float(seen.position_deviation), 2)  # mm
 0.17
-
-The state of tracking, by the time since the probe's last pose.
-
->>> from us_sim.tracking.measurement import TrackingClock
 >>> clock = TrackingClock(coast_for=0.3, lost_after=1.0)
->>> clock.state(0).value
-'waiting'
 >>> clock.seen(0)
 >>> [clock.state(ms * 1_000_000).value for ms in (100, 500, 1500)]
 ['tracked', 'coasting', 'lost']

@@ -1,33 +1,14 @@
-"""A 6-DOF mouse moves the probe: by velocity, or by displacement from where it was let go.
+"""A 6-DOF mouse that moves the probe, and the reports of a 3Dconnexion SpaceMouse.
+
+Axes are those of ROS's `spacenav_node`: forward, left and up, then turns about these (REP 103),
+each ±1 at full deflection.
 
 >>> from us_sim.tracking.mouse import SixDofMouse
->>> from us_sim.tracking.settings import SixDofMouseSettings
 >>> mouse = SixDofMouse(SixDofMouseSettings(speed=["50 mm/s", "-50 mm/s", "-50 mm/s"]))
->>> pushed_down = [0.0, 0.0, -1.0, 0.0, 0.0, 0.0]
->>> for tick in range(101):  # a second at 100 Hz
-...     probe = mouse.axes(pushed_down, [], tick * 10_000_000)
+>>> for tick in range(101):  # a second at 100 Hz, pushed down
+...     probe = mouse.axes([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], [], tick * 10_000_000)
 >>> probe.pose.position.round(6).tolist()  # from 10 mm above
 [0.0, 0.0, 0.04]
->>> mouse.axes([0.0, 0.0, 0.0], [], 1_010_000_000)
->>> mouse.last_problem
-'the message has 3 axes, but axis 5 is used: remap the joystick, or set six_dof_mouse.axes'
-
-A 3Dconnexion SpaceMouse as its own reports, without the manufacturer's or any other driver.
-
-The axes are those of ROS's `spacenav_node`: forward, left and up, then turns about these (REP
-103), each ±1 at full deflection.
-
->>> import struct
->>> from us_sim.tracking.mouse import SpaceMouseReports
->>> reports = SpaceMouseReports()
->>> reports.take(struct.pack("<B3h", 1, 0, -175, 350))  # half forward and fully down
-True
->>> reports.axes
-[0.5, 0.0, -1.0, 0.0, 0.0, 0.0]
->>> reports.take(bytes([3, 0b10]))
-True
->>> reports.buttons
-[0, 1]
 """
 
 from __future__ import annotations

@@ -1,29 +1,16 @@
-"""OpenIGTLink messages as bytes: poses in, images and transforms out (openigtlink.org, v1 to v3).
+"""OpenIGTLink: messages as bytes, a client of a tracker's server, and a server of images and poses.
 
-Everything is big-endian and in millimetres; a checksum is written but, over TCP, not asked for.
+Messages are those of openigtlink.org, versions 1 to 3: big-endian and in millimetres. A checksum
+is written but, over TCP, not verified.
 
->>> import numpy as np
 >>> from us_sim.tracking.openigtlink import HEADER, header_of, poses_in, transform_message
 >>> matrix = np.eye(4)
 >>> matrix[:3, 3] = [0.01, 0.02, 0.03]
 >>> message = transform_message("ProbeToTracker", 1_500_000_000, matrix)
 >>> header = header_of(message[: HEADER.size])
->>> header.kind, header.device, header.stamp, header.size
-('TRANSFORM', 'ProbeToTracker', 1500000000, 48)
 >>> [(name, matrix)] = poses_in(header, message[HEADER.size :])
 >>> name, matrix[:3, 3].round(6)
 ('ProbeToTracker', array([0.01, 0.02, 0.03]))
-
-Poses from an OpenIGTLink server (Plus, 3D Slicer, a tracker's own), whenever it is there.
-
-An OpenIGTLink server that sends each client the newest messages and never waits for one.
-
->>> from us_sim.tracking.openigtlink import OpenIGTLinkServer
->>> server = OpenIGTLinkServer("localhost", 0)
->>> server.send("ProbeToReference", b"...")
->>> server.clients
-0
->>> server.close()
 """
 
 from __future__ import annotations
@@ -525,7 +512,7 @@ class OpenIGTLinkServer:
                 self._clients[connection] = client
 
     def _serve(self, client: _Client, events: int) -> None:
-        """Read what is not listened to, and send what the connection takes."""
+        """Discard incoming data, and send as much as the connection takes."""
         if client.connection not in self._clients:
             return
         try:

@@ -1,57 +1,12 @@
-"""Settings of the tracker sources and filters, as a scene names them.
+"""Settings of the tracker sources and filters, each class a section of a scene's `tracker`.
 
-The settings of the camera source in a scene: the body to look for, and when to believe it.
-
->>> import math
->>> from us_sim.tracking.settings import CameraSettings
->>> settings = CameraSettings(dictionary="6X6_250", size="30 mm", marker=7)
->>> settings.size, round(math.degrees(settings.view_angle_limit))
-(0.03, 75)
->>> CameraSettings(minimum_markers=0)
-Traceback (most recent call last):
-...
-us_sim.errors.TrackingError: camera.minimum_markers: 0 is outside 1 to 1000
-
-The settings of the filters of a tracker's poses, and of the gate that refuses some.
-
->>> from us_sim.tracking.settings import OneEuroSettings
->>> OneEuroSettings(minimum_cutoff="2 Hz").minimum_cutoff
-2.0
+>>> from us_sim.tracking.settings import CameraSettings, OneEuroSettings
+>>> CameraSettings(size="25 mm").size
+0.025
 >>> OneEuroSettings(derivative_cutoff=0)
 Traceback (most recent call last):
 ...
 us_sim.errors.TrackingError: filter.derivative_cutoff: 0 Hz is outside 0.001 to 1000 Hz
-
-The settings of a haptic arm in a scene: how it moves the probe, and the limits of its wrench.
-
->>> from us_sim.tracking.settings import HapticSettings
->>> HapticSettings(scale=2, ramp="500 ms").ramp
-0.5
->>> HapticSettings(model_reach=3)
-Traceback (most recent call last):
-...
-us_sim.errors.TrackingError: haptic.model_reach: 3 m is outside 0.0001 to 1 m; did you mean '3 cm'?
-
-The settings of a 6-DOF mouse in a scene: how its cap's deflection moves the probe.
-
->>> from us_sim.tracking.settings import SixDofMouseSettings
->>> settings = SixDofMouseSettings(mode="position", reach=["30 mm", "-30 mm", "-30 mm"])
->>> settings.reach, settings.axes
-((0.03, -0.03, -0.03), (0, 1, 2, 3, 4, 5))
->>> SixDofMouseSettings(dead_band=2)
-Traceback (most recent call last):
-...
-us_sim.errors.TrackingError: six_dof_mouse.dead_band: 2 is outside 0 to 0.9
-
-The settings of an OpenIGTLink server in a scene: its address, and the frame of its poses.
-
->>> from us_sim.tracking.settings import OpenIGTLinkSettings
->>> OpenIGTLinkSettings(host="tracker.local", world="ras").port
-18944
->>> OpenIGTLinkSettings(port=70000)
-Traceback (most recent call last):
-...
-us_sim.errors.TrackingError: openigtlink.port: 70000 is outside 1 to 65535
 """
 
 from __future__ import annotations

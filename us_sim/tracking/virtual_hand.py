@@ -1,55 +1,11 @@
-"""The surface on which a probe is put: the patient's skin at rest.
-
->>> import numpy as np
->>> from us_sim.tracking.virtual_hand import RestSurface
->>> skin = RestSurface.plane(0.1)
->>> foot = skin.closest(np.array([0.01, 0.02, -0.03]))
->>> foot.point, foot.normal
-(array([0.01, 0.02, 0.  ]), array([ 0.,  0., -1.]))
-
-How something gets from where it is to where it is wanted: at once, smoothly, not too fast.
-
-A lead goes straight to the goal: as fast as it may, and within the last ``speed * time_constant``
-ever slower, by exp(-t / time_constant). What follows the lead lags by the same time constant. So
-near the goal it is the critically damped system of second order, which is the fastest linear one
-that does not overshoot; from afar it goes with the largest speed. Both phases are solved exactly,
-so the path does not depend on the steps in which time passes.
-
-A movement of minimum jerk (Flash and Hogan 1985) is closer to what an arm does by itself, yet it
-begins with the cube of time: planned anew whenever the mouse moves it would hardly begin at all.
-
->>> import numpy as np
->>> from us_sim.tracking.virtual_hand import Approach
->>> approach = Approach(np.zeros(1), speed=0.25, time_constant=0.02)
->>> approach.goal = np.array([0.05])
->>> [round(1e3 * float(approach.advance(0.05)[0]), 2) for _ in range(6)]  # mm
-[7.91, 20.03, 32.5, 44.48, 49.17, 49.9]
-
-The hand's movement from one stance to the next: a jump of the mouse does not stab the tissue.
-
->>> from us_sim.tracking.virtual_hand import Motion
->>> from us_sim.tracking.virtual_hand import Stance
->>> motion = Motion(Stance())
->>> motion.aim(Stance(press=0.01))
->>> pressed = [round(1e3 * motion.advance(0.04).press, 2) for _ in range(4)]  # mm
->>> pressed, motion.is_at_rest
-([3.41, 7.98, 9.57, 9.92], False)
-
-How a hand holds the probe on the skin, and the pose that follows.
+"""A hand that holds the probe on the skin: the stance it is asked for, and a smooth way there.
 
 The motions are those of the American Institute of Ultrasound in Medicine ("Transducer
-Manipulation", Journal of Ultrasound in Medicine 18, 1999, 169-175), in frame ``probe``: +x along
-the array, +y the elevation, +z into the tissue.
+Manipulation", Journal of Ultrasound in Medicine 18, 1999, 169-175): sliding along the skin,
+compressing along its normal, rotating about it, fanning about the probe's x axis (the array), and
+rocking about its y axis, within the image plane.
 
-- sliding: the point on the skin moves, along x or along y;
-- compressing: the probe moves along the skin's normal;
-- rotating: about the normal;
-- fanning (or tilting): about x, so the image plane swings through the tissue;
-- rocking: about y, within the image plane.
-
->>> import math
->>> from us_sim.tracking.virtual_hand import RestSurface
->>> from us_sim.tracking.virtual_hand import Stance
+>>> from us_sim.tracking.virtual_hand import Motion, RestSurface, Stance
 >>> skin = RestSurface.plane(0.1)
 >>> pressed = Stance([0.02, 0.0, 0.0], press=0.005, fan=math.radians(10))
 >>> (1e3 * pressed.pose(skin).position).round(6).tolist()  # mm
@@ -139,7 +95,7 @@ class RestSurface:
     def upper_side(
         cls, vertices: NDArray[np.floating], triangles: NDArray[np.integer]
     ) -> RestSurface:
-        """The part of a closed surface on which a probe can be put: what faces -z.
+        """The part of a closed surface that faces -z, on which a probe can stand.
 
         Args:
             vertices: (N, 3) m, frame ``patient``.
@@ -342,7 +298,7 @@ _AT_REST, _ALIGNED = 2e-6, 1e-4
 
 @dataclass(frozen=True)
 class HandSpeed:
-    """What a hand does at most: the quick end of what sonographers do, far below a thrust."""
+    """Speed limits of a hand: as a quick sonographer's, far below a thrust."""
 
     slide: float = 0.25  # m/s, of the line from the one point of the skin to the other
     press: float = 0.15  # m/s

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim import __version__
 from us_sim.errors import UsSimError
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.stream import Packet
 
 Sent = tuple[Mapping[str, Any], bytes]
 """Header and payload of a frame, as the page was sent them; pictures are JPEG, with ``time``, s."""

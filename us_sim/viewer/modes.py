@@ -10,22 +10,17 @@ from typing import Any
 
 from nicegui import ui
 
+from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.parameters import Kind
-from us_sim.viewer.simulator import Simulator
+from us_sim.viewer.stream import Simulator
 
 NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
 MODES = {
     "b-mode": ("B-mode", "The image as it is"),
     "none": ("Outlines", "With the outlines and names of structures, and marked when it is old"),
-    "strain": ("Strain", "How much the tissue is shortened along the beams since rest, exactly"),
-    "strain_estimate": ("Elastography", "Strain between two images, as a scanner estimates it"),
-    "velocity": ("Colour", "Velocity of blood along the beams, as colour Doppler shows it"),
+    **{name: mode[:2] for name, mode in OVERLAYS.items()},
 }
 """Label and title by value of the parameter ``overlay``, and the plain image before them."""
-STRIPS = {
-    "m_mode": ("M-mode", "Echoes along one line of the image over time"),
-    "spectrum": ("Spectrum", "Velocities of blood at the gate over time: pulsed-wave Doppler"),
-}
 _TOO_MUCH = 20.0  # N; sonographers press with some 5 to 10
 SWITCHES = {
     BESIDE: ("Beside", "The B-mode image beside the one with outlines or colours, on all pages"),
@@ -64,7 +59,7 @@ class _Modes:
             for mode, (label, title) in MODES.items():
                 self._buttons[mode] = _button(label, title, lambda mode=mode: self._choose(mode))
             ui.element("span").classes("us-gap")
-            for kind, (label, title) in STRIPS.items():
+            for kind, (label, title, _) in STRIPS.items():
                 self._buttons[kind] = _button(label, title, lambda kind=kind: self._toggle(kind))
             for name, (label, title) in SWITCHES.items():
                 self._buttons[name] = _button(label, title, lambda name=name: self._switch(name))

@@ -1,4 +1,4 @@
-"""The session as pages see it: what runs, what can be loaded and played, and how to ask for it.
+"""The session as pages see it: the running scene, what can be loaded and played, and requests.
 
 >>> from us_sim.viewer.session import SessionBoard
 >>> board = SessionBoard()
@@ -8,16 +8,24 @@
 
 from __future__ import annotations
 
+import json
 import threading
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import PurePath
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from sensor_msgs.msg import CompressedImage
+
+from us_sim.nodes.guarded_node import GuardedNode, shown
+from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
-
-Ask = Callable[[Mapping[str, object]], "Future[str]"]
-"""Sets parameters of ``session_control`` together; the future holds why not, or nothing."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +74,11 @@ class SessionState:
 
 
 class SessionBoard:
-    """The newest that is known of the session, and who looks at it; for any thread.
+    """The newest that is known of the session, and who shows it; for any thread.
 
     Args:
-        on_watch: called when pages begin to look, or no longer do.
-        ask: hands on what a page asks for.
+        on_watch: called when pages begin to show it, or no longer do.
+        send: sets parameters of ``session_control`` together; the future holds why not, or nothing.
         folder: to which pages record; "" is the one that us-sim runs in.
         is_own: whether all pages are this computer's own; others may ask for what is listed, and
             for recordings in that folder, and not for files anywhere.
@@ -79,84 +87,46 @@ class SessionBoard:
     def __init__(
         self,
         on_watch: Callable[[], None] = lambda: None,
-        ask: Ask | None = None,
+        send: Callable[[Mapping[str, object]], Future[str]] | None = None,
         folder: str = "",
         *,
         is_own: bool = True,
     ) -> None:
-        self._on_watch, self._ask = on_watch, ask
+        self._on_watch, self._send_to_control = on_watch, send
         self.folder, self._is_own = folder, is_own
         self._lock = threading.Lock()
         self._pages = 0
-        self._state = SessionState()
-        self._scenes: tuple[LoadableScene, ...] = ()
-        self._thumbnails: dict[str, bytes] = {}
-        self._bags: dict[str, str] = {}
+        self.state = SessionState()
+        self.scenes: tuple[LoadableScene, ...] = ()  # another object whenever it changes
+        self.thumbnails: dict[str, bytes] = {}  # JPEG of the image of a scene, by origins
+        self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
     @property
     def is_watched(self) -> bool:
         """Whether a page shows it."""
         return self._pages > 0
 
-    def watch(self) -> None:
-        """One more page looks."""
-        self._count(1)
-
-    def unwatch(self) -> None:
-        """One fewer."""
-        self._count(-1)
-
-    def _count(self, more: int) -> None:
+    def watch(self, pages: int = 1) -> None:
+        """Count so many pages more that show it; fewer where negative."""
         with self._lock:
             before = self.is_watched
-            self._pages += more
+            self._pages += pages
             changed = before != self.is_watched
         if changed:
             self._on_watch()
 
-    @property
-    def state(self) -> SessionState:
-        """What the simulation does."""
-        return self._state
-
-    @property
-    def scenes(self) -> tuple[LoadableScene, ...]:
-        """What can be loaded; another object whenever that changes."""
-        return self._scenes
-
-    @property
-    def bags(self) -> Mapping[str, str]:
-        """Files that can be played, by name; another object whenever that changes."""
-        return self._bags
-
-    def thumbnail(self, origin: str) -> bytes | None:
-        """JPEG of what the probe sees in a scene, once there is one."""
-        return self._thumbnails.get(origin)
-
-    def tell_state(self, state: SessionState) -> None:
-        """The simulation says what it does."""
-        self._state = state
-
-    def tell_scenes(self, scenes: tuple[LoadableScene, ...]) -> None:
-        """This can be loaded."""
-        self._scenes = scenes
-
-    def tell_thumbnail(self, origin: str, jpeg: bytes) -> None:
-        """A scene looks like this."""
-        self._thumbnails[origin] = jpeg
-
-    def tell_bags(self, bags: Mapping[str, str]) -> None:
-        """These can be played."""
-        self._bags = dict(bags)
+    def unwatch(self) -> None:
+        """One page shows it no longer."""
+        self.watch(-1)
 
     def ask(self, **values: object) -> Future[str]:
         """Set parameters of ``session_control``; the future holds why not, or nothing."""
         refusal = "" if self._is_own else self._refusal(values)
-        if self._ask is not None and self._state.is_there and not refusal:
+        if self._send_to_control is not None and self.state.is_there and not refusal:
             file = values.get("record")
             if self.folder and file:
                 values["record"] = str(PurePath(self.folder, str(file)))
-            return self._ask(values)
+            return self._send_to_control(values)
         refused: Future[str] = Future()
         refused.set_result(refusal or NOT_THERE)
         return refused
@@ -167,11 +137,181 @@ class SessionBoard:
         if PurePath(file).name != file or file.startswith(("~", "..")):
             return f"record: {file}: give a name without a folder"
         listed = {
-            "scene": [self._state.origin, *(each.origin for each in self._scenes)],
-            "replay": [self._state.replay, *self._bags.values()],
+            "scene": [self.state.origin, *(each.origin for each in self.scenes)],
+            "replay": [self.state.replay, *self.bags.values()],
             "volume": [],
         }
         for key, files in listed.items():
             if values.get(key) and values[key] not in files:
                 return f"{key}: {values[key]}: is not one of those that are listed"
         return ""
+
+
+CONTROL = "session_control"
+_EVERY_S = 0.5
+SILENT_S = 3.0
+"""Without a word, after which nobody answers for the simulation: it says something every second."""
+ANSWER_S = 10.0
+"""For it to answer, which it may do late while it reads a scene."""
+
+
+class ViewerSession(SessionBoard):
+    """A board that follows the session's topics while a page shows it, and asks `session_control`.
+
+    Args:
+        node: that listens.
+        post: has work done in the thread that spins ``node``.
+        folder, is_own: as for `SessionBoard`.
+    """
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        post: Callable[[Callable[[], Any]], Any],
+        folder: str = "",
+        *,
+        is_own: bool = True,
+    ) -> None:
+        super().__init__(lambda: post(self._listen), self._send, folder, is_own=is_own)
+        self._node, self._post = node, post
+        self._name = f"{node.get_namespace().rstrip('/')}/{CONTROL}"
+        self._subscriptions: list[Any] = []
+        self._timer: Any = None
+        self._client: AsyncParameterClient | None = None
+        self._heard = 0.0
+        self._asked: list[tuple[Future[str], float]] = []  # and when that was
+
+    def close(self) -> None:
+        """Answer whoever waits."""
+        for told, _ in self._asked:
+            if not told.done():
+                told.set_result("the viewer ends")
+
+    def _listen(self) -> None:
+        """Subscribe, or not, as pages want it now."""
+        if self.is_watched and not self._subscriptions:
+            if self._client is None:
+                self._client = AsyncParameterClient(self._node, CONTROL)
+            self._subscriptions = [
+                self._node.create_subscription(message_type, topic, callback, qos)
+                for message_type, topic, callback, qos in (
+                    (DiagnosticArray, "diagnostics", self._hear, STREAM),
+                    (DiagnosticArray, "session/scenes", self._take_scenes, LATCHED),
+                    (CompressedImage, "session/thumbnails", self._take_thumbnail, CATALOGUE),
+                    (DiagnosticArray, "session/bags", self._take_bags, LATCHED),
+                )
+            ]
+            self._timer = self._node.create_timer(_EVERY_S, self._check)
+        elif not self.is_watched and self._subscriptions:
+            for subscription in self._subscriptions:
+                self._node.destroy_subscription(subscription)
+            self._subscriptions = []
+            self._node.destroy_timer(self._timer)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == self._name:
+                self._heard = time.monotonic()
+                self.state = _state_of(status)
+
+    def _take_scenes(self, message: DiagnosticArray) -> None:
+        self.scenes = tuple(map(_scene_of, message.status))
+
+    def _take_thumbnail(self, message: CompressedImage) -> None:
+        self.thumbnails[message.header.frame_id] = bytes(message.data)
+
+    def _take_bags(self, message: DiagnosticArray) -> None:
+        self.bags = {shown(status.name): status.hardware_id for status in message.status}
+
+    def _check(self) -> None:
+        """Notice when nobody answers for the simulation any more."""
+        now = time.monotonic()
+        if self.state.is_there and now - self._heard > SILENT_S:
+            self.state = SessionState()
+        for told, asked in self._asked:
+            if not told.done() and now - asked > ANSWER_S:
+                told.set_result(f"{CONTROL} has not answered for {ANSWER_S:g} s")
+        self._asked = [(told, asked) for told, asked in self._asked if not told.done()]
+
+    def _send(self, values: Mapping[str, object]) -> Future[str]:
+        told: Future[str] = Future()
+
+        def ask() -> None:
+            if self._client is None or not self._client.services_are_ready():
+                told.set_result(NOT_THERE)
+                return
+            self._asked.append((told, time.monotonic()))
+            parameters = [Parameter(name, value=value) for name, value in values.items()]
+            answer = self._client.set_parameters_atomically(parameters)
+            answer.add_done_callback(lambda done: _tell(told, done))
+
+        if self._post(ask).cancelled():
+            told.set_result("the viewer ends")
+        return told
+
+
+def _tell(told: Future[str], answer: Any) -> None:
+    if told.done():
+        return
+    try:
+        told.set_result(answer.result().result.reason)
+    except Exception as error:  # whatever the middleware raises
+        told.set_result(f"{CONTROL} cannot be asked: {error}")
+
+
+def _scene_of(status: DiagnosticStatus) -> LoadableScene:
+    about = {each.key: shown(each.value) for each in status.values}
+    is_wrong = status.level != DiagnosticStatus.OK
+    said = shown(status.message)
+    return LoadableScene(
+        shown(status.name),
+        status.hardware_id,
+        about.get("kind", "scene"),
+        "" if is_wrong else said,
+        about.get("region", ""),
+        _names(about.get("structures", "")),
+        about.get("tracker", ""),
+        said if is_wrong else "",
+    )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """The texts of a JSON list; none where it is no such list."""
+    try:
+        listed = json.loads(text)
+    except (ValueError, RecursionError):
+        return ()
+    return tuple(map(str, listed)) if isinstance(listed, list) else ()
+
+
+def _state_of(status: DiagnosticStatus) -> SessionState:
+    said = {each.key: each.value for each in status.values}
+
+    def number(key: str, otherwise: float) -> float:
+        try:
+            return float(said[key])
+        except (KeyError, ValueError):
+            return otherwise
+
+    return SessionState(
+        is_there=True,
+        state=said.get("state", status.message),
+        scene=said.get("scene", ""),
+        origin=said.get("origin", ""),
+        loading=said.get("loading", ""),
+        fraction=number("fraction", 1.0),
+        problem=status.message if status.level != DiagnosticStatus.OK else "",
+        record=said.get("record", ""),
+        record_note=said.get("record_note", ""),
+        record_seconds=number("record_seconds", 0.0),
+        record_bytes=number("record_bytes", 0.0),
+        record_room=number("record_room_bytes", 0.0),
+        replay=said.get("replay", ""),
+        replay_as=said.get("replay_as", "path"),
+        replay_state=said.get("replay_state", ""),
+        position=number("position", 0.0),
+        duration=number("duration", 0.0),
+        rate=number("replay_rate", 1.0),
+        loop=said.get("replay_loop", "") == "true",
+        paused=said.get("replay_paused", "") == "true",
+    )

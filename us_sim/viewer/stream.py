@@ -1,26 +1,176 @@
-"""The websocket of one page: packets of the streams it watches, and its commands."""
+"""Streams to the pages: packets, feeds that make them while watched, and the side of one page.
+
+>>> from us_sim.viewer.stream import Feed, Packet
+>>> packet = Packet("image", 7, {"rows": 1, "columns": 4}, bytes([0, 85, 170, 255]))
+>>> len(packet.encoded) % 4, Packet.decoded(packet.encoded) == packet
+(0, True)
+>>> feed = Feed("image", lambda watched: print("watched" if watched else "left"))
+>>> told = []
+>>> feed.watch(lambda: told.append(feed.sequence))
+watched
+>>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"first"))
+>>> feed.offer(lambda sequence: Packet("image", sequence, {}, b"second"))
+>>> told, feed.newest().payload
+([1, 2], b'second')
+"""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import itertools
 import json
-from collections.abc import Callable
+import struct
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from us_sim.slicing.settings import STRIPS
+from us_sim.viewer.parameters import ParameterBoard
+from us_sim.viewer.session import SessionBoard
+from us_sim.viewer.status import StatusBoard
 
-from us_sim.viewer.feed import Feed
-from us_sim.viewer.simulator import Simulator
-
+_LENGTH = struct.Struct("<I")
+_ALIGNMENT = 8
+"""Bytes: the payload begins at a multiple, so that the page can read it as numbers."""
 _LONGEST = 65536
 """Characters of a page's message."""
 _numbers = itertools.count(1)
 
 
+@dataclass(frozen=True)
+class Packet:
+    """A message to the page: a header of JSON, and bytes."""
+
+    kind: str  # the stream's name
+    sequence: int  # counts the messages of the stream
+    header: Mapping[str, Any]  # JSON-like, of finite numbers
+    payload: bytes
+
+    @cached_property
+    def encoded(self) -> bytes:
+        """As sent: length of the header (32 bits, little endian), header, payload."""
+        header = {"kind": self.kind, "sequence": self.sequence, **self.header}
+        text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-(_LENGTH.size + len(text)) % _ALIGNMENT)
+        return b"".join((_LENGTH.pack(len(text)), text, self.payload))
+
+    @classmethod
+    def decoded(cls, data: bytes) -> Packet:
+        """The packet of :attr:`encoded`."""
+        (length,) = _LENGTH.unpack_from(data)
+        header = json.loads(data[_LENGTH.size : _LENGTH.size + length])
+        kind, sequence = header.pop("kind"), header.pop("sequence")
+        return cls(kind, sequence, header, data[_LENGTH.size + length :])
+
+
+Pack = Callable[[int], Packet | None]
+"""Makes the packet of a number; None where the message cannot be used."""
+
+
+class Feed:
+    """The newest of one stream: the graph offers, pages watch and take, each in its own thread.
+
+    Args:
+        kind: the stream's name, which its packets bear.
+        on_watch: called with True when the first page begins to watch and with False when the last
+            has left, in the thread of that page.
+        rate: Hz, at most, for each page; None sends every packet, of things that are told once.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        on_watch: Callable[[bool], object] = lambda _: None,
+        rate: float | None = 30.0,
+    ) -> None:
+        self.kind, self.rate = kind, rate
+        self.sequence = 0  # the number of the newest; 0 before the first
+        self._on_watch = on_watch
+        self._watchers: list[Callable[[], None]] = []
+        self._lock = threading.Lock()
+        self._packing = threading.Lock()
+        self._pack: Pack | None = None
+        self._packed: tuple[int, Packet | None] = (0, None)
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether any page watches."""
+        return bool(self._watchers)
+
+    def watch(self, notify: Callable[[], None]) -> None:
+        """Have ``notify`` called, from any thread, whenever there is a newer packet."""
+        with self._lock:
+            self._watchers.append(notify)
+            first = len(self._watchers) == 1
+        if first:
+            self._on_watch(True)
+
+    def unwatch(self, notify: Callable[[], None]) -> None:
+        """Stop the calls of ``notify``."""
+        with self._lock:
+            self._watchers.remove(notify)
+            last = not self._watchers
+        if last:
+            self._on_watch(False)
+
+    def offer(self, pack: Pack) -> None:
+        """Announce a newer packet, which ``pack`` makes if any page takes it."""
+        with self._lock:
+            self.sequence += 1
+            self._pack = pack
+            watchers = list(self._watchers)
+        for notify in watchers:
+            notify()
+
+    def forget(self) -> None:
+        """Drop the newest packet, as when another scene is loaded."""
+        with self._lock:
+            self._pack = None
+
+    def newest(self) -> Packet | None:
+        """The newest packet, made once for all pages; None where there is none to be used."""
+        with self._packing:
+            with self._lock:
+                sequence, pack = self.sequence, self._pack
+            if pack is None:
+                return None
+            if self._packed[0] != sequence:
+                self._packed = sequence, pack(sequence)
+            return self._packed[1]
+
+
+@dataclass
+class Simulator:
+    """The simulator as pages see it; filled by the node ``viewer``, or by a test."""
+
+    feeds: dict[str, Feed] = field(default_factory=dict)  # by kind
+    commands: dict[str, Callable[[Any, int], str | None]] = field(default_factory=dict)
+    """By the key of a page's message: takes the value and the page's number, returns an error."""
+    nodes: ParameterBoard = field(default_factory=ParameterBoard)
+    status: StatusBoard = field(default_factory=StatusBoard)
+    session: SessionBoard = field(default_factory=SessionBoard)
+    leaving: list[Callable[[int], object]] = field(default_factory=list)
+    """Called with a page's number when it has gone."""
+
+    @property
+    def is_changing_by_itself(self) -> bool:
+        """Whether a page watches blood or a strip of time, which go on while the probe rests."""
+
+        def watched(kind: str) -> bool:
+            return kind in self.feeds and self.feeds[kind].is_watched
+
+        overlay = self.nodes.of("slice_interpolator").parameters.get("overlay")
+        colours = overlay is not None and overlay.raw == "velocity" and watched("annotated")
+        return colours or any(map(watched, STRIPS))
+
+    def add(self, *feeds: Feed) -> None:
+        """Let pages watch these."""
+        self.feeds |= {feed.kind: feed for feed in feeds}
+
+
 class PageStream:
-    """What one page watches, and what of it is due.
+    """The streams that one page watches, and the packets that are due.
 
     A page says what it watches and then, for each stream, when it has drawn what came: so the
     newest is sent as soon as the page is ready, and a slow page gets fewer, not older ones.
@@ -39,7 +189,7 @@ class PageStream:
         self._earliest: dict[str, float] = {}  # s, when the next may be sent
 
     def take(self, text: str) -> str | None:
-        """Do what the page says; what is wrong with it, for a person, or None."""
+        """Obey a page's message; an error for a person, or None."""
         try:
             message = json.loads(text) if len(text) <= _LONGEST else None
         except (ValueError, RecursionError):
@@ -78,13 +228,10 @@ class PageStream:
         self._wake()
 
     def due(self, now: float) -> tuple[list[bytes], float | None]:
-        """What is to be sent now, encoded.
+        """The encoded packets to be sent now, and s until one that waits may be; None without.
 
         Args:
-            now: s, of a clock that is never set back.
-
-        Returns:
-            It, and s until more may be due that is there already; None where nothing is.
+            now: s, of a monotonic clock.
         """
         packets, later = [], None
         for kind, feed in self._watched.items():
@@ -98,58 +245,8 @@ class PageStream:
             self._sent[kind] = feed.sequence if packet is None else packet.sequence
             if packet is not None:
                 self._ready.discard(kind)
-                self._earliest[kind] = self._next_time(kind, now)
+                if feed.rate:  # on the beat of the rate, and not sooner after a rest
+                    beat = self._earliest.get(kind, now) + 1.0 / feed.rate
+                    self._earliest[kind] = max(beat, now)
                 packets.append(packet.encoded)
         return packets, later
-
-    def _next_time(self, kind: str, now: float) -> float:
-        """When the next one may be sent: on the beat of the rate, and not sooner after a rest."""
-        rate = self._watched[kind].rate
-        if not rate:
-            return now
-        return max(self._earliest.get(kind, now) + 1.0 / rate, now)
-
-    def close(self) -> None:
-        """The page has gone."""
-        self.watch([])
-
-
-async def serve_page(websocket: WebSocket, simulator: Simulator) -> None:
-    """Stay with one page until it goes."""
-    await websocket.accept()
-    loop = asyncio.get_running_loop()
-    awake = asyncio.Event()
-
-    def wake() -> None:
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(awake.set)
-
-    page = PageStream(simulator, wake)
-    sending = asyncio.ensure_future(_send(websocket, page, awake))
-    try:
-        while True:
-            wrong = page.take(await websocket.receive_text())
-            if wrong:
-                await websocket.send_text(json.dumps({"problem": wrong}))
-    except (WebSocketDisconnect, RuntimeError, KeyError):
-        pass  # it has gone, or sends bytes, which no page does
-    finally:
-        sending.cancel()
-        page.close()
-        for command in simulator.leaving:
-            command(page.number)
-
-
-async def _send(websocket: WebSocket, page: PageStream, awake: asyncio.Event) -> None:
-    loop = asyncio.get_running_loop()
-    later: float | None = None
-    while True:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(awake.wait(), later)
-        awake.clear()
-        packets, later = page.due(loop.time())
-        try:
-            for packet in packets:
-                await websocket.send_bytes(packet)
-        except (WebSocketDisconnect, RuntimeError):
-            return

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from us_sim.errors import VolumeError
-from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Placement
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import PHANTOMS
 from us_sim.settings.setting import Settings, setting

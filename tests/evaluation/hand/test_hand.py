@@ -31,8 +31,7 @@ from us_sim.evaluation.hand.report import JUDGED, evaluate_hand, targets
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.recording.hand_motion import HASTES, KINDS, Room
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_cg import FemCg
 
 MODEL = TissueModel.block(nodes=(5, 5, 4))

@@ -19,7 +19,7 @@ from us_sim.evaluation.tissue.report import evaluate_tissue, pareto_front
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.mesh.check import signed_volumes
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.solvers.msds import SpringSettings
 from us_sim.tissue.solvers.solver import create_solver
 

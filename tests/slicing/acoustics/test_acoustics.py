@@ -259,3 +259,6 @@ def test_an_image_that_is_deeper_than_a_box_says_by_how_much():
     half = np.radians(30) / 2
     turned = Pose(np.zeros(3), np.array([0.0, np.sin(half), 0.0, np.cos(half)]))
     assert beyond(deep, turned, box) == pytest.approx(0.08 - 0.05 / np.cos(np.radians(30)))
+    # 45° towards the box from beside it: the beam leaves the box's layer of depth before its side.
+    across = Pose(np.array([-0.08, 0.0, 0.03]), [0.0, np.sin(np.pi / 8), 0.0, np.cos(np.pi / 8)])
+    assert beyond(deep, across, np.array([[-0.05, -0.05, 0.0], [0.05, 0.05, 0.05]])) == 0.0

@@ -42,8 +42,8 @@ def contact_at(probe, where, pose=TURNED):
     """A contact of points (P, 3) of the probe's frame, and these in the patient's."""
     positions = pose.apply(np.array(where, dtype=float))
     contact = contact_of(probe, len(positions))
-    contact.aim(pose, positions)
-    contact.release(positions)
+    contact.set_pose(pose, positions)
+    contact.drop_planes(positions)
     return contact, positions
 
 
@@ -52,9 +52,9 @@ def forces_around(contact, positions, step):
     forces, normals = np.empty((2, 2, 3, *positions.shape))
     for k, sign in enumerate((1, -1)):
         for axis in range(3):
-            contact.look(positions + sign * step * np.eye(3)[axis])
+            contact.update_gaps(positions + sign * step * np.eye(3)[axis])
             forces[k, axis], normals[k, axis] = contact.force, contact.normal
-    contact.look(positions)
+    contact.update_gaps(positions)
     return forces, normals
 
 
@@ -68,7 +68,7 @@ def test_the_push_is_the_slope_of_the_energy(probe, where):
             moved, energy, normals = positions.copy(), [], []
             for sign in (1, -1):
                 moved[point] = positions[point] + sign * step * axis
-                contact.look(moved)
+                contact.update_gaps(moved)
                 energy.append(contact.energy)
                 normals.append(contact.normal[point].copy())
             # Deep inside are creases where the nearest surface is another one.
@@ -83,7 +83,7 @@ def test_the_energy_is_convex_in_the_gap(a, b, share, stiff, strong):
     contact = contact_of(FlaredProbe(Sphere(0.03), COARSE), 1, stiff, strong)
 
     def energy(height):
-        contact.aim(Pose(), np.array([[0.0, 0.0, height]]))
+        contact.set_pose(Pose(), np.array([[0.0, 0.0, height]]))
         assert contact.gap[0] == pytest.approx(height, abs=1e-15)
         return contact.energy
 
@@ -95,11 +95,11 @@ def test_the_energy_is_convex_in_the_gap(a, b, share, stiff, strong):
 @given(st.floats(-0.01, 0.01), moduli, moduli)
 def test_the_push_rises_faster_and_faster_up_to_the_greatest(gap, stiff, strong):
     contact = contact_of(FlaredProbe(Sphere(0.03), COARSE), 1, stiff, strong)
-    contact.aim(Pose(), np.array([[0.0, 0.0, gap]]))
+    contact.set_pose(Pose(), np.array([[0.0, 0.0, gap]]))
     depth = max(0.0, -gap)
     law = stiff * depth * (1 + (depth / STIFFENING) ** 2)
-    assert contact.push[0] == pytest.approx(min(law, strong), rel=1e-9)
-    np.testing.assert_array_equal(contact.push_at(contact.gap), contact.push)
+    assert contact.normal_force[0] == pytest.approx(min(law, strong), rel=1e-9)
+    np.testing.assert_array_equal(contact.normal_force_at(contact.gap), contact.normal_force)
 
 
 @EXAMPLES
@@ -113,8 +113,8 @@ def test_the_energy_goes_on_at_the_greatest_push(stiff, strong):
     deepest = brentq(lambda depth: law(depth) - strong, 0.0, strong / stiff, xtol=1e-18)
     assume(deepest < 0.01)  # lest the sphere ends
     held = 0.5 * stiff * deepest**2 + 0.25 * stiff * deepest**4 / STIFFENING**2
-    contact.aim(Pose(), np.array([[0.0, 0.0, -deepest - 0.003]]))
-    assert contact.push[0] == pytest.approx(strong)
+    contact.set_pose(Pose(), np.array([[0.0, 0.0, -deepest - 0.003]]))
+    assert contact.normal_force[0] == pytest.approx(strong)
     assert contact.energy == pytest.approx(held + 0.003 * strong)
     assert len(contact.springs_after(np.zeros((1, 3)))[0]) == 0  # it falls no more
 
@@ -159,8 +159,8 @@ def test_springs_and_turns_together_are_the_derivative_of_the_forces(collider, s
     expected = np.zeros_like(slope)
     active, directions, stiffness = contact.springs_after(np.zeros_like(positions))
     expected[active] -= np.einsum("k,ki,kj->kij", stiffness, directions, directions)
-    turned, turn = contact.turns(positions, contact.push)
-    assert (contact.push[turned] > 0.0).all()
+    turned, turn = contact.geometric_stiffness(positions, contact.normal_force)
+    assert (contact.normal_force[turned] > 0.0).all()
     expected[turned] += turn
     np.testing.assert_allclose(expected[smooth], slope[smooth], atol=5e-3 * STIFF)
     # Forces with an energy have a symmetric tangent.
@@ -177,8 +177,8 @@ def test_around_a_closed_loop_the_forces_do_no_work(probe, where, seed):
     loop = centre + np.cos(angle) * u + np.sin(angle) * v
     along = (np.cos(angle) * v - np.sin(angle) * u) * 2 * np.pi / len(angle)
     whole, _ = contact_at(probe, np.zeros((len(loop), 3)))
-    whole.aim(TURNED, loop)
-    whole.release(loop)
+    whole.set_pose(TURNED, loop)
+    whole.drop_planes(loop)
     power = (whole.force * along).sum(axis=1)
     assert abs(power.sum()) <= 2e-3 * np.abs(power).sum() + 1e-12
 
@@ -190,13 +190,13 @@ def test_energy_and_forces_know_only_the_pose_and_the_positions(probe, where, se
     other, rng = contact_of(probe, len(positions)), np.random.default_rng(seed)
     for _ in range(4):
         pose = Pose(TURNED.position + 0.02 * rng.normal(size=3), TURNED.orientation)
-        other.aim(pose, positions + 0.01 * rng.normal(size=3))
-    other.look(positions + 0.01)
-    other.aim(TURNED, positions)
-    other.release(positions)
+        other.set_pose(pose, positions + 0.01 * rng.normal(size=3))
+    other.update_gaps(positions + 0.01)
+    other.set_pose(TURNED, positions)
+    other.drop_planes(positions)
     assert other.energy == contact.energy
     np.testing.assert_array_equal(other.force, contact.force)
-    assert other.release(positions) is False
+    assert other.drop_planes(positions) is False
 
 
 def test_deep_points_are_pushed_back_through_where_they_came_in_until_they_are_released():
@@ -204,26 +204,26 @@ def test_deep_points_are_pushed_back_through_where_they_came_in_until_they_are_r
     probe, start = FlaredProbe(RoundedBox(0.05, 0.03, 0.06, 0.006), FINE), np.zeros((1, 3))
     contact = contact_of(probe, 1)
     assert probe.deep == pytest.approx(0.5 * 0.015)
-    contact.aim(Pose(position=[-0.034, 0.0, 0.01]), start)
-    assert not contact.push.any()
-    contact.aim(Pose(position=[-0.016, 0.0, 0.01]), start)
+    contact.set_pose(Pose(position=[-0.034, 0.0, 0.01]), start)
+    assert not contact.normal_force.any()
+    contact.set_pose(Pose(position=[-0.016, 0.0, 0.01]), start)
     np.testing.assert_allclose(contact.normal, [[1.0, 0.0, 0.0]], atol=1e-9)
     assert contact.gap[0] == pytest.approx(-0.009, abs=2e-6)
     # The plane stays where it is as the point moves, and it is flat.
     moved = np.array([[0.004, 0.002, 0.001]])
-    contact.look(moved)
+    contact.update_gaps(moved)
     assert contact.gap[0] == pytest.approx(-0.005, abs=2e-6)
-    assert len(contact.turns(moved, contact.push)[0]) == 0
-    contact.look(start)
-    assert contact.release(start)
+    assert len(contact.geometric_stiffness(moved, contact.normal_force)[0]) == 0
+    contact.update_gaps(start)
+    assert contact.drop_planes(start)
     assert contact.gap[0] == pytest.approx(-0.009)
-    contact.aim(Pose(position=[-0.016, 0.0, 0.01]), start)
+    contact.set_pose(Pose(position=[-0.016, 0.0, 0.01]), start)
     # From the same place without a way there, it came from before the front.
     anew = contact_of(probe, 1)
-    anew.aim(Pose(position=[-0.016, 0.0, 0.01]), start)
+    anew.set_pose(Pose(position=[-0.016, 0.0, 0.01]), start)
     np.testing.assert_allclose(anew.normal, [[0.0, 0.0, 1.0]], atol=1e-9)
     assert anew.gap[0] == pytest.approx(-0.01, abs=2e-6)
-    assert anew.release(start)
+    assert anew.drop_planes(start)
     np.testing.assert_allclose(anew.normal, [[1.0, 0.0, 0.0]], atol=1e-9)
 
 
@@ -231,8 +231,8 @@ def test_after_a_leap_points_came_from_before_the_front():
     probe, start = FlaredProbe(RoundedBox(0.05, 0.03, 0.06, 0.006), FINE), np.zeros((1, 3))
     for way, normal in [(0.019, [1.0, 0.0, 0.0]), (0.021, [0.0, 0.0, 1.0])]:
         contact = contact_of(probe, 1)
-        contact.aim(Pose(position=[-0.016 - way, 0.0, 0.01]), start)
-        contact.aim(Pose(position=[-0.016, 0.0, 0.01]), start)
+        contact.set_pose(Pose(position=[-0.016 - way, 0.0, 0.01]), start)
+        contact.set_pose(Pose(position=[-0.016, 0.0, 0.01]), start)
         np.testing.assert_allclose(contact.normal[0], normal, atol=1e-9)
 
 
@@ -267,22 +267,22 @@ def test_where_no_probe_is_nothing_is_pushed():
     assert contact.energy > 0.0
     contact.clear()
     assert contact.energy == 0.0
-    contact.look(positions)
+    contact.update_gaps(positions)
     assert not contact.force.any()
-    assert len(contact.turns(positions, np.ones(1))[0]) == 0
-    assert contact.release(positions) is False
-    assert contact.expect(np.ones(1)) is False
-    assert contact.settle() == 0.0
+    assert len(contact.geometric_stiffness(positions, np.ones(1))[0]) == 0
+    assert contact.drop_planes(positions) is False
+    assert contact.set_friction_bound(np.ones(1)) is False
+    assert contact.update_friction() == 0.0
 
 
 def test_tissue_that_comes_back_to_a_probe_at_rest_is_pushed_again():
     plate = FlaredProbe(RoundedBox(0.04, 0.04, 0.03, 0.001), 0.005)
     contact, there = contact_of(plate, 1), np.array([[0.0, 0.0, -0.001]])
     away = there + np.array([0.0, 0.0, 2 * plate.reach])
-    contact.aim(Pose(), away)
-    assert not contact.release(away)
-    contact.look(there)
-    assert not contact.push.any()  # it was too far to be looked at
-    assert contact.release(there)
-    assert contact.push[0] > 0.0
+    contact.set_pose(Pose(), away)
+    assert not contact.drop_planes(away)
+    contact.update_gaps(there)
+    assert not contact.normal_force.any()  # it was too far to be looked at
+    assert contact.drop_planes(there)
+    assert contact.normal_force[0] > 0.0
     assert contact.energy > 0.0

@@ -8,15 +8,14 @@ from hypothesis import strategies as st
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.triangle_parts import part_size
+from us_sim.geometry.triangles import part_size
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.probe_gap import only_forward, push_out, wrench_on_probe
 from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 from us_sim.tissue.solvers.solver import create_solver
 
 FINE, COARSE = 0.004, 0.02  # m, spacings that resolve a sphere of 30 mm, and that do not
@@ -190,24 +189,24 @@ REST = np.array([[0.0, 0, 0], [0.004, 0, 0], [0.1, 0, 0]])
 def test_touched_nodes_lie_on_the_probe():
     contact, displacement = ActiveSet(SPHERE, REST, FINE), np.zeros((3, 3))
     pose = Pose(np.array([0.0, 0.0, 0.01]))
-    assert contact.revise(pose, displacement)
+    assert contact.update(pose, displacement)
     np.testing.assert_array_equal(contact.touched, [True, True, False])
     distance, _ = signed_distance(SPHERE, pose, REST + displacement)
     np.testing.assert_allclose(distance[:2], 0, atol=1e-9)
     np.testing.assert_array_equal(displacement[2], 0)
-    assert not contact.revise(pose, displacement)
-    assert contact.consistent(pose, displacement)
+    assert not contact.update(pose, displacement)
+    assert contact.is_consistent(pose, displacement)
 
 
 def test_a_node_that_would_be_pulled_is_let_go():
     contact, displacement = ActiveSet(SPHERE, REST, FINE), np.zeros((3, 3))
     pose = Pose(np.array([0.0, 0.0, 0.01]))
-    contact.revise(pose, displacement)
-    contact.weigh(np.array([[0.0, 0, 1], [0.0, 0, -1], [0.0, 0, 5]]))
-    assert contact.push[0] == pytest.approx(1)
-    assert contact.push[2] == 0
-    assert not contact.consistent(pose, displacement)
-    assert contact.revise(pose, displacement)
+    contact.update(pose, displacement)
+    contact.set_forces(np.array([[0.0, 0, 1], [0.0, 0, -1], [0.0, 0, 5]]))
+    assert contact.normal_force[0] == pytest.approx(1)
+    assert contact.normal_force[2] == 0
+    assert not contact.is_consistent(pose, displacement)
+    assert contact.update(pose, displacement)
     np.testing.assert_array_equal(contact.touched, [True, False, False])
 
 
@@ -215,10 +214,10 @@ def test_a_probe_that_is_taken_away_holds_nothing():
     pose = Pose(np.array([0.0, 0.0, 0.01]))
     for elsewhere in (None, Pose(np.array([0.0, 0.0, -0.05]))):
         contact, displacement = ActiveSet(SPHERE, REST, FINE), np.zeros((3, 3))
-        contact.revise(pose, displacement)
-        assert contact.revise(elsewhere, displacement)
+        contact.update(pose, displacement)
+        assert contact.update(elsewhere, displacement)
         assert not contact.touched.any()
-        assert not contact.revise(elsewhere, displacement)
+        assert not contact.update(elsewhere, displacement)
 
 
 def test_adopted_nodes_are_those_on_the_surface():

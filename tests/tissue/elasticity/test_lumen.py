@@ -14,16 +14,16 @@ from us_sim.evaluation.independent_forces import neo_hookean_forces
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
-from us_sim.tissue.elasticity.lumen import emptying, lumen_table, require_solid
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import (
     TissueMaterials,
     average_over_labels,
     label_fractions,
     uniform_material,
+    volumetric_split,
 )
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.elasticity.volumetric_split import volumetric_split
+from us_sim.tissue.elasticity.neo_hookean_material import emptying, lumen_table, require_solid
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 

@@ -1,4 +1,4 @@
-"""Moduli from presses whose moduli are known, and presses that cannot tell them."""
+"""Moduli of known presses are found within their intervals; landmarks; refused inputs."""
 
 from dataclasses import replace
 
@@ -11,15 +11,13 @@ from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import LabelFractions, average_over_labels
-from us_sim.tissue.identification.landmarks import Landmarks
 from us_sim.tissue.identification.press_model import PressModel
-from us_sim.tissue.identification.press_record import paired, without_wrench
+from us_sim.tissue.identification.press_record import ChosenPoses, paired, without_wrench
 from us_sim.tissue.identification.settings import StiffnessSettings
-from us_sim.tissue.identification.stiffness import Tissue, fit_stiffness
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.identification.stiffness import Landmarks, Tissue, fit_stiffness, read_landmarks
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 
 FEW = StiffnessSettings(poses=16)
 
@@ -150,3 +148,82 @@ def test_what_cannot_be_fitted_is_refused(press, keep, sign, sentence):
     record = press.record(sign * press.felt)
     with pytest.raises(StiffnessError, match=sentence):
         fit_stiffness(press.tissue, record, replace(FEW, keep=keep))
+
+
+GOOD = "name,time,x,y,z\nvein,,0,0,10 mm\nvein,0.5,0,0,12 mm\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("name,x,y,z\n", "has no column time"),
+        ("name,time,x,y,z\nvein,,0,0,1 kg\n", "line 2: .*1 kg"),
+        ("name,time,x,y,z\nvein,1,0,0,0.01\n", "where it is at rest"),
+        ("name,time,x,y,z\nvein,,0,0,0.01\n", "nothing was seen"),
+        ("name,time,x,y,z\nvein,,0,0,0.01\nvein,,0,0,0.02\n", "at rest twice"),
+        ("name,time,x,y,z\nvein,,0,0\n", "line 2"),
+    ],
+)
+def test_what_is_no_list_of_landmarks_is_refused(tmp_path, text, sentence):
+    file = tmp_path / "seen.csv"
+    file.write_text(text)
+    with pytest.raises(StiffnessError, match=sentence):
+        read_landmarks(file)
+
+
+def test_a_missing_file_is_one_sentence(tmp_path):
+    with pytest.raises(StiffnessError, match="cannot be read"):
+        read_landmarks(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (GOOD.replace("0.5", "9"), "no pose with a wrench is within 10 ms"),
+        (GOOD.replace("10 mm", "-40 mm"), "40.0 mm outside the tissue's mesh"),
+        (GOOD.replace("0.5", "0.0"), "no landmark was seen while the probe pressed"),
+    ],
+)
+def test_landmarks_must_fit_the_press_and_the_tissue(tmp_path, press, text, sentence):
+    file = tmp_path / "seen.csv"
+    file.write_text(text)
+    path = press.path
+    record = without_wrench((path.stamps, path.positions, path.orientations))
+    apart = -path.positions[:, 2] + 0.02
+    apart[0] = 0.01
+    apart[10] = -0.005
+    chosen = ChosenPoses(np.array([10]), np.array([0]), apart)
+    with pytest.raises(StiffnessError, match=sentence):
+        read_landmarks(file).at(record, chosen, press.tissue.model.mesh, 0.01)
+
+
+POSE = Pose([0.004, 0.003, 0.008], [0.05, 0.02, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def felt(press):
+    tissue = press.tissue
+
+    def felt(moduli):
+        return PressModel(tissue.model, tissue.materials_for, list(moduli), [POSE]).predict(moduli)
+
+    return felt
+
+
+def test_slopes_are_those_between_presses_with_other_moduli(press, felt):
+    here, step = felt(press.moduli), 0.01
+    for p, name in enumerate(press.moduli):
+        more, less = (
+            felt({**press.moduli, name: press.moduli[name] * np.exp(change)}).wrenches[0]
+            for change in (step, -step)
+        )
+        between = (more - less) / (2 * step)
+        assert np.allclose(here.slopes[0, :, p], between, atol=2e-3 * np.abs(between).max())
+
+
+def test_all_moduli_twice_as_large_make_twice_the_force(press, felt):
+    here = felt(press.moduli)
+    twice = felt({name: 2 * modulus for name, modulus in press.moduli.items()})
+    assert np.allclose(twice.wrenches, 2 * here.wrenches, rtol=1e-4, atol=1e-6)
+    # Euler's theorem on homogeneous functions: the slopes add up to the function.
+    assert np.allclose(here.slopes.sum(axis=2), here.wrenches, rtol=1e-3, atol=1e-4)

@@ -8,13 +8,11 @@ from scipy.sparse.linalg import splu
 from tissue_block import block, block_mesh
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
-from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
+from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure, stiffness
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra import multifrontal
-from us_sim.tissue.linear_algebra.multifrontal import eliminate
-from us_sim.tissue.linear_algebra.nested_dissection import nested_dissection
+from us_sim.tissue.linear_algebra.multifrontal import eliminate, nested_dissection
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 

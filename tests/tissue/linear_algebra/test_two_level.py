@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 from tissue_block import block
 
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
-from us_sim.tissue.linear_algebra.two_level import TwoLevel, add_blocks, conjugate_gradients
+from us_sim.tissue.linear_algebra.two_level import (
+    CoarseGrid,
+    TwoLevel,
+    add_blocks,
+    conjugate_gradients,
+)
 
 MODEL = block((7, 5, 5))
 COUNT = len(MODEL.mesh.nodes)

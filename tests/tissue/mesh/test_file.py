@@ -9,8 +9,7 @@ from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.mesh.file import read_mesh
-from us_sim.tissue.mesh.gmsh import parse_gmsh
+from us_sim.tissue.mesh.file import parse_gmsh, read_mesh
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 
 GMSH = """$NOD

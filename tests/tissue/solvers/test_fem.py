@@ -17,7 +17,7 @@ from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.compliant_contact import FrictionalContact
 from us_sim.tissue.contact.probe_gap import push_out
-from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
+from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra import compliance as compliance_module

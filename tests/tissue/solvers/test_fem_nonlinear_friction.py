@@ -168,9 +168,9 @@ def test_the_wrench_is_what_holds_the_block():
 def test_no_step_raises_the_energy(friction):
     newton = Newton(block((9, 5, 5), LINEAR), friction)
     for i in range(5):
-        newton.settle()
-        newton.aim(at(x=0.003 * i, y=0.001 * i, z=0.004 + 0.003 * i))
-        newton.expect(newton.contact.push)
+        newton.update_contact()
+        newton.set_pose(at(x=0.003 * i, y=0.001 * i, z=0.004 + 0.003 * i))
+        newton.set_friction_bound(newton.contact.normal_force)
         for _ in range(6):
             before = newton.energy
             newton.step(20)
@@ -186,9 +186,9 @@ def test_forces_are_the_energys_slope_and_springs_are_theirs(seed, friction):
     nodes[:, 2] = random.uniform(-1e-3, 1e-3, count)
     plate, strongest = FlaredProbe(PLATE, 0.01), np.full(count, 50.0)
     contact = PenaltyFriction(plate, stiffness, strongest, 0.01, friction)
-    contact.aim(at(z=2e-3), nodes)
-    contact.expect(contact.push)
-    contact.aim(at(x=1e-3, y=-5e-4, z=2e-3, orientation=(0.05, 0.0, 0.1, 1.0)), nodes)
+    contact.set_pose(at(z=2e-3), nodes)
+    contact.set_friction_bound(contact.normal_force)
+    contact.set_pose(at(x=1e-3, y=-5e-4, z=2e-3, orientation=(0.05, 0.0, 0.1, 1.0)), nodes)
     change = random.normal(0, 1e-9, (count, 3))
     energy, force = contact.energy, contact.force
     index, directions, springs = contact.springs_after(np.zeros_like(change))
@@ -196,7 +196,7 @@ def test_forces_are_the_energys_slope_and_springs_are_theirs(seed, friction):
     pulls = springs * np.einsum("ij,ij->i", directions, change[index])
     np.add.at(predicted, index, -pulls[:, None] * directions)
     after = contact.force_after(change)
-    contact.look(nodes + change)
+    contact.update_gaps(nodes + change)
     np.testing.assert_allclose(contact.force, after, atol=1e-12)
     np.testing.assert_allclose(after, predicted, atol=1e-10)
     rise = -((force + after) / 2 * change).sum()

@@ -9,7 +9,7 @@ from us_sim.geometry.collider import RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.overstress import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import PronyBranch
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
 from us_sim.tissue.solvers.newton import Newton
 
@@ -125,7 +125,7 @@ def test_no_step_raises_the_energy():
     newton = Newton(block((9, 5, 5)), branch=branch)
     for i in range(5):
         newton.relax()
-        newton.aim(at(x=0.003 * i, z=0.004 + 0.003 * i))
+        newton.set_pose(at(x=0.003 * i, z=0.004 + 0.003 * i))
         for _ in range(6):
             before = newton.energy
             newton.step(20)

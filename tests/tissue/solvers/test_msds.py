@@ -8,8 +8,8 @@ from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.deformation import TissueState
-from us_sim.tissue.elasticity.tangling import count_inverted
+from us_sim.tissue.elasticity.stability import count_inverted
+from us_sim.tissue.model import TissueState
 from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 FRAME = 20 * 0.01  # s

@@ -10,12 +10,11 @@ from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.deformation import TissueState
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.springs import fitted_springs
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, volume_term
+from us_sim.tissue.elasticity.springs import VolumeTerm, fitted_springs, volume_term
+from us_sim.tissue.model import TissueState
 from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
 from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 from us_sim.tissue.solvers.msds_implicit import MsdsImplicit, MsdsImplicitSettings

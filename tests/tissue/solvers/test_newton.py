@@ -42,11 +42,11 @@ def newton_of(name):
 def pressed(name, pose, size=0.0, seed=0):
     """At a pose, every free node displaced by about ``size`` (m)."""
     newton = newton_of(name)
-    newton.rest()
+    newton.reset()
     displacement = np.random.default_rng(seed).normal(size=(3, COUNT)) * size
     displacement[:, MODELS[name].fixed] = 0.0
-    newton.put(displacement)
-    newton.aim(pose)
+    newton.set_displacement(displacement)
+    newton.set_pose(pose)
     return newton
 
 
@@ -63,14 +63,14 @@ poses = st.builds(
 @pytest.mark.parametrize("size", [1e-4, 1e-2])
 def test_unbalanced_forces_are_the_slope_of_the_energy(name, size):
     newton = pressed(name, at(z=0.01), size)
-    slope, start = newton.unbalanced.copy(), newton.displacement
-    assert newton.load > 0.0
-    assert np.linalg.norm(slope) == pytest.approx(newton.imbalance)
+    slope, start = newton.residual.copy(), newton.displacement
+    assert newton.contact_norm > 0.0
+    assert np.linalg.norm(slope) == pytest.approx(newton.residual_norm)
     change = np.random.default_rng(1).normal(size=(3, COUNT))
     change[:, MODELS[name].fixed] = 0.0
     step, energy = 1e-8, []
     for sign in (1, -1):
-        newton.put(start + sign * step * change)
+        newton.set_displacement(start + sign * step * change)
         energy.append(newton.energy)
     expected = (energy[0] - energy[1]) / (2 * step)
     scale = np.linalg.norm(slope) * np.linalg.norm(change)
@@ -89,13 +89,15 @@ def test_every_step_lowers_the_energy_from_any_start_also_inside_out(name):
         inverted += newton.tissue.inverted(newton.displacement) > 0
         for _ in range(12):
             energy, before = newton.energy, newton.displacement
-            taken = newton.step(newton.patience)
+            taken = newton.step(newton.iteration_limit)
             assert np.isfinite(newton.energy)
             assert newton.energy <= energy * (1 + 1e-11)
             # What is kept is what the displacement has.
-            kept, imbalance = newton.energy, newton.imbalance
-            newton.put(newton.displacement)
-            assert (newton.energy, newton.imbalance) == pytest.approx((kept, imbalance), rel=1e-9)
+            kept, imbalance = newton.energy, newton.residual_norm
+            newton.set_displacement(newton.displacement)
+            assert (newton.energy, newton.residual_norm) == pytest.approx(
+                (kept, imbalance), rel=1e-9
+            )
             if not taken:
                 np.testing.assert_array_equal(newton.displacement, before)
 
@@ -108,29 +110,29 @@ def test_every_step_lowers_the_energy_from_any_start_also_inside_out(name):
 def test_it_converges_to_a_balance(name, size):
     newton = pressed(name, at(x=0.004, z=0.015), size)
     for _ in range(80):
-        newton.step(newton.patience)
-        if newton.imbalance <= 1e-7 * newton.load:
+        newton.step(newton.iteration_limit)
+        if newton.residual_norm <= 1e-7 * newton.contact_norm:
             break
-    assert newton.imbalance <= 1e-7 * newton.load
-    assert not newton.is_stuck
-    assert not newton.unbalanced[:, MODELS[name].fixed].any()
+    assert newton.residual_norm <= 1e-7 * newton.contact_norm
+    assert not newton.has_stagnated
+    assert not newton.residual[:, MODELS[name].fixed].any()
 
 
 @EVERY
 def test_the_balance_depends_on_the_pose_and_not_on_the_way_there(name):
     def balanced(*ways):
         newton = newton_of(name)
-        newton.rest()
+        newton.reset()
         for pose in ways:
-            newton.aim(pose)
+            newton.set_pose(pose)
             for _ in range(80):
-                newton.step(newton.patience)
-                if newton.imbalance <= 1e-9 * newton.load:
+                newton.step(newton.iteration_limit)
+                if newton.residual_norm <= 1e-9 * newton.contact_norm:
                     break
-            if newton.settle():
+            if newton.update_contact():
                 for _ in range(40):
-                    newton.step(newton.patience)
-        assert newton.imbalance <= 1e-8 * newton.load
+                    newton.step(newton.iteration_limit)
+        assert newton.residual_norm <= 1e-8 * newton.contact_norm
         return newton.displacement
 
     there = at(x=0.004, z=0.012, tilt=0.05)
@@ -142,8 +144,8 @@ def test_the_balance_depends_on_the_pose_and_not_on_the_way_there(name):
 def test_rest_is_at_balance_and_a_fresh_start():
     newton = pressed("sphere", at(z=0.01))
     first = [newton.step(20) and newton.energy for _ in range(4)]
-    newton.rest()
-    assert newton.energy == newton.imbalance == newton.load == 0.0
+    newton.reset()
+    assert newton.energy == newton.residual_norm == newton.contact_norm == 0.0
     again = pressed("sphere", at(z=0.01))
     assert [again.step(20) and again.energy for _ in range(4)] == first
 
@@ -155,7 +157,7 @@ def test_a_factor_of_the_stiffness_changes_the_way_and_not_the_end():
         newton.may_factor = may_factor
         for _ in range(60):
             newton.step(200)
-            if newton.imbalance <= 1e-9 * newton.load:
+            if newton.residual_norm <= 1e-9 * newton.contact_norm:
                 break
         ends.append(newton.displacement)
     newton_of("layered").may_factor = False

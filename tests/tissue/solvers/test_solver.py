@@ -10,7 +10,7 @@ from tissue_block import block
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
-from us_sim.tissue.deformation import TissueState
+from us_sim.tissue.model import TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.008]))

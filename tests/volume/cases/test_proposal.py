@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CaseError
-from us_sim.geometry.placement import Placement
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.volume.cases.proposal import proposed_probe, proposed_start, with_proposal
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.files.readers import read_volume

@@ -32,9 +32,8 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.hand_motion import HASTES, KINDS, RATE, Room, hand_motion
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import find_scene, load_scene
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.frame_budget import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume

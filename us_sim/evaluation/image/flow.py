@@ -15,10 +15,8 @@ from us_sim.evaluation.image.measure import PROBES, Artefact, Point, voxel_grid,
 from us_sim.evaluation.report import ReportFolder, Target, filled, key_beside, picture, plain
 from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
-from us_sim.scene.blood import blood_of
-from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
+from us_sim.scene.building import blood_of, colour_of, scanner_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.scene.structures import colour_of
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.overlay import Overlay

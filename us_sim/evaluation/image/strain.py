@@ -38,9 +38,8 @@ from us_sim.slicing.strain import AxialStrain, displacement, strain_scale
 from us_sim.slicing.strain_estimate import Estimate, estimate_strain
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import average_over_labels, label_fractions
-from us_sim.tissue.mesh.node_selection import face_nodes
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 

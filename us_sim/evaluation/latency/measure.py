@@ -323,7 +323,7 @@ class _Running:
     @property
     def scheduling(self) -> str:
         """As `scheduling_of` the node that has most to do."""
-        from us_sim.nodes.realtime import scheduling_of
+        from us_sim.nodes.process import scheduling_of
 
         return scheduling_of(self.pids.get("tissue_deformer") or next(iter(self.pids.values())))
 

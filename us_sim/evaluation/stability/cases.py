@@ -29,10 +29,13 @@ from scipy.stats import qmc
 from us_sim.geometry.collider import Capsule, Collider, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import (
+    TetrahedralMesh,
+    box_mesh,
+    signed_volumes,
+    uniform_planes,
+)
+from us_sim.tissue.model import TissueModel, face_nodes
 
 COLLIDERS: dict[str, Collider] = {
     "sphere": Sphere(0.03),

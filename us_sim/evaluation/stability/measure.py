@@ -39,12 +39,10 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import springs_of
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 _RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_checked", "truthful")
@@ -198,14 +196,14 @@ def run_trial(
             trial.held.append(float(deformation.residual))
             volumes = signed_volumes(deformation.nodes, model.mesh.tetrahedra)
             trial.held_inverted = int((volumes <= 0).sum())
-        failed = deformation.has_failed
+        failed = Intervention.FRAME_FAILED in deformation.interventions
         if failed:
             trial.kept += 1
             residual.forget()
-            if last is not None and not np.array_equal(deformation.nodes, model.mesh.nodes):
+            if Intervention.KEPT_STATE in deformation.interventions and last is not None:
                 same = np.array_equal(deformation.nodes, last.nodes)
                 if not same or deformation.residual != last.residual:
-                    trial.failure = "failed, and returned neither the last good state nor rest"
+                    trial.failure = "said that it kept the last good state, and returned another"
         free = number - len(poses)
         moved = np.abs(deformation.nodes - model.mesh.nodes).max()
         trial.bounded = trial.bounded and bool(moved <= bound)
@@ -474,7 +472,8 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
             ended = solver.deform(None)
         moved = np.abs(ended.nodes - nodes).max()
         # Just below the limit amplitudes swell by 20 times and stay so.
-        return bool(ended.has_failed or moved > 1e3 * np.abs(shape).max())
+        failed = Intervention.FRAME_FAILED in ended.interventions
+        return bool(failed or moved > 1e3 * np.abs(shape).max())
 
     if model.fixed.all():
         return math.inf, math.inf

@@ -22,8 +22,7 @@ from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.mesh.node_selection import face_nodes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import TissueModel, face_nodes
 
 MAIN_SCENE = "press_25mm"
 """The scene that is pressed on every mesh."""

@@ -30,9 +30,8 @@ from us_sim.evaluation.tissue.finite_elements import LinearEquations
 from us_sim.evaluation.tissue.reference import Reference
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting, TissueMethod
 from us_sim.tissue.contact.probe_gap import push_out
-from us_sim.tissue.deformation import Deformation
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 _QUICK_SCENES = ("press_25mm", "press_and_slide", "tilt")

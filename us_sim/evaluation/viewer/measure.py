@@ -31,7 +31,7 @@ from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, s
 from us_sim.evaluation.report import Row, percentile
 from us_sim.evaluation.timing import Tell
 from us_sim.share import find_bag
-from us_sim.viewer.packet import Packet
+from us_sim.viewer.stream import Packet
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,153 @@
-"""A camera that sees the markers on the probe's grip."""
+"""A camera that sees the markers on the probe's grip, whatever encoding its driver sends."""
 
 from __future__ import annotations
 
+import contextlib
+import struct
 from collections.abc import Callable
 from typing import Any
 
+import cv2
+import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from us_sim.errors import TrackingError
-from us_sim.nodes.camera_images import camera_from, grey_from, grey_from_compressed
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.scene.tracker_building import camera_body_of
+from us_sim.scene.building import camera_body_of
+from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.source import CameraSource, practice
 from us_sim.tracking.settings import CameraSettings
+
+# Bytes a pixel, and OpenCV's conversion to grey where one is needed. A Bayer pattern is named by
+# ROS after its first row's first two pixels, and by OpenCV after its second row's second two.
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "mono16": (2, None),
+    "16UC1": (2, None),
+    "bgr8": (3, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
+    "8UC4": (4, cv2.COLOR_BGRA2GRAY),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUY2),
+    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+}
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_MOST_SEGMENTS = 1000  # of a JPEG before its picture
+_MOST_PIXELS = 1 << 26  # of a compressed image: as many as 8192 × 8192
+
+_LARGEST = 1e9  # pixels, or a coefficient of the distortion
+
+
+def camera_from(message: CameraInfo) -> CameraModel:
+    """The camera that a driver describes.
+
+    Raises:
+        TrackingError: it is not calibrated, or the numbers are none of a camera.
+    """
+    numbers = np.array([*message.k, *message.d], dtype=np.float64)
+    if (bad := numbers[~(np.abs(numbers) <= _LARGEST)]).size:
+        raise TrackingError(
+            f"the camera's matrix or its distortion holds {bad[0]:g}, which is not finite or far "
+            f"too large: calibrate the camera again"
+        )
+    return CameraModel(
+        message.width,
+        message.height,
+        np.array(message.k, dtype=np.float64).reshape(3, 3),
+        np.array(message.d, dtype=np.float64),
+        message.distortion_model or "plumb_bob",
+    )
+
+
+def grey_from(message: Image) -> NDArray[np.uint8]:
+    """(rows, columns) grey pixels.
+
+    Raises:
+        TrackingError: the encoding is not known, or there are fewer bytes than the size says.
+    """
+    if message.encoding not in _ENCODINGS:
+        raise TrackingError(
+            f"the image's encoding is '{message.encoding}'; known are {', '.join(_ENCODINGS)}"
+        )
+    size, conversion = _ENCODINGS[message.encoding]
+    row = message.width * size
+    step = message.step or row
+    if not message.width or not message.height or step < row:
+        raise TrackingError(
+            f"the image says it has {message.height} rows of {message.width} pixels in {step} "
+            f"bytes each, which cannot be"
+        )
+    if len(message.data) < message.height * step:
+        raise TrackingError(
+            f"the image holds {len(message.data)} bytes, but says it has {message.height} rows "
+            f"of {step}"
+        )
+    flat = np.frombuffer(message.data, dtype=np.uint8, count=message.height * step)
+    rows = flat.reshape(message.height, step)[:, :row]
+    if message.encoding in ("mono16", "16UC1"):
+        high = 0 if message.is_bigendian else 1  # the more significant byte is enough
+        return np.ascontiguousarray(rows[:, high::2])
+    if conversion is None:
+        return np.ascontiguousarray(rows)
+    pixels = rows if size == 1 else rows.reshape(message.height, message.width, size)
+    try:
+        grey = cv2.cvtColor(np.ascontiguousarray(pixels), conversion)
+    except cv2.error as error:  # an odd width of pairs, say, or a Bayer pattern of one pixel
+        raise TrackingError(
+            f"an image of {message.width} × {message.height} pixels cannot be {message.encoding}"
+        ) from error
+    return np.asarray(grey, dtype=np.uint8)
+
+
+def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
+    """(rows, columns) grey pixels of a JPEG or PNG.
+
+    Raises:
+        TrackingError: it cannot be decoded, or is larger than any camera's.
+    """
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    columns, rows = _stated_size(data.tobytes())
+    pixels = None
+    if columns * rows <= _MOST_PIXELS:
+        with contextlib.suppress(cv2.error):
+            pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if columns and rows else None
+    if pixels is None:
+        raise TrackingError(
+            f"the compressed image ('{message.format}', {data.size} bytes for {columns} × {rows} "
+            f"pixels) cannot be decoded: it must be a JPEG or PNG of {_MOST_PIXELS} pixels at most"
+        )
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _stated_size(data: bytes) -> tuple[int, int]:
+    """Columns and rows by a PNG's or JPEG's header; 0 and 0 where it is neither.
+
+    A few bytes may say that they are gigabytes, and are taken at their word when decoded.
+    """
+    if data.startswith(_PNG) and len(data) >= 24:
+        columns, rows = struct.unpack_from(">II", data, 16)
+        return columns, rows
+    place = 2
+    for _ in range(_MOST_SEGMENTS):
+        if not data.startswith(_JPEG) or place + 9 > len(data) or data[place] != 0xFF:
+            break
+        marker, length = data[place + 1], struct.unpack_from(">H", data, place + 2)[0]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            rows, columns = struct.unpack_from(">HH", data, place + 5)
+            return columns, rows
+        place += 1 if marker == 0xFF else 2 + length
+    return 0, 0
 
 
 class CameraInput(TrackerInput):
@@ -30,7 +164,7 @@ class CameraInput(TrackerInput):
             (Image, "camera/image_raw", grey_from),
             (CompressedImage, "camera/image_raw/compressed", grey_from_compressed),
         ):
-            device.listen_to_newest(message_type, topic, self._looking(topic, decode))
+            device.listen_to_newest(message_type, topic, self._measuring(topic, decode))
 
     def reset(self) -> None:
         """Forget where the probe was; the camera stays."""
@@ -38,7 +172,6 @@ class CameraInput(TrackerInput):
             self._source.reset()
 
     def _describe(self, message: CameraInfo) -> None:
-        """Look through this camera from now on; drivers repeat it with every image."""
         if self._described is not None and _is_same(message, self._described):
             return
         self._described = message
@@ -48,10 +181,10 @@ class CameraInput(TrackerInput):
             self._source = None
             self._device.refuse("camera", f"camera/camera_info: {error}")
 
-    def _looking(
+    def _measuring(
         self, topic: str, decode: Callable[[Any], NDArray[Any]]
     ) -> Callable[[Image | CompressedImage], None]:
-        def look(message: Image | CompressedImage) -> None:
+        def measure(message: Image | CompressedImage) -> None:
             if self._source is None:
                 if self._described is None:
                     self._device.refuse(
@@ -73,11 +206,10 @@ class CameraInput(TrackerInput):
                 self._device.health.values["markers"] = left_out or "all that are seen are used"
                 self._device.take(measurement)
 
-        return look
+        return measure
 
 
 def _is_same(a: CameraInfo, b: CameraInfo) -> bool:
-    """Whether two descriptions are of the same camera."""
     return (a.width, a.height, a.distortion_model) == (b.width, b.height, b.distortion_model) and (
         list(a.k) == list(b.k) and list(a.d) == list(b.d)
     )

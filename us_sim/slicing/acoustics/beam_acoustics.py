@@ -1,42 +1,9 @@
-"""What sound does along the beams as they are now, put on a slice: the room's facade.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.acoustics.beam_acoustics import BeamAcoustics
->>> from us_sim.slicing.acoustics.settings import Acoustics
->>> from us_sim.slicing.frame import Frame
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.volume.volume import Volume
->>> liver = np.ones((40, 4, 40), np.uint8)
->>> placed = np.diag([1e-3, 1e-3, 1e-3, 1.0])
->>> volume = Volume(100 * liver, placed, liver, {1: "liver"})
->>> probe = LinearProbe(aperture=0.02, depth=0.03, columns=8, rows=60)
->>> sound = BeamAcoustics(
-...     volume, probe, Acoustics(artefacts="live", frequency=5e6, compensation=0.0))
->>> frame = Frame(Pose([0.02, 0.001, 0.0]), None, probe, volume, None, lambda frame: liver)
->>> gain = sound.gain(frame)
->>> np.round(gain[:, 0] / sound.grid.distance / 1e2, 3)[:3]  # dB/cm: 2 × 0.45 × 5
-array([-4.5, -4.5, -4.5])
-
-The noise of the electronics: as strong everywhere, until the time gain lifts it with the echoes.
-
-Its envelope is Rayleigh distributed, and is as coarse as the pulse is long and beams are apart. It
-is another one from pose to pose, and the same whenever a pose is the same.
-
-Where the fibres of muscle, nerve and tendon point in tissue as it is deformed now.
-
-A direction at rest is carried by the deformation gradient F of the tetrahedron that it lies in,
-t = F t0. With the gradients of the barycentric coordinates at rest, F t0 is a weighted sum of where
-the four nodes are now.
-
-The acoustics of one scanner: of its volume, its probe, and the mesh that carries the volume.
-"""
+"""Echoes as the beams bring them: loss, shadows, surfaces, fibres and noise, put on a slice."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -70,20 +37,13 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
 from us_sim.volume.volume import Volume
 
-SPEED_OF_SOUND = 1540.0
-"""m/s, that scanners take for all soft tissue."""
-
+SPEED_OF_SOUND = 1540.0  # m/s, that scanners take for all soft tissue
 _PULSE = 2.0  # wavelengths, the length of a surface's echo
 _CROSSINGS = 16  # of each beam there is room for
 
 
 class BeamAcoustics:
     """Loss, shadows, surfaces and fibres, as one probe's beams meet them in one volume.
-
-    Args:
-        volume: its labels say what is where.
-        probe: its geometry, and the frequencies that it has.
-        acoustics: the settings.
 
     Raises:
         ProbeError: a volume without labels, a label without constants, constants of a label that
@@ -137,6 +97,28 @@ class BeamAcoustics:
         self._origin = -probe.image_to_probe[[0, 2], 3] / probe.pixel_spacing
         plane = probe.plane(Pose())
         self._runs = full_runs(plane) if plane.spans is None else plane.spans
+
+    def resolved(self, imaging: Imaging) -> Imaging:
+        """The console's settings with the blur of a frequency below the volume's own.
+
+        A point is as long as 1.5 wavelengths and as wide as a wavelength times the f-number, 2
+        (Szabo 2014, section 6.6). The blur of the volume's own frequency is taken off in squares.
+        """
+        own = self._acoustics.volume_frequency
+        frequency = self._acoustics.frequency_among(self._probe.frequencies)
+        if own is None or frequency >= own:
+            return imaging
+        wavelength = SPEED_OF_SOUND * math.sqrt(1.0 / frequency**2 - 1.0 / own**2)
+        return dataclasses.replace(
+            imaging,
+            lateral_resolution=min(math.hypot(imaging.lateral_resolution, 2.0 * wavelength), 0.01),
+            axial_resolution=min(math.hypot(imaging.axial_resolution, 1.5 * wavelength), 0.01),
+        )
+
+    def warm_up(self) -> None:
+        """Load every kernel, and find the volume's surfaces."""
+        blank = np.zeros((self._probe.rows, self._probe.columns), dtype=np.uint8)
+        self.heard(blank, Frame(Pose(), None, self._probe, self._volume))
 
     def carry(self, rest_nodes: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
         """Let a mesh carry the volume: (N, 3) m at rest and (M, 4)."""
@@ -195,7 +177,6 @@ class BeamAcoustics:
         return gain
 
     def _located(self, frame: Frame) -> tuple[Located, NDArray[np.float64]]:
-        """Where pixels lie in the mesh, and the mesh; without one all are rigid."""
         if frame.nodes is not None:
             return frame.locate_some(LOCATED), frame.nodes
         plane, (row_step, step) = frame.plane, LOCATED
@@ -248,7 +229,10 @@ _GRAIN = (0.8, 1.4)  # standard deviations in pixels, along columns and rows
 
 
 class Noise:
-    """Images of noise that is ``level`` dB at the face, and rises by ``rise`` dB/m."""
+    """Electronic noise of Rayleigh distribution, ``level`` dB at the face, rising by ``rise`` dB/m.
+
+    It is another one from pose to pose, and the same whenever a pose is the same.
+    """
 
     def __init__(self, probe: Probe, level: float, rise: float) -> None:
         distance = probe.pixel_beams[1]
@@ -279,7 +263,7 @@ class Noise:
 
 
 class Fibres:
-    """The directions of fibres at rest, carried by a mesh.
+    """The directions of fibres at rest, carried by a mesh: t = F t0 of the deformation gradient F.
 
     Args:
         directions: (D, 3) unit vectors in ``patient``.
@@ -338,64 +322,3 @@ def _carried(tetrahedra, corners, nodes, weights, across, down, out):
             scale = 1.0 / length if length > 0.0 else 0.0
             out[q, d, 0] = scale * (x * across[0] + y * across[1] + z * across[2])
             out[q, d, 1] = scale * (x * down[0] + y * down[1] + z * down[2])
-
-
-_F_NUMBER = 2.0  # of the aperture, over which a point is a wavelength times that wide
-_PULSE_LENGTH = 1.5  # wavelengths of a point along the beam, 6 dB below its peak
-
-
-class LiveAcoustics:
-    """Makes what is left of echoes on their way, with the probe and the tissue as they are.
-
-    Args:
-        volume: its labels say what is where.
-        probe: its geometry.
-        acoustics: the settings.
-
-    Raises:
-        ProbeError: the volume has no labels, a label no constants, constants no label, or the probe
-            not the frequency.
-    """
-
-    def __init__(self, volume: Volume, probe: Probe, acoustics: Acoustics) -> None:
-        self._volume, self._probe, self._acoustics = volume, probe, acoustics
-        self._beams = BeamAcoustics(volume, probe, acoustics)
-
-    def resolved(self, imaging: Imaging) -> Imaging:
-        """The console's settings with the blur of a frequency below the volume's own.
-
-        A point is as long as the pulse and as wide as a wavelength times the f-number (Szabo 2014,
-        section 6.6). What the volume's own frequency has blurred already is taken off in squares.
-        """
-        own = self._acoustics.volume_frequency
-        frequency = self._acoustics.frequency_among(self._probe.frequencies)
-        if own is None or frequency >= own:
-            return imaging
-        wavelength = SPEED_OF_SOUND * math.sqrt(1.0 / frequency**2 - 1.0 / own**2)
-        return dataclasses.replace(
-            imaging,
-            lateral_resolution=min(
-                math.hypot(imaging.lateral_resolution, _F_NUMBER * wavelength), 0.01
-            ),
-            axial_resolution=min(
-                math.hypot(imaging.axial_resolution, _PULSE_LENGTH * wavelength), 0.01
-            ),
-        )
-
-    def carry(self, rest_nodes: NDArray[np.float64], tetrahedra: NDArray[np.int32]) -> None:
-        """Let this mesh carry the volume: (N, 3) m at rest, and (M, 4) indices into them."""
-        self._beams.carry(rest_nodes, tetrahedra)
-
-    def heard(self, frame: Frame) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
-        """What makes of a frame's echoes (rows, columns) what is left of them."""
-        return lambda image: self._beams.heard(image, frame)
-
-    def gain_on_pixels(self, frame: Frame) -> NDArray[np.float32]:
-        """(rows, columns) dB that a frame's echoes are changed by, but for surfaces and noise."""
-        return self._beams.gain_on_pixels(frame)
-
-    def warm_up(self) -> None:
-        """Load every kernel, and find the volume's surfaces."""
-        blank = np.zeros((self._probe.rows, self._probe.columns), dtype=np.uint8)
-        frame = Frame(Pose(), None, self._probe, self._volume, None, lambda _: blank)
-        self.heard(frame)(blank)

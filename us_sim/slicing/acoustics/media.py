@@ -1,19 +1,4 @@
-"""From labels and their constants to the tables with which beams are followed.
-
->>> from us_sim.slicing.acoustics.media import crossing_loss, reflection
->>> round(float(crossing_loss(1.645e6, 6.364e6)), 2)  # dB, an echo from behind bone's surface
-3.7
->>> round(float(reflection(1.327e6, 1.645e6)), 3)  # fat and muscle
-0.107
-
-The beams along which sound is followed: half as many as pixels, with a few samples a millimetre.
-
->>> from us_sim.slicing.acoustics.media import BeamGrid
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> grid = BeamGrid(LinearProbe(aperture=0.04, depth=0.04, columns=512, rows=512))
->>> grid.beams, grid.samples, round(grid.step * 1e3, 4)  # mm
-(256, 86, 0.4688)
-"""
+"""The beams along which sound is followed, and the tables of the media they meet."""
 
 from __future__ import annotations
 
@@ -253,13 +238,11 @@ class BeamGrid:
 
 
 def _nearest_shown(probe: Probe) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Row and column of the pixel nearest to each that a beam reaches, all in steps of two."""
     row, column = _nearest(~np.isnan(probe.pixel_beams[0, ::2, ::2]))
     return row, column
 
 
 def _nearest(marked: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """(2, rows, columns) row and column of the marked pixel that is nearest to each."""
     from scipy.ndimage import distance_transform_edt  # which only a fan needs
 
     nearest: NDArray[np.int32] = distance_transform_edt(

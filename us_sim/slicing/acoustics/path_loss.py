@@ -1,21 +1,13 @@
-"""The loss along each beam, and where it crosses from one tissue into another.
+"""Loss along each beam, borders that it crosses, and the soft shadows of bone and gas.
 
-Sound goes there and back, so in a tissue of attenuation α (dB/cm/MHz, of the amplitude in one
-direction) an echo loses 2 α f dB each centimetre (Beer and Lambert). A border of impedances Z1 and
-Z2 reflects R = (Z2 - Z1) / (Z2 + Z1) of the amplitude, and of an echo from behind it 1 - R² passes
-in both directions together (Szabo 2014, section 3.3). Where a beam crosses a border is found to a
-64th of a sample, so that the loss at each sample is that of the true path.
+In a tissue of attenuation α (dB/cm/MHz, one way) an echo loses 2 α f dB each centimetre. A border
+of impedances Z1 and Z2 reflects R = (Z2 - Z1) / (Z2 + Z1) of the amplitude, and of an echo from
+behind it 1 - R² passes both ways together (Szabo 2014, section 3.3). Crossings are found to a 64th
+of a sample.
 
-What bone and gas take beyond what soft tissue would is kept apart: their shadows have soft edges
-(`penumbra`).
-
-Soft edges of the shadows of bone and gas: how much of the aperture sees past what blocks.
-
-An echo at depth r is formed by an aperture of length D. Of what blocks the sound at depth r0, the
-beam from the aperture to the echo is D (1 - r0 / r) wide there. So behind an edge the amplitude
-falls over a strip D (r - r0) / r wide, and in its middle, at the geometric edge, half of it is
-left. The amplitude is the mean, over that strip, of what the straight beams in it bring (soft
-shadows of area lights are made likewise: Fernando, Percentage-closer soft shadows, 2005).
+An echo at depth r is formed by an aperture D. Past a blocker at depth r0 its shadow's edge is a
+strip D (r - r0) / r wide; the amplitude is the mean over that strip of what straight beams bring
+(Fernando, Percentage-closer soft shadows, 2005).
 """
 
 from __future__ import annotations
@@ -28,13 +20,9 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.trilinear import SLACK
 
-NOTHING = 0
-"""The medium where there is no tissue."""
-
+NOTHING = 0  # the medium where there is no tissue
 _BEGIN = -0.5 - SLACK
-END = -0.5 + SLACK
-"""Of a volume, in voxels from its side."""
-
+END = -0.5 + SLACK  # of a volume, in voxels from its side
 _BITS = 24  # of a fixed-point coordinate, behind its point
 _PER_VOXEL = float(1 << _BITS)
 _UNIT = 1.0 / _PER_VOXEL
@@ -273,7 +261,6 @@ def _blocked_at(where, hard, loss, s):
 
 @njit(inline="always", error_model="numpy")
 def _fixed(value):
-    """A coordinate as a fixed-point number, also where it is far from any voxel."""
     held = min(max(value, -_FARTHEST), _FARTHEST)
     return np.int64(held * _PER_VOXEL)
 
@@ -359,7 +346,6 @@ _FINER = 4  # steps a sample, of beams that look for an edge
 
 
 def _amplitudes() -> np.ndarray:
-    """(…,) float32 amplitude at each sixteenth of a dB of loss, to 100 dB."""
     return (10.0 ** (-np.arange(100 * _FINE + 2) / (20.0 * _FINE))).astype(np.float32)
 
 

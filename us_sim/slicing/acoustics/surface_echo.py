@@ -1,31 +1,13 @@
-"""Echoes of the surfaces between tissues, as bright as their angle to the beam lets them be.
+"""Echoes of the surfaces between tissues, by the angle between surface and beam.
 
 A smooth border of impedances Z1 and Z2 reflects R = (Z2 - Z1) / (Z2 + Z1) of the amplitude at a
-right angle. Borders of tissue are rough on the scale of the image: their facets have slopes with a
-standard deviation m, and only those that face the beam send an echo back to it. So the amplitude
+right angle. Facets of a rough border have slopes with a standard deviation m, so the amplitude
 falls with the angle θ between beam and normal as exp(-tan²θ / (2 m²)) (Beckmann and Spizzichino,
-The Scattering of Electromagnetic Waves from Rough Surfaces, 1963, chapter 5), down to what
-the roughness scatters in all directions.
+The Scattering of Electromagnetic Waves from Rough Surfaces, 1963, chapter 5), down to a diffuse
+floor.
 
-The normal is that of the border as deformed now, also out of the image's plane: normals at rest are
-covectors of voxel indices, which the tetrahedron's map carries into the patient.
-
-Normals of the surfaces between labels, at rest: for each voxel beside another label.
-
-The normal is the gradient of what lies within a few voxels: 1 where it has the voxel's own label
-and 0 elsewhere, weighted as a Gaussian. So the steps of voxels are smoothed away. It is a covector
-of voxel indices, as the gradient of a function of these is. The weighted mean of the same tells how
-far the surface is from the voxel's centre: of a half space it is the normal distribution.
-
-Normals are kept in blocks of 8³ voxels, where there are surfaces at all.
-
->>> import numpy as np
->>> from us_sim.slicing.acoustics.surface_echo import SurfaceNormals
->>> labels = np.zeros((24, 24, 24), np.uint8)
->>> labels[:, :, 12:] = 1
->>> normal, distance = SurfaceNormals(labels).at(10, 10, 12)
->>> normal, round(distance, 1)  # the surface is half a voxel before the voxel's centre
-(array([0., 0., 1.]), 0.5)
+Normals at rest are Gaussian-weighted gradients of a label's indicator function: covectors of voxel
+indices, which a tetrahedron's map carries into the patient. They are kept in blocks of 8³ voxels.
 """
 
 from __future__ import annotations
@@ -42,9 +24,7 @@ from us_sim.volume.volume import Volume
 MIRROR = 11.0
 """dB: echo of a plane that reflects everything at a right angle, where the strongest shown is 0."""
 
-ROUGHNESS = 0.35
-"""Standard deviation of the slopes of a border's facets."""
-
+ROUGHNESS = 0.35  # standard deviation of the slopes of a border's facets
 _DIFFUSE = -25.0  # dB, of what a rough border sends in all directions, at a right angle
 _GRAZING = 0.3  # least cosine for the slope with which an echo is drawn
 _GRAIN_SIDE = 16  # voxels
@@ -255,9 +235,7 @@ def _carry_normal(normal, element, rest_index, tetrahedra, corners, nodes, rigid
 
 
 BLOCK = 8
-DISTANCE = 40.0
-"""Parts of a voxel in which the distance of a surface is kept."""
-
+DISTANCE = 40.0  # parts of a voxel in which the distance of a surface is kept
 _REACH = 3  # voxels
 _SIGMA = 1.5  # voxels
 _PARTS = 256  # of the weighted mean that are told apart
@@ -318,7 +296,6 @@ def surface_normals_of(volume: Volume) -> SurfaceNormals:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _beside_another(labels, shape, i, j, k):
-    """Whether one of a voxel's six neighbours has another label."""
     to_i = shape[1] * shape[2]
     to_j = shape[2]
     at = i * to_i + j * to_j + k
@@ -394,7 +371,6 @@ def _fill_normals(labels, shape, weights, distances, blocks, normals):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gradient(labels, shape, weights, distances, i, j, k, out):
-    """Sets the unit normal in 127ths, and the surface's distance."""
     own = labels[(i * shape[1] + j) * shape[2] + k]
     x = y = z = total = np.float32(0.0)
     for a in range(-_REACH, _REACH + 1):

@@ -1,17 +1,16 @@
-"""The polygons in which an image cuts tetrahedra, and the maps from pixels to rest.
+"""Polygons in which an image cuts tetrahedra, their pixels, and the outline of the mesh at rest.
 
 A node on the plane counts as above it, so that every cut is a triangle or a quadrilateral between
-crossings of the plane with edges of the mesh. A crossing is computed from its edge alone and
-always from the upper node down. So tetrahedra with an edge in common have the very same corner, and
-those with a face in common the very same side.
+crossings of the plane with edges of the mesh. A crossing is computed from its edge alone, from the
+upper node down, so that neighbouring tetrahedra have the very same corners and sides. The cuts of
+outer faces are kept too, as closed outlines: triangles, segments or points.
 
-That rule leaves out what only touches the plane from above. The mesh includes its outer surface, so
-the cuts of its outer faces are kept too, as closed outlines: triangles, segments or points.
+Scan conversion: a row belongs to a side of a polygon from its upper end to just above its lower
+end, and a column to a polygon from its left side to just before its right side. So no pixel between
+two polygons is missed and none is written twice.
 
-The area where an image cuts the mesh at rest, from the mesh's outer faces alone.
-
-Tissue that was there and moved away leaves black behind. How often the outer faces wind around a
-pixel says whether it lies in the mesh: their crossings with its row are counted from the left.
+Tissue that moved away leaves black behind: how often the outer faces of the mesh at rest wind
+around a pixel says whether it lay in the mesh.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 
 _STEEP = 1e3
 """Voxels per pixel beyond which a map is so steep that rounding may lead it out of the volume."""
-_MARGIN = 1e-6
-"""Pixels by which a cut may lie outside the image and still be considered."""
+_MARGIN = 1e-6  # pixels by which a cut may lie outside the image and still be considered
 
 
 class Cuts(NamedTuple):
@@ -177,7 +175,6 @@ def _cross(place, order, polygon):
 
 @njit(inline="always", error_model="numpy")
 def _is_on_image(place, polygon, sides, columns, rows):
-    """Whether the box around a tetrahedron's cut, or its nodes on the plane, meets the image."""
     left = np.inf
     right = -np.inf
     top = np.inf
@@ -253,7 +250,6 @@ def face_cut(place, a, b, c, points):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close_face(place, f, columns, rows, cuts, pieces, count):
-    """Adds the outline of a tetrahedron's face, if the image meets it, to those of a cut."""
     points = cuts.outlines[pieces]
     number = face_cut(place, FACES[f, 0], FACES[f, 1], FACES[f, 2], points)
     if number == 0 or not _is_on_image(place, points, number, columns, rows):
@@ -434,8 +430,7 @@ CUT_SHIFT, END_SHIFT = 26, 13
 """A span is one number: bits by which its cut and its end are shifted there. The lowest bits are
 its first column. A column is at most 4096."""
 
-_CLOSE = 1e-8
-"""Pixels from an outline within which a place is on it: rounding of positions."""
+_CLOSE = 1e-8  # pixels from an outline within which a place is on it: rounding of positions
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -516,7 +511,6 @@ def up_to(value, least, most):
 
 @njit(inline="always", error_model="numpy")
 def _add(q, first, end, row, runs, kinds, spans, used):
-    """Adds a span of cut ``q``, as far as the row shows something."""
     line = np.uint64(row)
     for k in range(kinds):
         a = max(first, np.int64(runs[line, k, 0]))

@@ -1,35 +1,17 @@
-"""Images of deformed tissue by locating every pixel on its own: the naive method, and the oracle.
+"""Images by locating every pixel on its own: slow, simple, and the oracle of the other methods.
 
-Every pixel is tried in every tetrahedron whose cut has it in its bounding box, in float64 and
-without any knowledge of its neighbours; the first that holds it says where it lay at rest. This is
-slow, but there is little in it that could be wrong: the other methods are tested against it.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.cutting.per_pixel import PerPixel
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> from us_sim.volume.volume import Volume
->>> ramp = np.tile(np.arange(50, dtype=np.uint8), (41, 41, 1))
->>> to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
->>> to_patient[:2, 3] = -0.02
->>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
->>> slicer = PerPixel(Volume(ramp, to_patient, None, {}), mesh.nodes, mesh.tetrahedra)
->>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
->>> slicer.image(mesh.nodes * [1, 1, 0.5], plane)[:, 0]
-array([ 4, 12, 20, 28, 36], dtype=uint8)
+Every pixel is tried in every tetrahedron whose cut has it in its bounding box, in float64; the
+first that holds it says where it lay at rest.
 """
 
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.kernels import njit
-from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import (
     BLACK,
     Located,
@@ -37,13 +19,10 @@ from us_sim.slicing.cutting.resampling import (
     parallel_rows,
     pixel_to_index,
 )
-from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
+from us_sim.slicing.cutting.section import INSIDE, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
-
-if TYPE_CHECKING:
-    from us_sim.volume.volume import Volume
 
 _ON_PLANE = 1e-9  # pixels off the plane that count as on it, as for a section
 _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
@@ -51,22 +30,6 @@ _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
 
 class PerPixel(Slicer):
     """Locates every pixel by brute force."""
-
-    def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
-        settings: Settings | None = None,
-    ) -> None:
-        del settings  # there is nothing to set
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
-        self._volume = volume
-        self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
-        self._threads = threads
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         inside, index = self._voxels(nodes, plane)
@@ -99,8 +62,7 @@ class PerPixel(Slicer):
         rest[~plane.is_shown()] = np.nan
         return rest
 
-    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
-        del cut  # nothing is kept
+    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
         moved = finite_nodes(nodes, len(self._mesh.nodes))
         covered, *_ = self._place(self._mesh.nodes, plane)
         rest, kept, elements = self._place(moved, plane)

@@ -1,12 +1,4 @@
-"""The rows of an image divided into bands, one a thread.
-
->>> from us_sim.slicing.cutting.resampling import parallel_rows
->>> done = []
->>> parallel_rows(3, 10, lambda first, end: done.append((first, end)), band=2)
->>> sorted(done)
-[(0, 4), (4, 8), (8, 10)]
-
-Where the pixels of an image lie in the mesh, for all that is shown or known of them.
+"""Where the pixels of an image lie at rest, and the volume's values there.
 
 >>> import numpy as np
 >>> from us_sim.slicing.cutting.resampling import Located
@@ -14,25 +6,6 @@ Where the pixels of an image lie in the mesh, for all that is shown or known of 
 >>> located = Located(np.zeros((2, 3), np.int32), np.concatenate([shift, shift]), np.array([7]))
 >>> located.rest_index()[1, 2]
 array([7., 5., 1.])
-
-Grey values and labels of a volume along an affine map from pixels to voxels.
-
-Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
-their value, so that the volume ends at the faces of its voxels and not half a voxel inside; beyond
-those faces everything is 0. Grey values are trilinear and rounded half up, see `span_sampling`;
-labels are those of the nearest voxel.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.cutting.resampling import sample_plane
->>> from us_sim.volume.volume import Volume
->>> ramp = np.tile(np.arange(50, dtype=np.uint8), (40, 3, 1))
->>> millimetres = np.diag([1e-3, 1e-3, 1e-3, 1.0])
->>> volume = Volume(ramp, millimetres, None, {})
->>> plane = LinearProbe(aperture=0.02, depth=0.01, columns=4, rows=5).plane(Pose([0.01, 0, 0]))
->>> sample_plane(volume, plane)[:, 0]
-array([1, 3, 5, 7, 9], dtype=uint8)
 """
 
 from __future__ import annotations
@@ -47,11 +20,7 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.cut_polygons import END_SHIFT, NO_OUTLINE
-from us_sim.slicing.cutting.span_sampling import (
-    MOST_VOXELS,
-    MOST_VOXELS_A_SIDE,
-    sample_spans,
-)
+from us_sim.slicing.cutting.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans
 from us_sim.slicing.cutting.trilinear import inside_volume
 from us_sim.slicing.probe.plane import SlicePlane
 
@@ -88,12 +57,10 @@ def parallel_rows(
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """The threads for all images, which are only started when they are used."""
     return ThreadPoolExecutor(threads, thread_name_prefix="rows")
 
 
-BLACK = -1
-"""The element of a pixel that shows nothing, as where tissue moved away."""
+BLACK = -1  # the element of a pixel that shows nothing, as where tissue moved away
 
 
 class Located(NamedTuple):

@@ -1,35 +1,12 @@
-"""Point location: the tetrahedron of a section that each pixel of an image lies in.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.cutting.row_subdivision import cells, subdivide_rows
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.cutting.section import RestMesh
->>> corners = np.array([[-0.1, -0.1, 0.0], [0.2, -0.1, 0.0], [-0.1, 0.2, 0.0], [0, 0, 0.035]])
->>> mesh = RestMesh(corners, np.array([[0, 1, 2, 3]]), np.eye(4))
->>> plane = LinearProbe(aperture=0.05, depth=0.04, columns=5, rows=4).plane(Pose())
->>> section = mesh.cut(corners, plane)
->>> lists = cells(section.bounds, plane.columns, plane.rows, 32)
->>> elements, outside = np.empty((4, 5), dtype=np.int32), np.empty(4, dtype=bool)
->>> subdivide_rows(section.barycentric, *lists, 0, plane.rows, elements, outside)
->>> elements
-array([[0, 0, 0, 0, 0],
-       [0, 0, 0, 0, 0],
-       [0, 0, 0, 0, 0],
-       [1, 1, 0, 1, 1]], dtype=int32)
-
-Images of deformed tissue by recursive subdivision of pixel rows (the paper, section IV).
+"""Images of deformed tissue by recursive subdivision of pixel rows (the paper, section IV).
 
 Both ends of a row are located in the deformed mesh. Where they lie in one tetrahedron, all pixels
-between do too, since it is convex, and the row runs linearly through the volume at rest; otherwise
-it is split in the middle. Lists of the tetrahedra in each region of the image keep the search
-short.
+between do too, and the row runs linearly through the volume at rest; otherwise it is split in the
+middle. Lists of the tetrahedra in each region of the image keep the search short.
 
-The paper leaves three things open. Where both ends lie outside the mesh, the row
-between them is only taken as outside when no tetrahedron of the regions it crosses meets it. A
-pixel is first sought in the tetrahedra of its neighbours. And a pixel outside the deformed mesh
-shows the rigid volume only where the mesh was not at rest either: tissue that was pushed away
-leaves black behind, not its ghost.
+Three things that the paper leaves open: a row whose ends lie outside the mesh is outside only when
+no tetrahedron of the regions it crosses meets it; a pixel is first sought in the tetrahedra of its
+neighbours; and where tissue was pushed away the image is black.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -65,15 +42,13 @@ from us_sim.slicing.cutting.resampling import (
     pixel_to_index,
     voxels_of,
 )
-from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes, row_span
+from us_sim.slicing.cutting.section import INSIDE, finite_nodes, row_span
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import sample_linear
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from us_sim.volume.volume import Volume
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -110,7 +85,6 @@ def cells(bounds, columns, rows, regions):
 
 @njit(inline="always", error_model="numpy")
 def _cell(pixel, size, count):
-    """The cell along one axis that holds a pixel coordinate, the outermost for those beyond."""
     return np.int64(min(max(pixel, 0.0) / size, count - 1.0))
 
 
@@ -187,7 +161,6 @@ def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row,
 
 @njit(inline="always", error_model="numpy")
 def _is_inside(barycentric, e, column, row):
-    """Whether a pixel lies in a tetrahedron, its faces included."""
     b = barycentric[e]
     return (
         b[0, 0] + b[0, 1] * column + b[0, 2] * row >= INSIDE
@@ -269,47 +242,32 @@ class RowSubdivisionSettings(Settings):
 
 
 class RowSubdivision(Slicer):
-    """The paper's method, for comparison. Every cell has a list of the tetrahedra that cross it.
-
-    Raises:
-        ValueError: fewer than one thread.
-    """
+    """The paper's method, for comparison. Every cell has a list of the tetrahedra that cross it."""
 
     Settings = RowSubdivisionSettings
 
-    def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
-        settings: RowSubdivisionSettings | None = None,
-    ) -> None:
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
-        self._volume = volume
-        self._mesh = RestMesh(
-            np.asarray(rest_nodes), np.asarray(tetrahedra), volume.patient_to_index
-        )
+    def _prepare(self, settings: RowSubdivisionSettings | None) -> None:
         self._regions = (settings or RowSubdivisionSettings()).regions
-        self._threads = threads
-        self._latest: Located | None = None
+        self._latest: tuple[ArrayLike, SlicePlane, Located] | None = None  # of an image
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         voxels, shape = voxels_of(self._volume.intensities)
-        elements, maps, _ = self.locate(nodes, plane)
+        located = self._locate(nodes, plane)
+        self._latest = nodes, plane, located
+        elements, maps, _ = located
         image = np.empty(elements.shape, dtype=np.uint8)
         self._in_bands(
             plane, lambda a, b: sample_linear(voxels, shape, maps, elements, a, b, image)
         )
         return image
 
-    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
-        if cut and cut == self.cuts and self._latest is not None:
-            return self._latest
+    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
+        if self._latest is not None and self._latest[0] is nodes and self._latest[1] is plane:
+            return self._latest[2]
+        return self._locate(nodes, plane)
+
+    def _locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
         moved = finite_nodes(nodes, len(self._mesh.nodes))
-        self.cuts += 1
         section = self._mesh.cut(moved, plane)
         self.skipped = section.skipped
         section.rest_index[-1] = pixel_to_index(self._volume, plane)
@@ -329,9 +287,7 @@ class RowSubdivision(Slicer):
             leave_black(rest.barycentric, rest.bounds, len(section.bounds), outside, elements)
         if plane.spans is not None:
             elements[~plane.is_shown()] = BLACK
-        self._latest = Located(elements, section.rest_index, section.tetrahedra.astype(np.intp))
-        return self._latest
+        return Located(elements, section.rest_index, section.tetrahedra.astype(np.intp))
 
     def _in_bands(self, plane: SlicePlane, work: Callable[[int, int], None]) -> None:
-        """Do ``work(first_row, end_row)`` for all rows, each thread a run of whole bands."""
         parallel_rows(self._threads, plane.rows, work, band=-(-plane.rows // self._regions))

@@ -1,9 +1,9 @@
 """Exact images of deformed tissue: every tetrahedron that an image cuts is scan-converted.
 
-The tetrahedra that the image may meet are found by `clusters` and cut by `cut_polygons`: each
-gets its polygon and the affine map from pixels to where its tissue lay at rest. `spans` says which
-pixels are in which polygon, every one exactly once, and `span_sampling` looks them up in the
-volume. `rest_outline` tells tissue that was pushed away from what lies beside it.
+`section.Clusters` finds the tetrahedra that the image may meet; `cut_polygons` gives each its
+polygon, the affine map from pixels to rest, and the spans of pixels in it; `span_sampling` looks
+these up in the volume. The outline of the mesh at rest tells tissue that was pushed away from what
+lies beside it.
 
 >>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
@@ -22,8 +22,6 @@ array([ 4, 12, 20, 28, 36], dtype=uint8)
 """
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,7 +44,7 @@ from us_sim.slicing.cutting.resampling import (
     parallel_rows,
     pixel_to_index,
 )
-from us_sim.slicing.cutting.section import Clusters, RestMesh, finite_nodes
+from us_sim.slicing.cutting.section import Clusters, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import (
     INNER_MARGIN,
@@ -56,28 +54,12 @@ from us_sim.slicing.cutting.span_sampling import (
 )
 from us_sim.slicing.probe.plane import SlicePlane
 
-if TYPE_CHECKING:
-    from us_sim.volume.volume import Volume
-
 
 class ScanConversion(Slicer):
     """Cuts exact images, and fast."""
 
-    def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
-        settings: Settings | None = None,
-    ) -> None:
-        del settings  # there is nothing to set
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
-        self._threads = threads
-        self._volume = volume
-        mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+    def _prepare(self, _: Settings | None) -> None:
+        volume, mesh = self._volume, self._mesh
         self._clusters = Clusters(mesh.nodes, mesh.tetrahedra)
         self._determinants = mesh.determinants[self._clusters.order]
         self._rest_index = mesh.rest_index
@@ -92,13 +74,14 @@ class ScanConversion(Slicer):
         self._spans = np.empty((0, 0), dtype=np.int64)
         self._used = np.empty(0, dtype=np.int32)
         self._full = np.empty((0, 2, 2), dtype=np.int32)
-        self._drawn: tuple[int, Outline] | None = None  # of the latest cut, if its spans are there
+        # Of the latest image, while its cuts and spans are there.
+        self._drawn: tuple[ArrayLike, SlicePlane, int, Outline] | None = None
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         count, pieces, outline, is_covered = self._cut(nodes, plane)
         runs = self._shown(plane)
         image = np.empty((plane.rows, plane.columns), dtype=np.uint8)
-        self._drawn = count, outline
+        self._drawn = nodes, plane, count, outline
 
         def draw(first_row: int, end_row: int) -> None:
             spans = self._convert(count, pieces, runs, first_row, end_row)
@@ -112,16 +95,14 @@ class ScanConversion(Slicer):
         parallel_rows(self._threads, plane.rows, draw)
         return image
 
-    def locate(self, nodes: ArrayLike, plane: SlicePlane, cut: int = 0) -> Located:
-        count, outline, runs, spans = self._spans_of(nodes, plane, cut)
+    def locate(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
+        count, outline, runs, spans = self._spans_of(nodes, plane)
         elements = np.empty((plane.rows, plane.columns), dtype=np.int32)
         fill_elements(spans, self._used, runs, count, BLACK, *outline, elements)
         return self._located(elements, count)
 
-    def locate_some(
-        self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int], cut: int = 0
-    ) -> Located:
-        count, outline, runs, spans = self._spans_of(nodes, plane, cut)
+    def locate_some(self, nodes: ArrayLike, plane: SlicePlane, steps: tuple[int, int]) -> Located:
+        count, outline, runs, spans = self._spans_of(nodes, plane)
         shape = -(-plane.rows // steps[0]), -(-plane.columns // steps[1])
         elements = np.empty(shape, dtype=np.int32)
         fill_some_elements(
@@ -135,12 +116,10 @@ class ScanConversion(Slicer):
         return Located(elements, self._cuts.maps[: count + 1].copy(), tetrahedra)
 
     def _spans_of(
-        self, nodes: ArrayLike, plane: SlicePlane, cut: int
+        self, nodes: ArrayLike, plane: SlicePlane
     ) -> tuple[int, Outline, NDArray[np.int32], NDArray[np.int64]]:
-        """How many cuts there are, the mesh at rest, and the runs and spans of the image."""
-        if cut and cut == self.cuts and self._drawn is not None:
-            count, outline = self._drawn
-            return count, outline, self._shown(plane), self._spans
+        if self._drawn is not None and self._drawn[0] is nodes and self._drawn[1] is plane:
+            return *self._drawn[2:], self._shown(plane), self._spans
         count, pieces, outline, _ = self._cut(nodes, plane)
         runs = self._shown(plane)
         return count, outline, runs, self._convert(count, pieces, runs, 0, plane.rows)
@@ -153,7 +132,6 @@ class ScanConversion(Slicer):
             known to cover the image, so that the mesh at rest does not matter.
         """
         moved = self._as_kernels_take(nodes)
-        self.cuts += 1
         self._drawn = None
         near = self._clusters.near(moved, plane)
         if 4 * len(near) >= len(self._cuts.sides):
@@ -194,7 +172,6 @@ class ScanConversion(Slicer):
     def _convert(
         self, count: int, pieces: int, runs: NDArray[np.int32], first_row: int, end_row: int
     ) -> NDArray[np.int64]:
-        """The spans of a run of rows."""
         cuts, spans = self._cuts, self._spans
         while True:
             most = convert_cuts(

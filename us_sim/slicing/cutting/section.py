@@ -1,47 +1,7 @@
-"""Barycentric coordinates of a tetrahedron on the plane of an image: affine in (1, column, row).
+"""The cut of a tetrahedral mesh by an image's plane, and the clusters that it may meet.
 
->>> import numpy as np
->>> from us_sim.slicing.cutting.section import adjugate
->>> corners = np.array([[0.0, 0, -1], [2, 0, 1], [0, 2, 1], [0, 0, 1]])
->>> determinant, first, second, third = adjugate(corners, 0, 1, 2, 3)
->>> column, row = 0.5, 0.0
->>> [(one + of_column * column + of_row * row) / determinant
-...  for one, of_column, of_row in (first, second, third)]
-[0.25, 0.0, 0.25]
-
-The cut of a tetrahedral mesh by the plane of an image.
-
-On the plane a tetrahedron's barycentric coordinates are affine in (column, row), and so is the map
-from a pixel to where its tissue lay at rest. A section holds both for each tetrahedron that
-the image meets, so that finding and mapping a pixel takes a few multiplications.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.cutting.section import RestMesh
->>> nodes = np.array([[-0.1, -0.1, 0.0], [0.2, -0.1, 0.0], [-0.1, 0.2, 0.0], [0.0, 0.0, 0.3]])
->>> mesh = RestMesh(nodes, np.array([[0, 1, 2, 3]], dtype=np.int32), np.eye(4))
->>> plane = LinearProbe(aperture=0.02, depth=0.04, columns=2, rows=4).plane(Pose())
->>> section = mesh.cut(nodes, plane)
->>> column, row = 1, 2
->>> np.round(section.barycentric[0] @ [1, column, row], 3)
-array([0.289, 0.322, 0.306, 0.083])
-
-A quick selection of the tetrahedra that an image may meet, by clusters of neighbours.
-
-Tetrahedra that are near each other at rest stay near each other. They are kept in clusters, and a
-cluster whose nodes all lie beyond one and the same side of the image is left out as a whole.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.cutting.section import Clusters
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> mesh = box_mesh([-0.02, 0.0, 0.02], [-0.021, -0.005, 0.01], [0.0, 0.02, 0.04])
->>> plane = LinearProbe(aperture=0.01, depth=0.01, columns=8, rows=8).plane(Pose())
->>> clusters = Clusters(mesh.nodes, mesh.tetrahedra)
->>> len(clusters.tetrahedra), len(clusters.near(mesh.nodes, plane))
-(40, 10)
+On the plane a tetrahedron's barycentric coordinates are affine in (1, column, row), and so is the
+map from a pixel to where its tissue lay at rest.
 """
 
 from __future__ import annotations
@@ -328,15 +288,12 @@ def _invert(pixel, tetrahedra, e, form):
     return determinant
 
 
-ON_PLANE = 1e-9
-"""Pixels off the plane within which a node counts as on it: rounding."""
-
+ON_PLANE = 1e-9  # pixels off the plane within which a node counts as on it: rounding
 _SIZE = 128
 """Tetrahedra of a cluster: few enough to follow the plane, many enough to have most nodes in
 common."""
 _BLOCK = 256  # nodes that are tested together
-_MARGIN = 1e-3
-"""Pixels beyond the image's border at which a tetrahedron may be left out."""
+_MARGIN = 1e-3  # pixels beyond the image's border at which a tetrahedron may be left out
 
 
 class Clusters:

@@ -1,31 +1,12 @@
-"""Scan conversion: which columns of each row of an image lie in which cut.
+"""Grey values of an image from its spans, a row of pixels at a time.
 
-A row belongs to a side of a polygon from its upper end to just above its lower end, and a column
-to a polygon from its left side to just before its right side. Since two tetrahedra compute the
-side between them from the same corners, no pixel is missed there and none is written twice.
-
-Grey values of an image from its spans, a row of pixels at a time.
-
-Where the pixels of a row lie at rest is written span after span, and only then are they sampled,
-so that neither the loads nor the arithmetic stop at the short spans of a fine mesh. Coordinates
-are fixed-point numbers, accurate to a ten-thousandth of a voxel, and grey values are blended in
-16 bits, 32 pixels at a time on a processor with vectors of 512 bits, to a tenth of a level.
+Coordinates at rest are written span after span and only then sampled, so that short spans of a fine
+mesh stop neither loads nor arithmetic. They are fixed-point numbers, accurate to a ten-thousandth
+of a voxel, and grey values are blended in 16 bits, 32 pixels at a time with vectors of 512 bits, to
+a tenth of a level. Two vector operations that numba lacks are written in LLVM's instructions.
 
 Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
 their value; beyond that everything is 0. Values are rounded half up.
-
-Two vector operations that numba lacks, in LLVM's instructions for every processor.
-
->>> import numpy as np
->>> from numba import njit
->>> from us_sim.slicing.cutting.span_sampling import LANES, write_ramp
->>> @njit
-... def write(line):
-...     write_ramp(line, np.uint64(1), np.int32(10), np.int32(3), np.int32(4))
->>> line = np.zeros(1 + LANES, dtype=np.int32)
->>> write(line)
->>> line[:6]
-array([ 0, 10, 13, 16, 19,  0], dtype=int32)
 """
 
 from __future__ import annotations
@@ -153,7 +134,6 @@ def fill_some_elements(
 
     Args:
         steps: (2,) rows and columns of the image from one element to the next.
-        columns: of the image.
     """
     rows, places = elements.shape
     row_step = steps[0]
@@ -253,7 +233,6 @@ def _write_clipped(m, shape, row, first, end, x, y, z):
 
 @njit(inline="always", error_model="numpy")
 def _held(index, count):
-    """A coordinate from the first to just below the last voxel's centre."""
     last = max(count - 1, 0) * _ONE - 1.0
     return np.int32(max(0.0, min(index * _ONE, last)))
 
@@ -308,7 +287,6 @@ def _between(least, most, start, slope, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _least(x):
-    """The least of some numbers, or 0."""
     least = np.int32(0)
     for k in range(len(x)):
         least = min(least, x[k])
@@ -380,8 +358,6 @@ _INDEX = ir.IntType(64)
 
 
 def _write_ramp(_: Any, array: Any, index: Any, start: Any, step: Any, count: Any) -> Any:
-    """A ramp's signature and the instructions that write it."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array, index, *numbers = arguments
         data = context.make_array(signature.args[0])(context, builder, array).data
@@ -404,8 +380,6 @@ def _load_pairs(
     _: Any, voxels: Any, near: Any, first: Any, to_y: Any, to_x: Any, p00: Any, p01: Any,
     p10: Any, p11: Any,
 ) -> Any:  # fmt: skip
-    """The signature of the loads of four corners and their instructions."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def data(argument: int) -> Any:
             array = context.make_array(signature.args[argument])
@@ -439,7 +413,6 @@ def _load_pairs(
 
 
 def _broadcast(builder: Any, number: Any) -> Any:
-    """A vector with the same number in every lane."""
     empty = ir.Constant(_VECTOR, ir.Undefined)
     one = builder.insert_element(empty, number, ir.Constant(_NUMBER, 0))
     return builder.shuffle_vector(one, empty, ir.Constant(_VECTOR, [0] * LANES))

@@ -2,16 +2,6 @@
 
 Voxel centres lie at whole indices. A point within half a voxel of the outermost centres takes
 their value; beyond that everything is 0. Values are rounded half up.
-
->>> import numpy as np
->>> from us_sim.slicing.cutting.resampling import voxels_of
->>> from us_sim.slicing.cutting.trilinear import sample_linear
->>> voxels, shape = voxels_of(np.arange(0, 80, 10, dtype=np.uint8).reshape(2, 2, 2))
->>> from_pixel = np.array([[[0.0, 0.25, 0], [0.5, 0, 0], [0.5, 0, 0]]])
->>> image = np.empty((1, 4), dtype=np.uint8)
->>> sample_linear(voxels, shape, from_pixel, np.zeros((1, 4), dtype=np.int32), 0, 1, image)
->>> image
-array([[15, 25, 35, 45]], dtype=uint8)
 """
 
 from __future__ import annotations

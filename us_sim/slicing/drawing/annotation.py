@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 _SCALE: Colour = (205, 215, 215)
 _FOCUS: Colour = (255, 210, 60)
 _SHADOW: Colour = (0, 0, 0)
-_FINE = 4
-"""Bits of the fraction of a pixel in the coordinates of outlines."""
-
+_FINE = 4  # bits of the fraction of a pixel in the coordinates of outlines
 Box = tuple[int, int, int, int]  # left, top, right, bottom
 
 
@@ -96,7 +94,6 @@ class Annotation:
         Args:
             pixels: (rows, columns) grey.
             labels: (rows, columns), where outlines are wanted.
-            badge: for an image that is not live.
             overlay: colours over the grey, below all else, and their bar.
             lines: (N, 2) column and row, such as a gate's.
             settle: of the labels' outlines, as for `label_outlines`.
@@ -134,7 +131,6 @@ class Annotation:
         return picture
 
     def _lay_out_depth(self, first: float, spacing: float) -> None:
-        """Lay out ticks and labels of depth below the face along the right side."""
         step, between = _steps(spacing, self._rows, 2.2 * self._text)
         edge = self._columns - 1
         for depth in _multiples(between, max(first - spacing, 0.0), first + self._rows * spacing):
@@ -150,7 +146,6 @@ class Annotation:
                 self._place(label, edge - self._text - 2 - label.width, top)
 
     def _lay_out_width(self, first: float, spacing: float) -> None:
-        """Lay out ticks and labels of lateral distance from the middle along the bottom."""
         widest = lettering(f"-{900 * abs(first):.0f}", self._text, _SCALE).width
         if self.is_flipped:
             first = first + (self._columns - 1) * spacing
@@ -248,12 +243,10 @@ class Annotation:
 
 
 def _fine(line: NDArray[np.floating]) -> NDArray[np.int32]:
-    """Column and row (N, 2) as OpenCV takes them with fractions of pixels."""
     return np.rint(line * (1 << _FINE)).astype(np.int32)
 
 
 def _bright(colour: tuple[float, float, float]) -> Colour:
-    """The colour as 0 to 255, bright enough to be seen on black."""
     red, green, blue = (round(255 * (0.25 + 0.75 * level)) for level in colour)
     return red, green, blue
 
@@ -275,7 +268,6 @@ def _steps(spacing: float, count: int, pixels: float) -> tuple[float, float]:
 
 
 def _multiples(step: float, lowest: float, highest: float) -> NDArray[np.float64]:
-    """All multiples of ``step`` in that range, its ends too."""
     first, last = np.ceil(lowest / step - 1e-6), np.floor(highest / step + 1e-6)
     return np.arange(first, last + 1) * step + 0.0  # without -0
 

@@ -1,35 +1,7 @@
-"""The outlines of a label in an image of labels.
+"""Outlines of labels in an image, by pixels or settled onto the border between voxels.
 
->>> import numpy as np
->>> from us_sim.slicing.drawing.label_outlines import label_outlines
->>> labels = np.zeros((40, 40), np.uint8)
->>> labels[10:20, 12:30] = 3  # its sides are half a pixel around the centres of its pixels
->>> outline, = label_outlines(labels, 3)
->>> np.abs(outline - [20.5, 14.5]).max(axis=0).round()
-array([9., 5.])
-
-Where the border of a label lies between voxels, in an image.
-
-Voxels have a label or not, so an outline of their pixels has their steps. Here each voxel counts by
-how much of its surroundings has the label (a Gaussian of two voxels), from a level on at which as
-many voxels lie inside as before. That level's contour has no steps and encloses the same volume. It
-is found in the tissue as it is deformed now.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.b_mode import BMode
->>> from us_sim.slicing.drawing.label_outlines import onto_border
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.volume.volume import Volume
->>> x, y, z = np.indices((40, 8, 40))
->>> labels = ((x - 20) ** 2 + (z - 20) ** 2 < 10.2**2).astype(np.uint8)
->>> volume = Volume(labels, np.diag([1e-3, 1e-3, 1e-3, 1.0]), labels, {1: "vein"})
->>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=160, rows=160)  # 4 pixels a voxel
->>> frame = BMode(volume, probe).frame(Pose([0.02, 0.004, 0.0]))
->>> near = 79.5 + 43.0 * np.array([[1.0, 0.0], [0.6, 0.8]])
->>> radius = np.hypot(*(onto_border(frame, 1, near) - 79.5).T)
->>> bool((abs(radius - 4 * 10.2) < 4 / 3).all())  # to a third of a voxel
-True
+On that border, each voxel counts by how much of its surroundings has the label (a Gaussian of two
+voxels); the border is the level at which as many voxels lie inside as have the label.
 """
 
 from __future__ import annotations
@@ -49,8 +21,7 @@ from us_sim.volume.volume import Volume
 Settle = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Moves points (P, 2) of a label's outline, see `us_sim.slicing.drawing.label_outlines`."""
 
-_MOST = 64
-"""Most outlines of one label; the longest are taken."""
+_MOST = 64  # most outlines of one label; the longest are taken
 
 
 def label_outlines(
@@ -181,7 +152,6 @@ def _settle(elements, maps, field, start, level, points):
 
 
 def _share_of(volume: Volume, label: int) -> _Share:
-    """Found when it is first asked for."""
     shares = _found.setdefault(volume, {})
     if label not in shares:
         assert volume.labels is not None

@@ -1,15 +1,4 @@
-"""Small text on a picture: bright letters in a dark halo, legible on any grey.
-
->>> import numpy as np
->>> from us_sim.slicing.drawing.overlay import lettering
->>> picture = np.zeros((40, 80, 3), np.uint8)
->>> label = lettering("10 mm", 12, (255, 255, 255))
->>> label.draw(picture, 5, 8)
-True
->>> bool(picture.any()), label.draw(picture, 75, 8)  # it does not fit there, and is left out
-(True, False)
-
-Colours laid over a grey image, with a bar that says which value has which colour.
+"""Colours laid over a grey image, their bar, and small legible text.
 
 >>> import numpy as np
 >>> from us_sim.slicing.drawing.overlay import ColourScale, Overlay
@@ -19,18 +8,6 @@ Colours laid over a grey image, with a bar that says which value has which colou
 >>> Overlay(np.float32([[-0.05, np.nan, 0.2]]), scale, opacity=1.0).lay_over(grey)
 >>> grey.tolist()
 [[[0, 0, 255], [100, 100, 100], [255, 0, 0]]]
-
-A bar of colours at the upper left of a picture, with what it shows, its values and their unit.
-
->>> import numpy as np
->>> from us_sim.slicing.drawing.overlay import ColourBar
->>> from us_sim.slicing.drawing.overlay import ColourScale
->>> bar = ColourBar(ColourScale("velocity", -0.2, 0.2, "cm/s", factor=100.0), 10)
->>> picture = np.zeros((200, 120, 3), np.uint8)
->>> bar.draw(picture)
->>> left, top, right, bottom = bar.box
->>> bool(picture[top:bottom, left:right].any()), bool(picture[:, right:].any())
-(True, False)
 """
 
 from __future__ import annotations
@@ -43,17 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Colour = tuple[int, int, int]
-"""Red, green and blue, 0 to 255."""
-
-_FINER = 4
-"""Letters are drawn this much larger and averaged, as OpenCV's own small ones are ragged."""
-
-_CAPITAL = 21
-"""Height of a capital letter of OpenCV's font at scale 1, px, without its strokes."""
-
-_HALO = 2
-"""Width of the halo around letters, px."""
+Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
+_FINER = 4  # letters are drawn this much larger and averaged, as OpenCV's own small ones are ragged
+_CAPITAL = 21  # height of a capital letter of OpenCV's font at scale 1, px, without its strokes
+_HALO = 2  # width of the halo around letters, px
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +70,6 @@ def lettering(text: str, height: int, colour: Colour) -> Label:
 
 
 def _letters(text: str, height: int) -> NDArray[np.float32]:
-    """The fraction of each pixel that the letters cover, cropped to them."""
     large = _FINER * height
     letters = _cropped(text, large, _scale(large))
     rows, columns = (-(-side // _FINER) for side in letters.shape)
@@ -118,7 +87,6 @@ def _scale(large: int) -> float:
 
 
 def _cropped(text: str, large: int, scale: float) -> NDArray[np.uint8]:
-    """White on black, in letters about ``large`` px high."""
     canvas = np.zeros((3 * large, 2 * large * (len(text) + 1)), np.uint8)
     stroke = max(1, round(large / 7))
     font = cv2.FONT_HERSHEY_SIMPLEX
@@ -164,7 +132,6 @@ class Overlay:
 
     Args:
         values: (rows, columns), NaN where the image is left as it is.
-        scale: which colour each has.
         opacity: of the colours over the grey, 0 to 1.
         note: a line of text below the bar; empty for none.
         outline: corners (N, 2) column and row of a closed line around where values are wanted; None
@@ -199,15 +166,13 @@ def mirrored(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
 
 
 _TEXT: Colour = (205, 215, 215)
-_HEIGHT = 9
-"""Of the bar, in heights of a letter."""
+_HEIGHT = 9  # of the bar, in heights of a letter
 
 
 class ColourBar:
     """Drawn over a picture, as far as that has room.
 
     Args:
-        scale: which colour each value has.
         text: px, height of its letters.
         note: a line below it; empty for none.
     """

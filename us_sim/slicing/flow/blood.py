@@ -1,31 +1,4 @@
-"""The blood of a scene: all vessels with a flow, on the frames of a scanner.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.b_mode import BMode
->>> from us_sim.slicing.flow.blood import Blood, Window
->>> from us_sim.slicing.settings import FlowSettings
->>> from us_sim.slicing.flow.vessel import Vessel
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.volume.volume import Volume
->>> y, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
->>> tube = np.repeat((y**2 + z**2 < 36)[None], 60, axis=0).astype(np.uint8)
->>> volume = Volume(tube, np.diag([5e-4, 5e-4, 5e-4, 1.0]), tube, {1: "vein"})
->>> flow = FlowSettings("venous", (1, 0, 0), peak_velocity=0.1, mean_velocity=0.05)
->>> blood = Blood([Vessel("vein", volume, 1, flow)])
->>> probe = LinearProbe(aperture=0.02, depth=0.01, columns=41, rows=21)
->>> frame = BMode(volume, probe).frame(Pose([0.015, 5e-3, 0.0]), time=0.0)
->>> steered = np.full((21, 41), np.radians(-30.0))  # against the flow
->>> velocity = blood.velocity(frame, Window(probe, steered))
->>> round(float(velocity[10, 20]), 2), bool(np.isnan(velocity[0, 0]))
-(0.05, True)
-
-Why Doppler shows nothing, as far as it is known.
-
->>> from us_sim.slicing.flow.blood import Absence
->>> Absence("across_flow").name
-'ACROSS_FLOW'
-"""
+"""The blood of all vessels of a scene at the pixels of a frame, and why Doppler shows none."""
 
 from __future__ import annotations
 
@@ -47,7 +20,6 @@ class Window:
     """Places in an image, and the directions of the beams there.
 
     Args:
-        probe: whose image it is.
         angles: rad, of the beams from the probe's z towards its x; of pixels (rows, columns) of the
             window, or of places (P,).
         places: (P, 2) column and row; None for the pixels of the window.
@@ -78,11 +50,7 @@ class Window:
 
 
 class Blood:
-    """The vessels of a scene that have a flow.
-
-    Args:
-        vessels: they are advanced from frame to frame.
-    """
+    """The vessels of a scene that have a flow."""
 
     def __init__(self, vessels: Sequence[Vessel]) -> None:
         self.vessels = tuple(vessels)
@@ -187,7 +155,6 @@ def _find_velocity(
 
 @njit(inline="always", error_model="numpy")
 def _blended(grid, i, j, k, u, v, w):
-    """Trilinear value in a cell of a grid."""
     c0 = (grid[i, j, k] * (1.0 - w) + grid[i, j, k + 1] * w) * (1.0 - v) + (
         grid[i, j + 1, k] * (1.0 - w) + grid[i, j + 1, k + 1] * w
     ) * v
@@ -219,7 +186,6 @@ def absence(
     """Why flow cannot be seen at the places of a window.
 
     Args:
-        blood: in it.
         lines: of the probe, as many as places in the window, whose echoes come from there.
         wall_filter: m/s.
     """

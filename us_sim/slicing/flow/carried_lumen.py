@@ -1,40 +1,8 @@
-"""A vessel's lumen where the tissue has carried it: its middle, its areas, and how blood fills it.
+"""A vessel's lumen as the tissue carries it, and the voxels' places in it.
 
-Points on rings around each station go with the tissue's tetrahedra. The area that a ring encloses
-across the vessel is the area vector of its polygon along the vessel's tangent, which a flow through
-it sees whatever the ring's own plane has become. Blood flows fastest at radial coordinate 0 and
-stands at the wall, 1, as the square of the coordinate falls (Poiseuille). What a lumen is filled
-by a flow with speed 1 on its axis is the sum over the rings of that profile times area.
-
->>> import numpy as np
->>> from us_sim.slicing.flow.carried_lumen import CarriedLumen
->>> from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> centres = np.array([[0.05, y, 0.05] for y in (0.02, 0.04, 0.06, 0.08)])
->>> along, across = np.tile([0.0, 1, 0], (4, 1)), np.tile([[0.0, 0, 1], [1, 0, 0]], (4, 1, 1))
->>> tube = Lumen(centres, along, across, np.full((4, DIRECTIONS), 0.01))
->>> mesh = box_mesh(*[np.linspace(0.0, 0.1, 5)] * 3)
->>> squeezed = CarriedLumen(tube, mesh).carry(mesh.nodes * [1.0, 1.0, 0.5])
->>> (squeezed.areas / tube.areas).round(3).tolist()
-[0.5, 0.5, 0.5, 0.5]
->>> (squeezed.filled / squeezed.areas).round(3).tolist()
-[0.5, 0.5, 0.5, 0.5]
-
-Where voxels are in a vessel: found once, and kept for the next start.
-
->>> import os, tempfile
->>> import numpy as np
->>> from us_sim.slicing.flow.carried_lumen import mapped_lumen
->>> from us_sim.volume.volume import Volume
->>> x, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
->>> tube = np.repeat((x**2 + z**2 < 36)[:, None], 60, axis=1).astype(np.uint8)
->>> volume = Volume(tube, np.diag([5e-4, 5e-4, 5e-4, 1.0]), tube, {1: "vein"})
->>> with tempfile.TemporaryDirectory() as os.environ["US_SIM_CACHE"]:
-...     lumen, places = mapped_lumen(volume, 1)
-...     again, _ = mapped_lumen(volume, 1)
->>> del os.environ["US_SIM_CACHE"]
->>> bool((again.radii == lumen.radii).all()), places.offset.shape
-(True, (15, 64, 15, 2))
+Points on rings around each station move with the tissue's tetrahedra. The area of a ring is the
+component of its polygon's area vector along the vessel's tangent. Blood flows fastest on the axis
+and stands at the wall, as the square of the radial coordinate (Poiseuille).
 """
 
 from __future__ import annotations
@@ -49,15 +17,12 @@ from numpy.typing import NDArray
 from us_sim.cache import Form, kept
 from us_sim.kernels import njit
 from us_sim.slicing.flow.lumen import DIRECTIONS, Lumen, lumen_of
-from us_sim.tissue.mesh.point_location import locate
+from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-_RINGS = 4
-"""Rings around a station that share its area at rest evenly."""
-
+_RINGS = 4  # rings around a station that share its area at rest evenly
 _FRACTIONS = np.sqrt(np.arange(_RINGS + 1) / _RINGS)
-
 _REACH = 2e-3
 """m outside the tissue beyond which a vessel stays where it is, as the volume does there."""
 
@@ -75,7 +40,6 @@ class CarriedLumen:
     """Carries a lumen with the tissue.
 
     Args:
-        lumen: at rest.
         mesh: of the tissue at rest; None for a lumen that stays as it is.
     """
 
@@ -159,8 +123,7 @@ def _measure(points, nodes, weights, moved, tangents, polygons):
             )
 
 
-_WAY = 1
-"""Raised when another lumen or map is made of the same voxels."""
+_WAY = 1  # raised when another lumen or map is made of the same voxels
 _OUTSIDE = 3.0  # radial coordinate that is well outside the wall
 _MARGIN = 2  # voxels beyond the wall in which coordinates are known
 

@@ -1,44 +1,19 @@
-"""Noise that is a function of where and when: the same in every run, whatever came before.
+"""Colour and pulsed-wave Doppler: the velocity of blood as a scanner estimates it.
 
-Numbers are hashed with the finaliser of SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast
-splittable pseudorandom number generators, OOPSLA 2014).
+Colour Doppler (Kasai, Namekawa, Koyano, Omoto, IEEE Trans. Sonics Ultrason. 32, 1985): from pulse
+to pulse the echo's phase turns by π v / n, for a velocity v along the beam and the Nyquist velocity
+n. The turn is averaged over pulses and places as a complex number R, and arg R is shown, so faster
+blood aliases. Here R comes of known velocities:
 
->>> import numpy as np
->>> from us_sim.slicing.flow.doppler import normal_pair, uniform
->>> pairs = np.array([normal_pair(np.uint64(7), np.uint64(k)) for k in range(4000)])
->>> bool(abs(pairs.mean()) < 0.05), bool(abs(pairs.std() - 1.0) < 0.05)
-(True, True)
+    R = w(v) exp(i π v / n), averaged over the resolution, plus noise,
 
-Colour Doppler: the velocity of blood in a box of the image, as a scanner estimates it.
+with a wall filter w and complex normal noise. Part of the noise is proportional to R (spectral
+broadening), part is the receiver's; both fall with the square root of the number of pulses.
 
-A scanner sends a few pulses along each beam and looks how far the echo's phase turns from one to
-the next: by pi v / n for a velocity v along the beam and the Nyquist velocity n. It averages the
-turn over pulses and places as complex numbers R, and shows arg R (C. Kasai, K. Namekawa, A. Koyano,
-R. Omoto, Real-time two-dimensional blood flow imaging using an autocorrelation technique, IEEE
-Trans. Sonics Ultrason. 32, 1985). So a velocity beyond n shows as one of the other sign, and where
-blood of both is in one place they cancel. Here R is made from velocities that are known:
-
-    R = w(v) exp(i pi v / n), averaged over the resolution, plus noise,
-
-with a wall filter w, which takes what is as slow as tissue, and complex normal noise; beams whose
-part of the face is in air have no signal. Part of the
-noise is proportional to R, as blood moves through the beam and is not the same from pulse to pulse
-(spectral broadening), part is not (the receiver's); both fall with the square root of the number of
-pulses. Places where R stays below a level show no colour, and gain lowers that.
-
-Pulsed-wave Doppler: the spectrum of velocities at a gate, over time.
-
-Each column is the spectrum of one moment: how much blood in the gate has which velocity along the
-beam. The beam sees each velocity somewhat spread, the more the faster it is, since blood passes
-through the gate in a short time (transit time broadening); and as the echo of many cells is a sum
-of random phases, the power in each bin is exponentially distributed around its mean (J. A. Jensen,
-Estimation of Blood Velocities Using Ultrasound, 1996, chapters 5 and 6). Velocities beyond the
-Nyquist velocity come in at the other end. A person sets the angle between beam and vessel, which
-makes velocities along the vessel of those along the beam: divided by its cosine.
-
-The vessel nearest to a place of the image, for a gate or a colour box that follows it.
-
-Compiling what shows blood, or loading it from numba's cache, before it is needed.
+Pulsed-wave Doppler: each column is the spectrum of one moment in the gate. The faster a velocity,
+the more it is spread (transit time broadening), and the power in each bin is exponentially
+distributed around its mean (J. A. Jensen, Estimation of Blood Velocities Using Ultrasound, 1996,
+chapters 5 and 6).
 """
 
 from __future__ import annotations
@@ -77,7 +52,10 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def uniform(seed, place):
-    """A number above 0, and at most 1, for two numbers of type uint64."""
+    """A number above 0, and at most 1, for two numbers of type uint64: the same in every run.
+
+    By the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
+    """
     x = (seed * _STEP) ^ (place + _STEP)
     for _ in range(2):
         x = (x ^ (x >> np.uint64(30))) * _FIRST
@@ -94,9 +72,7 @@ def normal_pair(seed, place):
     return size * np.cos(angle), size * np.sin(angle)
 
 
-_SHOWN = 0.3
-"""Size of R, over that of fast blood, from which colour is shown with a gain of 0 dB."""
-
+_SHOWN = 0.3  # size of R, over that of fast blood, from which colour is shown with a gain of 0 dB
 _BROADENING, _RECEIVER = 0.35, 0.15
 """Standard deviation of the noise for one pulse, over R and over that of fast blood."""
 
@@ -113,10 +89,6 @@ _EDGE = 24  # points along each side of the box
 
 class ColourDoppler:
     """Estimates velocities in the colour box of one probe's images.
-
-    Args:
-        probe: its geometry.
-        settings: of the box.
 
     Raises:
         ProbeError: the box is outside the image, or this probe cannot be steered.
@@ -223,7 +195,6 @@ class ColourDoppler:
         return np.clip(np.rint((start + 0.5) * probe.lines - 0.5), 0, probe.lines - 1).astype(int)
 
     def _lay_out(self) -> None:
-        """Find the pixels of the box."""
         fraction, depth = fractions_and_depths(self._probe)
         start = fraction - self._lean(depth)
         with np.errstate(invalid="ignore"):
@@ -293,29 +264,19 @@ def _show(turned, noise, within, nyquist, least, broadening, receiver, shown):
 
 
 _ROWS, _COLUMNS = 256, 512
-_ALONG, _ACROSS = 15, 7
-"""Places in the gate along the beam and across it."""
-
-_BEAM = 1e-3
-"""Width of the gate across the beam, m: that of a beam of 5 to 8 MHz at its focus."""
-
+_ALONG, _ACROSS = 15, 7  # places in the gate along the beam and across it
+_BEAM = 1e-3  # width of the gate across the beam, m: that of a beam of 5 to 8 MHz at its focus
 _LEAST_BROADENING, _TRANSIT = 0.012, 0.06
 """Standard deviation of what one velocity is spread over: of the Nyquist velocity, and of the
 velocity itself."""
 
-_DRAWN = 3e-3
-"""Length of the lines that show the gate, m."""
-
+_DRAWN = 3e-3  # length of the lines that show the gate, m
 _NOISE = 1e-4
 """The receiver's power in a bin, over that of a gate full of blood of one slow velocity."""
 
 
 class Spectrum:
     """The spectrum at a gate of one probe's images.
-
-    Args:
-        probe: its geometry.
-        settings: of the gate.
 
     Raises:
         ProbeError: the gate is outside the image, or this probe cannot be steered.
@@ -451,7 +412,6 @@ def nearest_vessel(
     """Where the middle is, in the image, of the lumen nearest to a place; None without any.
 
     Args:
-        blood: in the vessels.
         lateral, depth: of the place, fraction of the face and m, as of `pixels_of`.
         steering: rad, of beams that lead to places.
     """

@@ -1,34 +1,8 @@
-"""A vessel's lumen at rest: cross-sections along its centre line, and where a point is in them.
+"""A vessel's lumen at rest, from its voxels: the centre line, and cross-sections along it.
 
-A section is star-shaped around its centre: the distance of its wall in evenly spaced directions.
-A point within has a place along the vessel and a radial coordinate, its distance from the centre
-over that of the wall in the same direction: 0 on the axis and 1 at the wall.
-
->>> import numpy as np
->>> from us_sim.slicing.flow.lumen import lumen_of
->>> x, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
->>> tube = np.repeat((x**2 + z**2 < 36)[:, None], 60, axis=1)
->>> lumen = lumen_of(tube, np.diag([5e-4, 5e-4, 5e-4, 1.0]))
->>> bool(np.allclose(lumen.areas, np.pi * 3e-3**2, rtol=0.05))
-True
->>> station, offset = lumen.locate(np.array([[6.5e-3, 15e-3, 5e-3]]))  # 1.5 of 3 mm off
->>> round(float(np.hypot(*offset[0])), 1)
-0.5
-
-The centre line of a vessel from the voxels of its lumen, or why they are no tube.
-
-Voxels are walked from one end of the lumen to the other, along shortest paths within it. Those
-equally far from the end form a slice across the vessel, be it curved or not, and the centres of the
-slices are its centre line (A. Verroust, F. Lazarus, Extracting skeletal curves from 3D scattered
-data, Visual Computer 16, 2000). Where a slice falls apart, the vessel branches.
-
->>> import numpy as np
->>> from us_sim.slicing.flow.lumen import centreline
->>> x, z = np.meshgrid(np.arange(13) - 6, np.arange(13) - 6, indexing="ij")
->>> tube = np.repeat((x**2 + z**2 < 16)[:, None], 40, axis=1)
->>> line = centreline(tube, np.diag([1e-3, 1e-3, 1e-3, 1.0]))
->>> bool(np.allclose(line.points[:, [0, 2]], 6e-3, atol=4e-4)), round(line.width * 1e3)
-(True, 7)
+The centre line joins the centres of slices equally far from one end, along shortest paths within
+the lumen (A. Verroust, F. Lazarus, Extracting skeletal curves from 3D scattered data, Visual
+Computer 16, 2000). Where a slice falls apart, the vessel branches.
 """
 
 from __future__ import annotations
@@ -45,17 +19,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from us_sim.errors import VolumeError
 
-DIRECTIONS = 24
-"""Directions from a section's centre in which its wall is known."""
-
+DIRECTIONS = 24  # directions from a section's centre in which its wall is known
 _ANGLES = np.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
-
-_SOFTENED = 0.7
-"""Standard deviation, in voxels, of what softens the steps of a label's surface."""
-
-_INTERPOLATED = 1 / 6
-"""Variance, in voxels squared, of what linear interpolation averages over."""
-
+_SOFTENED = 0.7  # standard deviation, in voxels, of what softens the steps of a label's surface
+_INTERPOLATED = 1 / 6  # variance, in voxels squared, of what linear interpolation averages over
 _WALL_STEP = 0.25  # voxels between the places along a ray where its wall is looked for
 _REFINED = 4  # times that the centre line is moved into its sections' centres
 _WIDEST = 2.5  # farthest that a wall is looked for, over the vessel's mean width
@@ -137,8 +104,6 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
     Raises:
         VolumeError: they are no tube; the sentence begins with what they are instead.
     """
-    from us_sim.slicing.flow.lumen import centreline, resampled
-
     inside = np.argwhere(lumen)
     if not len(inside):
         raise VolumeError("is nowhere in the volume")
@@ -296,17 +261,12 @@ def _between(values: NDArray[np.float64], station: NDArray[np.float64]) -> NDArr
     return np.asarray(values[low] * (1.0 - part) + values[low + 1] * part)
 
 
-_MOST = 60_000
-"""Voxels of a lumen that are walked; of more, every second along each axis is."""
-
-_SLENDER = 3.0
-"""Least length of a vessel over its width."""
-
+_MOST = 60_000  # voxels of a lumen that are walked; of more, every second along each axis is
+_SLENDER = 3.0  # least length of a vessel over its width
 _PIECE = 0.05
 """Fraction of its voxels that may lie apart from a vessel, as segmentations have crumbs."""
 
-_BRANCH = 0.2
-"""Fraction of a slice from which a part that lies apart from the rest is a branch."""
+_BRANCH = 0.2  # fraction of a slice from which a part that lies apart from the rest is a branch
 
 _HALF = [
     (i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) > (0, 0, 0)
@@ -390,7 +350,6 @@ def resampled(
 
 
 def _one_piece(lumen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The largest connected part, if the others are crumbs."""
     parts, count = label(lumen, structure=np.ones((3, 3, 3)))
     if count == 0:
         raise VolumeError("is nowhere in the volume")
@@ -403,7 +362,6 @@ def _one_piece(lumen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _graph(
     lumen: NDArray[np.bool_], voxels: NDArray[np.int64], step: NDArray[np.float64]
 ) -> coo_matrix:
-    """Distances (m) between neighbouring voxels, as a sparse matrix."""
     number = np.full(np.array(lumen.shape) + 2, -1, dtype=np.int64)
     number[1:-1, 1:-1, 1:-1][lumen] = np.arange(len(voxels))
     ones, others, lengths = [], [], []

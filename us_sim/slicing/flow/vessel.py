@@ -1,8 +1,8 @@
-"""A vessel with its flow: how fast blood flows along it as the tissue has it now.
+"""A vessel with its flow in tissue that is pressed: circulation and pulse.
 
 >>> import numpy as np
->>> from us_sim.slicing.settings import FlowSettings
 >>> from us_sim.slicing.flow.vessel import Vessel
+>>> from us_sim.slicing.settings import FlowSettings
 >>> from us_sim.volume.volume import Volume
 >>> x, z = np.meshgrid(np.arange(21) - 10, np.arange(21) - 10, indexing="ij")
 >>> tube = np.repeat((x**2 + z**2 < 36)[:, None], 60, axis=1).astype(np.uint8)
@@ -12,57 +12,6 @@
 >>> vein.advance(0.0, None)
 >>> np.round(vein.axis_velocity[10], 2) + 0.0  # m/s, twice the mean
 array([ 0. , -0.1,  0. ])
-
-What drives a vessel's flow, and how that changes while the vessel is pressed: a lumped model.
-
-Blood comes from a bed of capillaries at pressure P through a resistance into a reservoir, the veins
-on the way, at pressure p. From there it flows through the vessel and on to where the pressure is
-zero. The reservoir is elastic, which makes this a Windkessel (N. Westerhof, J.-W. Lankhaar, B. E.
-Westerhof, The arterial Windkessel, Med. Biol. Eng. Comput. 47, 2009):
-
-    q = p / (D + R),    T dp/dt = (P - p) - S q.
-
-The resistance S of the bed and D downstream are those with which flow and pressure at rest have
-their settings' values, and T is the time constant with which a closed vein fills up. R is
-Poiseuille's resistance of the vessel itself, whose open area a differs from place to place:
-
-    R = sum of 8 pi mu ds / a^2.
-
-An artery has no reservoir behind a bed but the heart's pressure, p = P. Inertia is left out, and so
-is what a stenosis loses by turbulence behind it.
-
-A vessel is closed where opposite walls touch. For an elastic tube that is at 0.27 of its area at
-rest (J. E. Flaherty, J. B. Keller, S. I. Rubinow, Post buckling behavior of elastic tubes and
-rings with opposite sides in contact, SIAM J. Appl. Math. 23, 1972). What is open of a lumen is
-taken to fall to nothing there, evenly with its area.
-
->>> import numpy as np
->>> from us_sim.slicing.flow.vessel import Circulation
->>> from us_sim.slicing.settings import FlowSettings
->>> vein = FlowSettings("venous", (0, -1, 0), peak_velocity=0.15, mean_velocity=0.05)
->>> flow = Circulation(vein, rest_areas=np.full(30, 3e-5), spacing=2e-3)
->>> at_rest, closed = np.full(30, 3e-5), np.full(30, 0.7e-5)
->>> steps = [(0.0, at_rest), (1.0, closed), (31.0, closed), (31.01, at_rest), (60.0, at_rest)]
->>> [round(flow.advance(time, areas) / flow.at_rest, 2) for time, areas in steps]
-[1.0, 0.0, 0.0, 3.27, 1.0]
-
-The pulse of a vessel: how fast blood flows at each moment, over its mean.
-
-At rest an artery of a limb has a triphasic pulse: fast forward flow in systole, a short reversal as
-the aortic valve closes, and a slow forward wave after it (W. N. McDicken and P. R. Hoskins, in P.
-Hoskins, K. Martin and A. Thrush, Diagnostic Ultrasound: Physics and Equipment, 2nd ed., 2010,
-chapter 9). Its shape here is a sum of three bells, moved and scaled so that peak and mean are the
-settings' own. Flow in a vein of the arm swings with breathing, and a little with the heart (N.
-Baekgaard and C. Strandberg, Duplex ultrasound in the upper limb venous system, Phlebolymphology,
-2016): inspiration draws blood into the chest.
-
->>> import numpy as np
->>> from us_sim.slicing.settings import FlowSettings
->>> from us_sim.slicing.flow.vessel import Waveform
->>> pulse = Waveform(FlowSettings("arterial", (0, 1, 0), peak_velocity=0.8, mean_velocity=0.08))
->>> beat = pulse(np.arange(1000) / 1100)  # one beat at 1.1 a second
->>> round(float(beat.mean()), 3), round(float(beat.max()), 3), round(float(beat.min()), 1)
-(1.0, 5.0, -0.7)
 """
 
 from __future__ import annotations
@@ -78,8 +27,7 @@ from us_sim.slicing.settings import FlowSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-_ALONG = 0.25
-"""Least cosine between the direction that is set and the vessel's own."""
+_ALONG = 0.25  # least cosine between the direction that is set and the vessel's own
 
 
 class Vessel:
@@ -89,10 +37,8 @@ class Vessel:
     the square of the radial coordinate there at rest, which `map` knows.
 
     Args:
-        name: of it, for sentences.
         volume: in frame ``patient``, with labels.
         label: of the vessel's lumen.
-        settings: of the flow.
 
     Raises:
         SceneError: the label is no tube, or the flow's direction is across it.
@@ -202,10 +148,18 @@ def open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.flo
 
 
 class Circulation:
-    """Flow along a vessel as its lumen narrows and opens, averaged over the pulse.
+    """Flow along a vessel as its lumen narrows and opens, averaged over the pulse: a Windkessel.
+
+        q = p / (D + R),    T dp/dt = (P - p) - S q
+
+    Blood comes from capillaries at pressure P through a resistance S into an elastic reservoir at
+    pressure p, and flows on through the vessel's own resistance R, and D downstream (N. Westerhof,
+    J.-W. Lankhaar, B. E. Westerhof, Med. Biol. Eng. Comput. 47, 2009). R is Poiseuille's, the sum
+    of 8 π μ ds / a² of the open area a; T is the time constant of filling. An artery has p = P.
+    Inertia and turbulence are left out. A vessel is closed at 0.27 of its area at rest, as elastic
+    tubes are (Flaherty, Keller, Rubinow, SIAM J. Appl. Math. 23, 1972).
 
     Args:
-        settings: of the flow.
         rest_areas: (S,) m², of the lumen at rest, at places evenly spaced along it.
         spacing: m, between them.
         before: the same vessel with other settings, whose reservoir this one takes over.
@@ -268,14 +222,17 @@ class Circulation:
 _BELLS = ((0.13, 0.045, 1.0), (0.33, 0.06, -0.32), (0.52, 0.09, 0.10))
 """Middle and standard deviation, in beats, and height of the arterial pulse's three waves."""
 
-_CARDIAC = 0.25
-"""Fraction of the swing of a vein's flow that is the heart's; the rest is breathing."""
-
+_CARDIAC = 0.25  # fraction of the swing of a vein's flow that is the heart's; the rest is breathing
 _FINE = 4096  # places at which the pulse's shape is measured
 
 
 class Waveform:
     """Flow over its mean, as a function of time; its mean over a beat and a breath is 1.
+
+    An artery of a limb at rest has a triphasic pulse (McDicken and Hoskins, in Hoskins, Martin and
+    Thrush, Diagnostic Ultrasound: Physics and Equipment, 2nd ed., 2010, chapter 9): three bells,
+    scaled to the peak and mean that are set. Flow in a vein swings with breathing, and a little
+    with the heart (Baekgaard and Strandberg, Phlebolymphology, 2016).
 
     Args:
         settings: of the vessel's flow.

@@ -1,55 +1,23 @@
-"""The acoustic coupling of the transducer's face to the skin, line by line.
+"""Contact of the transducer's face with the skin: coupling, the layer of gel, echoes in air.
 
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.formation.coupling import ContactSurface
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> block = box_mesh([-0.01, 0.05], [-0.05, 0.05], [0.0, 0.05])  # skin from x = -10 mm on
->>> probe = LinearProbe(aperture=0.04, depth=0.04, lines=8)
->>> surface = ContactSurface(block.nodes, block.boundary)
->>> surface.contact(block.nodes, probe, Pose([0.0, 0.0, 0.002]))[0]  # pressed 2 mm
-array([0., 0., 1., 1., 1., 1., 1., 1.], dtype=float32)
-
-The layer between the transducer's face and the mesh under it, where a line is coupled.
-
-The triangles of a coarse mesh stand off a face that their nodes touch, by a millimetre or two where
-it digs in (`us_sim.slicing.formation.coupling`). Skin and gel fill that layer, and no tetrahedron
-carries the volume there. It shows the tissue beyond it, mirrored: grain and brightness go on to the
-face without a seam, and nothing is made up that is not there.
-
->>> import numpy as np
->>> from us_sim.slicing.formation.coupling import GelLayer
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=4, rows=40, lines=4)
->>> slice_ = np.zeros((40, 4), dtype=np.uint8)
->>> slice_[2:] = np.arange(2, 40)[:, None]  # 2 mm off the face
->>> layer = GelLayer(probe)
->>> layer.filled(slice_, np.full(4, 2e-3), np.array([1.0, 1.0, 0.0, 0.0]))[:5, [0, 3]].T
-array([[5, 4, 3, 3, 4],
-       [0, 0, 2, 3, 4]], dtype=uint8)
-
-Echoes of the transducer's own face in lines that are badly coupled to the skin.
+The triangles of a coarse mesh stand off a face that their nodes touch by a millimetre or two. Skin
+and gel fill that layer, where no tetrahedron carries the volume; it shows the tissue beyond it,
+mirrored.
 
 Air reflects everything, so the pulse runs to and fro in the lens of the transducer: bright bands
-a lens apart, each weaker than the one before, and a haze below them.
-
-A line sees the tissue through the elements that form it, and deeper echoes are formed by more
-elements. So the shadow of a part of the face without contact reaches all depths, with an edge that
-gets softer with depth. A partly coupled line is weaker by the coupling in decibels.
-Of two echoes at one place the stronger is shown: their sum is 3 dB more at most.
+a lens apart, each weaker than the one before, and a haze below them. Deeper echoes are formed by
+more elements, so the edge of the shadow of air gets softer with depth. A partly coupled line is
+weaker by the coupling in decibels. Of two echoes at one place the stronger is shown.
 
 >>> import numpy as np
->>> from us_sim.slicing.settings import Imaging
->>> from us_sim.slicing.probe.probe import LinearProbe
 >>> from us_sim.slicing.formation.coupling import Reverberation
+>>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.settings import Imaging
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=8, rows=8, lines=8)
 >>> tissue = np.full((8, 8), 150, dtype=np.uint8)
 >>> air = Reverberation(probe, Imaging(contact=True))
 >>> air.shown(tissue, np.full(8, 0.5, np.float32))[7]  # 6 dB less
 array([124, 124, 124, 124, 124, 124, 124, 124], dtype=uint8)
->>> int(air.shown(tissue, np.zeros(8, np.float32))[7].max())  # nothing but air
-0
 """
 
 from __future__ import annotations
@@ -278,9 +246,7 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
             press[line] = moved[line] - entered[line]
 
 
-_THICKEST = 5e-3
-"""m, of a layer that is filled: what is more is not the mesh's coarseness."""
-
+_THICKEST = 5e-3  # m, of a layer that is filled: what is more is not the mesh's coarseness
 _TRIES, _NEARER = 4, 0.8
 _BESIDE = (0, 1, -1)  # columns
 _NOT_FILLED = -1.0  # in place of how thick the layer is
@@ -310,7 +276,6 @@ class GelLayer:
         """The slice (rows, columns) with the layer filled; the slice itself where there is none.
 
         Args:
-            image: the slice.
             gap: (lines,) m, from the face to the surface of the mesh along each line.
             coupling: (lines,); lines without stay as they are.
         """
@@ -453,7 +418,6 @@ def _lose(coupled, reach, losses, out):
     Args:
         coupled: (places,) fraction of the amplitude transmitted in one direction.
         reach: (steps,) places on either side whose elements form a line.
-        losses: the table of losses.
         out: (steps, places), set: the tissue's loss, and that of the face's echo times 256.
     """
     places = len(coupled)

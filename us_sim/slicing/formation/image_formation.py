@@ -1,38 +1,18 @@
-"""The picture as the console forms it from slices, each part only where a setting asks for it.
+"""The picture as the console forms it from slices, each stage only where a setting asks for it.
+
+A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
+and 0 is no echo, which no gain makes visible.
 
 >>> import numpy as np
 >>> from us_sim.slicing.formation.image_formation import ImageFormation
->>> from us_sim.slicing.settings import Imaging
 >>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.settings import Imaging
 >>> slice_ = np.full((4, 4), 100, dtype=np.uint8)
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=4, rows=4)
 >>> ImageFormation(probe, Imaging()).form([slice_]) is slice_
 True
 >>> ImageFormation(probe, Imaging(gain=6.0)).form([slice_])[0]
 array([126, 126, 126, 126], dtype=uint8)
-
-Tables from echo levels to grey values: gain, time gain, dynamic range and grey map.
-
-A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
-and 0 is no echo, which no gain makes visible. The faintest echoes fade to black over the
-last 4 dB above no echo, so that there is no hard edge where gain lifts them.
-
->>> import numpy as np
->>> from us_sim.slicing.formation.image_formation import GreyLevels
->>> from us_sim.slicing.settings import Imaging
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> levels = GreyLevels(LinearProbe(0.04, 0.04, 3, 1), Imaging(gain=12.0))
->>> levels.shown(np.array([[0, 100, 250]], dtype=np.uint8))
-array([[  0, 151, 255]], dtype=uint8)
-
-The thickness of the beam: an image averages what lies in front of and behind its plane.
-
->>> from us_sim.slicing.formation.image_formation import Elevation
->>> from us_sim.slicing.settings import Imaging
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=64, rows=64)
->>> Elevation(probe, Imaging(elevation_planes=3, elevation_width=2e-3)).offsets * 1e3
-array([-1.69..., 0. , 1.69...])
 """
 
 from __future__ import annotations
@@ -77,8 +57,6 @@ class ImageFormation:
         self._reverberation: Reverberation | None = None
         self._grey_levels: GreyLevels | None = None
         if imaging.elevation_planes > 1:
-            from us_sim.slicing.formation.image_formation import Elevation
-
             self._elevation = Elevation(probe, imaging)
         if imaging.lateral_resolution > 0.0 or imaging.axial_resolution > 0.0:
             from us_sim.slicing.formation.resolution import Resolution
@@ -90,8 +68,6 @@ class ImageFormation:
             self._gel_layer = GelLayer(probe)
             self._reverberation = Reverberation(probe, imaging)
         if imaging.changes_grey_levels:
-            from us_sim.slicing.formation.image_formation import GreyLevels
-
             self._grey_levels = GreyLevels(probe, imaging)
 
     @property

@@ -1,23 +1,9 @@
 """The point spread function: the width of the beam and the length of the pulse at every depth.
 
 Echoes are spread as power. Scatterers within a beam send echoes of random phase, whose expected
-power is the sum of theirs (Wagner, Smith, Sandrik, Lopez 1983). So tissue keeps its brightness, a
-bright reflector smears over its dark surroundings as it does on a scanner, and 6 dB below its peak,
-where resolution is stated, a point is as wide as the setting says. Grey values are logarithms:
-spreading those would shrink bright areas and blacken what lies beside dark ones. A volume of grey
-values holds no phases, so speckle finer than the beam becomes smoother, where a scanner's is
-coarser.
-
->>> import numpy as np
->>> from us_sim.slicing.settings import Imaging
->>> from us_sim.slicing.probe.probe import LinearProbe
->>> from us_sim.slicing.formation.resolution import Resolution
->>> point = np.zeros((41, 41), dtype=np.uint8)
->>> point[20, 20] = 255
->>> probe = LinearProbe(aperture=0.041, depth=0.041, columns=41, rows=41)  # 1 mm pixels
->>> spread = Resolution(probe, Imaging(lateral_resolution=4e-3)).spread(point)
->>> spread[20, 16:25]  # 2 mm from the middle 6.02 dB less, which are 25.6 grey values
-array([132, 177, 209, 228, 235, 228, 209, 177, 132], dtype=uint8)
+power is the sum of theirs (Wagner, Smith, Sandrik, Lopez 1983). So tissue keeps its brightness, and
+6 dB below its peak a point is as wide as the setting says. A volume of grey values holds no phases,
+so speckle finer than the beam becomes smoother, where a scanner's is coarser.
 """
 
 from __future__ import annotations
@@ -143,7 +129,6 @@ def _remapped(image: NDArray[np.uint8], maps: Any, *, replicate: bool) -> NDArra
 
 
 def _length(points: NDArray[np.float64]) -> float:
-    """Length of the line through points (n, 2), m, with half a step beyond its ends."""
     count = len(points)
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return float(steps.sum()) * count / max(count - 1, 1)

@@ -1,14 +1,7 @@
-"""Depth along a probe's beams, and the width of a beam there, for all parts of image formation.
-
->>> from us_sim.slicing.probe.beams import beam_width
->>> round(float(beam_width(0.0, 2e-3, focus=0.02)) * 1e3, 3)  # mm, at the face
-2.828
-
-Beams of a probe by their place on its face, as a sonographer steers them.
+"""Places on a probe's beams: fractions of its face, depths, and the width of a beam there.
 
 A place across the array is a fraction: -0.5 at its first end, 0.5 at its other, of the face of a
-linear array and of the opening angle where beams spread. Where beams are parallel they may be
-steered, all by one angle.
+linear array and of the opening angle where beams spread.
 
 >>> import numpy as np
 >>> from us_sim.slicing.probe.beams import pixels_of
@@ -29,8 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import ProbeError
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-DEPTH_STEPS = 512
-"""Steps of depth in which tables of what changes with depth are made."""
+DEPTH_STEPS = 512  # steps of depth in which tables of what changes with depth are made
 
 
 def focus_of(probe: Probe) -> float:

@@ -1,14 +1,4 @@
-"""The plane of pixels on which an image is cut, in frame ``patient``.
-
->>> import numpy as np
->>> from us_sim.slicing.probe.plane import SlicePlane
->>> plane = SlicePlane(
-...     origin=np.zeros(3), column_step=np.array([1e-3, 0, 0]), row_step=np.array([0, 0, 1e-3]),
-...     columns=3, rows=2,
-... )
->>> plane.pixels()[1, 2]
-array([0.002, 0.   , 0.001])
-"""
+"""The plane of pixels on which an image is cut, in frame ``patient``."""
 
 from __future__ import annotations
 

@@ -87,7 +87,6 @@ def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None 
 
 
 def create_node(node_name: str, **arguments: Any) -> Node:
-    """Make a node; the arguments are those of `rclpy.node.Node`."""
     return Node(node_name, **arguments)
 
 

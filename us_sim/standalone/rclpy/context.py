@@ -57,8 +57,6 @@ class WakeUp:
 
 
 class SignalHandlerOptions(Enum):
-    """Which signals shut contexts down."""
-
     NO = 0
     SIGINT = 1
     SIGTERM = 2
@@ -80,7 +78,6 @@ def add_context(context: Any) -> None:
 
 
 def remove_context(context: Any) -> None:
-    """Forget a context."""
     global _contexts
     with _contexts_lock:
         _contexts = tuple(
@@ -102,7 +99,6 @@ def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions
 
 
 def get_current_signal_handlers_options() -> SignalHandlerOptions:
-    """Which handlers are installed now."""
     return SignalHandlerOptions((signal.SIGINT in _previous) + 2 * (signal.SIGTERM in _previous))
 
 
@@ -132,7 +128,7 @@ Callback = Callable[[], None]
 
 @dataclass(eq=False)
 class LocalNode:
-    """What others learn about a node of this process: its name, its readers and its writers."""
+    """A node of this process as others see it: its name, its readers and its writers."""
 
     name: str
     namespace: str
@@ -158,7 +154,6 @@ class Context(AbstractContextManager["Context"]):
         initialize_logging: bool = True,
         domain_id: int | None = None,
     ) -> None:
-        """Start this context's life."""
         with self._lock:
             if domain_id is not None and domain_id < 0:
                 raise RuntimeError(f"Domain id ({domain_id}) should not be lower than zero.")
@@ -178,17 +173,14 @@ class Context(AbstractContextManager["Context"]):
                 self._logging_initialized = True
 
     def ok(self) -> bool:
-        """Whether this context was initialised and not yet shut down."""
         return self._valid
 
     def get_domain_id(self) -> int:
-        """The DDS domain that this context is in."""
         if not self._initialized:
             raise RuntimeError("Context must be initialized before it can have a domain id")
         return self._domain_id
 
     def shutdown(self) -> None:
-        """End this context's life: executors stop, and everything leaves the network."""
         if not self._initialized:
             raise RuntimeError("Context must be initialized before it can be shutdown")
         was_ok = self._valid
@@ -214,7 +206,7 @@ class Context(AbstractContextManager["Context"]):
             release()
 
     def destroy(self) -> None:
-        """Leave the network. What the nodes still hold does nothing from now on."""
+        """Leave the network; endpoints that nodes still hold do nothing from now on."""
         if self._initialized:
             self._graph.close()
             self._participant.close()
@@ -248,9 +240,9 @@ class Context(AbstractContextManager["Context"]):
     def __exit__(self, *_: object) -> None:
         self.try_shutdown()
 
-    def _require_init(self, what: str) -> None:
+    def _require_init(self, thing: str) -> None:
         if not self._initialized:
-            raise NotInitializedException(f"cannot create {what}")
+            raise NotInitializedException(f"cannot create {thing}")
 
     def _invalidate(self) -> None:
         """Mark the context as shut down and wake whoever waits on its behalf.
@@ -274,13 +266,11 @@ class Context(AbstractContextManager["Context"]):
             self._waiting = (*alive, weakref.ref(waiting))
 
     def _add_node(self, node: LocalNode) -> None:
-        """Have a node known to others."""
         with self._lock:
             self._nodes.append(node)
         self._announce()
 
     def _remove_node(self, node: LocalNode) -> None:
-        """The counterpart of `_add_node`."""
         with self._lock:
             if node in self._nodes:
                 self._nodes.remove(node)
@@ -334,12 +324,10 @@ def get_default_context(*, shutting_down: bool = False) -> Context:
 
 
 def ok(*, context: Context | None = None) -> bool:
-    """Whether a context was initialised and not yet shut down."""
     return (get_default_context() if context is None else context).ok()
 
 
 def shutdown(*, context: Context | None = None) -> None:
-    """Shut a context down; raises when it is not up."""
     (get_default_context(shutting_down=True) if context is None else context).shutdown()
 
 
@@ -349,7 +337,7 @@ def try_shutdown(*, context: Context | None = None) -> None:
 
 
 def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
-    """A command line (`sys.argv` when None) without what is between --ros-args and --."""
+    """A command line (`sys.argv` when None) without the part between --ros-args and --."""
     return list(parse_arguments(sys.argv if args is None else args).others)
 
 

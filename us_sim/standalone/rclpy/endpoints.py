@@ -36,15 +36,12 @@ class CallbackGroup:
         self.entities: set[weakref.ReferenceType[Any]] = set()
 
     def add_entity(self, entity: Any) -> None:
-        """Make an entity a member of this group."""
         self.entities.add(weakref.ref(entity, self.entities.discard))
 
     def has_entity(self, entity: Any) -> bool:
-        """Whether an entity is a member of this group."""
         return weakref.ref(entity) in self.entities
 
     def can_execute(self, entity: Any) -> bool:  # noqa: ARG002
-        """Whether an entity's callback may start now."""
         raise RuntimeError(
             f"{type(self).__name__} does not say when callbacks may run; use "
             "MutuallyExclusiveCallbackGroup or ReentrantCallbackGroup"
@@ -120,10 +117,10 @@ class GuardCondition(Destroyable):
         super().destroy()
         self._triggered = False
 
-    def _stirred(self) -> bool:
+    def _may_be_ready(self) -> bool:
         return self._triggered
 
-    _fetch = _stirred
+    _fetch = _may_be_ready
 
     def _take(self) -> Callable[..., Any] | None:
         self._triggered = False
@@ -173,17 +170,14 @@ class Timer(Destroyable):
         self._period = int(value)
 
     def is_ready(self) -> bool:
-        """Whether the callback is due."""
         self._require_existence()
-        return self._stirred()
+        return self._may_be_ready()
 
     def is_canceled(self) -> bool:
-        """Whether the timer is stopped."""
         self._require_existence()
         return self._canceled
 
     def cancel(self) -> None:
-        """Stop the timer until `reset`."""
         self._require_existence()
         self._canceled = True
 
@@ -195,7 +189,6 @@ class Timer(Destroyable):
         self._context._wake_all()
 
     def time_since_last_call(self) -> int:
-        """Nanoseconds since the callback was called, or since the timer was made."""
         self._require_existence()
         return self._clock._now() - self._last_call
 
@@ -205,12 +198,11 @@ class Timer(Destroyable):
         return None if self._canceled else self._next_call - self._clock._now()
 
     def destroy(self) -> None:
-        """Stop the timer for good."""
         super().destroy()
         self._canceled = True
         self._clock._timers.discard(self)
 
-    def _stirred(self) -> bool:
+    def _may_be_ready(self) -> bool:
         return not self._canceled and self._next_call <= self._clock._now()
 
     def _fetch(self) -> bool:
@@ -247,42 +239,24 @@ class Timer(Destroyable):
 
 
 def serialize_message(message: Any) -> bytes:
-    """The CDR bytes of a message, with their four-byte header."""
     require_message_class(type(message))
     return serialize(message)
 
 
 def deserialize_message(serialized_message: bytes, message_type: Any) -> Any:
-    """The message of a class that CDR bytes hold."""
     require_message_class(message_type)
     return deserialize(serialized_message, message_type)
 
 
 def require_message_class(cls: Any) -> None:
-    """Raise NoTypeSupportImportedException for what is no class of messages."""
+    """Raise NoTypeSupportImportedException for anything but a class of messages."""
     if not isinstance(cls, type) or not hasattr(cls, "__msgtype__") or hasattr(cls, "Request"):
         raise NoTypeSupportImportedException()
 
 
-_KINDS: dict[
-    str, tuple[Callable[..., Any], str]
-] = {  # how the participant makes one, and what is said of one that does not fit
-    "publisher": (
-        Participant.create_writer,
-        "New subscription discovered on topic '{}', requesting incompatible QoS. "
-        "No messages will be sent to it. Last incompatible policy: {}",
-    ),
-    "subscription": (
-        Participant.create_reader,
-        "New publisher discovered on topic '{}', offering incompatible QoS. "
-        "No messages will be received from it. Last incompatible policy: {}",
-    ),
-}
-
-
 @dataclass(frozen=True)
 class NodeLink:
-    """What an endpoint needs of its node, without keeping the node alive."""
+    """A node's context, logger name and wake-up, without keeping the node alive."""
 
     context: Context
     logger_name: str
@@ -292,7 +266,7 @@ class NodeLink:
 def open_endpoint(
     kind: str, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
 ) -> Any:
-    """A DDS writer for a 'publisher', or reader for a 'subscription'.
+    """A DDS writer for a "publisher", or reader for a "subscription".
 
     Args:
         topic: the topic's name as the node wrote it.
@@ -304,7 +278,16 @@ def open_endpoint(
     """
     require_message_class(msg_type)
     package, folder, name = msg_type.__msgtype__.split("/")
-    create, refusal = _KINDS[kind]
+    if kind == "publisher":
+        create: Any = Participant.create_writer
+        other, effect = (
+            "subscription",
+            "requesting incompatible QoS. No messages will be sent to it",
+        )
+    else:
+        create = Participant.create_reader
+        other = "publisher"
+        effect = "offering incompatible QoS. No messages will be received from it"
     logger = get_logger(link.logger_name)
     try:
         return create(
@@ -313,7 +296,10 @@ def open_endpoint(
             f"{package}::{folder}::dds_::{name}_",
             qos,
             f"typehash={type_hash(msg_type.__msgtype__)};",
-            on_incompatible=lambda policy: logger.warning(refusal.format(topic, policy)),
+            on_incompatible=lambda policy: logger.warning(
+                f"New {other} discovered on topic '{topic}', {effect}. "
+                f"Last incompatible policy: {policy}"
+            ),
         )
     except DdsError as error:
         raise RCLError(f"failed to create {kind}: {error}") from None
@@ -339,20 +325,20 @@ class Inbox:
     def fetch(self) -> bool:
         """Whether there is something to take."""
         if self._fetched is None:
-            self.ready = False  # before looking, so that what comes meanwhile is noticed
+            self.ready = False  # before looking, so that data that come meanwhile are noticed
             self._fetched = self._take()
             self.ready = self.ready or self._fetched is not None
         return self._fetched is not None
 
     def take(self) -> Any:
-        """What was fetched, or is waiting now; None when there is nothing."""
+        """The data that were fetched or are waiting now; None when there are none."""
         self.fetch()
         fetched, self._fetched = self._fetched, None
         return fetched
 
 
 class Connected(Destroyable):
-    """What is on the network under an absolute name until `destroy`."""
+    """An endpoint that is on the network under an absolute name until `destroy`."""
 
     def __init__(self, link: NodeLink, full_name: str, endpoint: Any, qos: QoSProfile) -> None:
         self._context = link.context
@@ -385,7 +371,7 @@ class Receiver(Connected, ABC):
         self._inbox = Inbox(endpoint.take, link.wake)
         endpoint.set_on_data(self._inbox.notify)
 
-    def _stirred(self) -> bool:
+    def _may_be_ready(self) -> bool:
         return self._inbox.ready
 
     def _fetch(self) -> bool:
@@ -445,7 +431,6 @@ class Publisher(Connected):
             )
 
     def get_subscription_count(self) -> int:
-        """How many subscriptions are connected."""
         self._require_existence()
         return self._endpoint.matched_count()
 
@@ -480,7 +465,6 @@ class Subscription(Receiver):
         self.raw = raw
 
     def get_publisher_count(self) -> int:
-        """How many publishers are connected."""
         self._require_existence()
         return self._endpoint.matched_count()
 
@@ -559,7 +543,6 @@ class Client(Receiver):
         return future.result()
 
     def call_async(self, request: Any) -> Future:
-        """Send a request; the future of its response."""
         if not isinstance(request, self.srv_type.Request):
             raise TypeError(f"Expected {self.srv_type.Request}, got {type(request)}")
         self._require_existence()
@@ -586,12 +569,10 @@ class Client(Receiver):
                     break
 
     def service_is_ready(self) -> bool:
-        """Whether a service is connected."""
         self._require_existence()
         return self._endpoint.service_is_ready()
 
     def wait_for_service(self, timeout_sec: float | None = None) -> bool:
-        """Wait until a service is connected; whether it was within the time."""
         return wait_until(self.service_is_ready, self.context, timeout_sec)
 
     def _call_for(self, data: bytes, info: Any) -> Callable[[], Any] | None:
@@ -614,7 +595,7 @@ def wait_until(condition: Callable[[], bool], context: Context, timeout_sec: flo
 
 
 class Service(Receiver):
-    """Calls back with each request, and answers with what the callback returns."""
+    """Calls back with each request, and sends the returned response."""
 
     service_name = Receiver._existing_name
 

@@ -57,23 +57,17 @@ class Destroyable:
 
 
 class NotInitializedException(Exception):
-    """Something that needs rclpy.init() was used before it."""
-
     def __init__(self, message: str | None = None) -> None:
         sentence = "rclpy.init() has not been called."
         super().__init__(f"{sentence} msg:{message}" if message else sentence)
 
 
 class NoTypeSupportImportedException(Exception):
-    """A class that is no message or service was given as one."""
-
     def __init__(self) -> None:
         super().__init__("no type_support imported")
 
 
 class NameValidationException(Exception):
-    """A name of a node, namespace, topic or service is not allowed."""
-
     _kind = "name"
 
     def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
@@ -82,60 +76,42 @@ class NameValidationException(Exception):
 
 
 class InvalidNamespaceException(NameValidationException):
-    """A namespace is not allowed."""
-
     _kind = "namespace"
 
 
 class InvalidNodeNameException(NameValidationException):
-    """A node name is not allowed."""
-
     _kind = "node name"
 
 
 class InvalidTopicNameException(NameValidationException):
-    """A topic name is not allowed."""
-
     _kind = "topic name"
 
 
 class InvalidServiceNameException(NameValidationException):
-    """A service name is not allowed."""
-
     _kind = "service name"
 
 
 class ParameterException(Exception):
-    """Base of what can be wrong with parameters."""
-
     def __init__(self, error_msg: str, parameters: str | list[str]) -> None:
         super().__init__(f"{error_msg}: {parameters}")
 
 
 class ParameterNotDeclaredException(ParameterException):
-    """A parameter is read or written that was not declared."""
-
     def __init__(self, parameters: str | list[str]) -> None:
         super().__init__("Invalid access to undeclared parameter(s)", parameters)
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
-    """A parameter is declared a second time."""
-
     def __init__(self, parameters: str | list[str]) -> None:
         super().__init__("Parameter(s) already declared", parameters)
 
 
 class InvalidParameterException(ParameterException):
-    """A parameter's name is not allowed."""
-
     def __init__(self, parameter_name: str):
         super().__init__("Invalid parameter name", parameter_name)
 
 
 class InvalidParameterTypeException(ParameterException):
-    """A parameter is given a value of another type than it was declared with."""
-
     def __init__(self, desired_parameter: Any, expected_type: Any) -> None:
         super().__init__(
             f"Trying to set parameter '{desired_parameter.name}' to '{desired_parameter.value}'"
@@ -145,8 +121,6 @@ class InvalidParameterTypeException(ParameterException):
 
 
 class InvalidParameterValueException(ParameterException):
-    """A parameter's value is outside its range, or a callback rejects it."""
-
     def __init__(self, parameter: str, value: Any, reason: str) -> None:
         super().__init__(
             f"Invalid parameter value ({value}) for parameter. Reason: {reason}", parameter
@@ -154,8 +128,6 @@ class InvalidParameterValueException(ParameterException):
 
 
 class ParameterImmutableException(ParameterException):
-    """A read-only parameter is undeclared or described anew."""
-
     def __init__(self, parameter_name: str):
         super().__init__("Attempted to modify read-only parameter", parameter_name)
 

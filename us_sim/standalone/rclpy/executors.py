@@ -32,13 +32,11 @@ class RunningCallbacks:
         self._changed = threading.Condition()
 
     def begin(self) -> None:
-        """This thread runs a callback."""
         me = threading.get_ident()
         with self._changed:
             self._threads[me] = self._threads.get(me, 0) + 1
 
     def end(self) -> None:
-        """This thread has run a callback."""
         me = threading.get_ident()
         with self._changed:
             self._threads[me] -= 1
@@ -60,7 +58,7 @@ class ExternalShutdownException(Exception):
 
 
 class Executor(AbstractContextManager["Executor"]):
-    """What SingleThreadedExecutor and MultiThreadedExecutor have in common."""
+    """Base of SingleThreadedExecutor and MultiThreadedExecutor."""
 
     _runs_elsewhere = False  # callbacks run in other threads than the one that waits
     context = property(attrgetter("_context"))
@@ -88,7 +86,6 @@ class Executor(AbstractContextManager["Executor"]):
         return True
 
     def add_node(self, node: Node) -> bool:
-        """Run a node's callbacks; False when it was added before."""
         with self._nodes_lock:
             if node in self._nodes:
                 return False
@@ -98,7 +95,6 @@ class Executor(AbstractContextManager["Executor"]):
         return True
 
     def remove_node(self, node: Node) -> None:
-        """Run a node's callbacks no more."""
         with self._nodes_lock:
             if node in self._nodes:
                 del self._nodes[node]
@@ -109,12 +105,10 @@ class Executor(AbstractContextManager["Executor"]):
         self._wake_up.wake()
 
     def get_nodes(self) -> list[Node]:
-        """The nodes that were added."""
         with self._nodes_lock:
             return list(self._nodes)
 
     def spin(self) -> None:
-        """Run callbacks until the context or this executor is shut down."""
         while self._context.ok() and not self._is_shutdown:
             self.spin_once()
 
@@ -160,7 +154,7 @@ class Executor(AbstractContextManager["Executor"]):
             self._run(entity)
 
     def _next_ready(self, timeout_sec: float | None, condition: Callable[[], bool]) -> Any:
-        """What is to be run next; None when there is nothing in time, or the wait is ended.
+        """The entity to run next; None when none is ready in time, or the wait is ended.
 
         Whatever is ready at once runs in one round, each once, before anything runs again.
 
@@ -185,12 +179,12 @@ class Executor(AbstractContextManager["Executor"]):
         return None if self._is_shutdown else entity
 
     def _ready(self) -> Iterator[Any]:
-        """What may start, each looked at when its turn comes, in rclpy's order."""
+        """The entities that may start, each examined when its turn comes, in rclpy's order."""
         for node in self.get_nodes():
             for entity in node._rcl_entities():
                 if node not in self._nodes:
                     break
-                if entity._stirred() and self._may_start(entity) and entity._fetch():
+                if entity._may_be_ready() and self._may_start(entity) and entity._fetch():
                     entity._executor_event = True
                     yield entity
 
@@ -204,7 +198,7 @@ class Executor(AbstractContextManager["Executor"]):
         """
         rest = None if deadline is None else deadline - time.monotonic()
         for node in self.get_nodes():
-            if any(e._stirred() and self._may_start(e) for e in node._rcl_entities()):
+            if any(e._may_be_ready() and self._may_start(e) for e in node._rcl_entities()):
                 return 0.0
             for timer in list(node.timers):
                 until_due = timer._real_time_left()

@@ -10,6 +10,8 @@ Names with dots form a tree: a logger without a level takes its parent's, at the
 ('probe.camera', False)
 """
 
+from __future__ import annotations
+
 import os
 import sys
 import threading
@@ -21,8 +23,6 @@ from types import FrameType
 from typing import Any
 
 from .time import Clock
-
-__all__ = ["LoggingSeverity", "get_logger", "get_logger_effective_level", "set_logger_level"]
 
 
 class LoggingSeverity(IntEnum):
@@ -59,23 +59,23 @@ class Record:
     stamp: int  # ns since the epoch
 
 
+rosout: dict[str, Callable[[Record], None]] = {}  # publishing functions, by nodes' loggers
+
 _lock = threading.RLock()
-_levels: dict[str, LoggingSeverity] = {}
-_default_level = LoggingSeverity.INFO
+_levels = {"": LoggingSeverity.INFO}
 _disabled: frozenset[str] = frozenset()
 _users = 0
-_rosout: dict[str, Callable[[Record], None]] = {}
 
 
 def configure(arguments: Any) -> None:
     """Take log levels and outputs from the first context that is up."""
-    global _users, _default_level, _disabled
+    global _users, _disabled
     with _lock:
         _users += 1
         if _users > 1:
             return
         if arguments.log_level is not None:
-            _default_level = arguments.log_level
+            _levels[""] = arguments.log_level
         _levels.update(arguments.logger_levels)
         _disabled = arguments.disabled_outputs
 
@@ -89,48 +89,35 @@ def release() -> None:
             _disabled = frozenset()
 
 
-def set_level(name: str, level: LoggingSeverity) -> None:
-    """Give a logger a level of its own; the unnamed one has the default."""
-    global _default_level
-    with _lock:
-        if name:
-            _levels[name] = level
-        else:
-            _default_level = level
+def get_logger(name: str) -> RcutilsLogger:
+    """The logger of a name; raises ValueError for an empty one."""
+    if not name:
+        raise ValueError("Logger name must not be empty.")
+    return RcutilsLogger().get_child(name)
 
 
-def effective_level(name: str) -> LoggingSeverity:
-    """The level that holds for a logger: its own, its nearest ancestor's, or the default."""
-    while name and _levels:
-        level = _levels.get(name, LoggingSeverity.UNSET)
-        if level:
+def set_logger_level(
+    name: str,
+    level: int | LoggingSeverity,
+    detailed_error: bool = False,  # noqa: ARG001
+) -> None:
+    """Give a logger a level of its own; raises ValueError when it is no LoggingSeverity."""
+    _levels[name] = LoggingSeverity(level)
+
+
+def get_logger_effective_level(name: str) -> LoggingSeverity:
+    while name:
+        if level := _levels.get(name):
             return level
         name = name.rpartition(".")[0]
-    return _default_level
-
-
-def add_rosout(name: str, publish: Callable[[Record], None]) -> None:
-    """Publish what a node's logger says."""
-    with _lock:
-        _rosout[name] = publish
-
-
-def remove_rosout(name: str) -> None:
-    """Stop publishing what a node's logger and its children say."""
-    with _lock:
-        _rosout.pop(name, None)
-
-
-def is_published(name: str) -> bool:
-    """Whether a logger is a node's whose messages are published."""
-    return name in _rosout
+    return _levels[""]
 
 
 def emit(record: Record) -> None:
     """Write a record to the console, and publish it if its logger belongs to a node."""
     if "stdout" not in _disabled:
         _write(record)
-    publish = _rosout.get(record.node)
+    publish = rosout.get(record.node)
     if publish is not None and "rosout" not in _disabled:
         publish(record)
 
@@ -141,8 +128,8 @@ def _write(record: Record) -> None:
     if stream is None:
         return
     seconds, nanoseconds = divmod(record.stamp, 1_000_000_000)
-    moment = f"{seconds}.{nanoseconds:09d}"
-    text = f"[{record.severity.name}] [{moment}] [{record.name}]: {record.message}"
+    moment = f"[{seconds}.{nanoseconds:09d}]"
+    text = f"[{record.severity.name}] {moment} [{record.name}]: {record.message}"
     colorized = environment.get("RCUTILS_COLORIZED_OUTPUT", "")
     if colorized == "1" or (colorized != "0" and stream.isatty()):
         text = f"{_COLORS[record.severity]}{text}\033[0m"
@@ -177,26 +164,23 @@ class RcutilsLogger:
         if not name:
             raise ValueError("Child logger name must not be empty.")
         child = RcutilsLogger(f"{self.name}.{name}" if self.name else name)
-        if is_published(self._node_logger):
+        if self._node_logger in rosout:
             child._node_logger = self._node_logger
         return child
 
     def set_level(self, level):
-        """Give this logger a level of its own."""
-        set_level(self.name, LoggingSeverity(level))
+        set_logger_level(self.name, level)
 
     def get_effective_level(self):
-        """The level that holds for this logger, its own or an inherited one."""
-        return effective_level(self.name)
+        return get_logger_effective_level(self.name)
 
     def is_enabled_for(self, severity):
-        """Whether messages of a severity are written."""
-        return LoggingSeverity(severity) >= effective_level(self.name)
+        return LoggingSeverity(severity) >= self.get_effective_level()
 
     def log(self, message, severity, **kwargs):
         """Write a message; True when it was not filtered out."""
         severity = LoggingSeverity(severity)
-        if severity < effective_level(self.name):
+        if severity < self.get_effective_level():
             return False
         frame = _calling_frame()
         name = kwargs.pop("name", self.name)
@@ -276,27 +260,3 @@ def _calling_frame() -> FrameType:
     while frame.f_code.co_filename == __file__ and frame.f_back is not None:
         frame = frame.f_back
     return frame
-
-
-_root_logger = RcutilsLogger()
-
-
-def get_logger(name: str) -> RcutilsLogger:
-    """The logger of a name; raises ValueError for an empty one."""
-    if not name:
-        raise ValueError("Logger name must not be empty.")
-    return _root_logger.get_child(name)
-
-
-def set_logger_level(
-    name: str,
-    level: int | LoggingSeverity,
-    detailed_error: bool = False,  # noqa: ARG001
-) -> None:
-    """Give a logger a level of its own; raises ValueError when it is no LoggingSeverity."""
-    set_level(name, LoggingSeverity(level))
-
-
-def get_logger_effective_level(name: str) -> LoggingSeverity:
-    """The level that holds for a logger, its own or an inherited one."""
-    return effective_level(name)

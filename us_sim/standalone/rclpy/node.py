@@ -26,7 +26,6 @@ from ._names import (
     NODE_NAME,
     SERVICE,
     TOPIC,
-    RemapRule,
     error_in_full_topic_name,
     expand,
     remap,
@@ -54,7 +53,7 @@ from .exceptions import (
     NoTypeSupportImportedException,
     RCLError,
 )
-from .logging import Record, add_rosout, get_logger, remove_rosout
+from .logging import Record, get_logger, rosout
 from .parameter import Parameter, ParameterService
 from .qos import (
     DurabilityPolicy,
@@ -69,8 +68,6 @@ from .time import S_TO_NS, Clock, Duration, Infinite, ROSClock, Time
 
 
 class TopicEndpointTypeEnum(IntEnum):
-    """Whether an endpoint writes or reads."""
-
     INVALID = 0
     PUBLISHER = 1
     SUBSCRIPTION = 2
@@ -150,7 +147,7 @@ class Rosout:
     def __init__(self, link: NodeLink) -> None:
         self._name = link.logger_name
         self.publisher = Publisher(link, Log, "/rosout", "/rosout", _QOS)
-        add_rosout(self._name, self._publish)
+        rosout[self._name] = self._publish
 
     def _publish(self, record: Record) -> None:
         message = Log(
@@ -166,25 +163,102 @@ class Rosout:
             self.publisher.publish(message)
 
     def destroy(self) -> None:
-        """Publish nothing more."""
-        remove_rosout(self._name)
+        rosout.pop(self._name, None)
         self.publisher.destroy()
 
 
-class NodeGraph(NodeParameters):
-    """Names and questions; `Node` says what its own name and context are."""
+class Node(NodeParameters):
+    """A participant in the ROS graph."""
 
-    _context: Context
-    _rcl_name: str
-    _rcl_namespace: str
-    _rcl_remap_rules: list[RemapRule]
+    context = property(attrgetter("_context"))
+    _rcl_rosout: Rosout | None = None
+    _rcl_executor_weakref: weakref.ReferenceType[Any] | None = None
+
+    def __init__(
+        self,
+        node_name: str,
+        *,
+        context: Context | None = None,
+        cli_args: list[str] | None = None,
+        namespace: str | None = None,
+        use_global_arguments: bool = True,
+        enable_rosout: bool = True,
+        start_parameter_services: bool = True,
+        parameter_overrides: list[Parameter] | None = None,
+        allow_undeclared_parameters: bool = False,
+        automatically_declare_parameters_from_overrides: bool = False,
+    ) -> None:
+        self._context = get_default_context() if context is None else context
+        if not self._context.ok():
+            raise NotInitializedException("cannot create node")
+        sources = [parse_arguments(cli_args or [])]
+        if use_global_arguments:
+            sources.append(self._context._arguments)
+        self._rcl_remap_rules = [rule for source in sources for rule in source.remap_rules]
+        self._rcl_name, self._rcl_namespace = self._rcl_remapped_names(node_name, namespace or "")
+
+        path = self._rcl_namespace.strip("/").replace("/", ".")
+        logger_name = f"{path}.{self._rcl_name}" if path else self._rcl_name
+        self._rcl_link = NodeLink(self._context, logger_name, _waker_of(self))
+        self._rcl_local_node = LocalNode(self._rcl_name, self._rcl_namespace)
+        self._publishers: list[Publisher] = []
+        self._subscriptions: list[Subscription] = []
+        self._clients: list[Client] = []
+        self._services: list[Service] = []
+        self._timers: list[Timer] = []
+        self._guards: list[GuardCondition] = []
+        self._default_callback_group = MutuallyExclusiveCallbackGroup()
+        self._clock: ROSClock = ROSClock()
+
+        overrides: dict[str, Parameter] = {}
+        for source in reversed(sources):
+            for name, value in source.overrides_for(self.get_fully_qualified_name()).items():
+                overrides[name] = Parameter(name, value=value)
+        overrides.update((parameter.name, parameter) for parameter in parameter_overrides or [])
+        self._rcl_keep_parameters(overrides, allow_undeclared_parameters)
+
+        with self._context._announced_once():
+            self._context._add_node(self._rcl_local_node)
+            if enable_rosout and "rosout" not in self._context._arguments.disabled_outputs:
+                self._rcl_rosout = Rosout(self._rcl_link)
+            self._logger = get_logger(logger_name)
+            self._parameter_event_publisher = self.create_publisher(
+                message_class("rcl_interfaces/msg/ParameterEvent"),
+                "/parameter_events",
+                qos_profile_parameter_events,
+            )
+            if automatically_declare_parameters_from_overrides:
+                descriptor = message_class("rcl_interfaces/msg/ParameterDescriptor")
+                self.declare_parameters(
+                    "",
+                    [(name, p.value, descriptor()) for name, p in overrides.items()],
+                    ignore_override=True,
+                )
+            self._time_source = TimeSource(self, self._clock)
+            if start_parameter_services:
+                self._rcl_parameter_service = ParameterService(self)
+
+    def get_clock(self) -> Clock:
+        return self._clock
+
+    def get_logger(self):
+        return self._logger
+
+    def destroy_node(self):
+        """Leave the graph, with everything that belongs to this node."""
+        self._parameter_event_publisher = None
+        with self._context._announced_once():
+            self._rcl_destroy_all()
+            if self._rcl_rosout is not None:
+                self._rcl_rosout.destroy()
+                self._rcl_rosout = None
+            self._context._remove_node(self._rcl_local_node)
+        self._rcl_wake_executor()
 
     def get_name(self) -> str:
-        """This node's name, without namespace."""
         return self._rcl_name
 
     def get_namespace(self) -> str:
-        """This node's namespace, which begins with a slash."""
         return self._rcl_namespace
 
     def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
@@ -192,19 +266,15 @@ class NodeGraph(NodeParameters):
         return self._rcl_resolve(topic, TOPIC, only_expand)
 
     def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
-        """The absolute name that a service has for this node, remapped unless `only_expand`."""
         return self._rcl_resolve(service, SERVICE, only_expand)
 
     def get_node_names(self) -> list[str]:
-        """The names of all nodes, without namespaces."""
         return [node.name for node in self._rcl_graph.nodes()]
 
     def get_fully_qualified_node_names(self) -> list[str]:
-        """The absolute names of all nodes."""
         return [f"{node.namespace.rstrip('/')}/{node.name}" for node in self._rcl_graph.nodes()]
 
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        """Name and namespace of all nodes."""
         return [(node.name, node.namespace) for node in self._rcl_graph.nodes()]
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
@@ -218,11 +288,9 @@ class NodeGraph(NodeParameters):
         return [(name, sorted(types)) for name, types in sorted(found.items())]
 
     def count_publishers(self, topic_name: str) -> int:
-        """How many publishers a topic has."""
         return len(self._rcl_endpoints_on(f"rt{self._rcl_full_name(topic_name)}", is_writer=True))
 
     def count_subscribers(self, topic_name: str) -> int:
-        """How many subscriptions a topic has."""
         return len(self._rcl_endpoints_on(f"rt{self._rcl_full_name(topic_name)}", is_writer=False))
 
     def get_publishers_info_by_topic(
@@ -236,86 +304,6 @@ class NodeGraph(NodeParameters):
     ) -> list[TopicEndpointInfo]:
         """Everything known about the subscriptions to a topic; a DDS topic if not to be mangled."""
         return self._rcl_infos(topic_name, no_mangle, is_writer=False)
-
-    @property
-    def _rcl_graph(self) -> Graph:
-        return self._context._graph
-
-    def _rcl_resolve(self, name: str, kind: int, only_expand: bool) -> str:
-        try:
-            full = expand(name, self._rcl_name, self._rcl_namespace)
-            if not only_expand:
-                full = self._rcl_remapped(kind, full)
-        except ValueError as error:
-            raise RCLError(f"failed to resolve name: {error}") from None
-        if fault := error_in_full_topic_name(full):
-            raise RCLError(f"failed to resolve name: {fault[0]}")
-        return full
-
-    def _rcl_remapped(self, kind: int, name: str) -> str:
-        return remap(self._rcl_remap_rules, kind, name, self._rcl_name, self._rcl_namespace)
-
-    def _rcl_full_name(self, name: str, is_service: bool = False) -> str:
-        full = expand(name, self._rcl_name, self._rcl_namespace)
-        require_topic_name(full, is_service=is_service, is_full=True)
-        return full
-
-    def _rcl_endpoints_on(self, dds_topic: str, is_writer: bool) -> list[GraphEndpoint]:
-        return [e for e in self._rcl_graph.endpoints(dds_topic) if e.is_writer == is_writer]
-
-    def _rcl_infos(self, name: str, no_mangle: bool, is_writer: bool) -> list[TopicEndpointInfo]:
-        if not no_mangle:
-            name = f"rt{self._rcl_remapped(TOPIC, self._rcl_full_name(name))}"
-        owners = {
-            gid: (node.name, node.namespace)
-            for node in self._rcl_graph.nodes()
-            for gid in (node.writer_gids if is_writer else node.reader_gids)
-        }
-        unknown = ("_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_")
-        kinds = TopicEndpointTypeEnum
-        return [
-            TopicEndpointInfo(
-                *owners.get(endpoint.gid, unknown),
-                topic_type=_type_name(endpoint.type_name),
-                endpoint_type=kinds.PUBLISHER if is_writer else kinds.SUBSCRIPTION,
-                endpoint_gid=list(endpoint.gid),
-                qos_profile=_profile(endpoint.qos),
-            )
-            for endpoint in self._rcl_endpoints_on(name, is_writer)
-        ]
-
-
-def _type_name(dds_type: str) -> str:
-    """The ROS type behind a DDS type; the name itself when it is none of ROS."""
-    package, separator, rest = dds_type.partition("::dds_::")
-    if not separator or not rest.endswith("_"):
-        return dds_type
-    return f"{package.replace('::', '/')}/{rest[:-1]}"
-
-
-def _profile(qos: Any) -> QoSProfile:
-    policies = vars(qos).copy()
-    for name in ("lifespan", "deadline", "liveliness_lease_duration"):
-        policies[name] = Duration(nanoseconds=policies[name]) if policies[name] else Infinite
-    return QoSProfile(**policies)
-
-
-class NodeEntities(NodeGraph):
-    """Publishers, subscriptions, clients, services, timers and guard conditions."""
-
-    _rcl_link: NodeLink
-    _rcl_local_node: LocalNode
-    _rcl_rosout: Rosout | None = None
-    _rcl_executor_weakref: weakref.ReferenceType[Any] | None = None
-
-    def __init__(self) -> None:
-        self._publishers: list[Publisher] = []
-        self._subscriptions: list[Subscription] = []
-        self._clients: list[Client] = []
-        self._services: list[Service] = []
-        self._timers: list[Timer] = []
-        self._guards: list[GuardCondition] = []
-        self._default_callback_group = MutuallyExclusiveCallbackGroup()
 
     publishers = property(lambda self: iter(self._publishers))
     subscriptions = property(lambda self: iter(self._subscriptions))
@@ -393,7 +381,6 @@ class NodeEntities(NodeGraph):
         qos_profile: QoSProfile = qos_profile_services_default,
         callback_group: CallbackGroup | None = None,
     ) -> Client:
-        """Use a service."""
         _require_service_class(srv_type)
         full_name = self._rcl_full_or_refused(srv_name, is_service=True)
         group = callback_group or self._default_callback_group
@@ -443,38 +430,90 @@ class NodeEntities(NodeGraph):
     def create_guard_condition(
         self, callback: Callable[..., Any], callback_group: CallbackGroup | None = None
     ) -> GuardCondition:
-        """Call back when somebody triggers."""
         _refuse_coroutine(callback)
         group = callback_group or self._default_callback_group
         guard = GuardCondition(callback, group, context=self._context)
         return self._rcl_keep(guard, self._guards, group)
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
-        """Stop publishing; False when it is none of this node's."""
         return self._rcl_destroy(publisher, self._publishers)
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
-        """Stop subscribing; False when it is none of this node's."""
         return self._rcl_destroy(subscription, self._subscriptions)
 
     def destroy_client(self, client: Client) -> bool:
-        """Stop using a service; False when it is none of this node's."""
         return self._rcl_destroy(client, self._clients)
 
     def destroy_service(self, service: Service) -> bool:
-        """Stop offering a service; False when it is none of this node's."""
         return self._rcl_destroy(service, self._services)
 
     def destroy_timer(self, timer: Timer) -> bool:
-        """Stop a timer for good; False when it is none of this node's."""
         return self._rcl_destroy(timer, self._timers)
 
     def destroy_guard_condition(self, guard: GuardCondition) -> bool:
-        """Stop listening to triggers; False when it is none of this node's."""
         return self._rcl_destroy(guard, self._guards)
 
+    def _rcl_remapped_names(self, name: str, namespace: str) -> tuple[str, str]:
+        """Name and absolute namespace after the arguments had their say."""
+        if not namespace.startswith("/"):
+            namespace = f"/{namespace}"
+        require_node_name(name)
+        require_namespace(namespace)
+        name = remap_node(self._rcl_remap_rules, NODE_NAME, name) or name
+        namespace = remap_node(self._rcl_remap_rules, NAMESPACE, name) or namespace
+        require_node_name(name)
+        require_namespace(namespace)
+        return name, namespace
+
+    @property
+    def _rcl_graph(self) -> Graph:
+        return self._context._graph
+
+    def _rcl_resolve(self, name: str, kind: int, only_expand: bool) -> str:
+        try:
+            full = expand(name, self._rcl_name, self._rcl_namespace)
+            if not only_expand:
+                full = self._rcl_remapped(kind, full)
+        except ValueError as error:
+            raise RCLError(f"failed to resolve name: {error}") from None
+        if fault := error_in_full_topic_name(full):
+            raise RCLError(f"failed to resolve name: {fault[0]}")
+        return full
+
+    def _rcl_remapped(self, kind: int, name: str) -> str:
+        return remap(self._rcl_remap_rules, kind, name, self._rcl_name, self._rcl_namespace)
+
+    def _rcl_full_name(self, name: str, is_service: bool = False) -> str:
+        full = expand(name, self._rcl_name, self._rcl_namespace)
+        require_topic_name(full, is_service=is_service, is_full=True)
+        return full
+
+    def _rcl_endpoints_on(self, dds_topic: str, is_writer: bool) -> list[GraphEndpoint]:
+        return [e for e in self._rcl_graph.endpoints(dds_topic) if e.is_writer == is_writer]
+
+    def _rcl_infos(self, name: str, no_mangle: bool, is_writer: bool) -> list[TopicEndpointInfo]:
+        if not no_mangle:
+            name = f"rt{self._rcl_remapped(TOPIC, self._rcl_full_name(name))}"
+        owners = {
+            gid: (node.name, node.namespace)
+            for node in self._rcl_graph.nodes()
+            for gid in (node.writer_gids if is_writer else node.reader_gids)
+        }
+        unknown = ("_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_")
+        kinds = TopicEndpointTypeEnum
+        return [
+            TopicEndpointInfo(
+                *owners.get(endpoint.gid, unknown),
+                topic_type=_type_name(endpoint.type_name),
+                endpoint_type=kinds.PUBLISHER if is_writer else kinds.SUBSCRIPTION,
+                endpoint_gid=list(endpoint.gid),
+                qos_profile=_profile(endpoint.qos),
+            )
+            for endpoint in self._rcl_endpoints_on(name, is_writer)
+        ]
+
     def _rcl_entities(self) -> Iterator[Any]:
-        """What executors run, in the order in which rclpy looks at it."""
+        """The entities that executors run, in rclpy's order."""
         return iter(
             [*self._timers, *self._subscriptions, *self._guards, *self._clients, *self._services]
         )
@@ -519,13 +558,28 @@ class NodeEntities(NodeGraph):
             executor.wake()
 
     def _rcl_full_or_refused(self, name: str, is_service: bool = False) -> str:
-        """The absolute, remapped name, or the error that says what is wrong with the given one."""
+        """The absolute, remapped name; raises the error that explains an invalid one."""
         try:
             return self._rcl_resolve(name, SERVICE if is_service else TOPIC, only_expand=False)
         except RuntimeError:
             require_topic_name(name, is_service=is_service)
             self._rcl_full_name(name, is_service)
             raise
+
+
+def _type_name(dds_type: str) -> str:
+    """The ROS type behind a DDS type; the name itself when it is none of ROS."""
+    package, separator, rest = dds_type.partition("::dds_::")
+    if not separator or not rest.endswith("_"):
+        return dds_type
+    return f"{package.replace('::', '/')}/{rest[:-1]}"
+
+
+def _profile(qos: Any) -> QoSProfile:
+    policies = vars(qos).copy()
+    for name in ("lifespan", "deadline", "liveliness_lease_duration"):
+        policies[name] = Duration(nanoseconds=policies[name]) if policies[name] else Infinite
+    return QoSProfile(**policies)
 
 
 def _profile_of(qos_or_depth: Any) -> QoSProfile:
@@ -549,101 +603,6 @@ def _refuse_coroutine(callback: Any) -> None:
             f"{callback.__qualname__} is a coroutine, which this subset of rclpy does not run; "
             "make it a function, or install ROS 2"
         )
-
-
-class Node(NodeEntities):
-    """A participant in the ROS graph."""
-
-    context = property(attrgetter("_context"))
-
-    def __init__(
-        self,
-        node_name: str,
-        *,
-        context: Context | None = None,
-        cli_args: list[str] | None = None,
-        namespace: str | None = None,
-        use_global_arguments: bool = True,
-        enable_rosout: bool = True,
-        start_parameter_services: bool = True,
-        parameter_overrides: list[Parameter] | None = None,
-        allow_undeclared_parameters: bool = False,
-        automatically_declare_parameters_from_overrides: bool = False,
-    ) -> None:
-        self._context = get_default_context() if context is None else context
-        if not self._context.ok():
-            raise NotInitializedException("cannot create node")
-        sources = [parse_arguments(cli_args or [])]
-        if use_global_arguments:
-            sources.append(self._context._arguments)
-        self._rcl_remap_rules = [rule for source in sources for rule in source.remap_rules]
-        self._rcl_name, self._rcl_namespace = self._rcl_remapped_names(node_name, namespace or "")
-
-        path = self._rcl_namespace.strip("/").replace("/", ".")
-        logger_name = f"{path}.{self._rcl_name}" if path else self._rcl_name
-        self._rcl_link = NodeLink(self._context, logger_name, _waker_of(self))
-        self._rcl_local_node = LocalNode(self._rcl_name, self._rcl_namespace)
-        super().__init__()
-        self._clock: ROSClock = ROSClock()
-
-        overrides: dict[str, Parameter] = {}
-        for source in reversed(sources):
-            for name, value in source.overrides_for(self.get_fully_qualified_name()).items():
-                overrides[name] = Parameter(name, value=value)
-        overrides.update((parameter.name, parameter) for parameter in parameter_overrides or [])
-        self._rcl_keep_parameters(overrides, allow_undeclared_parameters)
-
-        with self._context._announced_once():
-            self._context._add_node(self._rcl_local_node)
-            if enable_rosout and "rosout" not in self._context._arguments.disabled_outputs:
-                self._rcl_rosout = Rosout(self._rcl_link)
-            self._logger = get_logger(logger_name)
-            self._parameter_event_publisher = self.create_publisher(
-                message_class("rcl_interfaces/msg/ParameterEvent"),
-                "/parameter_events",
-                qos_profile_parameter_events,
-            )
-            if automatically_declare_parameters_from_overrides:
-                descriptor = message_class("rcl_interfaces/msg/ParameterDescriptor")
-                self.declare_parameters(
-                    "",
-                    [(name, p.value, descriptor()) for name, p in overrides.items()],
-                    ignore_override=True,
-                )
-            self._time_source = TimeSource(self, self._clock)
-            if start_parameter_services:
-                self._rcl_parameter_service = ParameterService(self)
-
-    def _rcl_remapped_names(self, name: str, namespace: str) -> tuple[str, str]:
-        """Name and absolute namespace after the arguments had their say."""
-        if not namespace.startswith("/"):
-            namespace = f"/{namespace}"
-        require_node_name(name)
-        require_namespace(namespace)
-        name = remap_node(self._rcl_remap_rules, NODE_NAME, name) or name
-        namespace = remap_node(self._rcl_remap_rules, NAMESPACE, name) or namespace
-        require_node_name(name)
-        require_namespace(namespace)
-        return name, namespace
-
-    def get_clock(self) -> Clock:
-        """ROS time, as this node sees it."""
-        return self._clock
-
-    def get_logger(self):
-        """The logger of this node."""
-        return self._logger
-
-    def destroy_node(self):
-        """Leave the graph, with everything that belongs to this node."""
-        self._parameter_event_publisher = None
-        with self._context._announced_once():
-            self._rcl_destroy_all()
-            if self._rcl_rosout is not None:
-                self._rcl_rosout.destroy()
-                self._rcl_rosout = None
-            self._context._remove_node(self._rcl_local_node)
-        self._rcl_wake_executor()
 
 
 def _waker_of(node: Node) -> Callable[[], None]:

@@ -39,11 +39,9 @@ class Future:
         self._call_back()
 
     def cancelled(self):
-        """Whether it was cancelled before it was done."""
         return self._cancelled
 
     def done(self):
-        """Whether there is a result or an exception."""
         return self._done
 
     def result(self):
@@ -53,17 +51,14 @@ class Future:
         return self._result
 
     def exception(self):
-        """The exception, or None."""
         self._exception_fetched = True
         return self._exception
 
     def set_result(self, result):
-        """Be done, with a result."""
         self._conclude(result, None)
         self._call_back()
 
     def set_exception(self, exception):
-        """Be done, with an exception."""
         self._conclude(None, exception)
         self._call_back()
 
@@ -89,7 +84,7 @@ class Future:
             self._cancelled = False
 
     def _set_result_in_executor(self, result: Any) -> None:
-        """Be done, with a result; what a callback raises reaches who spins."""
+        """Be done, with a result; errors of callbacks reach whoever spins."""
         self._conclude(result, None)
         for callback in self._taken_callbacks():
             callback(self)

@@ -48,7 +48,6 @@ class Duration:
         self._nanoseconds = total
 
     def to_msg(self) -> Any:
-        """This span as a `builtin_interfaces/msg/Duration`."""
         seconds, nanoseconds = divmod(self._nanoseconds, S_TO_NS)
         cls = message_class("builtin_interfaces/msg/Duration")
         return cls(sec=seconds, nanosec=nanoseconds)
@@ -111,11 +110,9 @@ class Time:
         self._clock_type = clock_type
 
     def seconds_nanoseconds(self) -> tuple[int, int]:
-        """Whole seconds, and the nanoseconds beyond them."""
         return divmod(self._nanoseconds, S_TO_NS)
 
     def to_msg(self) -> Any:
-        """This point as a `builtin_interfaces/msg/Time`."""
         seconds, nanoseconds = divmod(self._nanoseconds, S_TO_NS)
         return message_class("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
 
@@ -203,7 +200,6 @@ class Clock:
         return f"Clock(clock_type={self._clock_type.name})"
 
     def now(self) -> Time:
-        """The time now."""
         return Time(nanoseconds=self._now(), clock_type=self._clock_type)
 
     def _now(self) -> int:
@@ -240,7 +236,7 @@ class ROSClock(Clock):
         self._change(enabled, self._override)
 
     def _change(self, active: bool, override: int) -> None:
-        """Show another time, and let the timers know what was shown before."""
+        """Show another time, and tell the timers the time before."""
         before, is_other_time = self._now(), active != self._active
         self._active, self._override = active, override
         if active or is_other_time:

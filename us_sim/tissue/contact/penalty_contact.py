@@ -1,4 +1,4 @@
-"""Frictionless contact whose forces have an energy: springs between the surface and the probe.
+"""Contact whose forces have an energy: springs between points of the surface and the probe.
 
 Each point of the surface that the probe has entered is pushed out along the probe's normal by a
 force that rises with its depth, faster and faster, and ends at a greatest one, as a hand cannot
@@ -10,48 +10,31 @@ So the state of tissue under a probe is a minimum of one energy that depends on 
 on how the probe came there (P. Wriggers, Computational Contact Mechanics, 2nd ed. 2006, section
 5.1). The price is that the probe sinks in a little, as it does into gel.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.probe_gap import FlaredProbe
->>> from us_sim.tissue.contact.penalty_contact import PenaltyContact
->>> probe = FlaredProbe(Sphere(0.03), spacing=0.01)
->>> contact = PenaltyContact(probe, np.array([1e4]), np.array([15.0]), stiffening=1e-3)
->>> contact.aim(Pose(position=[0.0, 0.0, 1e-4]), np.zeros((1, 3)))
->>> contact.push.round(9), contact.normal
-(array([1.01]), array([[0., 0., 1.]]))
->>> contact.aim(Pose(position=[0.0, 0.0, 1e-3]), np.zeros((1, 3)))
->>> contact.push
-array([15.])
-
-Friction whose forces have an energy while a frame lasts: springs along the probe's surface.
-
-Each pushed point hangs on the place of the probe where it was touched, by a spring along the
-surface that is as stiff as the one square to it begins, and slips at a greatest force. With t the
-spring's force, stretched by s, the energy is
+With friction each touched point is attached to the place of the probe where it was touched, by a
+spring along the surface as stiff as the one square to it begins, which slips at a greatest force.
+With t the spring's force, stretched by s, the energy is
 
     t^2 / (2 k) up to |t| = c, and c |t| / k - c^2 / (2 k) beyond,    t = k s.
 
-Coulomb's c, the coefficient times the push, is that of the frame before or of a prediction, and
-stays while a frame's energy is minimised (M. Li et al., Incremental Potential Contact, ACM Trans.
-Graph. 39, 2020, section 5). Between frames the places of points that slipped follow them, until
-their springs hold c again (return mapping; J. C. Simo and T. J. R. Hughes, Computational
-Inelasticity, 1998, section 1.4). So nothing creeps under a probe at rest.
+Coulomb's bound c, the coefficient times the normal force, is that of the frame before or of a
+prediction, and stays while a frame's energy is minimised (M. Li et al., Incremental Potential
+Contact, ACM Trans. Graph. 39, 2020, section 5). Between frames the anchors of points that slipped
+follow them, until their springs hold c again (return mapping; J. C. Simo and T. J. R. Hughes,
+Computational Inelasticity, 1998, section 1.4). So nothing creeps under a probe at rest.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import RoundedBox
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.probe_gap import FlaredProbe
->>> from us_sim.tissue.contact.penalty_contact import PenaltyFriction
+>>> from us_sim.geometry.collider import RoundedBox, Sphere
+>>> probe = FlaredProbe(Sphere(0.03), spacing=0.01)
+>>> contact = PenaltyContact(probe, np.array([1e4]), np.array([15.0]), stiffening=1e-3)
+>>> contact.set_pose(Pose(position=[0.0, 0.0, 1e-4]), np.zeros((1, 3)))
+>>> contact.normal_force.round(9), contact.normal
+(array([1.01]), array([[0., 0., 1.]]))
 >>> plate, point = FlaredProbe(RoundedBox(0.1, 0.1, 0.03, 0.001), 0.01), np.zeros((1, 3))
 >>> contact = PenaltyFriction(plate, np.array([1e4]), np.array([50.0]), 1.0, friction=0.5)
->>> contact.aim(Pose([0.0, 0.0, 1e-3]), point)
->>> contact.expect(contact.push)
+>>> contact.set_pose(Pose([0.0, 0.0, 1e-3]), point)
+>>> contact.set_friction_bound(contact.normal_force)
 True
->>> contact.force.round(3)  # touched, and not yet dragged
-array([[ 0.,  0., 10.]])
 >>> for x in (2e-4, 1e-3):
-...     contact.aim(Pose([x, 0.0, 1e-3]), point)
+...     contact.set_pose(Pose([x, 0.0, 1e-3]), point)
 ...     print(contact.force.round(3))  # sticking, and slipping
 [[ 2.  0. 10.]]
 [[ 5.  0. 10.]]
@@ -88,7 +71,7 @@ class PenaltyContact:
     Args:
         probe: the shape that presses.
         stiffness: (P,) N/m, k above.
-        strongest: (P,) N, F above.
+        greatest_force: (P,) N, F above.
         stiffening: m, d1 above.
     """
 
@@ -96,15 +79,15 @@ class PenaltyContact:
         self,
         probe: FlaredProbe,
         stiffness: NDArray[np.float64],
-        strongest: NDArray[np.float64],
+        greatest_force: NDArray[np.float64],
         stiffening: float,
     ) -> None:
         self._probe = probe
         self.stiffness = stiffness  # (P,) N/m, with which springs begin
-        self._strongest = strongest
+        self._greatest_force = greatest_force
         self._stiffening = stiffening
         # The real root of k d (1 + (d / d1)^2) = F, for d / d1, after Cardano.
-        half = strongest / (2 * stiffness * stiffening)
+        half = greatest_force / (2 * stiffness * stiffening)
         root = np.cbrt(half + np.sqrt(half * half + 1 / 27))
         self._deepest = stiffening * (root - 1 / (3 * root))  # (P,) m, where the push is F
         self._law = stiffness, self._deepest, stiffening
@@ -125,11 +108,12 @@ class PenaltyContact:
         gap, _ = self._probe.distance(pose, positions)
         return max(0.0, -float(gap.min(initial=np.inf)))
 
-    def aim(self, pose: Pose, positions: NDArray[np.float64]) -> None:
+    def set_pose(self, pose: Pose, positions: NDArray[np.float64]) -> None:
         """Put the probe at a pose, the points being at ``positions`` (P, 3) m, frame ``patient``.
 
         Where a move brings points deep into the probe, the nearest way out is no guide. They are
-        pushed back through where they came in, onto a plane; the next aim, or `release`, ends that.
+        pushed back through where they came in, onto a plane; the next pose, or
+        `drop_planes`, ends that.
         """
         last, self._pose = self._pose, pose
         gap, self.normal = self._probe.distance(pose, positions)
@@ -144,7 +128,7 @@ class PenaltyContact:
             self._height = np.einsum("ij,ij->i", inside, normal) - gap[self._planar]
         self._measure(gap)
 
-    def release(self, positions: NDArray[np.float64]) -> bool:
+    def drop_planes(self, positions: NDArray[np.float64]) -> bool:
         """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes, and any
         that have come near since the probe was put there.
 
@@ -153,15 +137,15 @@ class PenaltyContact:
         """
         if self._pose is None:
             return False
-        planar, before = len(self._planar), self.push
+        planar, before = len(self._planar), self.normal_force
         gap, _ = self._probe.distance(self._pose, positions)
         self._planar = self._planar[:0]
         self.near = np.flatnonzero(gap < self._probe.reach)
-        self.look(positions)
-        return planar > 0 or not np.array_equal(self.push, before)
+        self.update_gaps(positions)
+        return planar > 0 or not np.array_equal(self.normal_force, before)
 
-    def look(self, positions: NDArray[np.float64]) -> None:
-        """Measure gaps, normals and pushes at other positions (P, 3) m."""
+    def update_gaps(self, positions: NDArray[np.float64]) -> None:
+        """Update gaps, normals and forces at other positions (P, 3) m."""
         if self._pose is None:
             return
         gap, normal = self._probe.distance(self._pose, positions, self.near)
@@ -173,18 +157,18 @@ class PenaltyContact:
 
     def _measure(self, gap: NDArray[np.float64]) -> None:
         self.gap = gap  # (P,) m, infinite where the probe cannot push
-        self.push = np.zeros_like(gap)  # (P,) N, along the normal
-        self._energy = _push(self.near, gap, *self._law, self.push)
+        self.normal_force = np.zeros_like(gap)  # (P,) N, along the normal
+        self._energy = _normal_forces(self.near, gap, *self._law, self.normal_force)
 
     @property
     def energy(self) -> float:
         """J, of all springs."""
         return self._energy
 
-    def push_at(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
+    def normal_force_at(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
         """(P,) N, pushes at other gaps (P,) m."""
         push = np.zeros_like(gap)
-        _push(self.near, gap, *self._law, push)
+        _normal_forces(self.near, gap, *self._law, push)
         return push
 
     @property
@@ -203,7 +187,7 @@ class PenaltyContact:
     @property
     def force(self) -> NDArray[np.float64]:
         """(P, 3) N, on the tissue."""
-        force: NDArray[np.float64] = self.push[:, None] * self.normal
+        force: NDArray[np.float64] = self.normal_force[:, None] * self.normal
         return force
 
     def force_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -223,7 +207,7 @@ class PenaltyContact:
         active = np.flatnonzero(slope)
         return active, self.normal[active], slope[active]
 
-    def turns(
+    def geometric_stiffness(
         self, positions: NDArray[np.float64], push: NDArray[np.float64]
     ) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
         """How forces turn as points (P, 3) m, pushed by (P,) N, move along a bent surface: points
@@ -236,12 +220,12 @@ class PenaltyContact:
             return turned[:0], np.zeros((0, 3, 3))
         return turned, push[turned, None, None] * self.curvature(positions[turned])
 
-    def expect(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
-        """Learn which pushes (P,) N are likely at the new pose; returns if forces change by it."""
+    def set_friction_bound(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
+        """As `PenaltyFriction.set_friction_bound`; there is no friction to bound."""
         return False
 
-    def settle(self) -> float:
-        """Let a frame end; returns by how much what is pushed may still move for it, m."""
+    def update_friction(self) -> float:
+        """As `PenaltyFriction.update_friction`; there is none."""
         return 0.0
 
     def work_along(
@@ -284,19 +268,19 @@ class PenaltyContact:
 
 
 @njit(**_LOOP, inline="always")
-def _push_of(depth, stiffness, stiffening):
+def _spring_force(depth, stiffness, stiffening):
     ratio = depth / stiffening
     return stiffness * depth * (1.0 + ratio * ratio)
 
 
 @njit(**_LOOP)
-def _push(near, gap, stiffness, deepest, stiffening, push):
+def _normal_forces(near, gap, stiffness, deepest, stiffening, push):
     """Fills push (P,) of the points that are near; returns the springs' energy."""
     energy = 0.0
     for i in near:
         depth = max(-gap[i], 0.0)
         held = min(depth, deepest[i])
-        push[i] = _push_of(held, stiffness[i], stiffening)
+        push[i] = _spring_force(held, stiffness[i], stiffening)
         ratio = held / stiffening
         energy += 0.5 * stiffness[i] * held * held * (1.0 + 0.5 * ratio * ratio)
         energy += push[i] * (depth - held)
@@ -310,7 +294,7 @@ def _forces(near, gap, normal, change, stiffness, deepest, stiffening, force):
         n = normal[i]
         reached = gap[i] + (n[0] * change[i, 0] + n[1] * change[i, 1] + n[2] * change[i, 2])
         if reached < 0.0:
-            push = _push_of(min(-reached, deepest[i]), stiffness[i], stiffening)
+            push = _spring_force(min(-reached, deepest[i]), stiffness[i], stiffening)
             for d in range(3):
                 force[i, d] = push * n[d]
 
@@ -335,7 +319,7 @@ def _work(near, gap, normal, start, change, length, stiffness, deepest, stiffeni
         along = n[0] * b[0] + n[1] * b[1] + n[2] * b[2]
         reached = gap[i] + (n[0] * a[0] + n[1] * a[1] + n[2] * a[2]) + length * along
         if reached < 0.0:
-            total += along * _push_of(min(-reached, deepest[i]), stiffness[i], stiffening)
+            total += along * _spring_force(min(-reached, deepest[i]), stiffness[i], stiffening)
     return total
 
 
@@ -343,8 +327,8 @@ class PenaltyFriction(PenaltyContact):
     """Penalty contact with Coulomb's friction, or with a probe to which touched points stick.
 
     Args:
-        probe, stiffness, strongest, stiffening: as for `PenaltyContact`. No point is held along the
-            surface by more than ``strongest`` either.
+        probe, stiffness, greatest_force, stiffening: as for `PenaltyContact`. No point is held
+            along the surface by more than the greatest force either.
         friction: coefficient; infinite for a probe to which points stick while it pushes them.
     """
 
@@ -352,92 +336,96 @@ class PenaltyFriction(PenaltyContact):
         self,
         probe: FlaredProbe,
         stiffness: NDArray[np.float64],
-        strongest: NDArray[np.float64],
+        greatest_force: NDArray[np.float64],
         stiffening: float,
         friction: float,
     ) -> None:
         self._friction = friction
-        super().__init__(probe, stiffness, strongest, stiffening)
+        super().__init__(probe, stiffness, greatest_force, stiffening)
 
     def clear(self) -> None:
         """No probe is near."""
         super().clear()
         shape = self.normal.shape
-        self._hung = np.zeros(len(self.gap), bool)  # (P,) points on springs along the surface
-        self._place = np.zeros(shape)  # (P, 3) m, where these hang
+        self._attached = np.zeros(len(self.gap), bool)  # (P,) points on springs along the surface
+        self._anchor = np.zeros(shape)  # (P, 3) m, where these hang
         self._positions = np.zeros(shape)  # (P, 3) m, of the points when last looked at
-        self._hang(np.zeros(len(self.gap)))
+        self._attach(np.zeros(len(self.gap)))
 
-    def aim(self, pose: Pose, positions: NDArray[np.float64]) -> None:
-        """As `PenaltyContact.aim`; the places where points hang go where the probe went."""
-        self._slip()
-        before, push = self._pose, self.push
-        super().aim(pose, positions)
+    def set_pose(self, pose: Pose, positions: NDArray[np.float64]) -> None:
+        """As `PenaltyContact.set_pose`; the places where points hang go where the probe went."""
+        self._return_map()
+        before, push = self._pose, self.normal_force
+        super().set_pose(pose, positions)
         self._positions = positions
         if before is not None:
-            self._place = pose.apply(before.inverse().apply(self._place))
-        self._hung &= push > 0.0
-        self._hang(np.where(np.isfinite(self.gap), push, 0.0))
+            self._anchor = pose.apply(before.inverse().apply(self._anchor))
+        self._attached &= push > 0.0
+        self._attach(np.where(np.isfinite(self.gap), push, 0.0))
 
-    def look(self, positions: NDArray[np.float64]) -> None:
-        """Measure gaps, normals, pushes and slips at other positions (P, 3) m."""
-        super().look(positions)
+    def update_gaps(self, positions: NDArray[np.float64]) -> None:
+        """Update gaps, normals, forces and slips at other positions (P, 3) m."""
+        super().update_gaps(positions)
         self._positions = positions
 
-    def expect(self, push: NDArray[np.float64]) -> bool:
-        """Learn which pushes (P,) N are likely at the new pose; returns if forces change by it."""
-        self._hang(push)
+    def set_friction_bound(self, push: NDArray[np.float64]) -> bool:
+        """Bound friction by normal forces (P,) N that are likely at the new pose.
+
+        Returns:
+            Whether forces change by it.
+        """
+        self._attach(push)
         return True
 
-    def settle(self) -> float:
+    def update_friction(self) -> float:
         """Let a frame end: what slips is held by what the push allows now.
 
         Returns:
             m, by how much springs are longer or shorter for it at most.
         """
         before = self.force
-        self._slip()
-        self._hung &= self.push > 0.0
-        self._hang(self.push)
+        self._return_map()
+        self._attached &= self.normal_force > 0.0
+        self._attach(self.normal_force)
         changed = np.linalg.norm(self.force - before, axis=1) / self.stiffness
         return float(changed.max(initial=0.0))
 
-    def _slip(self) -> None:
+    def _return_map(self) -> None:
         """Let the places of points that slipped follow these."""
-        trial = self._trial(self._positions)
+        trial = self._trial_force(self._positions)
         size = np.linalg.norm(trial, axis=1)
         slipped = size > self._bound
         points, trial = self._points[slipped], trial[slipped]
-        too_long = (1.0 - self._bound[slipped] / size[slipped]) / self._stiff[slipped]
-        self._place[points] += too_long[:, None] * trial
+        too_long = (1.0 - self._bound[slipped] / size[slipped]) / self._shear[slipped]
+        self._anchor[points] += too_long[:, None] * trial
 
-    def _hang(self, push: NDArray[np.float64]) -> None:
+    def _attach(self, push: NDArray[np.float64]) -> None:
         """Let friction hold what ``push`` (P,) N, and the normals there, allow."""
-        fresh = (push > 0.0) & ~self._hung
-        self._place[fresh] = self._positions[fresh]
-        self._hung |= fresh
-        self._points = points = np.flatnonzero(self._hung)
+        fresh = (push > 0.0) & ~self._attached
+        self._anchor[fresh] = self._positions[fresh]
+        self._attached |= fresh
+        self._points = points = np.flatnonzero(self._attached)
         self._normal = self.normal[points]
-        self._stiff = self.stiffness[points]
-        strongest = self._strongest[points]
+        self._shear = self.stiffness[points]
+        greatest_force = self._greatest_force[points]
         if math.isinf(self._friction):
-            self._bound = np.where(push[points] > 0.0, strongest, 0.0)
+            self._bound = np.where(push[points] > 0.0, greatest_force, 0.0)
         else:
-            self._bound = np.minimum(self._friction * push[points], strongest)
+            self._bound = np.minimum(self._friction * push[points], greatest_force)
 
-    def _trial(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _trial_force(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """(K, 3) N, t above with points at positions (P, 3) m."""
         points = self._points
-        slip = _along(positions[points] - self._place[points], self._normal)
-        trial: NDArray[np.float64] = self._stiff[:, None] * slip
+        slip = _along(positions[points] - self._anchor[points], self._normal)
+        trial: NDArray[np.float64] = self._shear[:, None] * slip
         return trial
 
     @property
     def energy(self) -> float:
         """J, of all springs."""
-        size = np.linalg.norm(self._trial(self._positions), axis=1)
+        size = np.linalg.norm(self._trial_force(self._positions), axis=1)
         pull = np.minimum(size, self._bound)
-        return super().energy + float((pull * (size - pull / 2) / self._stiff).sum())
+        return super().energy + float((pull * (size - pull / 2) / self._shear).sum())
 
     @property
     def force(self) -> NDArray[np.float64]:
@@ -452,16 +440,16 @@ class PenaltyFriction(PenaltyContact):
         self, start: NDArray[np.float64], change: NDArray[np.float64], length: float
     ) -> float:
         """As `PenaltyContact.work_along`."""
-        trial = self._trial(self._positions + start + length * change)
-        drag = trial * _kept(trial, self._bound)[:, None]
+        trial = self._trial_force(self._positions + start + length * change)
+        drag = trial * _fraction_held(trial, self._bound)[:, None]
         work = super().work_along(start, change, length)
         return work - float((drag * change[self._points]).sum())
 
     def _with_drag(
         self, force: NDArray[np.float64], positions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        trial = self._trial(positions)
-        force[self._points] -= trial * _kept(trial, self._bound)[:, None]
+        trial = self._trial_force(positions)
+        force[self._points] -= trial * _fraction_held(trial, self._bound)[:, None]
         return force
 
     def springs_after(
@@ -471,14 +459,17 @@ class PenaltyFriction(PenaltyContact):
         and one across the way where they slip.
         """
         pushed, normal, stiffness = super().springs_after(change)
-        trial = self._trial(self._positions + change)
-        kept = _kept(trial, self._bound)
+        trial = self._trial_force(self._positions + change)
+        kept = _fraction_held(trial, self._bound)
         along = _directions(trial, self._normal)
         across = np.cross(self._normal, along)
         sticks, turns = kept == 1.0, kept > 0.0
         points = np.concatenate([pushed, self._points[sticks], self._points[turns]])
         directions = np.concatenate([normal, along[sticks], across[turns]])
-        along_surface = [self._stiff[sticks], (self._stiff * kept)[turns]]
+        along_surface = [
+            self._shear[sticks],
+            (self._shear * kept)[turns],
+        ]
         stiffness = np.concatenate([stiffness, *along_surface])
         return points, directions, stiffness
 
@@ -490,7 +481,7 @@ def _along(vectors: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray
     return left
 
 
-def _kept(trial: NDArray[np.float64], bound: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fraction_held(trial: NDArray[np.float64], bound: NDArray[np.float64]) -> NDArray[np.float64]:
     """(K,) fractions of trial forces (K, 3) N that bounds (K,) N allow."""
     size = np.linalg.norm(trial, axis=1)
     return np.divide(bound, size, out=np.ones_like(size), where=size > bound)

@@ -1,4 +1,4 @@
-"""The function that an implicit Euler step of damped springs and volumes minimises.
+"""The potential that an implicit Euler step of damped springs and volumes minimises.
 
 A step of h from x0 with velocity v minimises, over positions x,
 
@@ -9,20 +9,6 @@ Methods Appl. Mech. Engrg. 171, 1999), where W is sum of k (L - L0)**2 / 2 over 
 V e (J - 1)**2 / 2 over volumes, and D the same with the lengths and volumes at x0 for those at
 rest: damping by b times the stiffness. A damped spring is then only a stiffer one of another
 length, k (1 + b / h) and (L0 + L(x0) b / h) / (1 + b / h), and a volume likewise.
-
->>> import numpy as np
->>> from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
->>> from us_sim.tissue.elasticity.springs import SpringNetwork
->>> from us_sim.tissue.elasticity.volume_term import VolumeTerm
->>> one = np.ones(1)
->>> springs = SpringNetwork(np.array([[0, 1]], dtype=np.int32), 8 * one, 0 * one, one)
->>> volume, mass = VolumeTerm.nothing(2), np.ones(2)
->>> potential = IncrementalPotential(springs, volume, mass, time_step=0.5, damping_factor=0.0)
->>> stretched = np.array([[0.0, 0, 0], [1.1, 0, 0]])
->>> potential.begin(stretched, np.zeros((2, 3)))
->>> value, force = potential.evaluate(stretched)
->>> round(value, 6), force[1].round(6)  # 8 N/m stretched by 0.1 m
-(0.04, array([-0.8,  0. ,  0. ]))
 """
 
 from __future__ import annotations
@@ -33,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.tissue.elasticity.springs import SpringNetwork
-from us_sim.tissue.elasticity.volume_term import VolumeTerm, area_vectors, push_corners
+from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm, area_vectors, push_corners
 
 
 class IncrementalPotential:
@@ -91,12 +76,12 @@ class IncrementalPotential:
 
     def _value(
         self,
-        lengths: NDArray[np.float64],
-        volumes: NDArray[np.float64],
-        positions: NDArray[np.float64],
+        lengths: NDArray,
+        volumes: NDArray,
+        positions: NDArray,
         stiffening: float,
-        inertia: NDArray[np.float64],
-    ) -> tuple[float, NDArray[np.float64]]:
+        inertia: NDArray,
+    ) -> tuple[float, NDArray]:
         force = np.zeros_like(positions)
         value = _add_spring_forces(*self._springs, lengths, positions, force)
         value += _add_volume_forces(self._volume, volumes, positions, force)

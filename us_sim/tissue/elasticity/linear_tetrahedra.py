@@ -1,27 +1,24 @@
-"""Stiffness of linear (Cauchy strain) tetrahedra, assembled in 3x3 blocks.
+"""Stiffness of linear (Cauchy strain) tetrahedra, and of those with averaged nodal pressures.
 
->>> import numpy as np
->>> from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> mesh = box_mesh([0.0, 0.1, 0.2], [0.0, 0.1], [0.0, 0.1])
->>> matrix = stiffness(mesh, uniform_material(mesh, Material(10e3, 0.45, 1000.0)))
->>> translation = np.tile([1.0, 0.0, 0.0], len(mesh.nodes))
->>> bool(abs(matrix @ translation).max() < 1e-9)  # moved as a whole, nothing resists
-True
+Averaged pressures keep nearly incompressible tetrahedra from locking. The equations are those of
+the neo-Hookean material with the same `volumetric_split`, linearised at rest: K u + B' p = f and
+B u = C p, with one pressure at each node whose surroundings are nearly incompressible. Kept as
+unknowns, the pressures couple neighbours only; eliminated, they leave the stiffness K + B' C^-1 B,
+which couples neighbours of neighbours.
 """
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array
+from scipy.sparse import bsr_array, csr_array, dia_array
 
 from us_sim.errors import SolverError
-from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.elasticity.materials import TissueMaterials, volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
@@ -90,7 +87,7 @@ def free_stiffness(matrix: bsr_array, fixed: NDArray[np.bool_]) -> bsr_array:
 def require_held(mesh: TetrahedralMesh, fixed: NDArray[np.bool_]) -> None:
     """Check that no part of the mesh can move as a rigid body.
 
-    Tetrahedra of a part hang together by faces (`us_sim.tissue.mesh.check.check_mesh` refuses
+    Tetrahedra of a part hang together by faces (`check_mesh` refuses
     hinges), so that three of its nodes hold all of it.
 
     Raises:
@@ -120,3 +117,54 @@ def nodal_shear_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
     total = np.zeros(len(mesh.nodes))
     np.add.at(total, mesh.tetrahedra, resists)
     return total
+
+
+@dataclass(frozen=True, eq=False)
+class AveragedPressure:
+    """The matrices of the two equations; P nodes have a pressure."""
+
+    element: bsr_array  # (3N, 3N) N/m, K, of shear and the tetrahedra's own bulk stiffness
+    coupling: csr_array  # (P, 3N) N/m2 m2, B, change of volume around each node times its stiffness
+    capacity: NDArray[np.float64]  # (P,) N m, C, volume around each node times its stiffness
+    pressure_nodes: NDArray[np.int32]  # (P,)
+
+    @cached_property
+    def stiffness(self) -> csr_array:
+        """(3N, 3N) N/m, with the pressures eliminated."""
+        scaled = dia_array((1 / self.capacity[None], [0]), shape=2 * self.capacity.shape)
+        return (self.element + self.coupling.T @ (scaled @ self.coupling)).tocsr()
+
+    def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) N, what holds the nodes at a displacement (N, 3) m."""
+        moved = displacement.ravel()
+        swelling = self.coupling @ moved
+        held = self.element @ moved + self.coupling.T @ (swelling / self.capacity)
+        return held.reshape(-1, 3)
+
+
+def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> AveragedPressure:
+    """Assemble the equations of a mesh."""
+    split = volumetric_split(materials)
+    element = lame_stiffness(mesh, split.element - split.shear, split.shear)
+    weight = split.nodal * mesh.volumes / 4
+    # A nodal part this small is the rounding of zero: it gets no pressure.
+    weight[split.nodal <= 1e-9 * split.element] = 0.0
+    capacity: NDArray[np.float64] = np.bincount(
+        mesh.tetrahedra.ravel(), np.repeat(weight, 4), len(mesh.nodes)
+    ).astype(np.float64)
+    with_pressure = np.flatnonzero(capacity > 0).astype(np.int32)
+    number = np.cumsum(capacity > 0) - 1
+    near = np.flatnonzero(weight > 0)
+    corners = mesh.tetrahedra[near]
+    divergence = weight[near, None, None] * shape_gradients(mesh)[near]
+    rows = np.broadcast_to(number[corners][:, :, None, None], (len(near), 4, 4, 3))
+    columns = np.broadcast_to(
+        (3 * corners[:, :, None] + np.arange(3))[:, None], (len(near), 4, 4, 3)
+    )
+    values = np.broadcast_to(divergence[:, None], (len(near), 4, 4, 3))
+    coupling = csr_array(
+        (values.ravel(), (rows.ravel(), columns.ravel())),
+        shape=(len(with_pressure), 3 * len(mesh.nodes)),
+    )
+    coupling.sum_duplicates()
+    return AveragedPressure(element, coupling, capacity[with_pressure], with_pressure)

@@ -1,12 +1,30 @@
-"""The elastic constants of one kind of tissue.
+"""Elastic constants of one kind of tissue, and usual values of kinds that nobody measured.
 
->>> from us_sim.tissue.elasticity.material import Material
->>> Material(young_modulus="12 kPa", poisson_ratio=0.45).young_modulus
-12000.0
+Moduli of healthy adults at rest, for slow and moderate strains; a patient's own may differ by a
+factor of two and more. Sources, by kind:
+
+- muscle, kidney, pancreas, spleen, tendon, gland: shear-wave elastography of 127 volunteers (Arda
+  et al., Am J Roentgenol 197:532, 2011).
+- liver: 117 volunteers (Dhar et al., Int J Med Res Rev, 2022), 4.7 kPa; 45 (Basnet et al., J Nepal
+  Med Assoc, 2014), 4.2 kPa.
+- fat and skin: 3.0 and 56 kPa by aspiration in vivo ("In vivo measurement of breast tissues
+  stiffness using a light aspiration device", seven volunteers); a segmented skin is as thick as a
+  few voxels and holds some of the tissue under it, so it is taken softer.
+- artery: 200 kPa, a wall under blood pressure, filled; vein: a lumen at a pressure of 8 mmHg, with
+  the constants of the scene `upper_arm`.
+- bone and cartilage: stiff enough to keep their shape beside the others, and no stiffer, since
+  that only costs solvers time.
+- nerve: 40 kPa, of the same scene. fluid: of a cyst, a bladder: hardly resists, and is kept in.
+
+>>> from us_sim.tissue.elasticity.material import KINDS, kind_of
+>>> kind_of("Left hepatic vein"), KINDS["liver"].young_modulus
+('vein', 4700.0)
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from us_sim.errors import MaterialError
@@ -14,8 +32,8 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
 YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
+# Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness.
 POISSON_RATIO = Quantity("number", -0.99, 0.49999)
-"""Stable from -1 to 0.5, and at 0.5 linear tetrahedra have no stiffness."""
 DENSITY = Quantity("density", 1e-3, 1e6)
 LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e5)
 
@@ -25,7 +43,7 @@ class Material(Settings):
     """Isotropic elastic constants; for `fem_nonlinear`, also the pressure of a vessel's blood.
 
     With a ``lumen_pressure`` it is the inside of a vessel that empties (see
-    `us_sim.tissue.elasticity.lumen`), which the solver ``fem_nonlinear`` knows. To the others it is
+    `neo_hookean_material`), which the solver ``fem_nonlinear`` knows. To the others it is
     a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
 
     Raises:
@@ -42,3 +60,83 @@ class Material(Settings):
     lumen_pressure: float | None = setting(
         LUMEN_PRESSURE, "of a vessel's blood, which leaves if pressed by more", default=None
     )
+
+
+_BLOOD = 1060.0  # kg/m3
+_VENOUS = 1e3  # Pa, 8 mmHg
+
+
+def _soft(young_modulus: float, density: float = 1060.0) -> Material:
+    return Material(young_modulus, 0.45, density)
+
+
+# By name. The first is for whatever has no name that is known.
+KINDS: Mapping[str, Material] = {
+    "tissue": _soft(6e3),
+    "skin": _soft(30e3, 1100.0),
+    "fat": _soft(3e3, 920.0),
+    "muscle": _soft(11e3),
+    "liver": _soft(4.7e3),
+    "kidney": _soft(5e3),
+    "spleen": _soft(2.9e3),
+    "pancreas": _soft(4.8e3),
+    "gland": _soft(10.7e3),
+    "tendon": _soft(51.5e3, 1100.0),
+    "nerve": _soft(40e3),
+    "artery": _soft(200e3),
+    "vein": Material(5e3, 0.1, _BLOOD, _VENOUS),
+    "fluid": Material(1e3, 0.49, 1010.0),
+    "cartilage": Material(500e3, 0.45, 1100.0),
+    "bone": Material(10e6, 0.3, 1900.0),
+}
+
+# Kinds that lie in layers and fill what is between organs: they move with what is beside them.
+LAYERS = ("tissue", "skin", "fat", "muscle")
+_WORDS = {
+    **{kind: kind for kind in KINDS},
+    "aorta": "artery",
+    "arteries": "artery",
+    "carotid": "artery",
+    "veins": "vein",
+    "vessel": "vein",
+    "vessels": "vein",
+    "cava": "vein",
+    "portal": "vein",
+    "jugular": "vein",
+    "lumen": "vein",
+    "rib": "bone",
+    "ribs": "bone",
+    "bones": "bone",
+    "vertebra": "bone",
+    "spine": "bone",
+    "humerus": "bone",
+    "radius": "bone",
+    "ulna": "bone",
+    "femur": "bone",
+    "tibia": "bone",
+    "muscles": "muscle",
+    "biceps": "muscle",
+    "diaphragm": "muscle",
+    "heart": "muscle",
+    "thyroid": "gland",
+    "parotid": "gland",
+    "prostate": "gland",
+    "breast": "fat",
+    "gallbladder": "fluid",
+    "bladder": "fluid",
+    "cyst": "fluid",
+    "bile": "fluid",
+    "renal": "kidney",
+    "kidneys": "kidney",
+    "nerves": "nerve",
+    "tendons": "tendon",
+    "dermis": "skin",
+    "subcutis": "fat",
+    "adipose": "fat",
+}
+
+
+def kind_of(name: str) -> str:
+    """The kind of tissue that a structure's name says: of several known words the last one."""
+    words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _WORDS]
+    return _WORDS[words[-1]] if words else next(iter(KINDS))

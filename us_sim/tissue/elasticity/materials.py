@@ -1,17 +1,4 @@
-"""Elastic constants of tetrahedra, averaged over the labelled voxels that they contain.
-
->>> import numpy as np
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import average_over_labels, label_fractions
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> mesh = box_mesh([0.0, 0.01], [0.0, 0.01], [0.0, 0.01])
->>> labels = np.ones((10, 10, 10), dtype=np.uint8)
->>> index_from_patient = np.diag([1000.0, 1000.0, 1000.0, 1.0])
->>> muscle = Material(young_modulus=12e3, poisson_ratio=0.45, density=1060.0)
->>> fractions = label_fractions(mesh, labels, index_from_patient)
->>> average_over_labels(fractions, {1: muscle}).young_modulus
-array([12000., 12000., 12000., 12000., 12000.])
-"""
+"""Elastic constants of a mesh's tetrahedra, from one material or from labelled voxels."""
 
 from __future__ import annotations
 
@@ -27,12 +14,11 @@ from us_sim.kernels import njit
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
+# Samples of each tetrahedron: enough to measure a volume fraction to about one percent.
 _SAMPLES = 1024
-"""Samples of each tetrahedron: enough to measure a volume fraction to about one percent."""
 
 
 def _none() -> NDArray[np.float64]:
-    """As long as it has to be, of zeros."""
     return np.zeros(0)
 
 
@@ -109,9 +95,7 @@ class LabelFractions(NamedTuple):
 
 
 def label_fractions(
-    mesh: TetrahedralMesh,
-    labels: NDArray[np.uint8],
-    index_from_patient: NDArray[np.float64],
+    mesh: TetrahedralMesh, labels: NDArray[np.uint8], index_from_patient: NDArray[np.float64]
 ) -> LabelFractions:
     """The volume fraction of each label in each tetrahedron.
 
@@ -216,3 +200,31 @@ def _count_labels(indices, tetrahedra, labels, points):
                 voxel[axis] = min(max(int(np.floor(value)), 0), top[axis])
             counts[t, labels[voxel[0], voxel[1], voxel[2]]] += 1
     return counts
+
+
+# lambda + mu over mu at Poisson's ratio 0.4: up to there linear tetrahedra do not lock.
+_ELEMENT_LIMIT = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class VolumetricSplit:
+    """Shear modulus mu, and lambda + mu in two parts, of each tetrahedron."""
+
+    shear: NDArray[np.float64]  # (M,), Pa
+    element: NDArray[np.float64]  # (M,), Pa, resists the tetrahedron's own change of volume
+    nodal: NDArray[np.float64]  # (M,), Pa, resists the average change of volume around its nodes
+
+
+def volumetric_split(materials: TissueMaterials) -> VolumetricSplit:
+    """Split lambda + mu, the coefficient of (J - 1)^2 / 2 in a stable neo-Hookean energy.
+
+    (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
+    2018, without its logarithmic barrier.)
+    """
+    ratio = materials.poisson_ratio
+    shear = materials.young_modulus / (2 * (1 + ratio))
+    whole = shear / (1 - 2 * ratio)
+    limit = _ELEMENT_LIMIT * shear
+    # At the limit itself rounding must not leave the nodes any stiffness.
+    element = np.where(whole > limit * (1 + 1e-9), limit, whole)
+    return VolumetricSplit(shear, element, whole - element)

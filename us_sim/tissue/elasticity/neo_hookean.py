@@ -1,40 +1,43 @@
-"""Nearly incompressible stable neo-Hookean tissue without a matrix: energy, forces, their slope.
+"""Nearly incompressible neo-Hookean tissue without a matrix, and its viscous overstress.
 
-Linear tetrahedra have the energy of `neo_hookean_point`. The nodal part of `volumetric_split`
+Linear tetrahedra have the energy of `neo_hookean_material`. The nodal part of `volumetric_split`
 resists the average change of volume around each node:
 
     sum over tetrahedra e of V (mu/2 (|F|^2 - 3) - mu (J - 1) + element/2 (J - 1)^2)
     + 1/2 sum over nodes a of C q^2,   C = sum of c over a's e,   q = sum of c (J - 1) / C,
 
-with c = V nodal / 4, plus the term of `neo_hookean_point` against being crushed. Tetrahedra with a
-lumen have the energy of `us_sim.tissue.elasticity.lumen` in place of all but the shear's. Without
-them, linearised at rest, it is linear elasticity with the same split.
+with c = V nodal / 4, plus the term against being crushed. Tetrahedra with a lumen have its energy
+in place of all but the shear's. Without them, linearised at rest, it is linear elasticity with the
+same split.
 
->>> import numpy as np
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
->>> from us_sim.tissue.elasticity.neo_hookean import NeoHookean
->>> mesh = box_mesh(*[uniform_planes(0.0, 0.1, 4)] * 3)
->>> tissue = NeoHookean(mesh, uniform_material(mesh, Material(10e3, 0.49, 1000.0)))
->>> turned = mesh.nodes[:, [1, 2, 0]].T - mesh.nodes.T  # as a whole, by 120 degrees
->>> displacement = np.ascontiguousarray(turned, dtype=np.float32)
->>> bool(abs(tissue.forces(displacement)).max() < 1e-3), tissue.inverted(displacement)
-(True, 0)
->>> round(tissue.smallest_volume_ratio(displacement), 5)
-1.0
+Viscosity is one branch of a Prony series in quasi-static form: beside the tissue's own energy there
+is that of a spring of g times its stiffness K at rest, whose other end v follows the displacement u
+with a time constant,
+
+    g/2 (u - v)' K (u - v),    dv/dt = (u - v) / time.
+
+Where u changes evenly from frame to frame, h apart, the force at a frame's end is exactly
+
+    g (1 - exp(-h / time)) time / h K (u - v),    v = exp(-h / time) v + (1 - exp(-h / time)) u
+
+with v, u on the right those of the frame before (R. L. Taylor, K. S. Pister and G. L. Goudreau,
+Thermomechanical analysis of viscoelastic solids, Int. J. Numer. Methods Eng. 2, 1970). It is
+linear: tissue that turns as a whole is stressed until it has relaxed.
 """
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
-from us_sim.tissue.elasticity.lumen import neo_hookean_constants
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
+from us_sim.tissue.elasticity.neo_hookean_material import neo_hookean_constants
 from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
 from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
@@ -153,9 +156,7 @@ class NeoHookean:
         return self._nodal
 
 
-def _nodal_blocks(
-    mesh: TetrahedralMesh, weight: NDArray[np.float64], total: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _nodal_blocks(mesh: TetrahedralMesh, weight: NDArray, total: NDArray) -> NDArray:
     """(6, N) N/m, the diagonal blocks at rest of the nodal part of the bulk stiffness.
 
     Node n meets the average of each neighbour a, and its own, through s(a, n), the sum of c g over
@@ -179,3 +180,63 @@ def _nodal_blocks(
         products = sums[i] * sums[j] / total[pairs // count]
         blocks[entry] = np.bincount(pairs % count, products, count)
     return blocks
+
+
+@dataclass(frozen=True)
+class PronyBranch:
+    """A spring and a damper in series."""
+
+    modulus: float  # of the spring, over the tissue's own
+    relaxation_time: float  # s
+    interval: float  # s, from frame to frame
+
+
+class Overstress:
+    """The energy of a tissue's branch, and what it remembers.
+
+    Args:
+        branch: its constants.
+        tissue: in double precision, linearised at rest.
+        single: the same in the precision of `add_product`.
+    """
+
+    def __init__(self, branch: PronyBranch, tissue: NeoHookean, single: NeoHookean) -> None:
+        frames = branch.interval / branch.relaxation_time
+        self._kept = math.exp(-frames)
+        #: Stiffness within a frame, over the tissue's own at rest.
+        self.stiffness = branch.modulus * -math.expm1(-frames) / frames
+        self._tissue = tissue
+        self._single = single
+        self.relaxed = np.zeros((3, tissue.count))  # (3, N) m, v above
+        self.load = 0.0  # N, norm of the forces when last added
+        self._image = np.empty((3, tissue.count), single.dtype)
+
+    def stiffened(self, field: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(3, N) N, the stiffness at rest, the branch's included, times a field (3, N) m."""
+        product: NDArray[np.floating] = (1 + self.stiffness) * self._tissue.tangent_product(field)
+        return product
+
+    def energy(self, displacement: NDArray[np.float64]) -> float:
+        """J, at a displacement (3, N) m."""
+        change = displacement - self.relaxed
+        return self.stiffness / 2 * float((change * self._tissue.tangent_product(change)).sum())
+
+    def add_forces(self, displacement: NDArray[np.float64], force: NDArray[np.float64]) -> None:
+        """Add the energy's slope at a displacement (3, N) m to ``force`` (3, N) N."""
+        own = self.stiffness * self._tissue.tangent_product(displacement - self.relaxed)
+        self.load = float(np.linalg.norm(own))
+        force += own
+
+    def add_product(self, change: NDArray[np.floating], image: NDArray[np.floating]) -> None:
+        """Add how that changes with the displacement, by ``change``, to ``image``, both (3, N)."""
+        self._single.tangent_product(change, self._image)
+        self._image *= self._image.dtype.type(self.stiffness)
+        image += self._image
+
+    def relax(self, displacement: NDArray[np.float64]) -> None:
+        """Let the time from one frame to the next pass, the first of which ended as given."""
+        self.relaxed = displacement + self._kept * (self.relaxed - displacement)
+
+    def forget(self, displacement: NDArray[np.float64]) -> None:
+        """Be relaxed at a displacement (3, N) m."""
+        self.relaxed = displacement.copy()

@@ -1,9 +1,4 @@
-"""What can be set of a stiffness fit: each field is an option of ``us-sim fit-stiffness``.
-
->>> from us_sim.tissue.identification.settings import StiffnessSettings
->>> StiffnessSettings(time_offset="20 ms").time_offset
-0.02
-"""
+"""Settings of a stiffness fit: each field is an option of ``us-sim fit-stiffness``."""
 
 from __future__ import annotations
 

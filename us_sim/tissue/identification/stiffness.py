@@ -1,52 +1,293 @@
-"""Young's moduli of structures from a recorded press: the whole way from a record to a result.
+"""Young's moduli of structures from a recorded press and landmarks: from a record to a result.
 
-The tissue that presses in this example made the forces too, so that they say what it is made of:
+A force sensor has an offset (tare) on each channel, and its stamps may be late by a little more
+than is known. Both are unknowns beside the moduli, in which the measurements are linear; poses
+without contact, at which no model is needed, tell the offset.
 
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.identification.press_model import PressModel
->>> from us_sim.tissue.identification.press_record import paired
->>> from us_sim.tissue.identification.settings import StiffnessSettings
->>> from us_sim.tissue.identification.stiffness import Tissue, fit_stiffness
->>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.block(nodes=(5, 5, 5))
->>> tissue = Tissue(model, lambda e: uniform_material(model.mesh, Material(e["gel"])), {"gel": 4e3})
->>> depth = np.concatenate([np.linspace(-0.004, 0.008, 16), np.linspace(0.008, -0.004, 16)])
->>> places = np.column_stack([np.zeros((32, 2)), depth])
->>> poses = np.arange(32) * 10**8, places, np.tile([0.0, 0.0, 0.0, 1.0], (32, 1))
->>> made = PressModel(model, tissue.materials_for, [], [Pose(place) for place in places])
->>> press = paired(poses, (poses[0], made.predict({"gel": 9e3}).wrenches), tolerance=0.01)
->>> found = fit_stiffness(tissue, press, StiffnessSettings(poses=16))
->>> round(found.moduli["gel"]), found.intervals["gel"].factor < 1.01
-(9000, True)
+A CSV of landmarks has the columns name, time, x, y, z: seconds since the first pose of the
+recording, and metres in frame ``patient`` or with a unit. A row without a time says where the point
+is at rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import StiffnessError
-from us_sim.tissue.identification.fit import FARTHEST, Fitted, fit
-from us_sim.tissue.identification.identifiability import judge
-from us_sim.tissue.identification.landmarks import Landmarks
-from us_sim.tissue.identification.observations import (
-    GROUPS,
-    Observations,
-    observations_of,
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.text_files import read_text
+from us_sim.tissue.identification.fit import FARTHEST, Fitted, Verdict, fit, judge
+from us_sim.tissue.identification.press_model import (
+    Felt,
+    MaterialsFor,
+    PressedTissue,
+    PressModel,
+    SeenPoints,
 )
-from us_sim.tissue.identification.pose_choice import ChosenPoses, choose_poses
-from us_sim.tissue.identification.press_model import MaterialsFor, PressModel
-from us_sim.tissue.identification.press_record import PressRecord
-from us_sim.tissue.identification.pressed_tissue import PressedTissue
-from us_sim.tissue.identification.refusal import refusal
+from us_sim.tissue.identification.press_record import (
+    CHANNELS,
+    ChosenPoses,
+    PressRecord,
+    choose_poses,
+)
 from us_sim.tissue.identification.settings import StiffnessSettings
+from us_sim.tissue.mesh.embedding import locate
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
+
+# Kinds of measurements, each with a noise of its own: N, N m, m.
+GROUPS = ("force", "torque", "landmark")
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Places of landmarks that were seen."""
+
+    places: NDArray[np.float64]  # (S, 3) m, frame patient
+    poses: NDArray[np.intp]  # (S,) number among the chosen poses that press
+    times: NDArray[np.float64]  # (S,) s
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """n numbers that were measured; those with a model come first."""
+
+    values: NDArray[np.float64]  # (n,) N, N m or m
+    groups: NDArray[np.intp]  # (n,) into GROUPS
+    times: NDArray[np.float64]  # (n,) s
+    depths: NDArray[np.float64]  # (n,) m, of the probe in the undeformed tissue; 0 without contact
+    nuisance: NDArray[np.float64]  # (n, Q), how they change with each unknown that is no modulus
+    nuisance_names: tuple[str, ...]  # Q
+    channels: NDArray[np.intp]  # of the wrench, those used
+
+    def modelled(self, felt: Felt) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(n,) what a model says of these, and (n, P) its slopes by the logarithms of moduli."""
+        count = felt.slopes.shape[2]
+        values = [felt.wrenches[:, self.channels].ravel(), felt.places.ravel()]
+        slopes = [
+            felt.slopes[:, self.channels].reshape(-1, count),
+            felt.place_slopes.reshape(-1, count),
+        ]
+        without = len(self.values) - sum(map(len, values))
+        values.append(np.zeros(without))
+        slopes.append(np.zeros((without, count)))
+        return np.concatenate(values), np.concatenate(slopes)
+
+
+def observations_of(
+    record: PressRecord, chosen: ChosenPoses, seen: Seen | None = None, *, late: bool = False
+) -> Observations:
+    """The measurements at chosen poses.
+
+    Args:
+        record: the press.
+        chosen: its poses.
+        seen: landmarks.
+        late: whether the wrenches' stamps may be late by a little more.
+    """
+    channels = np.flatnonzero(record.channels)
+    count, free, width = len(chosen.pressed), len(chosen.free), len(channels)
+    places = np.zeros((0, 3)) if seen is None else seen.places
+    at_landmarks = np.zeros(0, np.intp) if seen is None else seen.poses
+    poses = np.concatenate([chosen.pressed, chosen.free])
+    felt = record.wrenches[poses][:, channels]
+    names = [f"offset of {CHANNELS[channel]}" for channel in channels] + ["delay"] * late
+    offsets = np.tile(np.eye(width), (count + free, 1))
+    if late:
+        offsets = np.column_stack([offsets, record.rates[poses][:, channels].ravel()])
+    split, seen_count = count * width, places.size
+    kinds = np.tile(np.where(channels < 3, 0, 1), count + free)
+    depths = np.maximum(-chosen.clearance, 0.0)
+
+    def joined(of_wrenches: NDArray, of_landmarks: NDArray) -> NDArray:
+        return np.concatenate([of_wrenches[:split], of_landmarks, of_wrenches[split:]])
+
+    return Observations(
+        values=joined(felt.ravel(), places.ravel()),
+        groups=joined(kinds, np.full(seen_count, 2)),
+        times=joined(
+            np.repeat(record.times[poses], width),
+            np.repeat(np.zeros(0) if seen is None else seen.times, 3),
+        ),
+        depths=joined(
+            np.repeat(depths[poses], width), np.repeat(depths[chosen.pressed][at_landmarks], 3)
+        ),
+        nuisance=joined(offsets, np.zeros((seen_count, offsets.shape[1]))),
+        nuisance_names=tuple(names),
+        channels=channels,
+    )
+
+
+_COLUMNS = ("name", "time", "x", "y", "z")
+_TIME, _LENGTH = Quantity("time", -1e6, 1e6), Quantity("length", -10.0, 10.0)
+_OUTSIDE = 1e-3  # m, that a point may lie outside the mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """L points at rest, and S sights of them."""
+
+    names: tuple[str, ...]  # L
+    rest: NDArray[np.float64]  # (L, 3) m, frame patient
+    which: NDArray[np.intp]  # (S,) of the points
+    times: NDArray[np.float64]  # (S,) s, since the first pose of the recording
+    places: NDArray[np.float64]  # (S, 3) m, frame patient
+
+    def at(
+        self, record: PressRecord, chosen: ChosenPoses, mesh: TetrahedralMesh, tolerance: float
+    ) -> tuple[ChosenPoses, Seen, SeenPoints]:
+        """The sights with the poses that they were had at, which are looked at as well.
+
+        Raises:
+            StiffnessError: there is no pose at the time of one, or a point is outside the mesh.
+        """
+        located = locate(mesh, self.rest)
+        for name, outside in zip(self.names, located.outside, strict=True):
+            if outside > _OUTSIDE:
+                raise StiffnessError(
+                    f"landmark {name} lies {1e3 * outside:.1f} mm outside the tissue's mesh: give "
+                    f"places at rest in frame patient"
+                )
+        nearest = np.abs(record.times[:, None] - self.times).argmin(axis=0)
+        for name, time, pose in zip(self.which, self.times, nearest, strict=True):
+            if abs(record.times[pose] - time) > tolerance:
+                raise StiffnessError(
+                    f"landmark {self.names[name]} was seen at {time:g} s, and no pose with a "
+                    f"wrench is within {1e3 * tolerance:g} ms of that"
+                )
+        pressing = chosen.clearance[nearest] < 0.0
+        nearest = nearest[pressing]
+        if len(nearest) == 0:
+            raise StiffnessError("no landmark was seen while the probe pressed the tissue")
+        pressed = np.union1d(chosen.pressed, nearest)
+        poses, which = np.searchsorted(pressed, nearest), self.which[pressing]
+        seen = Seen(self.places[pressing], poses, self.times[pressing])
+        points = SeenPoints(
+            poses,
+            self.rest[which],
+            mesh.tetrahedra[located.tetrahedra[which]],
+            located.weights[which],
+        )
+        return replace(chosen, pressed=pressed), seen, points
+
+
+def read_landmarks(file: str | Path) -> Landmarks:
+    """The landmarks of a CSV.
+
+    Raises:
+        StiffnessError: it cannot be read, a column is missing, a cell is no such quantity, or a
+            point has no place at rest, or is never seen.
+    """
+    file = Path(file)
+    rest: dict[str, list[float]] = {}
+    sights: list[tuple[str, float, list[float]]] = []
+    try:
+        reader = csv.DictReader(io.StringIO(read_text(file, "utf-8-sig")), skipinitialspace=True)
+        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+        missing = [name for name in _COLUMNS if name not in reader.fieldnames]
+        if missing:
+            raise StiffnessError(
+                f"{file}: has no column {missing[0]}; its first line must be {','.join(_COLUMNS)}"
+            )
+        for row in reader:
+            name, time = (row["name"] or "").strip(), (row["time"] or "").strip()
+            try:
+                place = [_LENGTH.parse((row[axis] or "").strip()) for axis in "xyz"]
+                when = _TIME.parse(time) if time else None
+            except ValueError as error:
+                raise StiffnessError(f"{file}: line {reader.line_num}: {error}") from error
+            if when is not None:
+                sights.append((name, when, place))
+            elif name in rest:
+                raise StiffnessError(f"{file}: line {reader.line_num}: {name} is at rest twice")
+            else:
+                rest[name] = place
+    except OSError as error:
+        raise StiffnessError(f"{file}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise StiffnessError(f"{file}: is no CSV: {error}") from error
+    for name, when, _ in sights:
+        if name not in rest:
+            raise StiffnessError(
+                f"{file}: {name} is seen at {when:g} s, but no row without a time says where it is "
+                f"at rest"
+            )
+    if not sights:
+        raise StiffnessError(f"{file}: no row has a time, so that nothing was seen")
+    names = tuple(rest)
+    return Landmarks(
+        names,
+        np.array([rest[name] for name in names]),
+        np.array([names.index(name) for name, _, _ in sights], dtype=np.intp),
+        np.array([when for _, when, _ in sights]),
+        np.array([place for _, _, place in sights]),
+    )
+
+
+_UNITS = (("force", 1.0, "N"), ("torque", 1.0, "N m"), ("landmarks", 1e3, "mm"))
+
+
+def refusal(
+    names: Sequence[str],
+    verdict: Verdict,
+    observed: Observations,
+    fitted: Fitted,
+    settings: StiffnessSettings,
+) -> str:
+    """The sentence.
+
+    Args:
+        names: of P structures.
+        verdict: on these.
+        observed: the measurements.
+        fitted: what they led to.
+        settings: with which they are judged.
+    """
+    reasons, unknown = [], [p for p in range(len(names)) if not verdict.determined[p]]
+    for p in unknown:
+        if not verdict.felt[p]:
+            reasons.append(f"{names[p]} hardly matters: {_effect(p, observed, fitted, settings)}")
+        elif verdict.like[p]:
+            others = " and ".join(names[other] for other in verdict.like[p][:3])
+            reasons.append(f"{names[p]} cannot be told from {others}, which act alike")
+        else:
+            factor = np.exp(min(verdict.half_widths[p], 50.0))
+            reasons.append(f"{names[p]} is known to a factor of {factor:.3g} only")
+    those = " ".join(names[p] for p in unknown)
+    known = [name for name, fine in zip(names, verdict.determined, strict=True) if fine]
+    rest = f"; it does determine {', '.join(known)}" if known else ""
+    return (
+        f"this press does not determine {', '.join(names[p] for p in unknown)}: "
+        f"{'; '.join(reasons)}{rest}; fix what it does not with --keep {those}, or press deeper, "
+        f"from other sides, or nearer to it"
+    )
+
+
+def _effect(p: int, observed: Observations, fitted: Fitted, settings: StiffnessSettings) -> str:
+    """What a stiffer structure would do, over the noise."""
+    best, text = -1.0, ""
+    for group, (name, scale, unit) in enumerate(_UNITS):
+        its = observed.groups == group
+        if not its.any():
+            continue
+        change = float(np.abs(fitted.jacobian[its, p]).max()) * np.log(settings.widest)
+        noise = float(fitted.noise[its][0])
+        if change / noise > best:
+            best = change / noise
+            text = (
+                f"{settings.widest:g} times as stiff it would change the {name} by "
+                f"{scale * change:.2g} {unit} at most, and their scatter is {scale * noise:.2g} "
+                f"{unit}"
+            )
+    return text
+
 
 Progress = Callable[[float, str], None]
 
@@ -127,11 +368,7 @@ def fit_stiffness(
         record, chosen, seen, late=settings.time_offset is None and not record.same_stamps
     )
     press = PressModel(
-        tissue.model,
-        tissue.materials_for,
-        names,
-        [record.pose(k) for k in chosen.pressed],
-        points,
+        tissue.model, tissue.materials_for, names, [record.pose(k) for k in chosen.pressed], points
     )
     start = np.log([tissue.moduli[name] for name in names])
     step = ""
@@ -155,7 +392,6 @@ def fit_stiffness(
 
 
 def _fitted_names(tissue: Tissue, record: PressRecord, settings: StiffnessSettings) -> list[str]:
-    """The structures whose moduli are looked for."""
     for name in settings.keep:
         if name not in tissue.moduli:
             raise StiffnessError(

@@ -1,17 +1,4 @@
-"""The compliance of the surface that a probe can touch, and the field of each force in the tissue.
-
->>> import numpy as np
->>> from us_sim.tissue.linear_algebra.compliance import surface_compliance
->>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.block(nodes=(5, 5, 5))
->>> compliance = surface_compliance(model)
->>> forces = np.zeros((25, 3))
->>> forces[12, 2] = 1.0  # N, downwards in the middle of the top
->>> field = compliance.field(forces)
->>> middle = compliance.nodes[12]
->>> bool(field[middle, 2] > 0), bool(np.isclose(field[middle, 2], compliance.matrix[38, 38]))
-(True, True)
-"""
+"""Compliance of the surface that a probe can touch, and the field of each force on it."""
 
 from __future__ import annotations
 
@@ -28,33 +15,99 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.cache import Form, kept
-from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure, averaged_pressure
-from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.linear_algebra.dense_fields import DenseFields
+from us_sim.kernels import njit
+from us_sim.tissue.elasticity.linear_tetrahedra import (
+    AveragedPressure,
+    averaged_pressure,
+    require_held,
+)
 from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.model import TissueModel
 
-_VERSION = 4
-"""Part of the cache's key: raise it when the bytes change."""
+_CHUNK = 64  # nodes for whose forces the fields are made at once
+Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
+
+@dataclass(frozen=True, eq=False)
+class DenseFields:
+    """What each of 3S forces does to F nodes."""
+
+    nodes: NDArray[np.integer]  # (F,)
+    fields: NDArray[np.floating]  # (3S, 3, F), m/N
+
+    def __post_init__(self) -> None:
+        # Always read-only, as from the cache: numba would compile the kernel again for others.
+        for name in ("nodes", "fields"):
+            array = getattr(self, name).view()
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def made(
+        cls, nodes: NDArray[np.integer], forces: int, solve: Solve, precision: type
+    ) -> DenseFields:
+        """The fields at ``nodes`` (F,) of forces on S nodes.
+
+        Args:
+            nodes: of the fields.
+            forces: S.
+            solve: the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
+            precision: of the numbers to keep.
+        """
+        fields: NDArray[np.floating] = np.empty((3 * forces, 3, len(nodes)), precision)
+        for first in range(0, forces, _CHUNK):
+            chunk = np.arange(first, min(first + _CHUNK, forces))
+            fields[3 * first : 3 * chunk[-1] + 3] = solve(chunk)[nodes].transpose(2, 1, 0)
+        return cls(nodes, fields)
+
+    def add(self, forces: NDArray[np.float64], displacement: NDArray[np.floating]) -> None:
+        """Add what forces (3S,) N do to displacement (N, 3) m; zeros are not read."""
+        rows = np.flatnonzero(forces)
+        _add_rows(self.fields, rows, forces[rows], self.nodes, displacement)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _add_rows(fields, rows, weights, nodes, displacement):
+    width = 1024  # nodes of a piece that stays in the fastest cache
+    four = len(rows) // 4 * 4
+    whole = np.empty((3, width))
+    for begin in range(0, len(nodes), width):
+        end = min(begin + width, len(nodes))
+        for axis in range(3):
+            piece = whole[axis, : end - begin]
+            piece[:] = 0.0
+            for m in range(0, four, 4):
+                a = fields[rows[m], axis, begin:end]
+                b = fields[rows[m + 1], axis, begin:end]
+                c = fields[rows[m + 2], axis, begin:end]
+                d = fields[rows[m + 3], axis, begin:end]
+                p, q, r, s = weights[m], weights[m + 1], weights[m + 2], weights[m + 3]
+                for i in range(len(piece)):
+                    piece[i] += p * a[i] + q * b[i] + r * c[i] + s * d[i]
+            for m in range(four, len(rows)):
+                a = fields[rows[m], axis, begin:end]
+                p = weights[m]
+                for i in range(len(piece)):
+                    piece[i] += p * a[i]
+        for i in range(end - begin):
+            for axis in range(3):
+                displacement[nodes[begin + i], axis] += whole[axis, i]
+
+
+_VERSION = 4  # Part of the cache's key: raise it when the bytes change
+# Numbers in the fields below which they are in double precision, as single would save little
+# time.
 _DOUBLE = 4_000_000
-"""Numbers in the fields below which they are in double precision, as single would save little
-time."""
-
+# Numbers in the fields from which on they are cached, as making them takes a second.
 _KEPT = 12_000_000
-"""Numbers in the fields from which on they are cached, as making them takes a second."""
-
+# Numbers in the fields from which on they are compressed, and made in single precision.
 _COMPRESSED = 100_000_000
-"""Numbers in the fields from which on they are compressed, and made in single precision."""
-
+# Singular values that compression leaves out, over the largest displacement by each force: a
+# whole press is then off by about a tenth of that.
 _TOLERANCE = 1e-4
-"""Singular values that compression leaves out, over the largest displacement by each force: a
-whole press is then off by about a tenth of that."""
-
+# Number of single forces, and of presses, by which the fields' rounding error is measured.
 _SAMPLES = 12
-"""Number of single forces, and of presses, by which the fields' rounding error is measured."""
-
 _PRESSED = 16  # nodes of the surface over those that such a press is on
 
 
@@ -159,7 +212,6 @@ def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> 
 
 
 def _scratch(needed: bool) -> AbstractContextManager[Any]:
-    """A file that vanishes when it is closed; None if it is not needed or there is no place."""
     with contextlib.suppress(OSError):
         if needed:
             return tempfile.TemporaryFile(buffering=0)
@@ -167,10 +219,7 @@ def _scratch(needed: bool) -> AbstractContextManager[Any]:
 
 
 def _rounding(
-    made: SurfaceCompliance,
-    points: NDArray[np.float64],
-    system: AveragedPressure,
-    fixed: NDArray[np.bool_],
+    made: SurfaceCompliance, points: NDArray, system: AveragedPressure, fixed: NDArray
 ) -> float:
     """The unbalanced force over the norm of the forces: the median of single ones and of presses,
     whichever is larger.

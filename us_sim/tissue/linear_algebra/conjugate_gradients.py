@@ -1,20 +1,4 @@
-"""Preconditioned conjugate gradients on 3x3 blocks, with some nodes confined to planes.
-
-A mass point between two springs of 1 N/m, 1 m away from its rest, comes back in one iteration:
-
->>> import numpy as np
->>> from us_sim.tissue.linear_algebra.conjugate_gradients import conjugate_gradients
->>> start, columns = np.array([0, 1], dtype=np.int32), np.array([0], dtype=np.int32)
->>> blocks = 2 * np.eye(3)[None]
->>> displacement = np.array([[1.0, 0.0, 0.0]])
->>> work = [np.zeros((1, 3)) for _ in range(3)]
->>> slope, before, after = conjugate_gradients(
-...     start, columns, blocks, np.linalg.inv(blocks), np.empty(0, dtype=np.int64),
-...     np.empty((0, 3)), displacement, *work, -1.0, np.inf, 20, 1e-9,
-... )
->>> before, after, displacement
-(2.0, 0.0, array([[0., 0., 0.]]))
-"""
+"""Preconditioned conjugate gradients on 3x3 blocks, with some nodes confined to planes."""
 
 from __future__ import annotations
 

@@ -1,27 +1,14 @@
-"""The displacement fields of forces on a surface, compressed: what is far varies little.
+"""Displacement fields of forces on a surface, compressed to products of low rank.
 
-A block of neighbouring nodes moves alike under all forces that are some way off. So what the forces
-of a patch of the surface do to a block is kept as a product of low rank, its singular vectors
-(W. Hackbusch, A sparse matrix arithmetic based on H-matrices, Computing 62, 1999). Patches are as
-large as pays: two halves are joined where their forces together need clearly fewer vectors than one
-by one, which is far from the block; next to it they stay small, of nearly full rank. Nothing is
-assumed about the mesh or its materials.
+A block of neighbouring nodes moves alike under all forces that are some way off. So the fields of
+the forces on a patch of the surface in a block are kept as a product of low rank, its singular
+vectors (W. Hackbusch, A sparse matrix arithmetic based on H-matrices, Computing 62, 1999). Patches
+are as large as pays: two halves are joined where their forces together need clearly fewer vectors
+than one by one, which is far from the block; next to it they stay small, of nearly full rank.
+Nothing is assumed about the mesh or its materials.
 
 Reading the vectors of the blocks is most of the time. So they are integers with a scale each: of 16
 bits, and the many with small singular values of 8 bits.
-
->>> import numpy as np
->>> from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
->>> line = np.column_stack([np.linspace(0, 1, 200), np.zeros(200), np.zeros(200)])
->>> def solve(chosen):  # something smooth
-...     reach = 1 / (0.05 + abs(line[:, 0][:, None] - line[chosen, 0]))
-...     return np.einsum("nk,ab->nakb", reach, np.eye(3)).reshape(200, 3, -1)
->>> fields = LowRankFields.made(line, np.arange(200), line, solve, 1e-4)
->>> displacement = np.zeros((200, 3))
->>> fields.add(np.tile([0.0, 0.0, 1.0], 200), displacement)
->>> exact = solve(np.arange(200))[:, 2, 2::3].sum(axis=1)
->>> bool(abs(displacement[:, 2] - exact).max() < 1e-4 * exact.max())
-True
 """
 
 from __future__ import annotations
@@ -35,23 +22,17 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.kernels import njit
 
 _BLOCK = 512  # nodes at most of a block
-
 _CHUNK = 64  # nodes at most for whose forces the fields are made at once
-
 _PATCH = 32  # nodes at most of the smallest patches
-
+# Two patches are joined if together they need this many vectors over those one by one, or fewer:
+# a block next to one of them that is not loaded need not be read.
 _GAIN = 0.75
-"""Two patches are joined if together they need this many vectors over those one by one, or fewer:
-a block next to one of them that is not loaded need not be read."""
-
+# Numbers of a vector beside each other, those of the next one after them: read in line, and added
+# up in registers.
 _TILE = 64
-"""Numbers of a vector beside each other, those of the next one after them: read in line, and added
-up in registers."""
-
+# Singular values up to this many times the tolerance are of vectors of 8 bits, whose rounding is
+# then below the tolerance.
 _MINOR = 100
-"""Singular values up to this many times the tolerance are of vectors of 8 bits, whose rounding is
-then below the tolerance."""
-
 Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 
@@ -142,14 +123,8 @@ class _Product:
 
 
 class _Compression:
-    """Fields on their way into products."""
-
     def __init__(
-        self,
-        nodes: NDArray[np.integer],
-        order: NDArray[np.int64],
-        solve: Solve,
-        tolerance: float,
+        self, nodes: NDArray[np.integer], order: NDArray[np.int64], solve: Solve, tolerance: float
     ) -> None:
         self._nodes, self._order, self._solve = nodes, order, solve
         self._tolerance = tolerance
@@ -181,9 +156,7 @@ class _Compression:
         halves = zip(self._compress(first, middle), self._compress(middle, last), strict=True)
         return [self._joined(block, *pair) for block, pair in enumerate(halves)]
 
-    def _split(
-        self, block: int, fields: NDArray[np.floating], first: int, last: int
-    ) -> _Product | None:
+    def _split(self, block: int, fields: NDArray, first: int, last: int) -> _Product | None:
         if last - first <= _PATCH:
             return _Product(first, last, *self._truncated(fields))
         middle = (first + last) // 2
@@ -207,9 +180,7 @@ class _Compression:
         self._finish(block, two)
         return None
 
-    def _truncated(
-        self, matrix: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _truncated(self, matrix: NDArray) -> tuple[NDArray, NDArray]:
         """Left and right factors, without singular values below the tolerance."""
         exact = matrix.astype(np.float64)
         squares, vectors = np.linalg.eigh(exact.T @ exact)
@@ -275,7 +246,6 @@ def _tiles(vectors: NDArray[np.float32], kind: type) -> tuple[NDArray, NDArray[n
 
 
 def _padded(count: int) -> int:
-    """The numbers in as many whole tiles as are needed."""
     return -(-count // _TILE) * _TILE
 
 

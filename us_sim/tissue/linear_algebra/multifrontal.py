@@ -1,29 +1,16 @@
-"""The displacement fields of unit forces, by a multifrontal elimination of the mesh.
+"""Displacement fields of unit forces, by a multifrontal elimination of the mesh.
 
-(J. W. H. Liu, The multifrontal method for sparse matrix solution, SIAM Review 34, 1992.) Each part
-of a nested dissection, when eliminated, stores how its unknowns follow those around it; the parts
-that forces are put on also store what forces on themselves do. Fields then come from dense
-products, down the tree, for many forces at once.
+(J. W. H. Liu, The multifrontal method for sparse matrix solution, SIAM Review 34, 1992.) The order
+of elimination is a nested dissection: halves first, then the nodes that separate them (A. George,
+Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10, 1973). Each part, when
+eliminated, stores how its unknowns follow those around it; parts with forces on them also store
+their own response to these. Fields then come from dense products, down the tree, for many forces
+at once.
 
 The pressures of nearly incompressible tissue are unknowns of their own. The matrix is then
 quasi-definite, and can be factored in any order without pivoting (R. J. Vanderbei, Symmetric
 quasidefinite matrices, SIAM J. Optim. 5, 1995): in every part first the displacements by a Cholesky
 factor, then the pressures by one of the negative.
-
->>> import numpy as np
->>> from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
->>> from us_sim.tissue.linear_algebra.multifrontal import eliminate
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.elasticity.materials import uniform_material
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
->>> mesh = box_mesh(*(uniform_planes(0.0, 0.1, 4) for axis in range(3)))
->>> system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.49, 1000.0)))
->>> top, fixed = np.flatnonzero(mesh.nodes[:, 2] == 0.0), mesh.nodes[:, 2] == 0.1
->>> fields = eliminate(mesh, system, fixed, top).fields(top[:2])
->>> fields.shape
-(64, 3, 6)
->>> float(abs(fields[fixed]).max())
-0.0
 """
 
 from __future__ import annotations
@@ -31,30 +18,88 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import FileIO
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
-from scipy.sparse import bmat, csr_array, dia_array
+from scipy.sparse import bmat, coo_array, csr_array, dia_array
 
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
-from us_sim.tissue.elasticity.averaged_pressure import AveragedPressure
-from us_sim.tissue.linear_algebra.nested_dissection import Part, nested_dissection
+from us_sim.tissue.elasticity.linear_tetrahedra import AveragedPressure
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
-_LARGE = 100_000
-"""Numbers in a matrix from which on it may be kept in a file."""
 
+@dataclass(eq=False)
+class Part:
+    """Nodes that are eliminated together, after those of the parts below."""
+
+    own: NDArray[np.int64]
+    parts: list[Part] = field(default_factory=list)
+    boundary: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))  # above it
+
+
+def nested_dissection(
+    points: NDArray[np.float64], edges: NDArray[np.integer], largest: int = 60
+) -> Part:
+    """The tree of parts.
+
+    Args:
+        points: (N, 3) m, by whose coordinates nodes are halved.
+        edges: (E, 2), which nodes couple.
+        largest: number of nodes up to which a part is not halved.
+    """
+    count = len(points)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    graph = coo_array((np.ones(len(both), np.int8), tuple(both.T)), shape=(count, count)).tocsr()
+    root = _dissect(points, graph, np.arange(count), largest)
+    _bound(root, graph, np.zeros(count, dtype=bool))
+    return root
+
+
+def _dissect(points: NDArray, graph: csr_array, nodes: NDArray, largest: int) -> Part:
+    if len(nodes) <= largest:
+        return Part(nodes)
+    axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
+    along = points[nodes, axis]
+    middle = np.partition(along, len(nodes) // 2)[len(nodes) // 2]
+    below = along < middle
+    if not below.any():
+        below = along <= middle
+        if below.all():
+            return Part(nodes)
+    inside = np.zeros(graph.shape[0], dtype=bool)
+    inside[nodes[below]] = True
+    above = nodes[~below]
+    separates = np.zeros(len(above), dtype=bool)
+    start = graph.indptr[above]
+    length = graph.indptr[above + 1] - start
+    owner = np.repeat(np.arange(len(above)), length)
+    offset = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
+    separates[owner[inside[graph.indices[start[owner] + offset]]]] = True
+    halves = [nodes[below], above[~separates]]
+    parts = [_dissect(points, graph, half, largest) for half in halves if len(half)]
+    return Part(above[separates], parts)
+
+
+def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
+    for below in part.parts:
+        _bound(below, graph, eliminated)
+    near = [below.boundary for below in part.parts]
+    near += [graph.indices[graph.indptr[i] : graph.indptr[i + 1]] for i in part.own]
+    eliminated[part.own] = True
+    boundary = np.unique(np.concatenate(near)) if near else part.own
+    part.boundary = boundary[~eliminated[boundary]].astype(np.int64)
+
+
+_LARGE = 100_000  # Numbers in a matrix from which on it may be kept in a file
 _Update = tuple[NDArray[np.int64], NDArray[np.float64]]  # unknowns, and what is added to them
 
 
 @dataclass(frozen=True, eq=False)
 class _Stored:
-    """A matrix, in memory or in a file."""
-
     matrix: NDArray[np.floating]  # empty if in a file
     file: FileIO | None
     place: int  # where in the file it begins
@@ -238,8 +283,8 @@ class _Elimination:
         return _Stored.put(matrix.astype(self._precision), self._file)
 
     def _assembled(
-        self, own: NDArray[np.int64], around: NDArray[np.int64], updates: list[_Update]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        self, own: NDArray, around: NDArray, updates: list[_Update]
+    ) -> tuple[NDArray, NDArray, NDArray]:
         """The blocks own-own, own-around and around-around, with the updates from below."""
         stiffness = np.zeros((len(own), len(own)))
         side = np.zeros((len(own), len(around)))
@@ -283,9 +328,7 @@ class _Factor:
         """Own unknowns under forces on them, those around at rest."""
         return self._rest(*self._halves(right))
 
-    def _halves(
-        self, right: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _halves(self, right: NDArray) -> tuple[NDArray, NDArray]:
         upper = _forward(self._factor, right[: self._moves])
         lower = self._side.T @ upper
         lower -= right[self._moves :]

@@ -1,7 +1,8 @@
 """A box of tetrahedra whose faces follow closed surfaces in it, by the mesher fTetWild.
 
 Surfaces may reach beyond the box, which cuts them. Nodes on the box's faces lie in them exactly.
-fTetWild makes a somewhat different mesh in every run.
+fTetWild makes a somewhat different mesh in every run. A surface of few flat triangles, within a
+tolerance of a round one, encloses too little: `with_inside_volume` corrects that.
 """
 
 from __future__ import annotations
@@ -20,17 +21,15 @@ from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_faces import boundary_triangles
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.tissue.mesh import wild_mesher
-from us_sim.tissue.mesh.repair import repair
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, repair, signed_volumes
 
-_SECONDS = 300.0
-"""After which fTetWild is given up; meshes of some thousand nodes take it seconds."""
-
+_SECONDS = 300.0  # After which fTetWild is given up; meshes of some thousand nodes take it seconds
+# Size of all over the longest edge asked for: fTetWild begins with a grid that reaches as far
+# beyond the box as an edge is long, and joins its tetrahedra where they may be longer at the end.
 _LONGEST = 10.0
-"""Size of all over the longest edge asked for: fTetWild begins with a grid that reaches as far
-beyond the box as an edge is long, and joins its tetrahedra where they may be longer at the end."""
-
+# Triangles of a box whose corner is 4 (x is high) + 2 (y is high) + (z is high).
 _BOX = np.array(
     [
         *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
@@ -38,7 +37,6 @@ _BOX = np.array(
     ],
     dtype=np.int32,
 )
-"""Triangles of a box whose corner is 4 (x is high) + 2 (y is high) + (z is high)."""
 
 _GRID = "`mesh: grid` in the case, `kind: grid` in a scene's tissue.mesh"
 
@@ -112,7 +110,6 @@ def conforming_mesh(
 
 
 def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """What fTetWild makes of it, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder).resolve()
         given, made = place / "given.npz", place / "made.npz"
@@ -140,12 +137,7 @@ def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], N
             return stored["nodes"].astype(np.float64), stored["tetrahedra"].astype(np.int32)
 
 
-def _within(
-    box: NDArray[np.float64],
-    nodes: NDArray[np.float64],
-    tetrahedra: NDArray[np.int32],
-    tolerance: float,
-) -> TetrahedralMesh:
+def _within(box: NDArray, nodes: NDArray, tetrahedra: NDArray, tolerance: float) -> TetrahedralMesh:
     """The tetrahedra in the box, with the nodes of its faces moved into them.
 
     Raises:
@@ -176,3 +168,48 @@ def _within(
     if abs(filled - 1.0) > 1e-6:
         raise MeshError(f"fTetWild filled {100 * filled:.4g} % of the box: say {_GRID}")
     return mesh
+
+
+_STEPS = 3
+_HALVINGS = 4
+_LEFT = 0.2  # Part of a tetrahedron's volume that it keeps in one step
+
+
+def with_inside_volume(
+    mesh: TetrahedralMesh, inside: NDArray[np.bool_], volume: float
+) -> TetrahedralMesh:
+    """The mesh with its interface moved alike along its normals until a part has a volume.
+
+    Nodes on the faces of the mesh's bounding box stay in them. Where tetrahedra are too flat for
+    all of the way, some of it is gone.
+
+    Args:
+        mesh: of a box.
+        inside: (M,) the tetrahedra of the part.
+        volume: m³, that they should have together.
+    """
+    nodes = mesh.nodes.copy()
+    on_face = [nodes == bound for bound in (nodes.min(axis=0), nodes.max(axis=0))]
+    triangles = boundary_triangles(mesh.tetrahedra[inside])
+    cap = np.zeros(len(triangles), dtype=bool)
+    for on in on_face:
+        cap |= on[triangles].all(axis=1).any(axis=1)
+    triangles = triangles[~cap]
+    if not len(triangles):
+        return mesh
+    moved = np.unique(triangles)
+    for _ in range(_STEPS):
+        before = signed_volumes(nodes, mesh.tetrahedra)
+        a, b, c = (nodes[triangles[:, corner]] for corner in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
+        normals = np.zeros_like(nodes)
+        normals[moved] = vertex_normals(nodes, triangles)[moved]
+        normals[on_face[0] | on_face[1]] = 0.0
+        step = (volume - before[inside].sum()) / area
+        for _ in range(_HALVINGS):
+            tried = nodes + step * normals
+            if (signed_volumes(tried, mesh.tetrahedra) > _LEFT * before).all():
+                nodes = tried
+                break
+            step /= 2.0
+    return TetrahedralMesh(nodes, mesh.tetrahedra)

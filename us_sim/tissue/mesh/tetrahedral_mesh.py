@@ -1,28 +1,216 @@
-"""Tetrahedral meshes of soft tissue, and the regular box mesh of the paper (section VI).
-
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
->>> mesh = box_mesh(
-...     uniform_planes(-0.1, 0.1, 20), uniform_planes(-0.05, 0.05, 10), uniform_planes(0, 0.1, 10)
-... )
->>> len(mesh.nodes), len(mesh.tetrahedra)
-(2000, 7695)
->>> f"{mesh.volumes.sum():.6f} m3"
-'0.002000 m3'
-"""
+"""Tetrahedral meshes: boxes made here, checks that solvers rely on, repair, and settings."""
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.connected_parts import connected_parts
-from us_sim.geometry.mesh_faces import boundary_faces, boundary_triangles
-from us_sim.tissue.mesh.check import EDGES, check_mesh, signed_volumes
+from us_sim.geometry.mesh_faces import (
+    FACES,
+    MOST_NODES,
+    boundary_faces,
+    boundary_triangles,
+    connected_parts,
+    face_order,
+)
+from us_sim.geometry.pose import PLACE, Placement
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.settings.spelling import counted
 
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # the six edges of a tetrahedron
+_FARTHEST = 1e6  # Largest coordinate of a body, m; beyond it volumes would overflow
+# Below this fraction of its longest edge cubed a tetrahedron's volume is rounding noise.
+_SMALLEST_VOLUME = 1e-9
+
+
+def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
+    """Refuse what no solver could work on; disconnected parts are allowed.
+
+    Args:
+        nodes: (N, 3) m.
+        tetrahedra: (M, 4) indices into nodes.
+
+    Raises:
+        MeshError: wrong shapes, nodes that are not finite, indices out of range, nodes that no
+            tetrahedron uses or that lie on one another, tetrahedra that are flat, inverted or
+            repeated, faces of more than two tetrahedra, tetrahedra that overlap a neighbour, or
+            parts that hang together by a node or an edge only. It says how many, and where one is.
+    """
+    check_arrays(nodes, tetrahedra)
+    used = np.zeros(len(nodes), dtype=bool)
+    used[tetrahedra] = True
+    if not used.all():
+        idle = np.flatnonzero(~used)
+        raise MeshError(
+            f"{counted(len(idle), 'mesh node belongs', 'mesh nodes belong')} to no tetrahedron, "
+            f"such as node {idle[0]}: remove them, or call `repair`"
+        )
+    _check_places(nodes)
+    _check_volumes(nodes, tetrahedra)
+    _check_faces(tetrahedra)
+
+
+def check_arrays(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
+    """Refuse arrays that say nothing about a mesh, whatever is wrong with the mesh itself.
+
+    Raises:
+        MeshError: wrong shapes or types, too many nodes, coordinates that are not finite or too
+            large, or indices out of range.
+    """
+    if nodes.ndim != 2 or nodes.shape[1] != 3:
+        raise MeshError(f"mesh nodes have shape {nodes.shape}: give (N, 3) coordinates")
+    if tetrahedra.ndim != 2 or tetrahedra.shape[1] != 4 or tetrahedra.shape[0] == 0:
+        raise MeshError(f"tetrahedra have shape {tetrahedra.shape}: give (M, 4) indices, M > 0")
+    if not np.issubdtype(tetrahedra.dtype, np.integer):
+        raise MeshError(f"tetrahedra are of type {tetrahedra.dtype}: give integer node indices")
+    if len(nodes) > MOST_NODES:
+        raise MeshError(
+            f"the mesh has {len(nodes)} nodes: give a coarser one, of {MOST_NODES} at most"
+        )
+    bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{counted(len(bad), 'mesh node is', 'mesh nodes are')} not finite, such as node "
+            f"{bad[0]} at {nodes[bad[0]].tolist()}: give every node three numbers"
+        )
+    bad = np.flatnonzero((np.abs(nodes) > _FARTHEST).any(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{counted(len(bad), 'mesh node is', 'mesh nodes are')} farther than {_FARTHEST:g} m "
+            f"away, such as node {bad[0]} at {nodes[bad[0]].tolist()}: give coordinates in metres"
+        )
+    if tetrahedra.min() < 0 or tetrahedra.max() >= len(nodes):
+        raise MeshError(
+            f"tetrahedra name nodes {tetrahedra.min()} to {tetrahedra.max()}, but the mesh "
+            f"has nodes 0 to {len(nodes) - 1}"
+        )
+
+
+def signed_volumes(
+    nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """(M,) m3, negative for an inverted tetrahedron."""
+    a, b, c, d = (nodes[tetrahedra[:, corner]] for corner in range(4))
+    b, c, d = b - a, c - a, d - a
+    x = c[:, 1] * d[:, 2] - c[:, 2] * d[:, 1]
+    y = c[:, 2] * d[:, 0] - c[:, 0] * d[:, 2]
+    z = c[:, 0] * d[:, 1] - c[:, 1] * d[:, 0]
+    return (b[:, 0] * x + b[:, 1] * y + b[:, 2] * z) / 6
+
+
+def _check_places(nodes: NDArray[np.float64]) -> None:
+    order = np.lexsort(nodes.T)
+    same = np.flatnonzero((nodes[order[1:]] == nodes[order[:-1]]).all(axis=1))
+    if len(same):
+        node, other = sorted((int(order[same[0]]), int(order[same[0] + 1])))
+        raise MeshError(
+            f"{counted(len(same), 'mesh node lies', 'mesh nodes lie')} exactly where another one "
+            f"lies, such as node {other} on node {node}: join them, or call `repair`"
+        )
+
+
+def _check_volumes(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
+    volumes = signed_volumes(nodes, tetrahedra)
+    longest = np.zeros(len(tetrahedra))
+    for one, other in EDGES:
+        along = nodes[tetrahedra[:, one]] - nodes[tetrahedra[:, other]]
+        np.maximum(longest, np.einsum("ij,ij->i", along, along), out=longest)
+    smallest = _SMALLEST_VOLUME * longest**1.5
+    for bad, what, remedy in (
+        (
+            np.flatnonzero(np.abs(volumes) <= smallest),
+            "flat",
+            "take out such tetrahedra, or move their nodes apart",
+        ),
+        (
+            np.flatnonzero(volumes < -smallest),
+            "inverted",
+            "order its nodes so that its volume is positive, or call `repair`",
+        ),
+    ):
+        if len(bad):
+            raise MeshError(
+                f"{counted(len(bad), 'tetrahedron is', 'tetrahedra are')} "
+                f"{what}, such as tetrahedron {bad[0]} (volume {volumes[bad[0]]:.3g} m3): {remedy}"
+            )
+
+
+def _check_faces(tetrahedra: NDArray[np.integer]) -> None:
+    """Whether tetrahedra meet face to face, two at a face, from its two sides."""
+    whole = np.sort(tetrahedra, axis=1).astype(np.int64)
+    order = np.lexsort((whole[:, 2] << 32 | whole[:, 3], whole[:, 0] << 32 | whole[:, 1]))
+    same = np.flatnonzero((whole[order[1:]] == whole[order[:-1]]).all(axis=1))
+    if len(same):
+        raise MeshError(
+            f"{counted(len(same), 'tetrahedron is', 'tetrahedra are')} repeated, such as "
+            f"tetrahedron {order[same[0] + 1]}, which has the nodes of tetrahedron "
+            f"{order[same[0]]}: keep each once, or call `repair`"
+        )
+    order, starts, counts = face_order(tetrahedra)
+    crowded = np.flatnonzero(counts > 2)
+    if len(crowded):
+        first = starts[crowded[0]]
+        several = (order[first : first + counts[crowded[0]]] // 4).tolist()
+        raise MeshError(
+            f"the mesh is not manifold: {counted(len(crowded), 'face belongs', 'faces belong')} "
+            f"to more than two tetrahedra, such as one of tetrahedra "
+            f"{', '.join(map(str, several))}: take out those that overlap"
+        )
+    paired = starts[counts == 2]
+    one, other = order[paired], order[paired + 1]
+    folded = np.flatnonzero(_turn(tetrahedra, one) == _turn(tetrahedra, other))
+    if len(folded):
+        raise MeshError(
+            f"{counted(len(folded), 'pair of tetrahedra lies', 'pairs of tetrahedra lie')} on the "
+            f"same side of the face they share, such as {one[folded[0]] // 4} and "
+            f"{other[folded[0]] // 4}: they overlap, mend the mesh"
+        )
+    _check_hinges(tetrahedra, one // 4, other // 4)
+
+
+def _turn(tetrahedra: NDArray[np.integer], numbers: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Whether faces name their nodes in an even permutation of ascending order."""
+    a, b, c = tetrahedra[numbers[:, None] // 4, FACES[numbers % 4]].T
+    return (a < b) ^ (b < c) ^ (a < c)
+
+
+def _check_hinges(tetrahedra: NDArray, one: NDArray, other: NDArray) -> None:
+    """Whether tetrahedra hang together by faces; the pairs (P,) and (P,) have one in common."""
+    body = connected_parts(len(tetrahedra), one, other)
+    bodies = int(body.max()) + 1
+    if bodies == 1:
+        return
+    nodes = tetrahedra.max() + 1
+    lowest = np.full(nodes, bodies)
+    highest = np.zeros(nodes, dtype=int)
+    np.minimum.at(lowest, tetrahedra.ravel(), np.repeat(body, 4))
+    np.maximum.at(highest, tetrahedra.ravel(), np.repeat(body, 4))
+    hinges = np.flatnonzero(lowest < highest)
+    if len(hinges):
+        node = hinges[0]
+        raise MeshError(
+            f"{bodies} parts of the mesh hang together by nodes or edges only, "
+            f"{counted(len(hinges), 'node', 'nodes')} in all, such as node {node} between "
+            f"tetrahedra {_with_node(tetrahedra, body == lowest[node], node)} and "
+            f"{_with_node(tetrahedra, body == highest[node], node)}: join such parts by faces, or "
+            f"give each its own nodes"
+        )
+
+
+def _with_node(tetrahedra: NDArray, among: NDArray, node: np.integer) -> np.intp:
+    return np.flatnonzero(among & (tetrahedra == node).any(axis=1))[0]
+
+
+# Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between.
 _FIVE = np.array(
     [
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -32,7 +220,6 @@ _FIVE = np.array(
         [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]],
     ]
 )
-"""Five tetrahedra of a cell, as corner offsets: four at alternate corners and the one between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +229,7 @@ class TetrahedralMesh:
     It may be in several parts that touch nowhere.
 
     Raises:
-        MeshError: as `us_sim.tissue.mesh.check.check_mesh`.
+        MeshError: as `check_mesh`.
     """
 
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient
@@ -131,3 +318,191 @@ def box_mesh(planes_x: ArrayLike, planes_y: ArrayLike, planes_z: ArrayLike) -> T
     mirrored = signed_volumes(nodes, tetrahedra) < 0
     tetrahedra[mirrored] = tetrahedra[mirrored][:, [0, 1, 3, 2]]
     return TetrahedralMesh(nodes, tetrahedra, tuple(planes))
+
+
+def repair(nodes: ArrayLike, tetrahedra: ArrayLike) -> tuple[TetrahedralMesh, tuple[str, ...]]:
+    """A mesh from nodes and tetrahedra that may be in disorder.
+
+    Nodes in exactly the same place become one, and tetrahedra that have no volume because of that,
+    repeated tetrahedra and unused nodes are left out. Inverted tetrahedra are turned. A tetrahedron
+    that was pulled inside out rather than written in another order overlaps its neighbours when it
+    is turned, and is refused.
+
+    Args:
+        nodes: (N, 3) m.
+        tetrahedra: (M, 4) indices into nodes.
+
+    Returns:
+        The mesh, and a sentence on each kind of repair; none where nothing was wrong.
+
+    Raises:
+        MeshError: nothing safe can be done about the rest, as
+            `check_mesh` says. Its numbers are those after the repair.
+    """
+    places = np.asarray(nodes, dtype=np.float64)
+    corners: NDArray[Any] = np.asarray(tetrahedra)
+    check_arrays(places, corners)
+    report = []
+
+    whole, joined = np.unique(places + 0.0, axis=0, return_inverse=True)
+    if len(whole) < len(places):
+        kept, first = np.unique(joined.reshape(-1), return_index=True)
+        order = np.argsort(first)  # nodes keep their order
+        number = np.empty(len(kept), dtype=np.int64)
+        number[order] = np.arange(len(kept))
+        corners = number[joined.reshape(-1)][corners]
+        report.append(
+            _said("joined", len(places) - len(whole), "node", "with another in its place")
+        )
+        places = places[np.sort(first)]
+
+    ordered = np.sort(corners, axis=1)
+    collapsed = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    _, once = np.unique(ordered, axis=0, return_index=True)
+    repeated = np.ones(len(corners), dtype=bool)
+    repeated[once] = False
+    for bad, what in ((collapsed, "that names a node twice"), (repeated & ~collapsed, "repeated")):
+        if bad.any():
+            report.append(_said("left out", bad.sum(), "tetrahedron", what))
+    corners = corners[~(collapsed | repeated)]
+
+    used, renumbered = np.unique(corners, return_inverse=True)
+    if len(used) < len(places):
+        left_out = len(places) - len(used)
+        report.append(_said("left out", left_out, "node", "that no tetrahedron uses"))
+        places, corners = places[used], renumbered.reshape(-1, 4)
+
+    inverted = signed_volumes(places, corners) < 0
+    if inverted.any():
+        corners = corners.astype(np.int32)
+        corners[inverted] = corners[inverted][:, [0, 1, 3, 2]]
+        report.append(_said("turned", inverted.sum(), "inverted tetrahedron"))
+    try:
+        return TetrahedralMesh(places, corners.astype(np.int32)), tuple(report)
+    except MeshError as error:
+        done = f" (after repair: {', '.join(report)})" if report else ""
+        raise MeshError(f"{error}{done}") from error
+
+
+def _said(verb: str, count: int, thing: str, how: str = "") -> str:
+    plural = thing.replace("tetrahedron", "tetrahedra") if "hedron" in thing else f"{thing}s"
+    if count > 1:
+        how = how.replace("names", "name").replace("its place", "their place")
+    return f"{verb} {count} {thing if count == 1 else plural} {how}".rstrip()
+
+
+# Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures.
+KINDS = ("grid", "conforming")
+_LEAST_NODES = 64
+_MOST_ALONG = 400
+
+
+@dataclass(frozen=True)
+class MeshSettings(Settings):
+    """A box of tetrahedra in ``patient``, or a mesh from a file."""
+
+    section = "mesh"
+    error = MeshError
+    alternatives = MappingProxyType(
+        {"file": ("unit", "pose", "margin"), "lower": ("upper", "nodes", "planes", "kind")}
+    )
+
+    lower: tuple[float, float, float] | None = setting(
+        PLACE, "corner of the box with the least x, y, z", default=None
+    )
+    upper: tuple[float, float, float] | None = setting(
+        PLACE, "corner of the box with the largest x, y, z", default=None
+    )
+    nodes: tuple[int, int, int] | int = setting(
+        Quantity("number", 2, 200_000),
+        "of the box along x, y, z; or how many it has at most, which are put close together under "
+        "the probe and where structures are thin",
+        default=(20, 10, 10),
+    )
+    planes: dict[str, tuple[float, ...]] = setting(
+        PLACE,
+        "coordinates of the box's nodes along x, y or z one by one, to put them where they count",
+        default_factory=dict,
+    )
+    kind: str = setting(
+        description="of the box: cells between planes, or tetrahedra whose faces follow the "
+        "structures' surfaces, which needs the extra `conforming` and one number of `nodes`",
+        choices=KINDS,
+        default="grid",
+    )
+    file: str | None = setting(
+        description="mesh in place of the box: Gmsh, VTK, or what else meshio reads",
+        default=None,
+        file=True,
+    )
+    unit: float = setting(
+        Quantity("length", 1e-9, 1e3), "length of a unit of the file", default=1.0
+    )
+    pose: Placement = setting(description="of the file's frame in `patient`", default=Placement())
+    margin: float | None = setting(
+        Quantity("length", 1e-6, 1.0),
+        "how near to a face of the file's bounding box a boundary node belongs to that face; not "
+        "given: a twentieth of the size along that axis",
+        default=None,
+    )
+
+    def check(self) -> None:
+        """A file, or a box whose corners and planes go together."""
+        box: dict[str, object] = {"lower": self.lower, "upper": self.upper}
+        box |= {"planes": self.planes or None, "kind": self.kind if self.kind != "grid" else None}
+        if self.file is not None:
+            for key, value in box.items():
+                if value is not None:
+                    raise self.refused("", f"has both `file` and `{key}`; keep one")
+            return
+        if self.lower is None or self.upper is None:
+            raise self.refused(
+                "lower" if self.lower is None else "upper",
+                "is missing; give the corners of a box, or a `file`",
+            )
+        if self.unit != 1.0 or self.pose != Placement() or self.margin is not None:
+            raise self.refused("", "`unit`, `pose` and `margin` are for a mesh from a `file` only")
+        if self.kind != "grid" and not isinstance(self.nodes, int):
+            raise self.refused(
+                "nodes",
+                f"must be one number, how many there are at most, where kind is {self.kind}",
+            )
+        if isinstance(self.nodes, int):
+            if self.planes:
+                raise self.refused(
+                    "nodes", "must be three numbers where `planes` say where the nodes are"
+                )
+            if self.nodes < _LEAST_NODES:
+                raise self.refused(
+                    "nodes", f"{self.nodes} make no box: give {_LEAST_NODES} or more"
+                )
+        elif max(self.nodes) > _MOST_ALONG:
+            raise self.refused(
+                f"nodes[{self.nodes.index(max(self.nodes))}]",
+                f"{max(self.nodes)} is outside 2 to {_MOST_ALONG}",
+            )
+        for name in self.planes:
+            if name not in ("x", "y", "z"):
+                raise self.refused("planes", f"unknown axis `{name}`; axes are x, y and z")
+        for axis, name in enumerate("xyz"):
+            lower, upper = self.lower[axis], self.upper[axis]
+            if lower >= upper:
+                raise self.refused(
+                    f"upper[{axis}]",
+                    f"{upper:g} m is not above tissue.mesh.lower[{axis}], {lower:g} m",
+                )
+            if name in self.planes and not isinstance(self.nodes, int):
+                self._check_planes(name, self.planes[name], lower, upper, self.nodes[axis])
+
+    def _check_planes(
+        self, axis: str, planes: tuple[float, ...], lower: float, upper: float, count: int
+    ) -> None:
+        if len(planes) < 2 or any(b <= a for a, b in itertools.pairwise(planes)):
+            raise self.refused(f"planes.{axis}", "needs two or more rising coordinates")
+        ends = zip((planes[0], planes[-1]), (lower, upper), strict=True)
+        if len(planes) != count or not all(math.isclose(a, b, abs_tol=1e-9) for a, b in ends):
+            raise self.refused(
+                f"planes.{axis}",
+                f"must be {count} coordinates from {lower:g} to {upper:g} m, as nodes, lower and "
+                f"upper say",
+            )

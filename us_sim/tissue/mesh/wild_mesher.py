@@ -12,8 +12,7 @@ import types
 
 import numpy as np
 
-_ROUNDS = 10
-"""Of optimization; further ones hardly better a mesh."""
+_ROUNDS = 10  # Of optimization; further ones hardly better a mesh
 
 
 def main(given: str, made: str) -> None:

@@ -19,7 +19,6 @@ displacement, and only the surface is solved to rounding.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -36,13 +35,11 @@ from us_sim.tissue.contact.compliant_contact import (
 )
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.deformation import Deformation, TissueState
-from us_sim.tissue.elasticity.averaged_pressure import averaged_pressure
-from us_sim.tissue.elasticity.tangling import count_inverted, watched_tetrahedra
-from us_sim.tissue.linear_algebra.compliance import surface_compliance
-from us_sim.tissue.linear_algebra.dense_fields import DenseFields
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
+from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
+from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
+from us_sim.tissue.linear_algebra.compliance import DenseFields, surface_compliance
+from us_sim.tissue.model import Deformation, TissueModel, TissueState
+from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver
 
 _ROUNDING = 1e-8
 """Rounding error of full fields, over the force, above which it is measured in every frame: where
@@ -98,7 +95,7 @@ class Fem(TissueSolver):
         self,
         model: TissueModel,
         settings: FemSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         settings = settings or FemSettings()
         self._compliance = surface_compliance(model, progress)
@@ -158,7 +155,7 @@ class Fem(TissueSolver):
             for _ in range(_EXTENSIONS):
                 if not contact.overlooked(pose, displacement[self._reached]):
                     break
-                solved = contact.press_again(pose)
+                solved = contact.solve(pose)
                 displacement = compliance.field(contact.forces)
             else:
                 solved = False

@@ -1,36 +1,24 @@
 """Large deformation of nearly incompressible tissue, in real time.
 
-Quasi-static: every frame the energy of `neo_hookean` and of a penalty contact is made least, by
-Newton's method with a line search (see `us_sim.tissue.solvers.newton`), from where the frame before
-ended. A new pose of the probe is met with the exact linear answer to it first (contact is a
-complementarity problem on the surface compliance). Friction and viscous tissue, where they are
-asked for, remember the frames before (see `us_sim.tissue.contact.penalty_contact` and
-`us_sim.tissue.elasticity.overstress`). What a frame's time does not allow for goes on
-in the next; under a probe at rest, until the forces balance. A tissue that is inside out is worked
-on but never shown.
+Quasi-static: every frame the energy of tissue and contact is made least, by Newton's method
+(`us_sim.tissue.solvers.newton`), from where the frame before ended. A new pose of the probe is met
+with the exact linear answer to it first (contact is a complementarity problem on the surface
+compliance). Friction and viscous tissue, where they are asked for, remember the frames before. What
+a frame's time does not allow for (`us_sim.tissue.solvers.frame_budget`) goes on in the next; under
+a probe at rest, until the forces balance. A tissue that is inside out is worked on but never shown.
 
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 >>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.block()
->>> solver = FemNonlinear(model)
+>>> solver = FemNonlinear(TissueModel.block())
 >>> for _ in range(20):
 ...     deformation = solver.deform(Pose(position=[0.0, 0.0, 0.02]))
 >>> deformation.residual <= 1e-5, deformation.action
 (True, '')
-
-What may be set of the solver ``fem_nonlinear``.
-
->>> from us_sim.tissue.solvers.fem_nonlinear import FemNonlinearSettings
->>> FemNonlinearSettings(frame_budget="8 ms").frame_budget
-0.008
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -39,21 +27,30 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import interpolate
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.complementarity import predict_forces
 from us_sim.tissue.contact.compliant_contact import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.elasticity.lumen import require_solid
-from us_sim.tissue.elasticity.overstress import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import PronyBranch
+from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
-from us_sim.tissue.mesh.check import signed_volumes
-from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.newton import Newton, strides
-from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver, same_pose
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
+from us_sim.tissue.solvers.frame_budget import FrameBudget
+from us_sim.tissue.solvers.newton import Newton
+from us_sim.tissue.solvers.solver import (
+    COUNT,
+    TOLERANCE,
+    Progress,
+    SolverSettings,
+    TissueSolver,
+    same_pose,
+)
+from us_sim.tissue.solvers.tuning import TUNING
 
 
 @dataclass(frozen=True)
@@ -113,52 +110,6 @@ class FemNonlinearSettings(SolverSettings):
     )
 
 
-__all__ = ["FemNonlinear", "FemNonlinearSettings"]
-
-
-_TOUCHING = 0.1
-"""Gap up to which a node may come to touch in one frame, over the tissue's smallest extent."""
-
-
-_RESTING = 30
-"""Frames of a probe at rest after which one may take longer than it should, if that is needed."""
-
-
-_SUNK = 10.0
-"""Change of what springs hold that settled tissue may still see, over the spacing of the nodes that
-the probe can touch, for a tolerance of 1."""
-
-
-_SINKS = 0.5
-"""Depth of the probe in the tissue, over that spacing, that is worth saying."""
-
-
-_APPROACHING, _SPENT = 0.7, 0.6
-"""Part of a frame's time, and of its iterations, after which no stride is begun any more."""
-
-
-_ANEW = 6
-"""How many times the iterations of other frames one may take that is begun anew from rest."""
-
-
-_STEP = 8
-"""What a step costs besides its iterations, in iterations."""
-
-
-_OVERTIME = 3.0
-"""How many times the time that a live simulation leaves a frame may take that is not in balance:
-tissue that is left behind is harder to balance than poses that were missed, and shows more."""
-
-
-_LOOSE, _STEPS = 0.2, 5
-"""Residual with which a stride ends, and the most steps that it may take."""
-
-
-_PATIENCE = 10
-"""Frames in a row that may end inside out before the tissue is begun anew from rest. None where
-time is short and the probe moves on: what is shown would stay behind ever farther."""
-
-
 class FemNonlinear(TissueSolver):
     """Stable neo-Hookean finite elements under a probe, by Newton's method.
 
@@ -189,7 +140,7 @@ class FemNonlinear(TissueSolver):
         self,
         model: TissueModel,
         settings: FemNonlinearSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         require_held(model.mesh, model.fixed)
         require_solid(model.mesh, model.materials)
@@ -197,15 +148,15 @@ class FemNonlinear(TissueSolver):
         super().__init__(model, settings, progress)
         self._surface = model.movable_contact_nodes
         smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
-        self._sunk = _SUNK * settings.tolerance * (model.contact_spacing or smallest)
-        self._sinks = _SINKS * (model.contact_spacing or smallest)
-        box = model.collider.offset_box
-        self._arm = math.hypot(box[0], box[1])
-        self._touching = _TOUCHING * smallest
+        spacing = model.contact_spacing or smallest
+        self._settled_motion = TUNING.settled_motion * settings.tolerance * spacing  # m
+        self._reported_depth = TUNING.reported_depth * spacing  # m
+        self._predicted_gap = TUNING.predicted_gap * smallest  # m
         laws = {"frictionless": 0.0, "coulomb": settings.friction, "sticking": math.inf}
         branch = PronyBranch(settings.viscosity, settings.relaxation_time, settings.frame_interval)
         self._newton = Newton(model, laws[settings.contact], branch if settings.viscosity else None)
-        self._upright = self._newton.displacement  # (3, N) m, the last that was
+        self._budget = FrameBudget()
+        self._recovery = Recovery(self._newton.displacement)
         if len(self._surface):
             self._compliance = surface_compliance(model, progress)
         self._restore(self.state)
@@ -213,11 +164,11 @@ class FemNonlinear(TissueSolver):
     @property
     def state(self) -> TissueState:
         """Where the tissue is; a quasi-static solver has no velocity."""
-        displacement = self._upright.T.copy()
+        displacement = self._recovery.upright.T.copy()
         return TissueState(displacement, np.zeros_like(displacement))
 
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Approximate: tissue as at rest, pushes that do not turn. Unknown with friction."""
+        """Approximate: tissue as at rest, forces that do not turn. Unknown with friction."""
         newton, contact = self._newton, self._newton.contact
         law = contact.slope, contact.gap, contact.normal
         gap, normal, softness = newton.points.nodal_springs(*law)
@@ -228,142 +179,149 @@ class FemNonlinear(TissueSolver):
             return None
         nodes = self._surface[pushed]
         # The springs of the contact and the tissue give way one after the other.
-        compliance = compliance_between(self._compliance.matrix, pushed) / self._stiffer
+        compliance = compliance_between(self._compliance.matrix, pushed) / self._stiffening
         across = normal[nodes, :, None] * normal[nodes, None, :]
         compliance += block_diag(*(softness[nodes, None, None] * across))
         return contact_stiffness(
             self.model.collider,
             self._pose,
             self.model.mesh.nodes[nodes] + newton.displacement.T[nodes],
-            newton.pushes[:, nodes].T,
+            newton.contact_forces[:, nodes].T,
             compliance,
             self.model.contact_spacing,
             (normal[nodes], np.zeros((len(nodes), 3, 3))),
         )
 
     @property
-    def _stiffer(self) -> float:
+    def _stiffening(self) -> float:
         """Stiffness within a frame, over the one that stays."""
         overstress = self._newton.overstress
         return 1.0 if overstress is None else 1.0 + overstress.stiffness
 
-    @property
-    def _has_relaxed(self) -> bool:
-        """Whether viscous tissue will not creep any more."""
-        overstress = self._newton.overstress
-        return overstress is None or overstress.load <= self.settings.tolerance * self._reference()
-
     def _restore(self, state: TissueState) -> None:
-        self._newton.rest()
-        self._heaviest = 0.0  # N, largest contact forces since rest; before there are, unbalanced
-        self._aimed: Pose | None = None  # the pose that the tissue is at or on its way to
-        self._still = 0  # frames in a row with the probe at rest
-        self._balanced = False  # whether the last frame's forces were
-        self._inverted = 0  # frames in a row that ended inside out
-        self._anew = False  # whether the tissue is begun anew, after such frames
+        self._newton.reset()
+        self._budget.reset()
+        self._greatest_norm = 0.0  # N, of contact forces since rest; before, of the residual
+        self._target: Pose | None = None  # the pose that the tissue is at or on its way to
+        self._was_balanced = False  # at the end of the last frame
         if state.displacement.any():
             displacement = np.ascontiguousarray(state.displacement.T)
             # The way out of tissue inside out may end in a minimum where it is folded over.
             if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
-                self._newton.put(displacement)
+                self._newton.set_displacement(displacement)
                 if self._newton.overstress is not None:
                     self._newton.overstress.forget(displacement)
-        self._upright = self._newton.displacement
+        self._recovery.reset(self._newton.displacement)
 
     def _rehearse(self) -> None:
         self._newton.rehearse()
 
     def _advance(self, pose: Pose | None) -> Deformation:
-        began = time.perf_counter()
-        newton, settings = self._newton, self.settings
+        newton, budget, settings = self._newton, self._budget, self.settings
+        moved = not same_pose(pose, self._target)
+        budget.begin(
+            settings.most_iterations,
+            settings.frame_budget,
+            self.frame_limit,
+            moved=moved,
+            restarted=self._recovery.take_restart(),
+        )
         newton.relax()
         if self._is_unloaded(pose):
             # Nothing reaches the undeformed tissue: it is the solution.
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
             return self._resting()
-        budget = settings.frame_budget or self.frame_limit
-        moved = not same_pose(pose, self._aimed)
-        goal = settings.frame_tolerance if moved else settings.tolerance
-        self._still = 0 if moved else self._still + 1
-        shifted, start, spent = np.inf, None, 0
+        motion, start = np.inf, None  # m, that updating the contact causes; guess of the first step
         if pose is None:
-            newton.lift()
-            self._aimed = None
+            newton.remove_probe()
+            self._target = None
         elif not moved:
-            shifted = newton.settle() if self._balanced else np.inf
+            motion = newton.update_contact() if self._was_balanced else np.inf
         elif len(self._surface):
-            spent = self._approach(pose, None if budget is None else began + _APPROACHING * budget)
-            start = self._predicted(pose)
-        hurried = budget is not None and self._still < _RESTING
-        newton.may_factor = newton.is_small or not (moved or hurried)
-        left = self._allowed() - spent
-        stuck, actions = False, []
-        while newton.imbalance > goal * self._reference() and left > 0 and not stuck:
-            enough, stepping = goal * newton.load if start is None else 0.0, time.perf_counter()
-            taken = newton.step(min(left, newton.patience), enough, start)
-            stuck = not taken and newton.is_stuck
-            left -= newton.used + _STEP
-            now = time.perf_counter()
-            if budget is not None and now - began > budget * self._overtime():
-                if now - stepping > budget and settings.frame_budget is not None:
-                    actions.append(
-                        f"frame_budget is {1e3 * budget:.3g} ms, but one step takes "
-                        f"{1e3 * (now - stepping):.2g} ms: give it more"
-                    )
-                break
+            self._approach(pose)
+            start = self._predict(pose)
+        newton.may_factor = newton.is_small or not (moved or budget.is_hurried)
+        actions: list[str] = []
+        tolerance = settings.frame_tolerance if moved else settings.tolerance
+        self._settled = self._solve(tolerance, start, actions)
+        self._was_balanced = not self._exceeds(settings.frame_tolerance)
+        return self._outcome(pose, motion, actions)
+
+    def _solve(
+        self, tolerance: float, start: NDArray[np.float64] | None, actions: list[str]
+    ) -> bool:
+        """Take Newton steps to a residual, or as far as the budget allows.
+
+        Args:
+            tolerance: the residual.
+            start: (3, N) m, a guess of the first step.
+            actions: to which problems are added.
+
+        Returns:
+            Whether no step leads any further.
+        """
+        newton, budget = self._newton, self._budget
+        while self._exceeds(tolerance) and budget.iterations_left > 0:
+            goal = tolerance * newton.contact_norm if start is None else 0.0
+            budget.begin_step()
+            limit = min(budget.iterations_left, newton.iteration_limit)
+            taken = newton.step(limit, goal, start)
+            budget.end_step(newton.iterations)
             start = None
-        self._balanced = newton.imbalance <= settings.frame_tolerance * self._reference()
-        if stuck:
-            actions.append(f"no step led any further: {self._obstacle()}")
-        self._settled = stuck
-        self._anew = False
-        return self._outcome(pose, shifted, actions, 0 if hurried else _PATIENCE)
+            stagnated = not taken and newton.has_stagnated
+            is_over = budget.is_over(balanced=not self._exceeds(self.settings.frame_tolerance))
+            if is_over and budget.is_shorter_than_a_step:
+                actions.append(
+                    f"frame_budget is {1e3 * (budget.time_limit or 0.0):.3g} ms, but one step "
+                    f"takes {1e3 * budget.step_time:.2g} ms: give it more"
+                )
+            if stagnated:
+                actions.append(f"no step lowers the energy any further: {self._obstacle()}")
+            if is_over or stagnated:
+                return stagnated
+        return False
 
-    def _allowed(self) -> int:
-        """Iterations that this frame may take, as `most_iterations` counts them."""
-        return self.settings.most_iterations * (_ANEW if self._anew else 2 if self._still else 1)
-
+    @property
     def _reference(self) -> float:
-        """N, what unbalanced forces are measured by."""
-        return self._newton.load or self._heaviest
+        """N, norm by which that of the residual is divided."""
+        return self._newton.contact_norm or self._greatest_norm
 
-    def _overtime(self) -> float:
-        """How many times its time a frame may take as it is now."""
-        balanced = self._newton.imbalance <= self.settings.frame_tolerance * self._reference()
-        return 1.0 if balanced or self.settings.frame_budget is not None else _OVERTIME
+    def _exceeds(self, tolerance: float) -> bool:
+        """Whether the residual is greater."""
+        return self._newton.residual_norm > tolerance * self._reference
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
         """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
         overstress = self._newton.overstress
-        if overstress is not None and np.abs(overstress.relaxed).max() > self._sunk:
+        if overstress is not None and np.abs(overstress.relaxed).max() > self._settled_motion:
             return False
         return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
 
-    def _approach(self, pose: Pose, end: float | None) -> int:
-        """Go most of a long way in strides, until a time (s): tissue that is hit or swept aside at
-        once may end elsewhere than if the probe had moved there. Returns the iterations spent, as
-        `most_iterations` counts them.
-        """
-        spent, most = 0, _SPENT * self._allowed()
-        last = self._aimed if self._newton.load > 0.0 else None
-        for nearer in strides(last, pose, self._newton.depth(pose), self._arm):
-            if spent > most or (end is not None and time.perf_counter() > end):
+    def _approach(self, pose: Pose) -> None:
+        """Go most of a long way in load steps, as far as the budget allows."""
+        newton, budget = self._newton, self._budget
+        last = self._target if newton.contact_norm > 0.0 else None
+        box = self.model.collider.offset_box
+        arm = math.hypot(box[0], box[1])
+        for nearer in load_steps(last, pose, newton.depth(pose), arm):
+            if not budget.allows_load_step:
                 break
-            start = self._predicted(nearer)
-            for k in range(_STEPS):
-                self._newton.step(self._newton.patience, 0.0, None if k else start)
-                spent += self._newton.used + _STEP
-                if self._newton.imbalance <= _LOOSE * self._newton.load:
+            start: NDArray[np.float64] | None = self._predict(nearer)
+            for _ in range(TUNING.load_step_newton_steps):
+                newton.step(newton.iteration_limit, 0.0, start)
+                budget.spend(newton.iterations)
+                start = None
+                if newton.residual_norm <= TUNING.load_step_tolerance * newton.contact_norm:
                     break
-        return spent
 
-    def _predicted(self, pose: Pose) -> NDArray[np.float64]:
-        """(3, N) m, aim at a new pose and return the linear answer to it."""
+    def _predict(self, pose: Pose) -> NDArray[np.float64]:
+        """(3, N) m, set a new pose and return the linear answer to it."""
         newton, contact, points = self._newton, self._newton.contact, self._newton.points
-        held, before = newton.pushes[:, self._surface].T.copy(), contact.push
-        newton.aim(pose)
-        self._aimed = pose
+        held = newton.contact_forces[:, self._surface].T.copy()
+        before = contact.normal_force
+        newton.set_pose(pose)
+        self._target = pose
         # As if each node had the springs of its points to itself.
         firm = np.where(contact.gap < 0.0, contact.stiffness, 0.0)
         gap, normal, softness = points.nodal_springs(firm, contact.gap, contact.normal)
@@ -371,22 +329,23 @@ class FemNonlinear(TissueSolver):
             self._compliance.matrix,
             gap[self._surface],
             normal[self._surface],
-            held / self._stiffer,
-            softness[self._surface] * self._stiffer,
-            self._touching,
+            held / self._stiffening,
+            softness[self._surface] * self._stiffening,
+            self._predicted_gap,
         )
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
         start = field.astype(np.float64)
         if self.settings.contact != "frictionless":
             along = np.einsum("ij,ij->i", contact.normal, points.moved(start))
-            newton.expect(np.where(before > 0.0, before, contact.push_at(contact.gap + along)))
+            predicted = contact.normal_force_at(contact.gap + along)
+            newton.set_friction_bound(np.where(before > 0.0, before, predicted))
         return start
 
     def _obstacle(self) -> str:
         """What holds up a tissue that cannot be balanced."""
         newton = self._newton
-        pulled = int(np.argmax(np.linalg.norm(newton.unbalanced, axis=0)))
+        pulled = int(np.argmax(np.linalg.norm(newton.residual, axis=0)))
         nodes = self.model.mesh.nodes + newton.displacement.T
         ratios = signed_volumes(nodes, self.model.mesh.tetrahedra) / self.model.mesh.volumes
         least = int(np.argmin(ratios))
@@ -395,37 +354,107 @@ class FemNonlinear(TissueSolver):
             "of its volume"
         )
 
-    def _outcome(
-        self, pose: Pose | None, shifted: float, actions: list[str], patience: int
-    ) -> Deformation:
-        newton, contact = self._newton, self._newton.contact
+    def _outcome(self, pose: Pose | None, motion: float, actions: list[str]) -> Deformation:
+        newton, recovery = self._newton, self._recovery
+        interventions = Intervention.NONE
         reached = newton.displacement
-        if newton.tissue.smallest_volume_ratio(reached) > 0.0:
-            self._upright, self._inverted = reached, 0
-        else:
-            self._inverted += 1
+        recovery.judge(reached, newton.tissue.smallest_volume_ratio(reached) > 0.0)
+        if recovery.inverted_frames:
             actions.append("still inside out, so the last upright state is shown")
-            newton.put(self._upright)
-        self._heaviest = max(self._heaviest, newton.load) or newton.imbalance
-        reference = self._reference()
-        residual = newton.imbalance / reference if reference else 0.0
-        sunk = -float(contact.gap.min(initial=np.inf))
-        if sunk > self._sinks:
-            actions.append(f"the probe is {1e3 * sunk:.2g} mm inside the tissue")
+            interventions |= Intervention.SHOWED_UPRIGHT
+            newton.set_displacement(recovery.upright)
+        self._greatest_norm = max(self._greatest_norm, newton.contact_norm) or newton.residual_norm
+        reference = self._reference
+        residual = newton.residual_norm / reference if reference else 0.0
+        depth = -float(newton.contact.gap.min(initial=np.inf))
+        if depth > self._reported_depth:
+            actions.append(f"the probe is {1e3 * depth:.2g} mm inside the tissue")
         nodes = self.model.mesh.nodes + newton.displacement.T
-        forces = newton.pushes[:, self.model.contact_nodes].T
+        forces = newton.contact_forces[:, self.model.contact_nodes].T
         pushed = forces.any(axis=1)
         touched, forces = self.model.contact_nodes[pushed], forces[pushed]
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[touched], forces)
-        if self._inverted == 0:
-            balanced = residual <= self.settings.tolerance and shifted <= self._sunk
-            self._settled = self._has_relaxed and (self._settled or balanced)
-        elif self._inverted > patience:
+        if not recovery.inverted_frames:
+            tolerance, overstress = self.settings.tolerance, newton.overstress
+            relaxed = overstress is None or overstress.load <= tolerance * reference
+            balanced = residual <= tolerance and motion <= self._settled_motion
+            self._settled = relaxed and (self._settled or balanced)
+        elif recovery.must_restart(hurried=self._budget.is_hurried):
             actions.append("begun anew from rest")
+            interventions |= Intervention.RESTARTED
             self._restore(TissueState.at_rest(len(nodes)))
-            self._anew = True
+            recovery.restarts = True
         else:
-            newton.put(reached)
-        return Deformation(nodes, touched, force, torque, residual, "; ".join(actions))
+            newton.set_displacement(reached)
+        return Deformation(
+            nodes,
+            touched,
+            force,
+            torque,
+            residual,
+            "; ".join(actions),
+            interventions=interventions,
+        )
+
+
+class Recovery:
+    """Keeps the last state of the tissue that was not inside out, and says when to begin anew.
+
+    Args:
+        displacement: (3, N) m, upright.
+    """
+
+    def __init__(self, displacement: NDArray[np.float64]) -> None:
+        self.reset(displacement)
+
+    def reset(self, displacement: NDArray[np.float64]) -> None:
+        """Go on from an upright displacement (3, N) m."""
+        self.upright = displacement  # (3, N) m
+        self.inverted_frames = 0  # in a row
+        self.restarts = False  # whether the next frame begins anew from rest
+
+    def judge(self, displacement: NDArray[np.float64], is_upright: bool) -> None:
+        """Take note of the displacement (3, N) m at the end of a frame."""
+        if is_upright:
+            self.upright, self.inverted_frames = displacement, 0
+        else:
+            self.inverted_frames += 1
+
+    def must_restart(self, *, hurried: bool) -> bool:
+        """Whether tissue that is inside out has had its time to come out."""
+        return self.inverted_frames > (0 if hurried else TUNING.inverted_frames)
+
+    def take_restart(self) -> bool:
+        """Whether this frame begins anew from rest; the next does not."""
+        restarts, self.restarts = self.restarts, False
+        return restarts
+
+
+def load_steps(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[Pose]:
+    """Poses on the way of a probe, so that tissue is swept aside and not left where it was hit.
+
+    >>> steps = load_steps(Pose(), Pose([0.0, 0.0, 0.008]), depth=0.008, arm=0.02)
+    >>> [f"{pose.position[2]:.4f}" for pose in steps]
+    ['0.0027', '0.0053']
+    >>> leap = load_steps(None, Pose([0, 0, 0.03]), depth=0.006, arm=0.02)
+    >>> [f"{pose.position[2]:.4f}" for pose in leap]
+    ['0.0270']
+
+    Args:
+        last: where the probe was, if it touched the tissue.
+        pose: where it is now.
+        depth: m, of that in the tissue as it is.
+        arm: m, from the probe's origin to the outermost of it, which turns move farthest.
+    """
+    length, most = TUNING.load_step, TUNING.most_load_steps
+    if last is not None:
+        turned = 2 * math.acos(min(1.0, abs(float(last.orientation @ pose.orientation))))
+        way = math.dist(last.position, pose.position) + arm * turned
+        count = math.ceil(way / length)
+        if count <= most:
+            return [interpolate(last, pose, k / count) for k in range(1, count)]
+    count = min(math.ceil(depth / length), most)
+    backs = [(1 - k / count) * depth for k in range(1, count)]
+    return [Pose(pose.position - x * pose.rotation[:, 2], pose.orientation) for x in backs]

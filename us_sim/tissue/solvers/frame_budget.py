@@ -1,4 +1,4 @@
-"""How long a frame of the tissue may take, so that the poses of a tracker are kept up with.
+"""The time and the iterations that a frame of ``fem_nonlinear`` may take.
 
 >>> from us_sim.tissue.solvers.frame_budget import frame_limit
 >>> f"{1e3 * frame_limit(sending=0.0005, cores=2):.1f} ms"
@@ -7,30 +7,106 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
 
-_PERIOD = 1 / 60
-"""s, between the poses of the trackers that are meant to be kept up with."""
+from us_sim.tissue.solvers.tuning import TUNING
 
-_SHARE, _LONELY_SHARE = 0.87, 0.5
-"""What one node may use of a period, the rest being for what else its core does: with two cores or
-more, and with one that all nodes share."""
 
-_LEAST = 0.002  # s
-_TRIES = 5
+class FrameBudget:
+    """Says when a frame has to end; whatever is left of it goes on in the next.
+
+    Args:
+        clock: s.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self.reset()
+
+    def reset(self) -> None:
+        """Count frames of a probe at rest anew."""
+        self._frames_at_rest = 0
+
+    def begin(
+        self,
+        iterations: int,
+        strict_limit: float | None = None,
+        live_limit: float | None = None,
+        *,
+        moved: bool,
+        restarted: bool = False,
+    ) -> None:
+        """Start the clock of a frame.
+
+        Args:
+            iterations: of conjugate gradients in a frame of a moving probe.
+            strict_limit: s, that no frame may exceed, in place of the following.
+            live_limit: s, for a simulation that has to keep up with its probe.
+            moved: whether the probe has.
+            restarted: whether the tissue begins anew from rest.
+        """
+        self._began = self._now = self._clock()
+        self._frames_at_rest = 0 if moved else self._frames_at_rest + 1
+        self._is_strict = strict_limit is not None
+        self.time_limit = strict_limit or live_limit
+        factor = TUNING.rest_factor if self._frames_at_rest else 1
+        self._allowed = iterations * (TUNING.restart_factor if restarted else factor)
+        self.iterations_left = self._allowed
+
+    @property
+    def is_hurried(self) -> bool:
+        """Whether the frame has a time limit that it must keep."""
+        return self.time_limit is not None and self._frames_at_rest < TUNING.rest_frames
+
+    @property
+    def allows_load_step(self) -> bool:
+        """Whether time and iterations are left for a load step and what follows it."""
+        spent = self._allowed - self.iterations_left
+        if spent > TUNING.load_step_iterations * self._allowed:
+            return False
+        limit = self.time_limit
+        return limit is None or self._clock() <= self._began + TUNING.load_step_time * limit
+
+    def spend(self, iterations: int) -> None:
+        """Take off the iterations of a Newton step, and what it costs besides."""
+        self.iterations_left -= iterations + TUNING.newton_step_cost
+
+    def begin_step(self) -> None:
+        """Begin to measure a Newton step."""
+        self._now = self._clock()
+
+    def end_step(self, iterations: int) -> None:
+        """As `spend`, with the time since `begin_step`."""
+        self.spend(iterations)
+        now = self._clock()
+        self.step_time, self._now = now - self._now, now
+
+    def is_over(self, *, balanced: bool) -> bool:
+        """Whether the frame's time is; a live frame that is not balanced has longer."""
+        if self.time_limit is None:
+            return False
+        factor = 1.0 if balanced or self._is_strict else TUNING.overtime
+        return self._now - self._began > self.time_limit * factor
+
+    @property
+    def is_shorter_than_a_step(self) -> bool:
+        """Whether the time limit that was set is shorter than the last Newton step took."""
+        return self._is_strict and self.step_time > (self.time_limit or math.inf)
 
 
 def frame_limit(sending: float, cores: int) -> float:
-    """s, that a frame may take.
+    """s, that a frame may take, so that poses at 60 Hz are kept up with.
 
     Args:
         sending: s, that it takes to send its result.
         cores: that the nodes of the simulation share.
     """
-    share = _SHARE if cores > 1 else _LONELY_SHARE
-    return max(share * _PERIOD - sending, _LEAST)
+    # Of a period one node may use so much; the rest is for what else its core does.
+    share = 0.87 if cores > 1 else 0.5
+    return max(share / 60 - sending, 0.002)
 
 
 def usable_cores() -> int:
@@ -39,9 +115,9 @@ def usable_cores() -> int:
 
 
 def shortest(work: Callable[[], object]) -> float:
-    """s, on the wall, of the shortest of a few runs of ``work``."""
+    """s, on the wall, of the shortest of five runs of ``work``."""
     times = []
-    for _ in range(_TRIES):
+    for _ in range(5):
         began = time.perf_counter()
         work()
         times.append(time.perf_counter() - began)

@@ -1,50 +1,35 @@
-"""Newton's method for the energy of tissue and contact together: every step lowers it.
+"""Mechanics of ``fem_nonlinear``: Newton's method for the energy of tissue and contact together.
 
-The energy is that of `neo_hookean` and of `penalty_contact`, where asked for also of
-`penalty_friction` and `overstress`. A step minimises its quadratic model, in which nodes come to
-touch and are let go as the displacement says, by conjugate gradients with the exact tangent; then a
-line search takes as much of it as lowers the energy itself. Where the tangent is indefinite or a
-step had to be cut, the model is made stiffer (K. Levenberg, A method for the solution of certain
-non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer again as steps succeed.
-The iterates may be inside out, which the energy allows for; whoever shows them has to wait.
+The energy is that of `neo_hookean` and `penalty_contact`, and of `overstress` for viscous tissue. A
+step minimises its quadratic model, in which points come to touch and are let go as the displacement
+says, by conjugate gradients with the exact tangent; then a line search takes as much of it as
+lowers the energy itself. Where the tangent is indefinite or a step had to be cut, the model is made
+stiffer (K. Levenberg, A method for the solution of certain non-linear problems in least squares, Q.
+Appl. Math. 2, 1944), and softer again as steps succeed. The iterates may be inside out, which the
+energy allows for; whoever shows them has to wait.
 
->>> import numpy as np
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.newton import Newton
 >>> newton = Newton(TissueModel.block(nodes=(5, 5, 5)))
->>> newton.aim(Pose(position=[0.0, 0.0, 0.005]))
->>> unbalanced, energy = newton.imbalance, newton.energy
+>>> newton.set_pose(Pose(position=[0.0, 0.0, 0.005]))
+>>> residual_norm, energy = newton.residual_norm, newton.energy
 >>> all(newton.step(20) for _ in range(6))
 True
->>> newton.imbalance < 1e-3 * unbalanced, newton.energy < energy
+>>> newton.residual_norm < 1e-3 * residual_norm, newton.energy < energy
 (True, True)
-
-Poses on the way of a probe, so that tissue is swept aside and not left where it was hit.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.solvers.newton import strides
->>> [pose.position.tolist() for pose in strides(Pose(), Pose([0.0, 0.0, 0.008]), 0.008, arm=0.02)]
-[[0.0, 0.0, 0.0026666666666666666], [0.0, 0.0, 0.005333333333333333]]
->>> [f"{pose.position[2]:.3f}" for pose in strides(None, Pose([0, 0, 0.03]), 0.006, arm=0.02)]
-['0.027']
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import interpolate
 from us_sim.tissue.contact.surface_points import add_springs, add_turns, surface_contact
-from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.elasticity.overstress import Overstress, PronyBranch
-from us_sim.tissue.linear_algebra.coarse_grid import CoarseGrid
-from us_sim.tissue.linear_algebra.factored_stiffness import FactoredStiffness
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean, Overstress, PronyBranch
+from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
+    CoarseGrid,
     Preconditioner,
     TwoLevel,
     add_blocks,
@@ -53,42 +38,7 @@ from us_sim.tissue.linear_algebra.two_level import (
     largest_local_eigenvalue,
 )
 from us_sim.tissue.model import TissueModel
-
-_SINGLE_CONTRAST = 1e4
-"""Ratio of Young's moduli beyond which rounding in single precision hides the softer forces."""
-
-_SINGLE_BULK = 1e3
-"""Bulk over shear modulus beyond which rounding in single precision hides the shear's forces."""
-
-_LEAST_PATIENCE = 12
-"""Iterations of the first step: solved further, a step after a large change overshoots. Those after
-it may take twice as many as long as steps need not be cut."""
-
-_SMALL = 500
-"""Free nodes up to which a factor of the stiffness takes no longer than a frame."""
-
-_MOST_PATIENCE, _MOST_PATIENCE_SMALL = 100, 45
-"""Iterations beyond which a factor of the stiffness takes less time, the latter up to that size."""
-
-_BACKTRACKS = 8
-"""Step lengths that are tried, each half the last."""
-
-_FORCING, _AIM = 0.2, 0.3
-"""A step ends when its model's unbalanced forces have fallen to this fraction, or to this fraction
-of the goal. Lower is no use: the next step has a new tangent."""
-
-_SEGMENT = 12
-"""Iterations after which the model looks anew which nodes touch; then twice as many."""
-
-_ROUNDING = 1e-12
-"""Fraction of the energy by which rounding may seem to raise it."""
-
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.01, 0.001, 1e3
-"""Stiffness added after a step that was cut, over the tissue's own at rest; and its range."""
-
-_LOCAL_WEIGHT = 12.0
-"""Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
-stiffness at rest; 1 to 25 were tried."""
+from us_sim.tissue.solvers.tuning import TUNING
 
 
 class Newton:
@@ -100,19 +50,26 @@ class Newton:
         branch: of viscous tissue.
     """
 
+    energy: float  # J, of tissue and contact
+    contact_forces: NDArray[np.float64]  # (3, N) N, on the nodes
+    contact_norm: float  # N, of those on free nodes
+    residual: NDArray[np.float64]  # (3, N) N, slope of the energy; zero at fixed nodes
+    residual_norm: float  # N
+    iterations: int  # of the last step
+
     def __init__(
         self, model: TissueModel, friction: float = 0.0, branch: PronyBranch | None = None
     ) -> None:
         self._model = model
         self._factored: FactoredStiffness | None = None  # made where it is first needed
         #: Whether a factor takes no longer than a frame.
-        self.is_small = int((~model.fixed).sum()) <= _SMALL
-        self._most_patience = _MOST_PATIENCE_SMALL if self.is_small else _MOST_PATIENCE
+        self.is_small = int((~model.fixed).sum()) <= TUNING.small_tissue
         #: Whether a step may take the time to factor the stiffness.
         self.may_factor = False
         mesh, modulus = model.mesh, model.materials.young_modulus
         bulk = 1 / (1 - 2 * model.materials.poisson_ratio.max())  # lambda + mu over mu
-        single = modulus.max() <= _SINGLE_CONTRAST * modulus.min() and bulk <= _SINGLE_BULK
+        single = modulus.max() <= TUNING.single_contrast * modulus.min()
+        single &= bulk <= TUNING.single_bulk
         self._dtype: type[np.floating] = np.float32 if single else np.float64
         self.tissue = NeoHookean(mesh, model.materials, np.float64)
         # Conjugate gradients only correct; what they correct is in double precision.
@@ -120,33 +77,35 @@ class Newton:
         self._fixed = np.flatnonzero(model.fixed)
         self.overstress: Overstress | None = None
         if branch is not None:
-            single = NeoHookean(mesh, model.materials, self._dtype)
-            self.overstress = Overstress(branch, self.tissue, single)
+            tangent = NeoHookean(mesh, model.materials, self._dtype)
+            self.overstress = Overstress(branch, self.tissue, tangent)
         stiffened = self.overstress.stiffened if self.overstress else None
         product = stiffened or self.tissue.tangent_product
         grid = CoarseGrid(mesh, model.fixed, product, self._dtype)
         rest = self.tissue.diagonal_blocks()
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         most = largest_local_eigenvalue(rest, self.tissue.tangent_product, self._fixed)
-        self._two_level = TwoLevel(grid, self._fixed, _LOCAL_WEIGHT / most)
+        self._two_level = TwoLevel(grid, self._fixed, TUNING.local_weight / most)
         self.points, self.contact = surface_contact(model, friction)
         self.displacement = np.zeros((3, len(mesh.nodes)))  # m
-        self._force = np.zeros_like(self.displacement)  # N, the slope of the tissue's energy
-        self.rest()
+        self._tissue_forces = np.zeros_like(self.displacement)  # N, slope of the tissue's energy
+        self.reset()
 
-    def rest(self) -> None:
+    def reset(self) -> None:
         """Put the tissue to rest: undeformed, and touched nowhere."""
         self.displacement = np.zeros_like(self.displacement)
-        self._places = self.points.rest  # (P, 3) m, where the points near the probe are
+        self._positions = self.points.rest  # (P, 3) m, of the points near the probe
         self.contact.clear()
-        self._carried = 0.0  # N, contact forces of that state, until a step is taken from there
-        self._held = self.contact.push  # (P,) N, pushes of the last state that was not just hit
+        # N, contact forces before the pose was set, until a step is taken from there
+        self._carried_norm = 0.0
+        # (P,) N, normal forces of the last state that was not just hit
+        self._carried_force = self.contact.normal_force
         if self.overstress is not None:
             self.overstress.forget(self.displacement)
         self._damping = 0.0
-        self.patience = _LEAST_PATIENCE  # iterations that the next step may take
-        self._factors = False  # whether factors have been needed since
-        self._weigh()
+        self.iteration_limit = TUNING.first_iteration_limit  # of the next step
+        self._needs_factor = False  # whether a step since has needed more iterations than allowed
+        self._assemble()
 
     def depth_at_rest(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the undeformed tissue."""
@@ -156,91 +115,89 @@ class Newton:
         """How deep (m) a probe would be in the tissue as it is."""
         return self.contact.depth(pose, self.points.placed(self.displacement))
 
-    def aim(self, pose: Pose) -> None:
-        """Put the probe at a pose, and weigh the forces; nothing moves."""
-        self._held = self.contact.push
-        self._carried = self.load
-        self._places = self.points.placed(self.displacement)
-        self.contact.aim(pose, self._places)
-        self._damping = _DAMPING
-        self.patience = _LEAST_PATIENCE
-        self._press()
+    def set_pose(self, pose: Pose) -> None:
+        """Put the probe at a pose; nothing moves."""
+        self._carried_force = self.contact.normal_force
+        self._carried_norm = self.contact_norm
+        self._positions = self.points.placed(self.displacement)
+        self.contact.set_pose(pose, self._positions)
+        self._damping = TUNING.damping
+        self.iteration_limit = TUNING.first_iteration_limit
+        self._assemble_contact()
 
-    def lift(self) -> None:
-        """Take the probe away, and weigh the forces; nothing moves."""
+    def remove_probe(self) -> None:
+        """Take the probe away; nothing moves."""
         self.contact.clear()
-        self._held = self.contact.push
+        self._carried_force = self.contact.normal_force
         self._damping = 0.0
-        self._press()
+        self._assemble_contact()
 
     def relax(self) -> None:
-        """Let the time from frame to frame pass; nothing moves."""
+        """Let the time from frame to frame pass for viscous tissue; nothing moves."""
         if self.overstress is not None:
             self.overstress.relax(self.displacement)
-            self._weigh()
+            self._assemble()
 
-    def settle(self) -> float:
-        """End a frame with the probe at rest; returns by how much tissue may move for it, m."""
-        change = self.contact.settle()
-        self._places = self.points.placed(self.displacement)
-        if self.contact.release(self._places):
+    def update_contact(self) -> float:
+        """Update friction and the direction of contact forces at the end of a frame.
+
+        Returns:
+            m, by how much tissue may move for it; infinite where that is not known.
+        """
+        change = self.contact.update_friction()
+        self._positions = self.points.placed(self.displacement)
+        if self.contact.drop_planes(self._positions):
             change = np.inf
-        self._press()
+        self._assemble_contact()
         return change
 
-    def expect(self, push: NDArray[np.float64]) -> None:
-        """Learn which pushes (P,) N on the surface are likely at the pose; nothing moves."""
-        if self.contact.expect(push):
-            self._press()
+    def set_friction_bound(self, normal_force: NDArray[np.float64]) -> None:
+        """Bound friction by normal forces (P,) N that are likely at the pose; nothing moves."""
+        if self.contact.set_friction_bound(normal_force):
+            self._assemble_contact()
 
-    def put(self, displacement: NDArray[np.float64]) -> None:
+    def set_displacement(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
         self._move(displacement)
-        self._weigh()
+        self._assemble()
 
     def _move(self, displacement: NDArray[np.float64]) -> None:
-        """Let the tissue be there, and measure the gaps to the probe."""
         self.displacement = displacement
-        self._places = self.points.placed(displacement, self.contact.near)
-        self.contact.look(self._places)
+        self._positions = self.points.placed(displacement, self.contact.near)
+        self.contact.update_gaps(self._positions)
 
-    def _weigh(self, energy: float | None = None) -> None:
-        """The energy, unless `_energy` has just been asked for it, and its slope."""
-        self.energy = self._energy() if energy is None else energy  # J
+    def _assemble(self, energy: float | None = None) -> None:
+        """Energy, unless `_evaluate` has just been asked for it, and residual."""
+        self.energy = self._evaluate() if energy is None else energy
         if self.overstress is not None:
-            self.overstress.add_forces(self.displacement, self._force)
-        self._press(self.energy)
+            self.overstress.add_forces(self.displacement, self._tissue_forces)
+        self._assemble_contact(self.energy)
 
-    def _press(self, energy: float | None = None) -> None:
-        """As `_weigh`, where only the contact has changed."""
+    def _assemble_contact(self, energy: float | None = None) -> None:
+        """As `_assemble`, where only the contact has changed."""
         contact = self.contact
-        self.energy = self._inner + contact.energy if energy is None else energy
-        self.pushes = np.zeros_like(self._force)  # (3, N) N, contact forces on the nodes
-        self.points.add(contact.force, self.pushes, contact.near)
-        self._slope = self._force - self.pushes
-        clear_nodes(self._slope, self._fixed)
-        self.imbalance = float(np.linalg.norm(self._slope))  # N, of the unbalanced forces
-        moving = self.pushes.copy()
-        clear_nodes(moving, self._fixed)
-        self.load = float(np.linalg.norm(moving))  # N, of the contact forces
+        self.energy = self._tissue_energy + contact.energy if energy is None else energy
+        self.contact_forces = np.zeros_like(self._tissue_forces)
+        self.points.add(contact.force, self.contact_forces, contact.near)
+        self.residual = self._tissue_forces - self.contact_forces
+        clear_nodes(self.residual, self._fixed)
+        self.residual_norm = float(np.linalg.norm(self.residual))
+        free = self.contact_forces.copy()
+        clear_nodes(free, self._fixed)
+        self.contact_norm = float(np.linalg.norm(free))
 
-    def _energy(self) -> float:
-        """J, of tissue and contact at the displacement; finds the tissue's forces there too."""
-        self._inner = self.tissue.energy_and_forces(self.displacement, self._force)
+    def _evaluate(self) -> float:
+        """J, energy at the displacement; finds the tissue's forces there too."""
+        self._tissue_energy = self.tissue.energy_and_forces(self.displacement, self._tissue_forces)
         if self.overstress is not None:
-            self._inner += self.overstress.energy(self.displacement)
-        return self._inner + self.contact.energy
+            self._tissue_energy += self.overstress.energy(self.displacement)
+        return self._tissue_energy + self.contact.energy
 
     def rehearse(self) -> None:
         """Take a step with a factor and with damping, as only some frames do."""
-        self._factors, self.may_factor, self._damping = True, True, _DAMPING
+        self._needs_factor, self.may_factor, self._damping = True, True, TUNING.damping
         self.step(2)
-        self.rest()
-
-    @property
-    def unbalanced(self) -> NDArray[np.float64]:
-        """(3, N) N, the energy's slope."""
-        return self._slope
+        self.reset()
 
     def step(
         self, iterations: int, goal: float = 0.0, start: NDArray[np.float64] | None = None
@@ -248,40 +205,42 @@ class Newton:
         """One Newton step with a line search.
 
         Args:
-            iterations: the most of the conjugate gradients.
-            goal: N, imbalance below which there is no need to go.
+            iterations: limit of the conjugate gradients.
+            goal: N, residual norm below which there is no need to go.
             start: (3, N) m, a guess of the step.
 
         Returns:
             Whether a step was taken; if not, the next will be shorter.
         """
-        change, curved = self._minimise_model(iterations, goal, start)
+        change, indefinite = self._minimise_model(iterations, goal, start)
         length = self._search(change)
-        self._carried = 0.0
+        self._carried_norm = 0.0
         if length > 0.0:
-            self._held = self.contact.push
+            self._carried_force = self.contact.normal_force
         if length < 1.0:
-            self.patience = _LEAST_PATIENCE
-        elif self.used >= iterations:
-            self.patience *= 2
-            if self.patience > self._most_patience and self.may_factor:
-                self._factors = True
-        if length < 1.0 or curved:
-            self._damping = min(max(4 * self._damping, _DAMPING), _MOST_DAMPING)
+            self.iteration_limit = TUNING.first_iteration_limit
+        elif self.iterations >= iterations:
+            self.iteration_limit *= 2
+            most = TUNING.small_iteration_limit if self.is_small else TUNING.iteration_limit
+            if self.iteration_limit > most and self.may_factor:
+                self._needs_factor = True
+        if length < 1.0 or indefinite:
+            raised = max(4 * self._damping, TUNING.damping)
+            self._damping = min(raised, TUNING.most_damping)
         else:
-            self._damping = self._damping / 4 if self._damping > _LEAST_DAMPING else 0.0
+            self._damping = self._damping / 4 if self._damping > TUNING.least_damping else 0.0
         return length > 0.0
 
     @property
-    def is_stuck(self) -> bool:
+    def has_stagnated(self) -> bool:
         """Whether even the shortest steps lead no further."""
-        return self._damping >= _MOST_DAMPING
+        return self._damping >= TUNING.most_damping
 
     def _minimise_model(
         self, iterations: int, goal: float, start: NDArray[np.float64] | None
     ) -> tuple[NDArray[np.float64], bool]:
         """The step (3, N) m, and whether the tangent was found to be indefinite."""
-        self.used = 0  # iterations
+        self.iterations = 0
         contact, points, tangent = self.contact, self.points, self._tangent
         tangent.linearise(self.displacement.astype(self._dtype))
         blocks = tangent.diagonal_blocks()
@@ -291,11 +250,12 @@ class Newton:
         if (overstress := self.overstress) is not None:
             blocks += self._dtype(overstress.stiffness) * self._rest_blocks
         # Just hit, points are pushed far more than they will be.
-        turned, turn = contact.turns(self._places, np.minimum(contact.push, self._held))
+        force = np.minimum(contact.normal_force, self._carried_force)
+        turned, turn = contact.geometric_stiffness(self._positions, force)
         bend = points.nodes[turned], points.weights[turned], -turn
 
         def elastic(change: NDArray, image: NDArray) -> None:
-            """The tangent without springs, of which there are more or fewer as nodes touch."""
+            """The tangent without springs, of which there are more or fewer as points touch."""
             tangent.tangent_product(change, image)
             if damping > 0.0:
                 add_blocks(self._rest_blocks, damping, change, image)
@@ -312,25 +272,25 @@ class Newton:
             product = np.empty(step.shape, self._dtype)
             elastic((step / scale).astype(self._dtype), product)
             image = scale * product.astype(np.float64)
-            self.used += 1
+            self.iterations += 1
             none = np.zeros_like(contact.normal)
             length = self._best_length(none, step, image, np.zeros_like(image))
             step *= length
             image *= length
-        enough: float | None = None
-        segment = _SEGMENT
+        tolerance: float | None = None  # N
+        interval = TUNING.contact_interval
         while True:
             moved = points.moved(step, contact.near)
-            left = -self._force - image
+            left = -self._tissue_forces - image
             points.add(contact.force_after(moved), left, contact.near)
             clear_nodes(left, self._fixed)
             size = float(np.linalg.norm(left))
-            if enough is None:
-                begun = max(size, self.imbalance * (start is None))
+            if tolerance is None:
+                begun = max(size, self.residual_norm * (start is None))
                 # Just hit, the forces are far more than they will be.
-                begun = min(begun, self._carried or begun)
-                enough = max(_FORCING * begun, _AIM * goal)
-            if size <= enough or self.used >= iterations:
+                begun = min(begun, self._carried_norm or begun)
+                tolerance = max(TUNING.forcing_term * begun, TUNING.goal_fraction * goal)
+            if size <= tolerance or self.iterations >= iterations:
                 return step, False
             active, directions, stiffness = contact.springs_after(moved)
             springs = points.nodes[active], points.weights[active], directions, stiffness
@@ -343,12 +303,12 @@ class Newton:
                 elastic,
                 self._preconditioner(blocks, *points.lumped(active, directions, stiffness)),
                 (left / size).astype(self._dtype),
-                min(iterations - self.used, segment),
-                enough / size,
+                min(iterations - self.iterations, interval),
+                tolerance / size,
                 pressed,
             )
-            self.used += solved.iterations
-            segment *= 2
+            self.iterations += solved.iterations
+            interval *= 2
             change = size * solved.solution.astype(np.float64)
             bent = size * solved.image.astype(np.float64)
             length = self._best_length(moved, change, bent, image)
@@ -368,11 +328,10 @@ class Newton:
         """How much of a change (3, N) m lowers the model's energy most, the points having moved by
         (P, 3) m; the tangent's products with the change and before it are (3, N) N.
         """
-        pull = -float(np.vdot(change, self._force + image))
+        pull = -float(np.vdot(change, self._tissue_forces + image))
         curvature = float(np.vdot(change, bent))
-        contact = self.contact
-        along = self.points.moved(change, contact.near)
-        return contact.length_along(moved, along, pull, curvature)
+        along = self.points.moved(change, self.contact.near)
+        return self.contact.length_along(moved, along, pull, curvature)
 
     def _preconditioner(
         self,
@@ -384,7 +343,7 @@ class Newton:
         """Of the tangent, whose blocks are (6, N) N/m, with springs: a factor where one is needed,
         there is time to make it, and it can be made.
         """
-        if self._factors and self.may_factor:
+        if self._needs_factor and self.may_factor:
             if self._factored is None:
                 self._factored = FactoredStiffness(self._model)
             if self._factored.prepare(self.displacement, nodes, directions, stiffness):
@@ -394,43 +353,16 @@ class Newton:
 
     def _search(self, change: NDArray[np.float64]) -> float:
         """Move by the largest fraction of the change that lowers the energy; returns it."""
-        start, energy, imbalance = self.displacement, self.energy, self.imbalance
-        bound = energy + _ROUNDING * abs(energy)
+        start, energy, residual_norm = self.displacement, self.energy, self.residual_norm
+        rounding = TUNING.energy_rounding * abs(energy)
         length = 1.0
-        for _ in range(_BACKTRACKS):
+        for _ in range(TUNING.backtracks):
             self._move(start + length * change)
-            tried = self._energy()
-            if tried <= bound:
-                self._weigh(tried)
-                if tried < energy - _ROUNDING * abs(energy) or self.imbalance < imbalance:
+            tried = self._evaluate()
+            if tried <= energy + rounding:
+                self._assemble(tried)
+                if tried < energy - rounding or self.residual_norm < residual_norm:
                     return length
             length /= 2
-        self.put(start)
+        self.set_displacement(start)
         return 0.0
-
-
-_STRIDE = 3e-3
-"""Way of a probe in tissue that is gone at once, m."""
-
-_MOST = 8
-"""Strides in a frame; a longer way is a leap."""
-
-
-def strides(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[Pose]:
-    """Poses on the way to one: from the last, or after a leap from before the tissue.
-
-    Args:
-        last: where the probe was, if it touched the tissue.
-        pose: where it is now.
-        depth: m, of that in the tissue as it is.
-        arm: m, from the probe's origin to the outermost of it, which turns move farthest.
-    """
-    if last is not None:
-        turned = 2 * math.acos(min(1.0, abs(float(last.orientation @ pose.orientation))))
-        way = math.dist(last.position, pose.position) + arm * turned
-        count = math.ceil(way / _STRIDE)
-        if count <= _MOST:
-            return [interpolate(last, pose, k / count) for k in range(1, count)]
-    count = min(math.ceil(depth / _STRIDE), _MOST)
-    backs = [(1 - k / count) * depth for k in range(1, count)]
-    return [Pose(pose.position - x * pose.rotation[:, 2], pose.orientation) for x in backs]

@@ -34,17 +34,19 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import Settings
-from us_sim.tissue.deformation import Deformation, TissueState
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
-from us_sim.tissue.model import TissueModel
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
+
+Progress = Callable[[float, str], None]
+"""Told the fraction done of what takes long, and what is being made."""
 
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
 TOLERANCE = Quantity("number", 1e-15, 1.0)
 """The residual at which a solver stops."""
 
-_PATIENCE = 5
+_FAILURES = 5
 """Frames in a row that may fail before the tissue is put to rest."""
 
 
@@ -86,7 +88,7 @@ class TissueSolver(ABC):
         self,
         model: TissueModel,
         settings: SolverSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,  # noqa: ARG002
+        progress: Progress | None = None,  # noqa: ARG002
     ) -> None:
         self.model = model
         self.settings = settings if settings is not None else self.Settings()
@@ -127,17 +129,20 @@ class TissueSolver(ABC):
 
     def _recovered(self, good: TissueState) -> Deformation:
         """The result in place of a frame that failed; the next one tries again."""
-        action = "the frame came out not finite or far away, so the last good state was kept"
         self._failures += 1
-        if self._failures < _PATIENCE:
+        if self._failures < _FAILURES:
+            action = "the frame came out not finite or far away, so the last good state was kept"
+            done = Intervention.KEPT_STATE
             self._restore(good)
         else:
-            self.reset()
             action = (
-                f"{_PATIENCE} frames came out not finite or far away, so the tissue was put to rest"
+                f"{_FAILURES} frames came out not finite or far away, so the tissue was put to rest"
             )
+            done = Intervention.PUT_TO_REST
+            self.reset()
         self._settled = False
-        return replace(self._last, action=action, has_failed=True, is_balanced=False)
+        done |= Intervention.FRAME_FAILED
+        return replace(self._last, action=action, interventions=done, is_balanced=False)
 
     def reset(self) -> None:
         """Back to the undeformed tissue, with no probe near."""
@@ -232,7 +237,7 @@ def create_solver(
     name: str,
     model: TissueModel,
     settings: SolverSettings | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
     **values: Any,
 ) -> TissueSolver:
     """A solver by the name that scenes and reports use.

@@ -1,6 +1,8 @@
-"""Boards whose photos calibrate a camera: ChArUco, a grid of ArUco markers, a chessboard.
+"""Calibration of a camera from photos of a ChArUco board, a grid of markers, or a chessboard.
 
->>> import cv2, numpy as np
+Zhang, "A flexible new technique for camera calibration" (2000), with OpenCV; with it goes how much
+the photos leave open.
+
 >>> from us_sim.tracking.calibration.camera import Board
 >>> board = Board("chessboard", 6, 5, 0.02)
 >>> squares = np.add.outer(np.arange(5), np.arange(6)) % 2 * 255
@@ -9,21 +11,6 @@
 >>> seen = board.find(photo)
 >>> len(seen), round(float(np.linalg.norm(seen.pixels[1] - seen.pixels[0])), 1)
 (20, 40.0)
-
-Camera calibration from photos of a board (Zhang 2000), with what the photos leave open.
-
->>> import numpy as np
->>> from scipy.spatial.transform import Rotation
->>> from us_sim.tracking.calibration.camera import BoardView
->>> from us_sim.tracking.calibration.camera import calibrate_camera
->>> board = 0.05 * np.stack([*np.indices((7, 5)), np.zeros((7, 5))], axis=-1).reshape(-1, 3)
->>> views = []
->>> for tilt in ([0.5, 0, 0], [0, 0.5, 0], [-0.4, 0.3, 0], [0.2, -0.6, 0.3]):
-...     seen = Rotation.from_rotvec(tilt).apply(board - [0.15, 0.1, 0]) + [0, 0, 0.35]
-...     pixels = 600 * seen[:, :2] / seen[:, 2:] + [320, 240]
-...     views.append(BoardView(np.float32(board), np.float32(pixels)))
->>> calibrate_camera(views, 640, 480).camera.matrix.round(1)[0]
-array([600.,   0., 320.])
 """
 
 from __future__ import annotations
@@ -228,7 +215,7 @@ class CameraCalibration:
 
     @property
     def note(self) -> str:
-        """What the photos leave open, in a sentence; empty when nothing."""
+        """A sentence on what the photos do not determine, or ""."""
         notes = []
         if self.rms > _GOOD_RMS * _scale(self.camera.width):
             notes.append(

@@ -1,27 +1,14 @@
-"""Point registration: the rigid transform between two lists of the same points.
+"""Point registration by landmarks, and their files: CSV with a header, and Plus' phantoms (XML).
 
 Horn (1987), Closed-form solution of absolute orientation, by singular values as Arun (1987) and
 Umeyama (1991) do, without scale. FRE is the fiducial, TRE the target registration error
 (Fitzpatrick 1998); the latter is measured by leaving each landmark out once.
 
->>> import numpy as np
 >>> from us_sim.tracking.calibration.landmarks import register_landmarks
 >>> phantom = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
 >>> found = register_landmarks(phantom, phantom[:, [1, 2, 0]] + 0.5)
 >>> found.pose.position
 array([0.5, 0.5, 0.5])
->>> found.fre < 1e-12
-True
-
-Named points in files: CSV with a header, and the phantom definitions of Plus (XML).
-
->>> import pathlib, tempfile
->>> from us_sim.tracking.calibration.landmarks import read_landmarks
->>> with tempfile.TemporaryDirectory() as folder:
-...     file = pathlib.Path(folder, "phantom.csv")
-...     _ = file.write_text("name,x,y,z\\nsternum,0.1,0,20 mm\\n")
-...     read_landmarks(file)
-{'sternum': array([0.1 , 0.  , 0.02])}
 """
 
 from __future__ import annotations
@@ -41,7 +28,7 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.text_file import read_bytes, read_text
+from us_sim.settings.text_files import read_bytes, read_text
 
 Array = NDArray[np.float64]
 

@@ -1,44 +1,8 @@
-"""Covariance of least squares whose errors come in clusters, such as all those at one wire.
-
-A wire is not quite where the phantom's drawing says, and neighbouring frames err alike, so a
-thousand sightings tell far less than a thousand independent ones. What is assumed instead is that
-errors of different clusters are independent; within one they may be related in any way. The
-estimate is the sandwich of Liang and Zeger (1986) with the correction for few clusters of Bell and
-McCaffrey (2002), known as CR2: residuals are smaller than errors where a cluster pulls the fit
-towards itself, and are made larger by as much (Pustejovsky and Tipton 2018, equation 11).
-
-The mean of 12 numbers in 4 clusters that are each constant is as certain as that of 4 numbers:
-
->>> import numpy as np
->>> from us_sim.tracking.calibration.pivot import clustered_covariance
->>> of_each = np.array([1.0, -1.0, 2.0, -2.0])
->>> residuals = np.repeat(of_each, 3)[:, None]
->>> covariance = clustered_covariance(np.ones((12, 1, 1)), residuals, np.repeat(np.arange(4), 3))
->>> np.allclose(covariance, of_each.var(ddof=1) / 4)
-True
-
-Landmarks that somebody touched: places where a stylus' tip stayed while it was tilted.
-
-As Plus' landmark detection has it: whoever touches a landmark pivots about it for a second, which
-tells it from a stylus that lies on the table.
-
->>> import numpy as np
->>> from scipy.spatial.transform import Rotation
->>> from us_sim.tracking.calibration.pivot import find_dwells
->>> times = 0.05 * np.arange(60)
->>> tips = np.outer(np.clip(times - 2.0, 0.0, None), [0.3, 0.0, 0.0])
->>> tilts = Rotation.from_euler("x", np.sin(times)[:, None]).as_matrix()
->>> [touched] = find_dwells(times, tips, tilts)
->>> touched.position, round(touched.start, 2)
-(array([0., 0., 0.]), 0.0)
-
-Pivot calibration: where a stylus' tip is, from poses while the tip stays in one place.
+"""Pivot calibration of a stylus, the landmarks it touches, and the covariance of clustered errors.
 
 A pose (R, p) of the body puts the tip t at R t + p, which is the same point c for all of them:
 [R  -I] [t; c] = -p, solved at once ("algebraic one-step", Yaniv 2015, Which pivot calibration?).
 
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.calibration.pivot import calibrate_pivot
 >>> tip, hole = np.array([0.0, 0.0, 0.15]), np.array([0.1, 0.2, 0.3])
 >>> turns = [Pose(orientation=[np.sin(a), np.cos(3 * a) - 1, 0, 4]) for a in range(20)]
@@ -93,7 +57,12 @@ def cluster_numbers(features: Sequence[str]) -> NDArray[np.intp]:
 def clustered_covariance(
     jacobian: NDArray[np.float64], residuals: NDArray[np.float64], clusters: NDArray[np.intp]
 ) -> NDArray[np.float64]:
-    """(P, P) covariance of parameters that minimise the sum of squares of residuals.
+    """Covariance (P, P) of parameters fitted by least squares, errors correlated within clusters.
+
+    The sandwich of Liang and Zeger (1986) with the correction for few clusters of Bell and
+    McCaffrey (2002), CR2 (Pustejovsky and Tipton 2018, equation 11). A wire is not quite where the
+    phantom's drawing says, and neighbouring frames err alike: a thousand sightings tell far less
+    than a thousand independent ones.
 
     Args:
         jacobian: (N, D, P) derivatives of each observation's D residuals to the parameters, which

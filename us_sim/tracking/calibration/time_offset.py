@@ -1,21 +1,10 @@
-"""Motion as one number over time, from positions of a body or images of a line.
-
->>> import numpy as np
->>> from us_sim.tracking.calibration.time_offset import signal_of_positions
->>> times = np.linspace(0, 1, 5)
->>> swing = signal_of_positions(times, np.outer([0.0, 1, 2, 1, 0], [0.03, 0.04, 0.0]))
->>> (swing.values - swing.values[0]).round(3)
-array([0.  , 0.05, 0.1 , 0.05, 0.  ])
-
-The offset between two clocks, from one motion that both recorded.
+"""The offset between two clocks, from one motion that both recorded as positions or as images.
 
 The offset with the largest normalised cross-correlation, to a part of a sample; its standard
 deviation by leaving out a tenth of the recording at a time (block jackknife, Künsch 1989), which
 holds for errors that are correlated in time too.
 
->>> import numpy as np
->>> from us_sim.tracking.calibration.time_offset import PositionSignal
->>> from us_sim.tracking.calibration.time_offset import find_time_offset
+>>> from us_sim.tracking.calibration.time_offset import PositionSignal, find_time_offset
 >>> def swing(t):
 ...     return np.sin(2 * t) + np.sin(3.1 * t + 0.2 * t**2)
 >>> tracker, video = np.arange(0, 10, 0.02), np.arange(1, 9, 0.085)

@@ -32,8 +32,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
 from us_sim.volume.sequences.transforms import split_transform_name
 
@@ -52,7 +51,7 @@ class _Written(Settings):
 
 @dataclass(frozen=True, eq=False)
 class TransformFile:
-    """A pose and what its file says of it."""
+    """A pose, and the frames, residuals and method that its file states."""
 
     pose: Pose  # of from_frame in to_frame
     from_frame: str
@@ -144,7 +143,7 @@ def write_transform(
 
 
 def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write what a calibration found as YAML, with the date.
+    """Write the result of a calibration as YAML, with the date.
 
     Raises:
         CalibrationError: the file exists already or cannot be written.

@@ -1,50 +1,10 @@
-"""The two poses of a plane that its perspective image leaves: IPPE.
+"""The pose of a body of markers from where its points are in one image.
 
-Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109 (2014).
+A plane has two poses in a perspective image: IPPE (Collins and Bartoli, "Infinitesimal plane-based
+pose estimation", IJCV 109, 2014) gives both, Gauss-Newton refines them, and the evidence of all
+images so far chooses one.
 
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.camera.markers import square
->>> from us_sim.tracking.camera.body_pose import plane_poses
->>> true = Pose([0.02, 0.01, 0.4], [1.0, 0.2, 0.1, 0.0])
->>> seen = true.apply(square(0.04))
->>> for rotation, position in plane_poses(square(0.04), seen[:, :2] / seen[:, 2:]):
-...     print(np.abs(rotation - true.rotation).max().round(6), position.round(4))
-0.0 [0.02 0.01 0.4 ]
-0.488948 [0.0195 0.0099 0.3999]
-
-Small systems of equations with a positive definite matrix, solved inside compiled loops.
-
->>> import numpy as np
->>> from us_sim.tracking.camera.body_pose import solve_definite
->>> right = np.array([6.0, 7.0])
->>> solve_definite(np.array([[4.0, 2.0], [2.0, 3.0]]), right), right
-(True, array([0.5, 2. ]))
-
-The choice between a plane's two poses, by the evidence of all images so far.
-
->>> import numpy as np
 >>> from us_sim.tracking.camera.body_pose import body_poses
->>> from us_sim.tracking.camera.model import CameraModel
->>> from us_sim.tracking.camera.markers import square
->>> from us_sim.tracking.camera.body_pose import PlaneAmbiguity
->>> from us_sim.geometry.pose import Pose
->>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]])
->>> true = Pose([0.0, 0.0, 1.5], [1.0, 0.0, 0.3, 0.0])  # a marker of 16 pixels
->>> seen = camera.project(true.apply(square(0.04)))
->>> poses, ambiguity = body_poses(camera, square(0.04), seen), PlaneAmbiguity(0.1)
->>> pose = ambiguity.chosen(poses, None)
->>> covariance = ambiguity.settled(poses, pose, None)
->>> [round(float(np.degrees(np.sqrt(np.trace(each[3:, 3:]))))) for each in (
-...     pose.covariance, covariance)]  # degrees, without and with the other pose
-[1, 16]
-
-A body's pose from where its points are in one image: both of a plane's two, refined.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.camera.body_pose import body_poses
->>> from us_sim.tracking.camera.model import CameraModel
 >>> from us_sim.tracking.camera.markers import square
 >>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]])
 >>> true = Pose([0.02, 0.01, 0.4], [1.0, 0.2, 0.1, 0.0])
@@ -97,7 +57,7 @@ def plane_poses(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve(points, rays, turns, shifts, errors):
-    """Fill in both rotations, positions and errors, infinite of what is no pose; whether there
+    """Fill in both rotations, positions and errors (infinite for no pose); return whether there
     are any.
     """
     count = len(points)
@@ -347,7 +307,7 @@ class PlaneAmbiguity:
         self._evidence = 0.0  # log likelihood ratio of the pose that is followed to the other
 
     def reset(self) -> None:
-        """Forget what was seen."""
+        """Forget all images."""
         self._evidence = 0.0
 
     def chosen(self, found: list[BodyPose], before: Pose | None) -> BodyPose:

@@ -1,9 +1,8 @@
-"""Corners of a marker where its four edges meet, each edge fitted to all pixels along it.
+"""Corners of markers and chessboards to a part of a pixel, fitted to all pixels along their edges.
 
 The gradients of a corner alone, which OpenCV's ``cornerSubPix`` uses, put a blurred corner about
 a fifth of a pixel inside the true one, by which a marker seems farther away than it is.
 
->>> import numpy as np
 >>> from us_sim.tracking.camera.corner_refinement import refined_corners
 >>> image = np.full((80, 80), 200, np.uint8)
 >>> image[20:60, 25:65] = 20
@@ -14,15 +13,6 @@ array([[24. , 19.5],
        [64.5, 19.5],
        [64.5, 59.5],
        [24. , 59.5]])
-
-Corners of a chessboard's squares, fitted to the pixels along the edges that cross there.
-
->>> import numpy as np
->>> from us_sim.tracking.camera.corner_refinement import refined_crossing
->>> image = np.full((60, 60), 20, np.uint8)
->>> image[:30, 30:] = image[30:, :30] = 200
->>> refined_crossing(image, np.array([31.0, 28.5]), np.eye(2), side=20.0, gap=5.0).round(2)
-array([29.5, 29.5])
 """
 
 from __future__ import annotations

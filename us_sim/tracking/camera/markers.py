@@ -1,33 +1,16 @@
-"""Fiducial markers: the dictionaries they are from, and where their corners are.
+"""Fiducial markers: their dictionaries, their corners, and a fit of a small marker's whole pattern.
+
+An edge of a small marker is too few pixels to fit by itself. So the pattern, which is known, is
+drawn as the camera would see it, and its homography, blur, greys and the light's slope across it
+are changed until image and drawing differ least: Gauss-Newton with steps composed onto the
+homography (Lucas and Kanade 1981; Baker and Matthews 2004, section 3). The residual tells whether
+all of the marker is in view.
 
 >>> from us_sim.tracking.camera.markers import dictionary, square
 >>> dictionary("6X6_250").bytesList.shape[0]
 250
 >>> square(0.04)[0]
 array([-0.02,  0.02,  0.  ])
-
-Corners of a small marker, where its whole pattern fits the image best.
-
-An edge of a small marker is too few pixels to fit by itself, and its black border is hardly wider
-than the lens's blur. So the pattern, which is known, is drawn as the camera would see it, and its
-homography, blur, greys and the light's slope across it are changed until image and drawing differ
-least: Gauss-Newton with steps composed onto the homography (Lucas and Kanade 1981; Baker and
-Matthews 2004, section 3).
-What is left over tells whether all of the marker is in view.
-
->>> import cv2, numpy as np
->>> from us_sim.tracking.camera.markers import fitted_corners, pattern
->>> cells = pattern("APRILTAG_36h11", 7)
->>> cells.shape  # a cell of white about a border of black about 6 × 6
-(10, 10)
->>> image = np.kron(cells, np.full((2, 2), 200, np.uint8))  # two pixels a cell, 16 the marker
->>> image = cv2.GaussianBlur(np.pad(image, 10, mode="edge"), (0, 0), 0.7)
->>> rough = np.array([[12.2, 11.0], [27.0, 11.9], [27.8, 27.2], [11.0, 27.9]])
->>> fitted_corners(image, rough, cells).round(1)
-array([[11.5, 11.5],
-       [27.5, 11.5],
-       [27.5, 27.5],
-       [11.5, 27.5]])
 """
 
 from __future__ import annotations
@@ -154,7 +137,7 @@ def fitted_corners(
 
 
 class _View:
-    """A marker's pattern drawn over a part of an image, and what differs.
+    """A marker's pattern drawn over a part of an image, and the difference.
 
     Args:
         image, corners, cells: as for `fitted_corners`.
@@ -235,7 +218,7 @@ class _View:
         return True
 
     def is_explained(self) -> bool:
-        """Whether what is left over is little, in all and about any place."""
+        """Whether the residual is small, overall and everywhere."""
         inside = self._within(self._judged).astype(np.float32)
         squares = inside * self._left**2
         if squares.sum() > (_UNEXPLAINED * self._contrast) ** 2 * inside.sum():

@@ -1,6 +1,5 @@
-"""The camera model: a pinhole and its lens, as ROS's camera_info has them.
+"""The camera model of ROS' camera_info, a pinhole with a lens, and its YAML file.
 
->>> import numpy as np
 >>> from us_sim.tracking.camera.model import CameraModel
 >>> camera = CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]], [-0.2, 0, 0, 0, 0])
 >>> pixels = camera.project(np.array([[0.1, 0.05, 0.5]]))
@@ -8,17 +7,6 @@
 array([[438.8, 299.4]])
 >>> camera.rays(pixels).round(6)
 array([[0.2, 0.1]])
-
-Camera info: ROS's YAML file of a calibrated camera, read and written.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.tracking.camera.model import read_camera_info, write_camera_info
->>> from us_sim.tracking.camera.model import CameraModel
->>> path = Path(tempfile.mkdtemp()) / "webcam.yaml"
->>> write_camera_info(path, CameraModel(640, 480, [[600, 0, 320], [0, 600, 240], [0, 0, 1]]))
->>> read_camera_info(path).matrix[0]
-array([600.,   0., 320.])
 """
 
 from __future__ import annotations
@@ -35,8 +23,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.kernels import njit
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """ROS's names of the lens models, and how many coefficients each has."""
@@ -129,7 +116,7 @@ class CameraModel:
         return pixels, slopes
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x / z and y / z (N, 2) of what is seen at pixels (N, 2); NaN where the lens model has
+        """Rays x / z and y / z (N, 2) through pixels (N, 2); NaN where the lens model has
         no such point.
         """
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Rigid bodies of fiducial markers: one marker, a board, or markers around a probe's grip.
+"""Rigid bodies of markers, and the files that define them: YAML, text tables, PLUS' marker maps.
 
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
 >>> board = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
@@ -8,22 +8,6 @@
 Traceback (most recent call last):
 ...
 us_sim.errors.TrackingError: marker 50: dictionary 4X4_50 has only markers 0 to 49
-
-Files that say where a body's markers are: YAML, text tables, and PLUS's marker maps.
-
->>> import tempfile
->>> from pathlib import Path
->>> from us_sim.tracking.camera.rigid_body import read_rigid_body
->>> path = Path(tempfile.mkdtemp()) / "grip.yaml"
->>> _ = path.write_text('''
-... dictionary: 4X4_50
-... markers:
-...   - {id: 0, size: 30 mm}
-...   - {id: 1, size: 30 mm, position: [0.02, 0, -0.02], orientation: [0, 0.7071, 0, 0.7071]}
-... ''')
->>> read_rigid_body(path).normals.round(3) + 0.0
-array([[0., 0., 1.],
-       [1., 0., 0.]])
 """
 
 from __future__ import annotations
@@ -39,14 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import PoseError, TrackingError
-from us_sim.geometry.placement import PLACE
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import PLACE, Pose
 from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
 from us_sim.tracking.settings import MARKER_SIZE
 
@@ -231,7 +213,7 @@ def _require_in_dictionary(name: str, number: int) -> None:
 
 
 def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
-    """Refuse what is no flat convex quadrilateral of a marker's size."""
+    """Refuse corners that are no flat convex quadrilateral of a marker's size."""
     if not np.isfinite(corners).all():
         raise TrackingError(f"marker {number}: a corner is not finite")
     edges = np.roll(corners, -1, axis=0) - corners

@@ -1,13 +1,7 @@
-"""A sentence on the other markers in an image that lacks the ones looked for.
+"""Poses of a body by a camera: images from a device, stream or file, a measurement from each.
 
-The pose of a body of markers by a camera: one image in, one measurement out.
-
->>> import cv2, numpy as np
->>> from us_sim.tracking.camera.model import CameraModel
->>> from us_sim.tracking.settings import CameraSettings
 >>> from us_sim.tracking.camera.source import CameraSource
 >>> from us_sim.tracking.camera.markers import dictionary
->>> from us_sim.tracking.camera.rigid_body import RigidBody
 >>> camera = CameraModel(640, 480, [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
 >>> source = CameraSource(camera, RigidBody.single("4X4_50", 7, 0.04))
 >>> image = np.full((480, 640), 255, np.uint8)
@@ -16,22 +10,6 @@ The pose of a body of markers by a camera: one image in, one measurement out.
 array([0.  , 0.  , 0.25])
 >>> source.measure(np.zeros_like(image), 33_000_000), source.last_problem
 (None, 'no marker of 4X4_50 is in the image, which is black: uncover the lens or add light')
-
-Images from a camera, a stream or a video file, as OpenCV opens them.
-
->>> from us_sim.tracking.camera.source import VideoSource
->>> VideoSource("0").is_file, VideoSource("rtsp://camera.local/stream").is_file
-(False, False)
->>> VideoSource("film.avi")
-Traceback (most recent call last):
-us_sim.errors.TrackingError: film.avi: there is no such file; give a video, a camera's number or ...
-
-Tracking of a drawn image at the start, so that the first real one finds all compiled.
-
->>> from us_sim.tracking.camera.source import practice
->>> from us_sim.tracking.camera.rigid_body import RigidBody
->>> practice(RigidBody.single("4X4_50", 7, 0.04))
-True
 """
 
 from __future__ import annotations
@@ -84,7 +62,7 @@ class StrayMarkers:
         self._found = ""
 
     def look(self, image: NDArray[np.uint8], start: str) -> str:
-        """The sentence that begins with ``start`` and goes on with what is there instead."""
+        """A sentence that begins with ``start`` and names the markers seen instead."""
         name = self._families[self._turn % len(self._families)]
         if self._turn % len(self._families) == 0:
             self._found = ""

@@ -30,8 +30,7 @@ from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
 from us_sim.settings.spelling import nearest
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.files.readers import open_image, read_placement, read_volume

@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CaseError
-from us_sim.geometry.placement import Placement
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import COLLIDERS, PROBES
-from us_sim.tissue.elasticity.tissue_kinds import LAYERS, kind_of
+from us_sim.tissue.elasticity.material import LAYERS, kind_of
 from us_sim.volume.cases.settings import SLIDE, CaseSettings, CaseStart
 from us_sim.volume.volume import Volume
 

@@ -20,11 +20,10 @@ import yaml
 
 import us_sim
 from us_sim.errors import CaseError
+from us_sim.settings.reading import document_of
 from us_sim.settings.setting import Settings, rules_of
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_file import read_text
-from us_sim.settings.writing import document_of
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 
 PROVENANCE = "provenance.yaml"
 

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from us_sim.errors import CaseError
-from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import shown, unknown
-from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.tissue_kinds import KINDS, kind_of
-from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
+from us_sim.tissue.elasticity.material import KINDS, Material, kind_of
+from us_sim.tissue.mesh.tetrahedral_mesh import KINDS as KINDS_OF_MESH
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
 AROUND = "tissue"

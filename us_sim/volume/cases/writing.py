@@ -20,8 +20,8 @@ from pathlib import Path
 import yaml
 
 from us_sim.errors import CaseError, VolumeError
+from us_sim.settings.reading import document_of
 from us_sim.settings.spelling import unknown
-from us_sim.settings.writing import document_of
 from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.provenance import Step, add_step

@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_file import read_text
+from us_sim.settings.text_files import read_text
 from us_sim.volume.files.dicom.header import is_dicom, open_dicom
 from us_sim.volume.files.readers import ENDINGS, open_image
 from us_sim.volume.files.segments import Segment, check_representation, segments_of

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.settings.text_file import read_bytes
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_bytes
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.transforms import frame_matrix, in_metres
 

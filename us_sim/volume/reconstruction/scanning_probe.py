@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import theilslopes
 
 from us_sim.errors import UsSimError
-from us_sim.geometry.placement import Placement
+from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.registry import PROBES

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.choice import Chosen
-from us_sim.settings.writing import document_of
+from us_sim.settings.reading import document_of
 from us_sim.share import shared_roots
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, is_case, read_case
 from us_sim.volume.cases.provenance import Source, Step, add_step

@@ -16,8 +16,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SEGMENTATIONS
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_file import read_text
-from us_sim.settings.yaml_text import YamlError, load_yaml
+from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.structure_names import Colour, problem_with
 from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 

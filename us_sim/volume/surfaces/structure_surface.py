@@ -25,7 +25,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.geometry.normals import vertex_normals
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.kernels import njit
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.label_surface import structure_name, voxel_surface

@@ -1,0 +1,130 @@
+"""The time and iterations of a frame, and recovery from tissue inside out, without any tissue."""
+
+import numpy as np
+import pytest
+
+from us_sim.tissue.solvers.fem_nonlinear import Recovery
+from us_sim.tissue.solvers.frame_budget import FrameBudget, frame_limit
+
+IDENTITY = np.eye(3)
+
+
+class Clock:
+    """A clock that stands until it is moved on."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def steps_until_over(balanced_after, *, strict=None, live=None):
+    """Newton steps of one second each until a frame ends."""
+    clock = Clock()
+    budget = FrameBudget(clock)
+    budget.begin(10_000, strict, live, moved=True)
+    for number in range(1, 101):
+        budget.begin_step()
+        clock.now += 1.0
+        budget.end_step(12)
+        if budget.is_over(balanced=number >= balanced_after):
+            break
+    return number
+
+
+@pytest.mark.parametrize(
+    ("limits", "balanced_after", "steps"),
+    [
+        ({"strict": 4.5}, 1, 5),
+        ({"strict": 4.5}, 1000, 5),  # never longer than was set
+        ({"strict": 4.5, "live": 1.0}, 1000, 5),
+        ({"live": 4.5}, 1, 5),
+        ({"live": 4.5}, 8, 8),  # live, longer for a balance,
+        ({"live": 4.5}, 1000, 14),  # but no more than three times as long
+        ({}, 1000, 100),
+    ],
+)
+def test_a_frame_ends_with_its_time_and_a_live_one_when_it_is_balanced(
+    limits, balanced_after, steps
+):
+    assert steps_until_over(balanced_after, **limits) == steps
+
+
+def test_each_step_counts_as_eight_iterations_besides_its_own():
+    budget = FrameBudget()
+    budget.begin(440, moved=True)
+    for _ in range(10):
+        budget.spend(12)
+    assert budget.iterations_left == 440 - 10 * (12 + 8)
+    budget.begin(440, moved=False)
+    assert budget.iterations_left == 2 * 440  # of a probe at rest
+    budget.begin(440, moved=False, restarted=True)
+    assert budget.iterations_left == 6 * 440
+
+
+def test_a_limit_shorter_than_a_step_is_known_where_it_was_set():
+    clock = Clock()
+    budget = FrameBudget(clock)
+    for strict, live, short in [(0.5, None, True), (1.5, None, False), (None, 0.5, False)]:
+        budget.begin(440, strict, live, moved=True)
+        budget.begin_step()
+        clock.now += 1.0
+        budget.end_step(1)
+        assert budget.is_shorter_than_a_step == short
+
+
+def test_load_steps_leave_time_and_iterations_for_the_pose_itself():
+    clock = Clock()
+    budget = FrameBudget(clock)
+    budget.begin(100, 10.0, moved=True)
+    clock.now += 6.9
+    assert budget.allows_load_step
+    clock.now += 0.2
+    assert not budget.allows_load_step
+    budget.begin(100, moved=True)
+    budget.spend(52)  # and 8
+    clock.now += 1000.0
+    assert budget.allows_load_step
+    budget.spend(0)
+    assert not budget.allows_load_step
+
+
+def test_a_probe_at_rest_is_not_hurried_after_a_while():
+    budget = FrameBudget()
+    hurried = []
+    for frame in range(32):
+        budget.begin(440, 0.01, moved=frame == 0)
+        hurried.append(budget.is_hurried)
+    assert hurried == [True] * 30 + [False] * 2
+    budget.begin(440, 0.01, moved=True)
+    assert budget.is_hurried
+    budget.begin(440, moved=True)
+    assert not budget.is_hurried
+
+
+@pytest.mark.parametrize(("hurried", "frames"), [(True, 1), (False, 11)])
+def test_tissue_inside_out_is_begun_anew_after_its_time(hurried, frames):
+    recovery = Recovery(IDENTITY)
+    recovery.judge(2.0 * IDENTITY, True)
+    count = 0
+    while not recovery.must_restart(hurried=hurried):
+        recovery.judge(-IDENTITY, False)
+        count += 1
+    assert count == frames
+    np.testing.assert_array_equal(recovery.upright, 2.0 * IDENTITY)
+    recovery.judge(IDENTITY, True)
+    assert not recovery.must_restart(hurried=hurried)
+    np.testing.assert_array_equal(recovery.upright, IDENTITY)
+
+
+def test_a_restart_holds_for_one_frame():
+    recovery = Recovery(IDENTITY)
+    assert not recovery.take_restart()
+    recovery.restarts = True
+    assert [recovery.take_restart(), recovery.take_restart()] == [True, False]
+
+
+def test_a_node_with_a_core_to_itself_may_use_more_of_a_period_and_never_none():
+    assert frame_limit(0.0, 1) < frame_limit(0.0, 2) < 1 / 60
+    assert frame_limit(0.001, 2) == pytest.approx(frame_limit(0.0, 2) - 0.001)
+    assert frame_limit(1.0, 2) > 0.0

@@ -1,0 +1,155 @@
+"""Node selections of a box, and what a model refuses."""
+
+import numpy as np
+import pytest
+from tissue_block import SOFT, block, block_mesh
+
+from us_sim.errors import MeshError
+from us_sim.geometry.collider import Sphere
+from us_sim.tissue.elasticity.materials import label_fractions, uniform_material
+from us_sim.tissue.mesh.file import read_mesh
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import (
+    FACES,
+    TissueModel,
+    face_nodes,
+    facing_nodes,
+    held_remark,
+    nodes_in_label,
+)
+
+
+@pytest.mark.parametrize(
+    ("face", "axis", "value"),
+    [
+        ("top", 2, 0.0),
+        ("bottom", 2, 0.1),
+        ("left", 0, -0.1),
+        ("right", 0, 0.1),
+        ("front", 1, -0.05),
+        ("back", 1, 0.05),
+    ],
+)
+def test_faces_are_the_planes_they_are_named_after(face, axis, value):
+    mesh = block_mesh((6, 5, 4))
+    nodes = face_nodes(mesh, face)
+    assert (mesh.nodes[nodes, axis] == value).all()
+    assert len(nodes) == {0: 5 * 4, 1: 6 * 4, 2: 6 * 5}[axis]
+    assert nodes.dtype == np.int32
+
+
+def test_sides_are_all_but_top_and_bottom():
+    mesh = block_mesh((6, 5, 4))
+    assert len(face_nodes(mesh, "sides")) == 4 * (6 * 5 - 4 * 3)
+
+
+def test_it_is_said_how_many_nodes_are_held_where_they_may_be_few():
+    organ, box = unstructured(), block_mesh((6, 5, 4))
+    bottom = face_nodes(organ, "bottom")
+    assert held_remark("bottom", bottom, organ) == "fixed: `bottom` holds 30 of 120 nodes"
+    assert held_remark("bottom", face_nodes(box, "bottom"), box) is None
+    assert "holds 6 of 120 nodes, which is little" in (
+        held_remark("bottom", bottom[:6], organ) or ""
+    )
+    assert "`bone` holds 0 of 120 nodes" in (held_remark("bone", bottom[:0], box) or "")
+
+
+def unstructured(nodes=(6, 5, 4)):
+    """The block's mesh as if a file had brought it."""
+    block = block_mesh(nodes)
+    return TetrahedralMesh(block.nodes, block.tetrahedra)
+
+
+def test_faces_of_a_box_from_a_file_are_the_same():
+    for face in FACES:
+        expected = face_nodes(block_mesh((6, 5, 4)), face)
+        np.testing.assert_array_equal(face_nodes(unstructured(), face), expected)
+    top = face_nodes(block_mesh((6, 5, 4)), "top")
+    np.testing.assert_array_equal(facing_nodes(unstructured()), top)
+
+
+def test_faces_of_an_organ_are_its_boundary_near_its_bounding_box(shared_data):
+    organ, _ = read_mesh(shared_data / "meshes-sofa" / "liver2.msh", metres_per_unit=0.03)
+    low, high = organ.nodes.min(axis=0), organ.nodes.max(axis=0)
+    bottom = face_nodes(organ, "bottom")
+    deepest = organ.nodes[organ.boundary].reshape(-1, 3)[:, 2] > high[2] - 0.05 * (high - low)[2]
+    np.testing.assert_array_equal(bottom, np.unique(organ.boundary.ravel()[deepest]))
+    assert len(face_nodes(organ, "bottom", margin=0.03)) > len(bottom) > 3
+    assert len(face_nodes(organ, "bottom", margin=1e-9)) == 1
+
+
+def test_what_looks_at_the_probe_is_the_near_half_of_an_organ(shared_data):
+    cylinder, _ = read_mesh(shared_data / "meshes-sofa" / "truthcylinder1.msh", 1e-3)
+    x, _, z = (cylinder.nodes - cylinder.nodes.mean(axis=0))[facing_nodes(cylinder)].T
+    radius = np.ptp(cylinder.nodes[:, 2]) / 2
+    # Its axis is y: what looks at the probe is the half of the mantle with z < 0.
+    assert z.max() < 0.02 * radius
+    np.testing.assert_allclose(np.hypot(x, z), radius, rtol=0.05)
+
+
+def test_an_unknown_face_is_refused():
+    assert "bottom" in FACES
+    with pytest.raises(MeshError, match="no face 'lid'"):
+        face_nodes(block_mesh((2, 2, 2)), "lid")
+
+
+def test_nodes_within_bone_are_found():
+    mesh = block_mesh((21, 11, 11))  # 10 mm apart
+    index = np.diag([1000.0, 1000.0, 1000.0, 1.0])
+    index[:3, 3] = [99.5, 49.5, -0.5]
+    labels = np.ones((200, 100, 100), dtype=np.uint8)
+    labels[75:125, :, 55:85] = 6  # x from -25 to 25 mm, z from 55 to 85 mm
+    fractions = label_fractions(mesh, labels, index)
+    found = mesh.nodes[nodes_in_label(mesh, fractions, 6)]
+    np.testing.assert_allclose(np.unique(found[:, 0]), [-0.02, -0.01, 0, 0.01, 0.02], atol=1e-12)
+    np.testing.assert_allclose(np.unique(found[:, 2]), [0.06, 0.07, 0.08], atol=1e-12)
+    assert len(nodes_in_label(mesh, fractions, 9)) == 0
+
+
+def test_lumped_mass_is_the_tissues_mass():
+    assert block().lumped_mass.sum() == pytest.approx(2.0)
+
+
+def test_contact_spacing_is_that_of_the_surface():
+    assert block((21, 11, 6)).contact_spacing == pytest.approx(0.01, rel=0.5)
+    assert block((21, 11, 6)).contact_spacing >= 0.01
+
+
+def test_no_contact_nodes_are_no_contact():
+    model = block()
+    bare = TissueModel(
+        model.mesh, model.materials, model.fixed, model.collider, np.empty(0, np.int32)
+    )
+    assert bare.contact_spacing == 0.0
+
+
+MESH = block_mesh((3, 3, 3))
+FREE = np.zeros(27, dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "contact", "words"),
+    [
+        (np.zeros(26, dtype=bool), [0], "give 27 booleans"),
+        (np.zeros(27), [0], "give 27 booleans"),
+        (FREE, [27], "run from 27 to 27"),
+        (FREE, [-1], "run from -1 to -1"),
+        (FREE, [1, 1], "names a node twice"),
+        (FREE, [0.5], "node indices"),
+        (FREE, [[1, 2]], "node indices"),
+    ],
+)
+def test_models_that_do_not_fit_their_mesh_are_refused(fixed, contact, words):
+    with pytest.raises(MeshError, match=words):
+        TissueModel(MESH, uniform_material(MESH, SOFT), fixed, Sphere(0.03), np.array(contact))
+
+
+def test_materials_of_another_mesh_are_refused():
+    with pytest.raises(MeshError, match="materials are given for 5 tetrahedra"):
+        TissueModel(
+            MESH,
+            uniform_material(block_mesh((2, 2, 2)), SOFT),
+            FREE,
+            Sphere(0.03),
+            np.empty(0, np.int32),
+        )

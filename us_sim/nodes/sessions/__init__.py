@@ -1,0 +1,1 @@
+"""Recording, playing and controlling sessions, beside the nodes that do it."""

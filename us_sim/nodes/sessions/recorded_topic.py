@@ -1,0 +1,160 @@
+"""A subscription to serialized messages that follows the quality that publishers offer."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import time
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from us_sim.errors import BagError
+from us_sim.recording.schemas import schema_text
+from us_sim.recording.topic import QosProfile
+
+QUEUE = 1000  # messages that may wait for the executor
+OVERLAP_S = 2.0  # in which publishers find a new subscription, before the old one is given up
+
+
+class RecordedTopic:
+    """Takes every message of a topic once, from every publisher there is or comes.
+
+    Where a publisher comes that cannot serve the subscription, a weaker one takes its place. Both
+    are there for a while, and what comes by both is taken once.
+
+    Args:
+        node: that subscribes.
+        name: of the topic, in full.
+        message_type: class of its messages.
+        offered: what its publishers offer.
+        take: called with a serialized message and where it comes from.
+        lost: called with a number of messages that did not come.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        message_type: Any,
+        offered: Iterable[QoSProfile],
+        take: Callable[[str, bytes, Mapping[str, Any]], None],
+        lost: Callable[[str, int], None],
+    ) -> None:
+        self.name = name
+        self._node, self._type = node, message_type
+        self._take, self._lost = take, lost
+        self._offered = dict.fromkeys(map(QosProfile.of, offered))
+        self._adopted = _adopted(self._offered)
+        self._old: Subscription | None = None
+        self._old_until = 0.0  # s, monotonic
+        self._recent: dict[tuple[int, int], None] = {}
+        self._publishers = len(self._offered)
+        self._sequence: int | None = None
+        self._subscription = self._subscribed()
+
+    @property
+    def offered(self) -> list[QosProfile]:
+        """What its publishers have offered so far."""
+        return [*self._offered]
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether its publishers keep messages for those who come later."""
+        return self._adopted.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+    def follow(self, offered: Iterable[QoSProfile]) -> list[QosProfile]:
+        """Look at what publishers offer now; what none has offered before."""
+        now = [QosProfile.of(profile) for profile in offered]
+        if len(now) != self._publishers:
+            self._publishers, self._sequence = len(now), None
+        if self._old is not None and time.monotonic() > self._old_until:
+            self._node.destroy_subscription(self._old)
+            self._old = None
+        new = [profile for profile in dict.fromkeys(now) if profile not in self._offered]
+        self._offered |= dict.fromkeys(new)
+        adopted = _adopted(self._offered)
+        if adopted != self._adopted:
+            if self._old is not None:
+                self._node.destroy_subscription(self._old)
+            self._adopted, self._old = adopted, self._subscription
+            self._old_until = time.monotonic() + OVERLAP_S
+            self._subscription = self._subscribed()
+        return new
+
+    def close(self) -> None:
+        """Take no more."""
+        for subscription in filter(None, (self._old, self._subscription)):
+            self._node.destroy_subscription(subscription)
+
+    def _subscribed(self) -> Subscription:
+        return self._node.create_subscription(
+            self._type, self.name, self._receive, self._adopted, raw=True
+        )
+
+    def _receive(self, data: bytes, info: Mapping[str, Any]) -> None:
+        if self._old is not None or self.is_latched:
+            key = info["source_timestamp"], zlib.crc32(data)
+            if key in self._recent and key[0] > 0:
+                return
+            self._recent[key] = None
+            if len(self._recent) > QUEUE:
+                del self._recent[next(iter(self._recent))]
+        self._count(info.get("publication_sequence_number"))
+        self._take(self.name, data, info)
+
+    def _count(self, sequence: int | None) -> None:
+        """Notice messages that are missing in the numbers of the only publisher.
+
+        Not every middleware gives numbers, and those of several publishers cannot be told apart.
+        """
+        if sequence is None or self._publishers != 1:
+            return
+        if self._sequence is not None and sequence > self._sequence + 1:
+            self._lost(self.name, sequence - self._sequence - 1)
+        self._sequence = sequence
+
+
+def _adopted(offered: Iterable[QosProfile]) -> QoSProfile:
+    """What every one of the publishers can serve, as rosbag2 chooses it."""
+    offered = list(offered)
+    reliable = all(q.reliability == "reliable" for q in offered)
+    latched = all(q.durability == "transient_local" for q in offered)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=QUEUE,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+_MESSAGE_TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
+"""What a message type of ROS 2 is called."""
+
+
+def message_type(name: str) -> Any:
+    """The class of a message type, of which a definition is known.
+
+    Nothing is imported for a name that is not known to be a message's: importing runs code.
+
+    Raises:
+        BagError: it is no message type's name, has no definition here, or its package for Python
+            is not installed.
+    """
+    match = _MESSAGE_TYPE.fullmatch(name)
+    if match is None:
+        shown = name if len(name) < 100 else f"{name[:100]}…"
+        raise BagError(f"{shown!r} is no message type of ROS 2")
+    schema_text(name)
+    package, short = match.groups()
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), short)
+    except (ImportError, AttributeError):
+        raise BagError(
+            f"message type {name} cannot be imported: install the ROS 2 package {package} and "
+            f"source its setup file"
+        ) from None

@@ -1,0 +1,178 @@
+"""Services and events of rosbag2's recorder and player, where its interfaces are installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from us_sim.nodes.settings import LOST, PathPlayerSettings, SessionPlayerSettings
+from us_sim.recording.write_behind import Loss
+
+
+def offer_service(node: Node, service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
+    """Offer a service as a node of rosbag2 does; False where its type is not known here.
+
+    Args:
+        node: that offers it.
+        service: its type in ``rosbag2_interfaces``, without the package.
+        name: below the node's own.
+        act: does what the request asks for, and fills the response.
+    """
+    try:
+        from rosbag2_interfaces import srv
+    except ImportError:
+        return False
+
+    def answer(request: Any, response: Any) -> Any:
+        act(request, response)
+        return response
+
+    if not hasattr(srv, service):
+        return False
+    node.create_service(getattr(srv, service), f"~/{name}", answer)
+    return True
+
+
+def offer_player_services(
+    node: Node,
+    settings: Callable[[], PathPlayerSettings | SessionPlayerSettings],
+    first: int,
+    length: int,
+) -> None:
+    """Offer them where ``rosbag2_interfaces`` is installed.
+
+    Args:
+        node: that plays, with the parameters ``rate``, ``paused`` and ``time``.
+        settings: gives them as they are now.
+        first: ns since 1970, when what is played was recorded: `seek` counts as its stamps do.
+        length: ns.
+    """
+
+    def set_to(name: str, value: object) -> bool:
+        result = node.set_parameters_atomically([Parameter(name, value=value)])
+        return bool(result.successful)
+
+    def seek(request: Any, response: Any) -> None:
+        position = 1_000_000_000 * request.time.sec + request.time.nanosec - first
+        inside = 0 <= position <= length
+        response.success = inside and set_to("time", 1e-9 * position)
+
+    def set_rate(request: Any, response: Any) -> None:
+        response.success = set_to("rate", request.rate)
+
+    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> None:
+        offer_service(node, service, name, act)
+
+    offer("Pause", "pause", lambda *_: set_to("paused", True))
+    offer("Resume", "resume", lambda *_: set_to("paused", False))
+    offer("TogglePaused", "toggle_paused", lambda *_: set_to("paused", not settings().paused))
+    offer("IsPaused", "is_paused", lambda _, answer: setattr(answer, "paused", settings().paused))
+    offer("GetRate", "get_rate", lambda _, answer: setattr(answer, "rate", settings().rate))
+    offer("SetRate", "set_rate", set_rate)
+    offer("Seek", "seek", seek)
+
+
+class Controlled(Protocol):
+    """A recorder."""
+
+    paused: bool
+
+    def pause(self) -> None:
+        """Record nothing until `resume`."""
+        ...
+
+    def resume(self) -> None:
+        """Go on."""
+        ...
+
+    def split(self) -> None:
+        """Go on in a further file."""
+        ...
+
+    def stop(self) -> None:
+        """End the recording."""
+        ...
+
+    def record(self, file: str) -> str:
+        """Begin a further recording; why that cannot be, or nothing."""
+        ...
+
+    def snapshot(self) -> bool:
+        """Write what was kept in memory; False where nothing is kept."""
+        ...
+
+
+def offer_services(node: Node, recorder: Controlled) -> bool:
+    """Offer rosbag2's services; False where ``rosbag2_interfaces`` is not installed."""
+
+    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
+        return offer_service(node, service, name, act)
+
+    def toggle(_: Any, __: Any) -> None:
+        (recorder.resume if recorder.paused else recorder.pause)()
+
+    def record(request: Any, response: Any) -> None:
+        response.error_string = recorder.record(request.uri)
+        response.return_code = int(bool(response.error_string))
+
+    if not offer("Pause", "pause", lambda *_: recorder.pause()):
+        return False
+    offer("Resume", "resume", lambda *_: recorder.resume())
+    offer("TogglePaused", "toggle_paused", toggle)
+    offer("IsPaused", "is_paused", lambda _, answer: setattr(answer, "paused", recorder.paused))
+    offer("SplitBagfile", "split_bagfile", lambda *_: recorder.split())
+    offer("Stop", "stop", lambda *_: recorder.stop())
+    offer("Record", "record", record)  # newer than Jazzy
+    offer(
+        "Snapshot",
+        "snapshot",
+        lambda _, answer: setattr(answer, "success", recorder.snapshot()),
+    )
+    return True
+
+
+class RecorderEvents:
+    """Publishes rosbag2's events, as far as ``rosbag2_interfaces`` has their types."""
+
+    SPLIT = "events/write_split"
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._msg: Any = None
+        self._split: Any = None
+        self._lost: Any = None
+        try:
+            from rosbag2_interfaces import msg
+        except ImportError:
+            return
+        self._msg = msg
+        self._split = node.create_publisher(msg.WriteSplitEvent, self.SPLIT, 1)
+        if hasattr(msg, "MessagesLostEvent"):  # newer than Jazzy
+            self._lost = node.create_publisher(msg.MessagesLostEvent, LOST, 10)
+
+    def split(self, closed: str, opened: str) -> None:
+        """A file was closed, and another one begun; none when the recording ended."""
+        if self._split is not None:
+            name = self._node.get_fully_qualified_name()
+            event = self._msg.WriteSplitEvent(
+                closed_file=closed, opened_file=opened, node_name=name
+            )
+            self._split.publish(event)
+
+    def lost(self, losses: Mapping[str, Loss]) -> None:
+        """Messages were lost since this was said last."""
+        if self._lost is None or not losses:
+            return
+        event = self._msg.MessagesLostEvent(node_name=self._node.get_fully_qualified_name())
+        event.messages_lost_statistics = [
+            self._msg.MessagesLostEventTopicStat(
+                topic_name=topic,
+                messages_lost_in_transport=loss.in_transport,
+                messages_lost_in_recorder=loss.in_recorder,
+            )
+            for topic, loss in losses.items()
+        ]
+        self._lost.publish(event)

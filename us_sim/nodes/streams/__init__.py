@@ -1,0 +1,38 @@
+"""Topics of images made from the frames of a scanner, for those who subscribe.
+
+Only those are there that a scene and its volume can provide.
+"""
+
+from __future__ import annotations
+
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.streams.stream import BModeStream, FrameStream, MModeStream
+from us_sim.slicing.probe.probe import Probe
+from us_sim.volume.volume import Volume
+
+
+def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameStream]:
+    """All that can be made of the frames of the node's scene, in the order of making; prepared.
+
+    Raises:
+        UsSimError: one of them cannot be used with this probe, or a flow with its structure.
+    """
+    further: list[FrameStream] = []
+    if volume.labels is not None:
+        from us_sim.nodes.streams.stream import LabelStream
+
+        further.append(LabelStream(node))
+    if node.scene.tissue is not None:
+        from us_sim.nodes.streams.strain import strain_streams
+        from us_sim.nodes.streams.stream import DisplacementStream
+
+        further += [DisplacementStream(node), *strain_streams(node)]
+    if node.scene.flows:
+        from us_sim.nodes.streams.doppler import doppler_streams
+
+        further += doppler_streams(node, volume)
+    further.append(MModeStream(node))
+    for stream in further:
+        stream.prepare(probe)
+    # Whoever waits for the images may begin when their topic is there, so it comes last.
+    return [BModeStream(node), *further]

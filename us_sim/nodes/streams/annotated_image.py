@@ -1,0 +1,285 @@
+"""The image with millimetres, outlines, colours and its age, for those who look at it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+
+from us_sim.errors import SettingsError, UsSimError
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import colour_image_message, nanoseconds_of
+from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
+from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
+from us_sim.nodes.streams.stream import FrameStream
+from us_sim.scene.building import colour_of
+from us_sim.slicing.drawing.annotation import Annotation, Badge
+from us_sim.slicing.drawing.label_outlines import onto_border
+from us_sim.slicing.drawing.overlay import Overlay
+from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.settings import OVERLAYS
+
+REMEMBERED = 256  # poses whose arrival is kept for the images at them
+
+
+class PoseAge:
+    """How long ago the newest pose came, and what that makes of an image at it.
+
+    A pose ages from its arrival: its stamp may be of another clock, such as that of a tracker
+    which is ahead, or of the day it was recorded. It ages while ROS's time goes on, and never by
+    more than has really passed: that time may be set, and stands still while a bag is paused. How
+    long is too long are the parameters of `PoseAgeSettings`.
+
+    Args:
+        node: whose clock is used, and which gets the parameters.
+    """
+
+    def __init__(self, node: GuardedNode) -> None:
+        self._node = node
+        self._arrivals: dict[int, tuple[int, int]] = {}  # ns, as `_now`, by stamps in ns
+        self._settings = LiveSettings(node, {"age": Group(PoseAgeSettings())})
+
+    def came(self, stamp: TimeMessage) -> None:
+        """A pose with that stamp has come."""
+        nanoseconds = nanoseconds_of(stamp)
+        self._arrivals.pop(nanoseconds, None)  # so that the newest comes last
+        self._arrivals[nanoseconds] = self._now()
+        if len(self._arrivals) > REMEMBERED:
+            del self._arrivals[next(iter(self._arrivals))]
+
+    @property
+    def pose(self) -> float | None:
+        """Age of the newest pose, s; None before the first."""
+        if not self._arrivals:
+            return None
+        newest = next(reversed(self._arrivals))
+        return self._since(newest)
+
+    def image(self, stamp: TimeMessage) -> float:
+        """Age of an image of the pose with that stamp, s, or of the oldest that is remembered."""
+        if not self._arrivals:
+            return 0.0
+        nanoseconds = nanoseconds_of(stamp)
+        known = nanoseconds in self._arrivals
+        return self._since(nanoseconds if known else next(iter(self._arrivals)))
+
+    def word(self, age: float | None) -> str:
+        """``live``, ``stale``, ``lost``, or ``waiting`` for the first."""
+        if age is None:
+            return "waiting"
+        limits = self._settings.values["age"]
+        if age > limits.lost_after:
+            return "lost"
+        return "stale" if age > limits.stale_after else "live"
+
+    def _since(self, stamp: int) -> float:
+        now, real = self._now()
+        came, really = self._arrivals[stamp]
+        if came > now:  # time was set back, as when a bag starts again
+            self._arrivals[stamp] = came, really = now, real
+        return 1e-9 * min(now - came, real - really)
+
+    def _now(self) -> tuple[int, int]:
+        """ns of ROS's time, and of one that nobody sets."""
+        return int(self._node.get_clock().now().nanoseconds), time.monotonic_ns()
+
+
+CHECKS = 5.0  # times a second that the age of the newest pose is looked at
+
+_AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
+_NEVER = TimeMessage()  # the stamp of a picture of no pose: zero
+
+Pixels = NDArray[np.uint8]
+
+
+class AnnotatedImage:
+    """``ultrasound/image_annotated``: the image, what is in it, and whether it is live.
+
+    A picture is drawn for each image while somebody subscribes, with the colours of the stream
+    that the parameter ``overlay`` chooses. When no pose has come for a while, the last image is
+    sent again with a badge, under its own stamp; before the first pose a black one. In lockstep
+    nothing ages.
+
+    Args:
+        node: that publishes it.
+        probe: whose images they are.
+        label_names: of the volume's labels.
+        streams: those there are, some of which have colours to be laid over the image.
+    """
+
+    def __init__(
+        self,
+        node: SceneNode,
+        probe: Probe,
+        label_names: Mapping[int, str],
+        streams: Sequence[FrameStream] = (),
+    ) -> None:
+        self._node = node
+        self._streams = streams
+        by_topic = {each.topic: each for each in streams}
+        self._overlays = {
+            name: by_topic[mode.topic] for name, mode in OVERLAYS.items() if mode.topic in by_topic
+        }
+        self._settings = LiveSettings(
+            node, {"shown": Group(AnnotatedImageSettings())}, self._require_overlay
+        )
+        self._require_overlay(self._settings.values)
+        numbers = {name: number for number, name in label_names.items()}
+        self._structures = {
+            numbers[given.label or name]: (name, colour_of(node.scene, name))
+            for name, given in node.scene.structures.items()
+            if not given.file and (given.label or name) in numbers
+        }
+        self._publisher = node.stream(Image, "ultrasound/image_annotated")
+        self._came = self._missing = False
+        self._stamp = _NEVER
+        self.show_probe(probe)
+        self._age: PoseAge | None = None
+        if not node.lockstep:
+            self._age = PoseAge(node)
+            node.create_timer(1.0 / CHECKS, self._check)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody subscribes."""
+        return bool(self._publisher.get_subscription_count() > 0)
+
+    @property
+    def state(self) -> str:
+        """Of the probe's pose: ``waiting`` for the first, ``live``, ``stale`` or ``lost``."""
+        if self._age is None:
+            return "live" if self._came else "waiting"
+        return self._age.word(self._age.pose)
+
+    def show_probe(self, probe: Probe) -> None:
+        """The images that come are of another probe; those before it are not shown again."""
+        self._probe = probe
+        self._annotation = Annotation(
+            probe, self._structures, is_flipped=self._settings.values["shown"].flip
+        )
+        self._frame: Frame | None = None
+        self._labels: Pixels | None = None
+        self._is_outlined = False
+        self._stamp = _NEVER
+
+    def pose_came(self, stamp: TimeMessage) -> None:
+        """A pose that can be used has come, whether or not an image is made at it."""
+        self._came = True
+        if self._age is not None:
+            self._age.came(stamp)
+
+    def show(self, frame: Frame, stamp: TimeMessage) -> None:
+        """Keep the frame of the pose with that stamp, and send its picture if wanted.
+
+        Raises:
+            UsSimError: there is no picture of it; then the one before is kept.
+        """
+        if self.is_wanted:
+            _ = frame.pixels
+        self._frame, self._stamp = frame, stamp
+        self._labels = None
+        self._is_outlined = not self._structures
+        if self.is_wanted:
+            self._send(self._badge())
+
+    def _check(self) -> None:
+        """Send the last image again, marked, once it is old; a black one where there is none."""
+        self._report()
+        badge = self._badge()
+        if badge is not None and self.is_wanted:
+            self._send(badge)
+
+    def _report(self) -> None:
+        node, state = self._node, self.state
+        node.health.values["probe_pose"] = state
+        missing = state in ("stale", "lost")
+        warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
+        if missing and is_left_by_pages(node):
+            warning = f"{NO_PAGE}: the image is frozen"
+            if not self._missing:
+                node.get_logger().info(f"{warning} until somebody does")
+        elif missing and not self._missing and self._age is not None:
+            node.health.problem(
+                "pose age",
+                f"the newest probe pose is {self._age.pose:.1f} s old: the image is frozen; look "
+                f"at the tracker",
+            )
+        elif self._missing and state == "live":
+            node.get_logger().info("probe poses come again")
+        self._missing = missing
+        node.health.warning = warning
+
+    def _badge(self) -> Badge | None:
+        if self._age is None:
+            return None
+        word = self.state
+        if word == "waiting":
+            return Badge("NO PROBE POSE", _GREY)
+        if word == "lost":
+            return Badge("LOST", _RED)
+        if self._frame is None:
+            return Badge("NO IMAGE YET", _GREY)
+        age = self._age.image(self._stamp)
+        if self._age.word(age) == "live":
+            return None
+        return Badge(f"STALE {age:.1f} s", _AMBER)
+
+    def _send(self, badge: Badge | None) -> None:
+        frame, overlay = self._frame, None
+        if frame is None:
+            image = np.zeros((self._probe.rows, self._probe.columns), np.uint8)
+        else:
+            image = frame.pixels
+            self._outline(frame)
+            overlay = self._overlay(frame)
+        shown = self._settings.values["shown"]
+        if self._annotation.is_flipped != shown.flip:
+            self._annotation = Annotation(
+                self._probe, self._structures, is_flipped=not self._annotation.is_flipped
+            )
+        lines = [line for each in self._streams if each.is_wanted for line in each.lines]
+        settle = None if frame is None else partial(onto_border, frame)
+        picture = self._annotation.draw(image, self._labels, badge, overlay, lines, settle)
+        if shown.beside:
+            plain = image[:, ::-1] if shown.flip else image
+            picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])
+        self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))
+        self._node.health.published("ultrasound/image_annotated")
+
+    def _outline(self, frame: Frame) -> None:
+        if self._is_outlined:
+            return
+        self._is_outlined = True
+        try:
+            self._labels = frame.labels
+        except UsSimError as error:
+            self._node.health.problem("labels", f"{error}; nothing is outlined")
+
+    def _overlay(self, frame: Frame) -> Overlay | None:
+        stream = self._overlays.get(self._settings.values["shown"].overlay)
+        try:
+            return stream.overlay(frame) if stream else None
+        except UsSimError as error:
+            self._node.health.problem("overlay", f"{error}; no colours are laid over the image")
+            return None
+
+    def _require_overlay(self, wanted: Mapping[str, AnnotatedImageSettings]) -> None:
+        """Refuse colours that this scene cannot provide.
+
+        Raises:
+            SettingsError: with what it can.
+        """
+        name = wanted["shown"].overlay
+        if name not in ("none", *self._overlays):
+            there = ", ".join(["none", *self._overlays])
+            raise SettingsError(
+                f"overlay: {self._node.scene.name} has nothing for {name!r}; it has {there}"
+            )

@@ -1,0 +1,209 @@
+"""Sources of poses on topics: any driver's, several bodies, a haptic arm, a SpaceMouse, tf."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geometry_msgs.msg import PoseArray, PoseStamped, Twist
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Joy
+from std_msgs.msg import Bool
+from tf2_msgs.msg import TFMessage
+
+from us_sim.errors import PoseError, SceneError
+from us_sim.geometry.pose import FrameTree
+from us_sim.nodes.messages import transform_from
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.settings.spelling import counted
+from us_sim.tracking.haptic import HapticDevice
+from us_sim.tracking.measurement import PATIENT, Measurement
+from us_sim.tracking.mouse import SixDofMouse
+from us_sim.tracking.settings import HapticSettings, SixDofMouseSettings
+
+
+class PoseInput(TrackerInput):
+    """``tracker/pose`` in the frame that the scene names.
+
+    Where that is another one than ``patient``, a pose in ``patient`` is the probe's own: who knows
+    where the patient is needs neither registration nor calibration.
+    """
+
+    def __init__(self, device: Device, settings: Any) -> None:
+        super().__init__(device, settings)
+        self._frame = device.scene.tracker.frame
+        device.listen_to_device(PoseStamped, "tracker/pose", self._take)
+
+    def _take(self, message: PoseStamped) -> None:
+        of_probe = message.header.frame_id == PATIENT != self._frame
+        frame = PATIENT if of_probe else self._frame
+        pose = self._device.pose_in(message, "tracker/pose", frame)
+        if pose is not None:
+            stamp = self._device.stamp_of(message.header, "tracker/pose")
+            self._device.take(Measurement(stamp, pose, of_probe=of_probe))
+
+
+class PoseArrayInput(TrackerInput):
+    """The pose ``tracker.entry`` of ``tracker/poses``, in the frame that the scene names."""
+
+    def __init__(self, device: Device, settings: Any) -> None:
+        super().__init__(device, settings)
+        self._entry = device.scene.tracker.entry
+        device.listen_to_device(PoseArray, "tracker/poses", self._take)
+
+    def _take(self, message: PoseArray) -> None:
+        if self._entry >= len(message.poses):
+            self._device.refuse(
+                "entry",
+                f"tracker/poses holds {counted(len(message.poses), 'pose')}, so none is "
+                f"number {self._entry} (from 0): set tracker.entry in the scene",
+            )
+            return
+        entry = PoseStamped(header=message.header, pose=message.poses[self._entry])
+        pose = self._device.pose_in(entry, "tracker/poses")
+        if pose is not None:
+            stamp = self._device.stamp_of(message.header, "tracker/poses")
+            self._device.take(Measurement(stamp, pose))
+
+
+class HapticInput(TrackerInput):
+    """``haptic/pose`` in the frame that the scene names; ``haptic/clutch`` holds the probe."""
+
+    def __init__(self, device: Device, settings: HapticSettings) -> None:
+        super().__init__(device, settings)
+        self._handle = HapticDevice(settings)
+        device.listen_to_device(PoseStamped, "haptic/pose", self._take)
+        device.listen_to_device(Bool, "haptic/clutch", self._clutch)
+
+    def reset(self) -> None:
+        """Forget the clutch."""
+        self._handle.reset()
+
+    def _take(self, message: PoseStamped) -> None:
+        pose = self._device.pose_in(message, "haptic/pose")
+        if pose is None:
+            return
+        stamp = self._device.stamp_of(message.header, "haptic/pose")
+        self._device.take(self._handle.take(pose, stamp))
+
+    def _clutch(self, message: Bool) -> None:
+        self._handle.clutch(message.data)
+
+
+class SixDofMouseInput(TrackerInput):
+    """``spacenav/joy``, or ``spacenav/twist`` where there is no joystick message."""
+
+    def __init__(self, device: Device, settings: SixDofMouseSettings) -> None:
+        super().__init__(device, settings)
+        self._mouse = SixDofMouse(settings)
+        self._has_joy = False
+        device.listen_to_device(Joy, "spacenav/joy", self._take_joy)
+        device.listen_to_device(Twist, "spacenav/twist", self._take_twist)
+
+    def reset(self) -> None:
+        """Bring the probe home."""
+        self._mouse.reset()
+
+    def _take_joy(self, message: Joy) -> None:
+        self._has_joy = True
+        stamp = self._device.stamp_of(message.header, "spacenav/joy")
+        self._take(list(message.axes), list(message.buttons), stamp, "spacenav/joy")
+
+    def _take_twist(self, message: Twist) -> None:
+        """The same deflections without buttons; a driver that sends both is heard once."""
+        if self._has_joy:
+            return
+        v, w = message.linear, message.angular
+        axes = [v.x, v.y, v.z, w.x, w.y, w.z]
+        self._take(axes, [], self._device.now(), "spacenav/twist")
+
+    def _take(self, axes: list[float], buttons: list[int], stamp: int, topic: str) -> None:
+        measurement = self._mouse.axes(axes, buttons, stamp)
+        if measurement is not None:
+            self._device.take(measurement)
+        elif self._mouse.last_problem:
+            self._device.refuse("axes", f"{topic}: {self._mouse.last_problem}")
+
+
+MOVING = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+)
+"""Many nodes share `tf`, this one too: the newest message alone would often be another's."""
+
+STATIC = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+class TfInput(TrackerInput):
+    """The frame ``tracker.body`` in the frame ``tracker.frame``, each time a frame between moves.
+
+    Its stamp is that of the transform that came: frames between are taken where they last were.
+    """
+
+    def __init__(self, device: Device, settings: Any) -> None:
+        super().__init__(device, settings)
+        tracker = device.scene.tracker
+        if tracker.body is None:
+            raise SceneError(
+                f"{device.scene.origin}: tracker.body: is missing; name the probe's frame in tf"
+            )
+        if tracker.body == "probe":
+            raise SceneError(
+                f"{device.scene.origin}: tracker.body: `probe` is the frame that this node "
+                f"publishes itself; name the frame that the tracker gives the probe"
+            )
+        self._frame, self._body = tracker.frame, tracker.body
+        self._tree = FrameTree()
+        self._fixed: set[str] = set()
+        device.listen_to_device(TFMessage, "tf", self._take, MOVING)
+        device.listen(TFMessage, "tf_static", self._take_static, STATIC)
+
+    def _take_static(self, message: TFMessage) -> None:
+        """Keep what does not move; a way of nothing else makes no poses."""
+        self._fixed |= self._keep(message)
+        chain = self._tree.chain(self._body, self._frame)
+        if chain is not None and self._fixed.issuperset(chain):
+            self._device.refuse(
+                "frame",
+                f"nothing moves in tf between '{self._frame}' and '{self._body}': all of it is in "
+                f"tf_static, so no pose comes",
+            )
+
+    def _keep(self, message: TFMessage) -> set[str]:
+        """Remember the transforms of a message; the frames that have moved."""
+        moved = set()
+        for transform in message.transforms:
+            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id
+            try:
+                pose = transform_from(transform)
+            except PoseError as error:
+                self._device.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
+                continue
+            if self._tree.place(child, parent.lstrip("/"), pose):
+                moved.add(child)
+        return moved
+
+    def _take(self, message: TFMessage) -> None:
+        moved = self._keep(message)
+        self._fixed -= moved
+        chain = self._tree.chain(self._body, self._frame)
+        if chain is None:
+            self._device.refuse(
+                "frame",
+                f"tf has no way from '{self._body}' up to '{self._frame}' yet: see tracker.body "
+                f"and tracker.frame in the scene",
+            )
+            return
+        stamps = [
+            self._device.stamp_of(transform.header, "tf")
+            for transform in message.transforms
+            if transform.child_frame_id.lstrip("/") in moved & set(chain)
+        ]
+        if stamps:
+            self._device.take(Measurement(max(stamps), self._tree.pose(chain)))

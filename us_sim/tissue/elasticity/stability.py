@@ -1,0 +1,261 @@
+"""Stability and residual of spring tissues: stable steps, inverted tetrahedra, unbalanced forces.
+
+A mode of circular frequency w, damped by b times its stiffness, is multiplied in a symplectic Euler
+step of dt by a root of z**2 - (2 - b w**2 dt - w**2 dt**2) z + 1 - b w**2 dt. Both roots are inside
+the unit circle (E. I. Jury's conditions) if and only if dt**2 + 2 b dt < 4 / w**2.
+
+Springs know lengths and not volumes: pressed beyond the mesh's spacing, a node can pass through a
+face and then rests on the wrong side. Under the probe this is only reported; without a probe the
+tissue is put back to its undeformed state, which is then the state of rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from us_sim.errors import SolverError
+from us_sim.kernels import njit
+from us_sim.settings.spelling import counted
+from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm, area_vectors
+from us_sim.tissue.model import TissueModel
+
+_MARGIN = 1.05  # Safety factor of masses and sub-steps on Gershgorin's bound of stability
+_TOLERANCE = 1e-4  # relative, of the square of the highest frequency
+
+
+def step_limit(frequency: float, damping_factor: float) -> float:
+    """s, the longest stable step of symplectic Euler for stiffness-proportional damping.
+
+    Args:
+        frequency: the highest one, 1/s.
+        damping_factor: s, damping constant over stiffness.
+    """
+    span = 4 / frequency**2
+    return span / (damping_factor + math.sqrt(damping_factor**2 + span))
+
+
+def highest_frequency(
+    factors: Sequence[csr_array], mass: NDArray[np.float64], fixed: NDArray[np.bool_]
+) -> float:
+    """1/s, the largest circular frequency of small undamped oscillations.
+
+    By Lanczos iterations on the largest generalised eigenvalue of stiffness and mass, to 1e-4.
+
+    Args:
+        factors: B (rows, 3N) of each kind of force, whose B'B add up to the stiffness.
+        mass: (N,) kg.
+        fixed: (N,), held nodes.
+    """
+    scale = np.repeat(np.where(fixed, 0.0, 1 / np.sqrt(mass)), 3)
+    free = np.repeat(~fixed, 3)
+    factor = csr_array(vstack(factors).multiply(scale).tocsc()[:, free])
+    size = factor.shape[1]
+    if size <= 30:
+        return math.sqrt(max(np.linalg.eigvalsh((factor.T @ factor).toarray())[-1], 0.0))
+    back = factor.T.tocsr()
+    product = LinearOperator((size, size), matvec=lambda v: back @ (factor @ v), dtype=float)
+    start = np.random.default_rng(0).standard_normal(size)
+    largest = eigsh(product, k=1, which="LA", v0=start, tol=_TOLERANCE, return_eigenvectors=False)
+    return math.sqrt(largest[0])
+
+
+def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
+    """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
+
+    For springs alone it is the sum of a node's spring constants, which holds however they turn and
+    stretch. With or without a volume term it is about 2.7 times what the undeformed tissue needs.
+
+    Args:
+        factors: as in `highest_frequency`.
+    """
+    count = factors[0].shape[1] // 3
+    axes = np.repeat(np.arange(count), 3), np.arange(3 * count)
+    merge = csr_array((np.ones(3 * count), axes[::-1]), shape=(3 * count, count))
+    total = np.zeros(count)
+    for factor in factors:
+        size = csr_array(factor.multiply(factor) @ merge).sqrt()
+        total += 0.5 * (size.T @ np.asarray(size.sum(axis=1)).ravel())
+    return total
+
+
+def stabilised(
+    model: TissueModel,
+    factors: Sequence[csr_array],
+    time_step: float,
+    damping_factor: float,
+    stabilisation: str,
+    maximum_substeps: int,
+) -> tuple[NDArray[np.float64], int, str]:
+    """Masses (N,) kg and number of sub-steps that make a step stable, and what was done, in words.
+
+    They follow from the bound of `node_stiffness`, so that the step stays stable as the tissue
+    deforms. The limit in the words is the one of small oscillations.
+
+    Args:
+        model: whose lumped masses are simulated where possible.
+        factors: as in `highest_frequency`.
+        time_step: s, as set.
+        damping_factor: s, damping constant over stiffness.
+        stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only says what it is.
+        maximum_substeps: of one step.
+
+    Raises:
+        SolverError: more sub-steps than allowed.
+    """
+    mass, free = model.lumped_mass, ~model.fixed
+    if not free.any():
+        return mass, 1, ""
+    stiffness = node_stiffness(factors)
+    span = time_step**2 + 2 * damping_factor * time_step
+    needed = 0.5 * _MARGIN * span * stiffness
+    if not (needed > mass)[free].any():
+        return mass, 1, ""
+    limit = step_limit(highest_frequency(factors, mass, model.fixed), damping_factor)
+    unstable = f"steps beyond {1e3 * limit:.2g} ms are unstable"
+    if stabilisation == "none":
+        return mass, 1, unstable
+    if stabilisation == "mass_scaling":
+        scaled = np.maximum(mass, needed)
+        factor = (scaled / mass)[free]
+        low, high = factor.min(), factor.max()
+        return scaled, 1, f"masses scaled {low:.0f} to {high:.0f} times: unscaled, {unstable}"
+    bound = math.sqrt(2 * _MARGIN * (stiffness / mass)[free].max())
+    substeps = math.ceil(time_step / step_limit(bound, damping_factor))
+    if substeps > maximum_substeps:
+        raise SolverError(
+            f"msds needs {substeps} sub-steps for each step of {1e3 * time_step:g} ms, more than "
+            f"maximum_substeps = {maximum_substeps}: use stabilisation mass_scaling, or lower "
+            f"damping_factor"
+        )
+    return mass, substeps, f"{substeps} sub-steps a step: undivided, {unstable}"
+
+
+# Tetrahedra up to which all are watched, which takes less than a millisecond; and how many layers
+# under the surface are watched otherwise.
+_WATCHED, _LAYERS = 50_000, 2
+_PATIENCE = 10  # Frames in which a released tissue may untangle by itself
+
+
+class Tangling:
+    """Watches a tissue for tetrahedra inside out, frame by frame.
+
+    Args:
+        model: of the tissue.
+    """
+
+    def __init__(self, model: TissueModel) -> None:
+        self._tetrahedra = model.mesh.tetrahedra
+        self._held = bool(model.fixed.any())
+        self._frames_free = 0
+
+    def forget(self) -> None:
+        """Begin anew, since the tissue was put elsewhere."""
+        self._frames_free = 0
+
+    def judge(self, positions: NDArray[np.float64], touched: bool) -> tuple[str, bool]:
+        """What to say at the end of a frame, and whether the tissue is to be put back to rest.
+
+        Args:
+            positions: (N, 3) m.
+            touched: whether the probe pushes the tissue.
+        """
+        self._frames_free = 0 if touched else self._frames_free + 1
+        inverted = count_inverted(positions, self._tetrahedra)
+        if inverted == 0:
+            return "", False
+        if self._frames_free < _PATIENCE or not self._held:
+            return f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out", False
+        return (
+            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
+            f"was put back to rest",
+            True,
+        )
+
+
+def watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:
+    """(W, 4), where a press turns tetrahedra inside out first: all, or those under the surface."""
+    tetrahedra = model.mesh.tetrahedra
+    if len(tetrahedra) <= _WATCHED:
+        return tetrahedra
+    near = np.zeros(len(model.mesh.nodes), dtype=bool)
+    near[model.contact_nodes] = True
+    for _ in range(_LAYERS):
+        touched = near[tetrahedra].any(axis=1)
+        near[tetrahedra[touched]] = True
+    return np.ascontiguousarray(tetrahedra[touched])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_inverted(nodes, tetrahedra):
+    """How many tetrahedra (M, 4) have no positive volume."""
+    count = 0
+    for t in range(len(tetrahedra)):
+        if not area_vectors(nodes, tetrahedra, t)[0] > 0.0:
+            count += 1
+    return count
+
+
+class ElasticBalance:
+    """Residual of each frame of a run.
+
+    It is the norm of the unbalanced elastic forces over the norm of the contact forces, or, without
+    contact, over the largest such norm since rest. Inertia and damping do not count: it follows
+    from the nodes alone and says how far the tissue is from where it would come to rest.
+
+    Args:
+        rounding: N, norm of the forces at rest that arise when coordinates are rounded.
+    """
+
+    def __init__(self, rounding: float) -> None:
+        self._rounding = rounding
+        self._heaviest = 0.0
+
+    @classmethod
+    def of(
+        cls, springs: SpringNetwork, volume: VolumeTerm, nodes: NDArray[np.float64]
+    ) -> ElasticBalance:
+        """The balance of springs and volumes that are undeformed at nodes (N, 3) m."""
+        stiffness = float(np.linalg.norm(springs.stiffness))
+        if len(volume.tetrahedra):
+            # A tetrahedron resists as a spring of its modulus and size.
+            size = np.cbrt(volume.rest_volume)
+            stiffness += float(np.linalg.norm((volume.element + volume.nodal) * size))
+        return cls(4 * float(np.finfo(np.float64).eps * np.abs(nodes).max()) * stiffness)
+
+    @property
+    def heaviest(self) -> float:
+        """N, largest norm of contact forces since the tissue was at rest."""
+        return self._heaviest
+
+    def forget(self) -> None:
+        """Begin anew, since the tissue was put elsewhere: earlier loads no longer count."""
+        self._heaviest = 0.0
+
+    def residual(
+        self,
+        holding: NDArray[np.float64],
+        touched: NDArray[np.integer],
+        normal: NDArray[np.float64],
+    ) -> float:
+        """The residual of one frame.
+
+        Args:
+            holding: (N, 3) N that would hold the nodes where they are, nothing at fixed ones.
+            touched: (K,) nodes that the probe pushes.
+            normal: (K, 3) unit directions in which it pushes them where they are.
+        """
+        push = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
+        unbalanced = holding.copy()
+        unbalanced[touched] -= push[:, None] * normal
+        imbalance, load = float(np.linalg.norm(unbalanced)), float(np.linalg.norm(push))
+        if load == 0.0 and imbalance <= self._rounding:
+            self._heaviest = 0.0
+            return 0.0
+        self._heaviest = max(self._heaviest, load) or imbalance
+        return imbalance / (load or self._heaviest)

@@ -1,0 +1,93 @@
+"""Every tuned constant of ``fem_nonlinear``: Newton's method, its load steps, time and recovery.
+
+"Iterations" are those of the conjugate gradients, in which nearly all of a frame's time goes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """The constants, each with its unit, its meaning, and what other values cost."""
+
+    # Newton's method (`us_sim.tissue.solvers.newton`)
+    first_iteration_limit: int = 12
+    """Iterations of the first step at a pose. It doubles while steps need not be cut. Solved
+    further, the step after a large change overshoots and is cut by the line search."""
+    iteration_limit: int = 100
+    """Greatest iteration limit of a step: beyond, a factor of the stiffness takes less time."""
+    small_iteration_limit: int = 45
+    """The same of a small tissue."""
+    small_tissue: int = 500
+    """Free nodes up to which factoring the stiffness takes no longer than a frame."""
+    forcing_term: float = 0.2
+    """Residual norm of a step's linear model, over the first, at which conjugate gradients end.
+    A lower one is no use: the next step has a new tangent."""
+    goal_fraction: float = 0.3
+    """The same over the residual norm that a frame is to reach."""
+    contact_interval: int = 12
+    """Iterations after which the linear model finds anew which points touch; then twice as many."""
+    backtracks: int = 8
+    """Step lengths of a line search, each half of the one before."""
+    energy_rounding: float = 1e-12
+    """Fraction of the energy by which rounding may seem to raise it."""
+    damping: float = 0.01
+    """Levenberg's damping after a step that was cut, over the tissue's stiffness at rest; four
+    times as much after each further one, and a quarter after each that was not."""
+    least_damping: float = 0.001
+    """Damping below which there is none."""
+    most_damping: float = 1e3
+    """Damping beyond which no step leads any further: the method has stagnated."""
+    local_weight: float = 12.0
+    """Weight of the local preconditioner, over the largest eigenvalue of the locally preconditioned
+    stiffness at rest. 1 to 25 were tried."""
+    single_contrast: float = 1e4
+    """Ratio of Young's moduli beyond which conjugate gradients need double precision: rounding in
+    single hides the softer forces."""
+    single_bulk: float = 1e3
+    """Bulk over shear modulus beyond which they need it, since rounding hides the shear's."""
+
+    # Load steps and prediction (`us_sim.tissue.solvers.fem_nonlinear`)
+    load_step: float = 3e-3
+    """m, longest way of a probe in tissue that is gone at once. Tissue that is hit or swept aside
+    at once may end elsewhere than if the probe had moved there."""
+    most_load_steps: int = 8
+    """Load steps of a frame; a longer way is a leap, after which the probe comes from above."""
+    load_step_tolerance: float = 0.2
+    """Residual with which a load step ends."""
+    load_step_newton_steps: int = 5
+    """Newton's steps of a load step."""
+    load_step_time: float = 0.7
+    """Part of a frame's time after which no load step is begun."""
+    load_step_iterations: float = 0.6
+    """Part of a frame's iterations after which none is begun."""
+    predicted_gap: float = 0.1
+    """Gap up to which a node may come to touch within a frame, over the tissue's smallest side."""
+
+    # Time and iterations of a frame (`us_sim.tissue.solvers.frame_budget`)
+    newton_step_cost: int = 8
+    """What a Newton step costs besides its iterations, in iterations."""
+    overtime: float = 3.0
+    """How many times its time a live frame may take that is not in balance: tissue that is left
+    behind is harder to balance than poses that were missed, and shows more."""
+    rest_frames: int = 30
+    """Frames of a probe at rest after which one may take longer than its time, to be solved."""
+    rest_factor: int = 2
+    """How many times the iterations of other frames one of a probe at rest may take."""
+    restart_factor: int = 6
+    """How many times these one may take that begins anew from rest."""
+
+    # Recovery, and when tissue is settled
+    inverted_frames: int = 10
+    """Frames in a row that may end inside out before the tissue is begun anew from rest. None where
+    time is short and the probe moves on: what is shown would stay behind ever farther."""
+    settled_motion: float = 10.0
+    """Motion that settled tissue may still see when contact is updated, over the spacing of the
+    nodes that the probe can touch, for a tolerance of 1."""
+    reported_depth: float = 0.5
+    """Depth of the probe in the tissue, over that spacing, from which on it is reported."""
+
+
+TUNING = Tuning()

@@ -1,0 +1,544 @@
+"""Streams to the pages, made of topics that are subscribed to only while a page watches them.
+
+Messages are kept as bytes; only those that a page takes are decoded and made into packets, in the
+page's thread. The node reports a message that cannot be used.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image, PointCloud2
+from shape_msgs.msg import Mesh
+from std_msgs.msg import Float64MultiArray, Int32MultiArray
+from visualization_msgs.msg import MarkerArray
+
+from us_sim.errors import MeshError, VolumeError
+from us_sim.nodes.guarded_node import GuardedNode, decoded
+from us_sim.nodes.messages import (
+    affine_from,
+    colour_pixels_from,
+    line_from,
+    markers_stamp,
+    mesh_from,
+    nanoseconds_of,
+    pixels_from,
+    pose_from,
+    tetrahedra_from,
+    triangles_from,
+    vectors_from,
+    wrench_from,
+)
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.qos import LATCHED, STREAM
+from us_sim.slicing.settings import STRIPS
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.viewer.stream import Feed, Packet
+from us_sim.viewer.surfaces import (
+    CarriedSurfaces,
+    ColouredSurface,
+    EquivalentStrain,
+    RestSurface,
+    transducer_packet,
+    welded,
+)
+
+_QUALITY = 90
+"""Of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were."""
+_STRAIN_RATE = 12.0
+"""Hz: strain takes longer than positions, and its colours are read and not followed."""
+_NODES, _STRUCTURES = "tissue/nodes", "tissue/structures"
+_POSE, _WRENCH = "probe/pose", "probe/wrench"
+
+Make = Callable[[Any, int], Packet | None]
+"""The packet of a message and a number; None while none can be made."""
+
+
+def made_of(
+    node: GuardedNode, message_type: Any, topic: str, data: bytes, make: Callable[[Any], Any]
+) -> Any:
+    """The result of ``make`` for a message's bytes; None, and reported, where it refuses them."""
+    made: list[Any] = []
+    take = decoded(message_type, lambda message: made.append(make(message)))
+    node.guarded(node.resolve_topic_name(topic), take)(data)
+    return made[0] if made else None
+
+
+class Subscriptions:
+    """Subscriptions that are there or not, all together.
+
+    Args:
+        node: that subscribes.
+        wanted: type, topic, callback, quality of service, and whether bytes are handed over.
+    """
+
+    def __init__(self, node: GuardedNode, *wanted: tuple[Any, str, Any, QoSProfile, bool]) -> None:
+        self._node, self._wanted = node, wanted
+        self._there: list[Any] = []
+
+    def keep(self, is_wanted: bool) -> bool:
+        """Subscribe, or no longer; whether that is a change."""
+        if is_wanted == bool(self._there):
+            return False
+        for subscription in self._there:
+            self._node.destroy_subscription(subscription)
+        self._there = []
+        if is_wanted:
+            self._there = [
+                self._node.create_subscription(kind, topic, take, qos, raw=raw)
+                for kind, topic, take, qos, raw in self._wanted
+            ]
+        return True
+
+
+def topic_feed(
+    node: GuardedNode,
+    post: Posted,
+    message_type: Any,
+    topic: str,
+    make: Make,
+    kind: str,
+    rate: float | None,
+    qos: QoSProfile = STREAM,
+) -> Feed:
+    """A stream of the messages of one topic.
+
+    Args:
+        node: that subscribes.
+        post: has work done in the node's thread.
+        message_type, topic, qos: of the subscription.
+        make: the packet of a message; an error that it raises refuses the message.
+        kind: the stream's name.
+        rate: Hz, at most, for each page; None is all.
+    """
+
+    def take(data: bytes) -> None:
+        def pack(sequence: int) -> Packet | None:
+            packet: Packet | None = made_of(
+                node, message_type, topic, data, lambda message: make(message, sequence)
+            )
+            return packet
+
+        feed.offer(pack)
+
+    subscription = Subscriptions(node, (message_type, topic, take, qos, True))
+    # As it is once that is done: the page may have gone meanwhile.
+    feed = Feed(kind, lambda _: post(lambda: subscription.keep(feed.is_watched)), rate)
+    return feed
+
+
+def image_feeds(
+    node: GuardedNode,
+    post: Posted,
+    rate: float,
+    known: Callable[[int], dict[str, Any]] = lambda _: {},
+    arranged: Callable[[], tuple[bool, bool]] = lambda: (False, False),
+) -> list[Feed]:
+    """The B-mode image as ``image`` and ``image_jpeg``, and pictures in colour.
+
+    The header of a B-mode image, and of the annotated one, says where its pixels are (``matrix``).
+
+    Args:
+        node: that subscribes.
+        post: has work done in the node's thread.
+        rate: Hz, of images, at most, for each page.
+        known: more for the header of the image of a stamp, ns.
+        arranged: whether left and right are to be exchanged, as in the annotated image, and
+            whether that has the B-mode image at its left.
+    """
+    places: list[NDArray[np.float64]] = []
+
+    def place(message: Float64MultiArray) -> None:
+        places[:] = [affine_from(message)]
+
+    node.create_subscription(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
+
+    def telling(make: Callable[[Image, int, bool], Packet]) -> Make:
+        def tell(message: Image, sequence: int) -> Packet:
+            flip, is_beside = arranged()
+            packet = make(message, sequence, flip)
+            header = {**packet.header, **known(int(packet.header["stamp"]))}
+            panels = 2 if is_beside and packet.kind == "annotated" else 1
+            if panels > 1:
+                header["panels"] = panels
+            for matrix in places:
+                columns = int(header["columns"]) // panels
+                of_pixels = _flipped(matrix, columns) if flip else matrix
+                header["matrix"] = of_pixels.ravel().tolist()
+            return replace(packet, header=header)
+
+        return tell
+
+    def images(topic: str, kind: str, make: Make) -> Feed:
+        return topic_feed(node, post, Image, topic, make, kind, rate)
+
+    annotated = partial(_colour_jpeg, "annotated")
+    return [
+        images("ultrasound/image", "image", telling(_pixels)),
+        images("ultrasound/image", "image_jpeg", telling(_grey_jpeg)),
+        images("ultrasound/image_annotated", "annotated", telling(lambda m, n, _: annotated(m, n))),
+        *(images(strip.topic, kind, partial(_colour_jpeg, kind)) for kind, strip in STRIPS.items()),
+    ]
+
+
+def _pixels(message: Image, sequence: int, flip: bool) -> Packet:
+    return Packet("image", sequence, _header(message, "mono8"), _grey(message, flip).tobytes())
+
+
+def _grey_jpeg(message: Image, sequence: int, flip: bool) -> Packet:
+    return _jpeg(message, "image_jpeg", sequence, _grey(message, flip))
+
+
+def _grey(message: Image, flip: bool) -> NDArray[np.uint8]:
+    pixels = pixels_from(message)
+    return np.ascontiguousarray(pixels[:, ::-1] if flip else pixels)
+
+
+def _flipped(matrix: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+    """From (column, row, 0, 1) of the image whose left and right are exchanged."""
+    exchange = np.diag([-1.0, 1.0, 1.0, 1.0])
+    exchange[0, 3] = columns - 1
+    return matrix @ exchange
+
+
+def _colour_jpeg(kind: str, message: Image, sequence: int) -> Packet:
+    pixels = cv2.cvtColor(colour_pixels_from(message), cv2.COLOR_RGB2BGR)
+    return _jpeg(message, kind, sequence, pixels)
+
+
+def _jpeg(message: Image, kind: str, sequence: int, pixels: NDArray[Any]) -> Packet:
+    done, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not done:
+        raise VolumeError("the image cannot be made a JPEG")
+    return Packet(kind, sequence, _header(message, "jpeg"), encoded.tobytes())
+
+
+def _header(message: Image, encoding: str) -> dict[str, Any]:
+    rows, columns = int(message.height), int(message.width)
+    return {"stamp": _stamp(message), "rows": rows, "columns": columns, "encoding": encoding}
+
+
+def _stamp(message: Any) -> str:
+    """ns, as a text: it has more digits than a number of JavaScript."""
+    return str(nanoseconds_of(message.header.stamp))
+
+
+def surfaces_of(message: MarkerArray, frame: str) -> list[ColouredSurface]:
+    """One surface of each namespace, with shared vertices.
+
+    Raises:
+        MeshError: the corners do not make whole triangles, or one is not finite.
+        MessageError: a marker is in another frame.
+    """
+    surfaces = []
+    for name, colour, corners in triangles_from(message, frame):
+        vertices, triangles = welded(corners)
+        if len(triangles):
+            surfaces.append(ColouredSurface(name, colour, vertices, triangles))
+    return surfaces
+
+
+class ProbeFeeds:
+    """The streams ``probe_mesh``, of ``probe/marker``, and ``probe``, of pose and wrench."""
+
+    def __init__(self, node: GuardedNode, post: Posted, rate: float) -> None:
+        self._node = node
+        self._feed = Feed("probe", lambda _: post(self._listen), rate)
+        # Until the image of their stamp is made.
+        self._poses: deque[bytes] = deque(maxlen=16)
+        self._wrenches: deque[bytes] = deque(maxlen=16)
+        self._subscriptions = Subscriptions(
+            node,
+            (PoseStamped, _POSE, partial(self._take, self._poses), STREAM, True),
+            (WrenchStamped, _WRENCH, partial(self._take, self._wrenches), STREAM, True),
+        )
+        told = topic_feed(
+            node, post, MarkerArray, "probe/marker", _shape, "probe_mesh", None, LATCHED
+        )
+        self.feeds: list[Feed] = [told, self._feed]
+
+    def _listen(self) -> None:
+        if self._subscriptions.keep(self._feed.is_watched) and self._feed.is_watched:
+            self._wrenches.clear()  # of the time before
+
+    def _take(self, kept: deque[bytes], data: bytes) -> None:
+        kept.append(data)
+        if self._poses:
+            wrench = self._wrenches[-1] if self._wrenches else None
+            self._feed.offer(partial(self._pack, self._poses[-1], wrench))
+
+    def at(self, stamp: str) -> dict[str, Any]:
+        """Position, quaternion, force and torque of a stamp, ns, as far as they are known.
+
+        They are not while nobody watches the stream ``probe``.
+        """
+        found: dict[str, Any] = {}
+        for kind, topic, kept, make, key in (
+            (PoseStamped, _POSE, self._poses, _pose_header, "stamp"),
+            (WrenchStamped, _WRENCH, self._wrenches, _wrench_header, "force_stamp"),
+        ):
+            headers = (made_of(self._node, kind, topic, each, make) for each in reversed([*kept]))
+            found |= next((each for each in headers if each and each[key] == stamp), {})
+        return found
+
+    def _pack(self, pose: bytes, wrench: bytes | None, sequence: int) -> Packet | None:
+        header = made_of(self._node, PoseStamped, _POSE, pose, _pose_header)
+        if header is None:
+            return None
+        force = wrench and made_of(self._node, WrenchStamped, _WRENCH, wrench, _wrench_header)
+        if force:
+            age = 1e-9 * (int(header["stamp"]) - int(force["force_stamp"]))
+            header |= force | {"force_age": round(age, 3)}
+        return Packet("probe", sequence, header, b"")
+
+
+def _shape(message: MarkerArray, sequence: int) -> Packet:
+    parts = surfaces_of(message, "probe")
+    return transducer_packet("probe_mesh", sequence, parts, line_from(message, "probe"))
+
+
+def _pose_header(message: PoseStamped) -> dict[str, Any]:
+    pose = pose_from(message, "patient")
+    place = {"position": pose.position.tolist(), "quaternion": pose.orientation.tolist()}
+    return {"stamp": _stamp(message), **place}
+
+
+def _wrench_header(message: WrenchStamped) -> dict[str, Any]:
+    wrench = wrench_from(message, "probe").tolist()
+    return {"force": wrench[:3], "torque": wrench[3:], "force_stamp": _stamp(message)}
+
+
+class SkinFeeds:
+    """The streams ``skin_mesh``, of ``skin/mesh``, and ``skin``, of ``skin/nodes``."""
+
+    def __init__(self, node: GuardedNode, post: Posted, rate: float) -> None:
+        self._surface: RestSurface | None = None
+        self.feeds: list[Feed] = [
+            topic_feed(node, post, Mesh, "skin/mesh", self._tell, "skin_mesh", None, LATCHED),
+            topic_feed(node, post, PointCloud2, "skin/nodes", self._move, "skin", rate),
+        ]
+
+    def _tell(self, message: Mesh, sequence: int) -> Packet:
+        self._surface = RestSurface(*mesh_from(message))
+        return self._surface.told("skin_mesh", sequence)
+
+    def _move(self, message: PointCloud2, sequence: int) -> Packet | None:
+        return _moved(self._surface, message, "skin", sequence)
+
+
+def _moved(
+    surface: RestSurface | None, message: PointCloud2, kind: str, sequence: int
+) -> Packet | None:
+    if surface is None:
+        return None
+    positions, stamp = vectors_from(message, "patient"), nanoseconds_of(message.header.stamp)
+    return surface.moved(positions, kind=kind, sequence=sequence, stamp=stamp)
+
+
+class RestMesh:
+    """The tissue's mesh of ``tissue/rest`` and ``tissue/tetrahedra``, subscribed to while used.
+
+    One serves all who work with the mesh, in the node's thread.
+
+    Args:
+        node: that subscribes.
+    """
+
+    def __init__(self, node: GuardedNode) -> None:
+        self._node = node
+        self._watchers: list[Callable[[], None]] = []
+        self._subscriptions = Subscriptions(
+            node,
+            (PointCloud2, "tissue/rest", self._take_rest, LATCHED, False),
+            (Int32MultiArray, "tissue/tetrahedra", self._take_tetrahedra, LATCHED, False),
+        )
+        self._rest: PointCloud2 | None = None
+        self._tetrahedra: Int32MultiArray | None = None
+        self.mesh: TetrahedralMesh | None = None
+        self.surface: RestSurface | None = None  # its outer faces, with their edges
+
+    def watch(self, came: Callable[[], None], is_wanted: bool = True) -> None:
+        """Have ``came`` called when there is another mesh, or no longer.
+
+        The mesh that is there is kept, and nobody is called for it.
+        """
+        if is_wanted == (came in self._watchers):
+            return
+        if is_wanted:
+            self._watchers.append(came)
+        else:
+            self._watchers.remove(came)
+        self._subscriptions.keep(bool(self._watchers))
+
+    def _take_rest(self, message: PointCloud2) -> None:
+        self._rest = message
+        self._make(is_complete=False)
+
+    def _take_tetrahedra(self, message: Int32MultiArray) -> None:
+        self._tetrahedra = message
+        self._make(is_complete=True)
+
+    def _make(self, is_complete: bool) -> None:
+        """Make a mesh, unless the second message must still follow the first of another scene."""
+        if self._rest is None or self._tetrahedra is None:
+            return
+        nodes = vectors_from(self._rest, "patient")
+        tetrahedra = tetrahedra_from(self._tetrahedra)
+        if tetrahedra.max(initial=-1) + 1 != len(nodes):
+            if not is_complete:
+                return
+            raise MeshError(
+                f"the tissue has {len(nodes)} nodes at rest, and its tetrahedra name "
+                f"{tetrahedra.max(initial=-1) + 1}: the two are not of the same mesh"
+            )
+        mesh = TetrahedralMesh(nodes, tetrahedra)
+        surface = RestSurface.around(mesh)
+        if self.surface is not None and surface.number == self.surface.number:
+            return
+        self.mesh, self.surface = mesh, surface
+        for came in list(self._watchers):
+            self._node.guarded(self._node.resolve_topic_name("tissue/rest"), came)()
+
+
+class TissueFeeds:
+    """The streams ``tissue_mesh``, ``tissue`` and ``strain``, of ``tissue/…``."""
+
+    def __init__(self, node: GuardedNode, post: Posted, rate: float, rest: RestMesh) -> None:
+        self._rest = rest
+        self._number: int | None = None  # of the mesh that was told
+        self._strain: tuple[TetrahedralMesh, EquivalentStrain] | None = None
+        self._told = Feed("tissue_mesh", lambda _: post(self._listen), rate=None)
+        strain_rate = min(rate, _STRAIN_RATE)
+        self.feeds: list[Feed] = [
+            self._told,
+            topic_feed(node, post, PointCloud2, _NODES, self._move, "tissue", rate),
+            topic_feed(node, post, PointCloud2, _NODES, self._be_strained, "strain", strain_rate),
+        ]
+
+    def _listen(self) -> None:
+        """Hear of meshes while a page watches; one may be there already."""
+        self._rest.watch(self._offer, self._told.is_watched)
+        self._offer()
+
+    def _offer(self) -> None:
+        surface = self._rest.surface
+        if surface is not None and surface.number != self._number:
+            self._number = surface.number
+            self._told.offer(lambda sequence: surface.told("tissue_mesh", sequence))
+
+    def _move(self, message: PointCloud2, sequence: int) -> Packet | None:
+        return _moved(self._rest.surface, message, "tissue", sequence)
+
+    def _be_strained(self, message: PointCloud2, sequence: int) -> Packet | None:
+        mesh, surface = self._rest.mesh, self._rest.surface
+        if mesh is None or surface is None:
+            return None
+        if self._strain is None or self._strain[0] is not mesh:
+            self._strain = mesh, EquivalentStrain(mesh)
+        nodes = vectors_from(message, "patient")
+        if nodes.shape != mesh.nodes.shape:
+            raise MeshError(f"{len(nodes)} nodes came, and the mesh has {len(mesh.nodes)}")
+        header = {"stamp": _stamp(message), "mesh": surface.number, "points": len(nodes)}
+        values = self._strain[1].of(nodes).astype(np.float32)
+        return Packet("strain", sequence, header, values.tobytes())
+
+
+class StructuresFeed:
+    """The stream ``structures``, of ``tissue/structures``.
+
+    That is three megabytes a message, twenty times a second. So it is listened to until one
+    message has come whose stamp is also one of ``tissue/nodes``; then it is known where in the
+    tissue each vertex lies, and the page moves the structures with the tissue.
+    """
+
+    def __init__(self, node: GuardedNode, post: Posted, rest: RestMesh) -> None:
+        self._node, self._post, self._rest = node, post, rest
+        self.feed = Feed("structures", lambda _: post(self._listen), rate=None)
+        self._subscriptions = Subscriptions(
+            node,
+            (PointCloud2, _NODES, self._take_nodes, STREAM, True),
+            (MarkerArray, _STRUCTURES, self._take_structures, STREAM, True),
+        )
+        self._nodes: dict[int, bytes] = {}  # by stamp, ns
+        self._structures: tuple[int, bytes] | None = None
+        self._made_for: int | None = None  # the number of the mesh
+        self._making: threading.Thread | None = None
+
+    def _listen(self) -> None:
+        """Hear of meshes while watched, and of the rest until it has been used."""
+        self._rest.watch(self._listen, self.feed.is_watched)
+        surface = self._rest.surface
+        is_new = surface is not None and surface.number != self._made_for
+        if is_new:
+            self.feed.forget()  # the tissue that carried them is of another scene
+        if self._subscriptions.keep(self.feed.is_watched and is_new and self._making is None):
+            self._nodes.clear()
+            self._structures = None
+
+    def _take_nodes(self, data: bytes) -> None:
+        stamp = made_of(
+            self._node, PointCloud2, _NODES, data, lambda m: nanoseconds_of(m.header.stamp)
+        )
+        if stamp is None:
+            return
+        self._nodes[stamp] = data
+        while len(self._nodes) > 32:
+            del self._nodes[next(iter(self._nodes))]
+        self._try()
+
+    def _take_structures(self, data: bytes) -> None:
+        stamp = markers_stamp(data)
+        if stamp is not None:
+            self._structures = stamp, data
+            self._try()
+
+    def _try(self) -> None:
+        if self._structures is None or self._making is not None:
+            return
+        nodes = self._nodes.get(self._structures[0])
+        mesh, surface = self._rest.mesh, self._rest.surface
+        if nodes is None or mesh is None or surface is None:
+            return
+        arguments = (mesh, surface.number, nodes, self._structures[1])
+        self._making = threading.Thread(
+            target=self._make, args=arguments, daemon=True, name="structures"
+        )
+        self._making.start()
+        self._listen()
+
+    def _make(self, mesh: TetrahedralMesh, number: int, nodes: bytes, structures: bytes) -> None:
+        def deformed(message: PointCloud2) -> TetrahedralMesh:
+            return TetrahedralMesh(vectors_from(message, "patient"), mesh.tetrahedra)
+
+        def carried_by(now: TetrahedralMesh, message: MarkerArray) -> CarriedSurfaces:
+            surfaces = surfaces_of(message, "patient")
+            if not surfaces:
+                raise MeshError("there is no triangle in it")
+            return CarriedSurfaces(now, surfaces)
+
+        carried = None
+        made = made_of(self._node, PointCloud2, _NODES, nodes, deformed)
+        if made is not None:
+            make = partial(carried_by, made)
+            carried = made_of(self._node, MarkerArray, _STRUCTURES, structures, make)
+        self._post(lambda: self._end(number, carried, is_wrong=made is not None))
+
+    def _end(self, number: int, carried: CarriedSurfaces | None, is_wrong: bool) -> None:
+        """Offer the structures. Those that cannot be used are not tried again."""
+        self._making = None
+        if carried is not None or is_wrong:
+            self._made_for = number
+        surface = self._rest.surface
+        if carried is not None and surface is not None and surface.number == number:
+            self.feed.offer(lambda sequence: carried.told("structures", sequence, number))
+        self._listen()

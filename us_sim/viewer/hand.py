@@ -1,0 +1,472 @@
+"""The hand of the pages: moves the probe as they ask, unless somebody else moves it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from numpy.typing import ArrayLike
+from shape_msgs.msg import Mesh
+
+from us_sim.errors import UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.probe_lead import LEAD_TOPIC
+from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.tracking.measurement import PATIENT, TrackingState
+from us_sim.tracking.virtual_hand import Motion, RestSurface, Stance
+from us_sim.viewer.feeds import RestMesh, Subscriptions
+from us_sim.viewer.hand_command import HOME_PRESS, AskedPoses, HandCommand, hand_state, is_source
+from us_sim.viewer.session import SessionState
+from us_sim.viewer.stream import Feed, Packet, Simulator
+
+PLAYERS = ("path_player", "session_player")
+"""Nodes that `session_control` starts and ends."""
+
+
+@dataclass(frozen=True)
+class Lead:
+    """Who leads, and whether a page's hand may."""
+
+    who: str  # a node, "tracker" for the scene's own, "hand", or "nobody"
+    obstacle: str = ""  # why the hand may not move the probe, for a person; "" if it may
+    can_take: bool = False  # whether a page can end what moves it
+
+
+def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> Lead:
+    """Who moves the probe, by who publishes and hears ``tracker/pose``.
+
+    Args:
+        node: whose hand would move it.
+        session: what is replayed.
+        is_publishing: whether that hand publishes already.
+    """
+    name = node.resolve_topic_name(LEAD_TOPIC)
+    others = [info.node_name for info in node.get_publishers_info_by_topic(name)]
+    if is_publishing and node.get_name() in others:
+        others.remove(node.get_name())
+    if others and others[0] in PLAYERS and session.replay:
+        what = "moves the probe"
+        if session.replay_state == "finished":
+            what = "has ended"
+            what += " and holds the probe" if others[0] == PLAYERS[0] else ""
+        obstacle = f"the replay of {PurePath(session.replay).name} {what}"
+        return Lead(others[0], obstacle, can_take=True)
+    if others:
+        return Lead(others[0], f"{others[0]} moves the probe: end it to take the probe yourself")
+    hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    if "probe_tracker" in hearers:
+        return Lead("hand")
+    if node.count_publishers(node.resolve_topic_name("probe/pose")):
+        return Lead(
+            "tracker",
+            "the probe follows the scene's own tracker: start without --tracker, or with --param "
+            "probe_tracker.source=pose, to take it yourself",
+        )
+    return Lead("nobody", "no simulator with a probe runs yet")
+
+
+class ProbeWhereabouts:
+    """Each pose of ``probe/pose``, and the last one, which is in the latched ``probe/status``.
+
+    Args:
+        node: that listens.
+        moved: called with each pose that comes, in frame ``patient``.
+        rested: called when no more poses come, with the last and its stamp in ns; with None while
+            there never was one.
+        goes_on: called when poses come.
+    """
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        moved: Callable[[Pose], None],
+        rested: Callable[[Pose | None, int], None],
+        goes_on: Callable[[], None],
+    ) -> None:
+        self._node, self._moved, self._rested, self._goes_on = node, moved, rested, goes_on
+        self._subscriptions = Subscriptions(
+            node,
+            (PoseStamped, "probe/pose", self._follow, STREAM, False),
+            (DiagnosticStatus, "probe/status", self._find, LATCHED, False),
+        )
+        self._subscriptions.keep(True)
+
+    @property
+    def is_told(self) -> bool:
+        """Whether anybody publishes it."""
+        return self._node.count_publishers(self._node.resolve_topic_name("probe/status")) > 0
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._subscriptions.keep(False)
+
+    def _follow(self, message: PoseStamped) -> None:
+        self._moved(pose_from(message, PATIENT))
+
+    def _find(self, status: DiagnosticStatus) -> None:
+        said = {each.key: each.value for each in status.values}
+        if "pose" in said:
+            stamp = said.get("stamp", "")
+            self._rested(pose_from_text(said["pose"]), int(stamp) if stamp.isdecimal() else 0)
+        elif status.message == TrackingState.WAITING.value:
+            self._rested(None, 0)
+        else:
+            self._goes_on()
+
+
+class ViewerSurface:
+    """The skin at rest; where the scene has none the tissue's upper side, else the plane z = 0.
+
+    Args:
+        node: that hears ``skin/mesh``.
+        rest: the tissue's mesh.
+        changed: called when there is another surface.
+    """
+
+    def __init__(self, node: GuardedNode, rest: RestMesh, changed: Callable[[], None]) -> None:
+        self._node, self._rest, self._changed = node, rest, changed
+        self._skin: RestSurface | None = None
+        self._tissue: RestSurface | None = None
+        self._plane = RestSurface.plane(0.1)  # m around the origin
+        self._heard = node.create_subscription(Mesh, "skin/mesh", self._take_skin, LATCHED)
+        rest.watch(self._make_tissue)
+        node.guarded(node.resolve_topic_name("tissue/rest"), self._make_tissue)()
+
+    @property
+    def best(self) -> RestSurface | None:
+        """The surface; None while one is still awaited."""
+        if self._skin is not None and (self._tissue is None or self._is_offered("skin/mesh")):
+            return self._skin
+        if self._tissue is not None:
+            return self._tissue
+        is_awaited = self._is_offered("skin/mesh") or self._is_offered("tissue/rest")
+        return None if is_awaited else self._plane
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._node.destroy_subscription(self._heard)
+        self._rest.watch(self._make_tissue, is_wanted=False)
+
+    def _is_offered(self, topic: str) -> bool:
+        return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
+
+    def _take_skin(self, message: Mesh) -> None:
+        self._skin = RestSurface(*mesh_from(message))
+        self._changed()
+
+    def _make_tissue(self) -> None:
+        """The tissue's upper side, of the mesh that is there now."""
+        if self._rest.mesh is not None:
+            self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
+            self._changed()
+
+
+MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
+"""Poses a second: on two cores the simulator and the browser share them, and a page shows no more
+images than that."""
+RESTING = 5.0
+"""Poses a second; images are called stale after half a second."""
+TICKS = 2.0
+"""Timer ticks from pose to pose."""
+STREAMING, LATEST = 3.0, 1.45
+"""From pose to pose: how long after a command the next is expected, and then waited for. A timer's
+pose just before it would hold up the command's own."""
+STATE_RATE = 10.0
+"""Hz at which pages are told at most how the probe is held: to a person's eye sliders follow, and
+more often to lay them out would take time from the image."""
+LONGEST_STEP = 0.05
+"""s of movement at most between two poses: were the node held up, the probe would leap."""
+NEAR = 0.02
+"""m from the old place to a new surface: it is another one of the same patient."""
+KEPT = 512
+"""Poses whose press is remembered until their image is made."""
+UNANSWERED = 3.0
+"""s without a pose of the tracked probe, after which it is said that nobody answers."""
+ASTRAY, SETTLED = 3e-3, 1.0
+"""m, and s of rest, from which on the tracked probe is not where it was put."""
+
+
+class ViewerHand:
+    """A tracker source that pages move: ``tracker/pose`` in frame ``patient``.
+
+    It publishes only while a page watches and nobody else does: a driver or a player leads as long
+    as it has a publisher, and the hand goes on from where that has left the probe. Poses come as
+    soon as a page asks, `MOVING` times a second while the probe moves or a page watches what goes
+    on by itself, such as blood, and `RESTING` else.
+
+    Args:
+        node: that publishes.
+        post: has work done in the node's thread.
+        simulator: given the stream ``hand`` and the command of the same name.
+        rest: the tissue's mesh, on which the probe stands where there is no skin.
+    """
+
+    def __init__(
+        self, node: GuardedNode, post: Posted, simulator: Simulator, rest: RestMesh
+    ) -> None:
+        self._node, self._post, self._rest = node, post, rest
+        self.feed = Feed("hand", self._watched, STATE_RATE)
+        self._simulator = simulator
+        simulator.add(self.feed)
+        simulator.commands["hand"] = self._command
+        simulator.commands["take"] = self._ask_for_probe
+        simulator.leaving.append(lambda page: post(lambda: self.asked.left(page)))
+        self._session = simulator.session
+        self._lead = Lead("nobody", "the viewer finds out who moves the probe")
+        self._surface: ViewerSurface | None = None
+        self._standing: RestSurface | None = None  # the surface that the motion is on
+        self._motion: Motion | None = None
+        self._publisher: Any = None
+        self._whereabouts: ProbeWhereabouts | None = None
+        self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
+        self._elsewhere: Pose | None = None  # where somebody else has the probe
+        self._last_stamp = 0  # ns, of the last pose
+        self.asked = AskedPoses()
+        self._presses: dict[int, float] = {}  # m, by stamp, ns
+        self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
+        self._warning = ""
+        self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
+        self._moving_timer = node.create_timer(1.0 / (TICKS * MOVING), self._tick)
+        self._resting_timer = node.create_timer(1.0 / RESTING, self._update)
+        self._moving_timer.cancel()
+        self._resting_timer.cancel()
+
+    def press(self, stamp: int, position: ArrayLike | None) -> float | None:
+        """How deep (m) the probe is pressed, see `Stance`; None while that is not known.
+
+        Args:
+            stamp: ns, of its pose.
+            position: (3,) m, where it is, for poses of others.
+        """
+        known, surface = self._presses.get(stamp), self._standing
+        if known is not None or surface is None or position is None:
+            return known
+        return surface.under(np.asarray(position, dtype=np.float64))[1]
+
+    def _command(self, value: Any, page: int) -> str | None:
+        """Take a page's command, in its thread; why it is not done, or None."""
+        try:
+            asked = HandCommand.read(value)
+        except UsSimError as error:
+            return str(error)
+        if self._lead.obstacle:
+            return self._lead.obstacle
+        self._post(lambda: self._obey(asked, page))
+        return None
+
+    def _watched(self, _: bool) -> None:
+        """Called in a page's thread."""
+        self._post(self._watch)
+
+    def _watch(self) -> None:
+        """Begin with the first page, and leave everything when the last has gone."""
+        if self.feed.is_watched and self._surface is None:
+            self._surface = ViewerSurface(self._node, self._rest, self._stand)
+            self._session.watch()
+            self._is_found = False
+            self._whereabouts = ProbeWhereabouts(
+                self._node, self._follow, self._find, self._be_elsewhere
+            )
+            self._resting_timer.reset()
+            self._update()
+        elif not self.feed.is_watched and self._surface is not None:
+            self._let_go()
+            self._surface.close()
+            self._surface = None
+            if self._whereabouts is not None:
+                self._whereabouts.close()
+            self._session.unwatch()
+            self._resting_timer.cancel()
+
+    def _stand(self) -> None:
+        """On another surface: where the probe is, if that is near, else at home."""
+        surface = self._surface.best if self._surface is not None else None
+        if surface is None or surface is self._standing:
+            return
+        self._standing = surface
+        if self._motion is None:
+            return
+        stance = self._motion.stance
+        foot = surface.closest(stance.point)
+        if float(np.linalg.norm(foot.point - stance.point)) < NEAR:
+            self._motion.rest_at(replace(stance, point=foot.point))
+        else:
+            self._motion.rest_at(Stance.home(surface, HOME_PRESS))
+
+    def _update(self) -> None:
+        """Find out who leads and where to stand, and publish the pose at rest."""
+        self._stand()
+        self._lead = self._lead_now()
+        if self._lead.obstacle:
+            self._let_go()
+            self._tell()
+            return
+        if self._publisher is None:
+            self._take()
+        if self._moving_timer.is_canceled():
+            self._publish()
+            if self._simulator.is_changing_by_itself:
+                self._moving_timer.reset()
+
+    def _lead_now(self) -> Lead:
+        """Who moves the probe; the hand, if there is also somewhere to begin."""
+        lead = probe_lead(
+            self._node, self._session.state, is_publishing=self._publisher is not None
+        )
+        if lead.obstacle:
+            return lead
+        if self._standing is None:
+            return Lead("nobody", "the patient's surface is awaited")
+        if not self._is_found and self._whereabouts is not None and self._whereabouts.is_told:
+            return Lead("nobody", "the viewer finds out where the probe is")
+        return lead
+
+    def _take(self) -> None:
+        """Lead from here on: from where the probe is, or else where it was held, or at home."""
+        assert self._standing is not None
+        if self._elsewhere is not None:
+            self._motion = Motion(Stance.of(self._elsewhere, self._standing))
+            self._elsewhere = None
+        elif self._motion is None:
+            self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
+        self._publisher = self._node.create_publisher(
+            PoseStamped, LEAD_TOPIC, STREAM, qos_overriding_options=overridable()
+        )
+        self._rests_since = self._taken_at = time.monotonic()
+
+    def _let_go(self) -> None:
+        """Publish no more."""
+        self._moving_timer.cancel()
+        self._warning = ""
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+        if self._motion is not None:
+            self._motion.rest_at(self._motion.stance)
+
+    def _ask_for_probe(self, value: Any, page: int) -> str | None:
+        """Hold the probe that nobody holds, or that a replay moves, which ends; in its thread."""
+        if self._lead.can_take:
+            self._session.ask(replay="")
+        elif self._lead.obstacle or self.asked.holder not in ("", value):
+            return self._lead.obstacle or None
+        if is_source(value):
+            self._post(lambda: self.asked.hold(value, page))
+        return None
+
+    def _find(self, pose: Pose | None, stamp: int) -> None:
+        """Where the probe was when poses ended; there it is unless this hand has had it."""
+        self._is_found = True
+        if self._publisher is None and pose is not None and stamp != self._last_stamp:
+            self._elsewhere = pose
+        self._update()
+
+    def _be_elsewhere(self) -> None:
+        """Poses come, or came a moment ago: of this hand, if it has had the probe."""
+        self._is_found |= self._motion is not None
+
+    def _follow(self, pose: Pose) -> None:
+        """Where the probe is: there somebody else has it, or there it should not be."""
+        self._followed_at = time.monotonic()
+        if self._publisher is None or self._motion is None or self._standing is None:
+            self._elsewhere, self._is_found = pose, True
+        elif (
+            self._motion.is_at_rest
+            and time.monotonic() - self._rests_since > SETTLED
+            and not self._warning
+        ):
+            wanted = self._motion.stance.pose(self._standing).position
+            distance = float(np.linalg.norm(pose.position - wanted))
+            if distance > ASTRAY:
+                self._warning = (
+                    f"the probe is {1e3 * distance:.0f} mm from where it is held: the scene "
+                    f"registers or calibrates poses in frame patient; give its tracker another "
+                    f"frame"
+                )
+
+    def _obey(self, asked: HandCommand, page: int) -> None:
+        """Move to where a page wants the probe, from now on."""
+        if self._publisher is None or self._motion is None or self._standing is None:
+            return  # somebody else has taken it meanwhile
+        self._motion.aim(asked.stance(self._motion.goal, self._standing))
+        self.asked.ask(asked.source, asked.sequence, page)
+        rested = self._moving_timer.is_canceled()
+        if rested:
+            self._moving_timer.reset()
+        if rested or self.asked.at - self._sent_at > 0.5 / MOVING:
+            self._advance(1.0 / MOVING if rested else LONGEST_STEP)
+
+    def _tick(self) -> None:
+        """The next pose of a movement, if it is due."""
+        now = time.monotonic()
+        is_streaming = now - self.asked.at < STREAMING / MOVING
+        if now - self._sent_at > (LATEST if is_streaming else 0.9) / MOVING:
+            self._advance(LONGEST_STEP)
+
+    def _advance(self, longest: float) -> None:
+        """Publish where the movement is by now; at most so many s after the last pose."""
+        if self._publisher is None or self._motion is None:
+            self._moving_timer.cancel()
+            return
+        if not self._motion.is_at_rest:
+            self._motion.advance(min(time.monotonic() - self._sent_at, longest))
+            self._rests_since = time.monotonic()
+        self._publish()
+        if self._motion.is_at_rest and not self._simulator.is_changing_by_itself:
+            self._moving_timer.cancel()
+            self._resting_timer.reset()
+            self._tell()
+
+    def _publish(self) -> None:
+        """Where the probe is held."""
+        assert self._motion is not None
+        assert self._standing is not None
+        stamp = self._node.get_clock().now()
+        self._last_stamp = stamp.nanoseconds
+        stance = self._motion.stance
+        pose = stance.pose(self._standing)
+        self._presses[stamp.nanoseconds] = stance.press
+        if len(self._presses) > KEPT:
+            del self._presses[next(iter(self._presses))]
+        self.asked.published(stamp.nanoseconds)  # said first: its image may be there at once
+        self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
+        self._sent_at = time.monotonic()
+        self._node.health.published(LEAD_TOPIC)
+        self._tell()
+
+    def _unanswered(self) -> str:
+        """Whether nobody follows the poses any more that are published; "" if somebody does."""
+        silent = time.monotonic() - max(self._followed_at, self._taken_at)
+        if self._publisher is None or silent < UNANSWERED:
+            return ""
+        return f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
+
+    def _tell(self) -> None:
+        """The pages how the probe is held, and by whom."""
+        motion, surface = self._motion, self._standing
+        stance = motion.stance if motion is not None else None
+        goal = motion.goal if motion is not None else None
+        if self._publisher is None and self._elsewhere is not None and surface is not None:
+            stance = goal = Stance.of(self._elsewhere, surface)
+        header = {
+            "leader": self._lead.who,
+            "holder": self.asked.holder,
+            "is_moving": self.asked.is_moving,
+            "every": 1.0 / RESTING,  # s, at the latest
+            "is_resting": self._publisher is not None and self._moving_timer.is_canceled(),
+            "obstacle": self._lead.obstacle,
+            "can_take": self._lead.can_take,
+            "warning": self._unanswered() or self._warning,
+            **hand_state(surface, stance, goal),
+        }
+        self.feed.offer(lambda sequence: Packet("hand", sequence, header, b""))

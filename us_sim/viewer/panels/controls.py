@@ -1,0 +1,283 @@
+"""Controls of parameters, each made from what its node says of the parameter.
+
+>>> from us_sim.viewer.panels.controls import on_sliders, slider_span
+>>> slider_span(-60.0, 60.0, 6.0)
+SliderSpan(low=-60.0, high=60.0, step=0.2, is_logarithmic=False)
+>>> slider_span(1e-6, 1e10, 12.0)  # kPa
+SliderSpan(low=0.12, high=1200.0, step=0.0, is_logarithmic=True)
+>>> on_sliders((0.0, 6.0), 4)
+[0.0, 2.0, 4.0, 6.0]
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from us_sim.viewer.parameters import Kind, Parameter, ParameterBoard
+
+
+class WhileShown(Element, component="while_shown.js"):
+    """A part of the page that is kept up to date only while a person can see it.
+
+    Args:
+        begin: called when a person begins to see it.
+        end: called when another tab is chosen, the drawer is closed, or the browser has gone.
+        every: s between two calls of ``refresh`` while it is seen, the first at once.
+        refresh: brings it up to date.
+    """
+
+    def __init__(
+        self,
+        begin: Callable[[], None],
+        end: Callable[[], None],
+        every: float,
+        refresh: Callable[[], None],
+    ) -> None:
+        super().__init__()
+        self.classes("us-while-shown")
+        self._begin, self._end, self._refresh = begin, end, refresh
+        self._is_shown = False
+        with self:
+            self._timer = ui.timer(every, refresh, active=False, immediate=True)
+        self.on("shown", lambda event: self._show(bool(event.args)))
+        self.client.on_disconnect(lambda: self._show(False))
+        self.client.on_delete(lambda: self._show(False))
+        # A page that was away for a moment does not know that it was.
+        self.client.on_connect(lambda: self.run_method("again"))
+
+    def close(self) -> None:
+        """End before it is taken off the page."""
+        self._show(False)
+
+    def _show(self, is_shown: bool) -> None:
+        if is_shown == self._is_shown:
+            return
+        self._is_shown = is_shown
+        (self._begin if is_shown else self._end)()
+        self._timer.active = is_shown
+        if is_shown:
+            self._refresh()
+
+
+_BY_FACTORS = 50.0
+"""From the smallest number to the largest: beyond, a slider goes by factors."""
+_WIDE = 1000.0
+"""Likewise: beyond, a slider covers what is near the present value."""
+_AROUND = 100.0
+"""Times the present value, and a hundredth of it, where a slider goes by factors."""
+_ROOM = 4.0
+"""Times the present value, where a slider begins at zero."""
+_STEPS = 600
+_NOTHING = 1e-12
+"""Of the range: a smaller value is zero on a slider."""
+
+
+@dataclass(frozen=True)
+class SliderSpan:
+    """The numbers that a slider covers."""
+
+    low: float
+    high: float
+    step: float  # 0 where it goes by factors
+    is_logarithmic: bool
+
+    def holds(self, value: float | None) -> bool:
+        """Whether a value can be shown on it; nothing can."""
+        return value is None or self.low <= value <= self.high
+
+
+def slider_span(
+    low: float, high: float, value: float | None, is_whole: bool = False
+) -> SliderSpan | None:
+    """The span of a slider around a value; None where no slider makes sense.
+
+    Args:
+        low, high: the range, in the unit that is shown.
+        value: at present; None is nothing.
+        is_whole: only whole numbers will do.
+    """
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        return None
+    if low > 0.0 and high / low > _BY_FACTORS and not is_whole:
+        if value and value > 0.0 and high / low > _WIDE:
+            low, high = max(low, value / _AROUND), min(high, value * _AROUND)
+        return SliderSpan(low, high, 0.0, True)
+    reach = max(abs(low), abs(high))
+    if value and abs(value) < _NOTHING * reach:
+        value = 0.0
+    if value and reach > _WIDE * abs(value):
+        end = _round_number(_ROOM * abs(value))
+        low, high = max(low, -end), min(high, end)
+    elif is_whole and value and high - low > _WIDE:
+        high = min(high, _round_number(_ROOM * abs(value)))
+    if (high - low) / _STEPS < sys.float_info.min:
+        return None
+    step = 1.0 if is_whole else _round_number((high - low) / _STEPS)
+    return SliderSpan(low, high, step, False)
+
+
+def _round_number(number: float) -> float:
+    """The next of 1, 2, 5 times a power of ten that is not smaller."""
+    power = 10.0 ** math.floor(math.log10(number))
+    factor = next(f for f in (1.0, 2.0, 5.0, 10.0) if f * power >= number * (1.0 - 1e-9))
+    return float(f"{factor * power:.6g}")
+
+
+class Control(Element):
+    """A control of one parameter, which sets one value at a time, and of several the last.
+
+    Args:
+        board: where the parameter is set.
+        parameter: as it is now.
+        label: in place of the parameter's own.
+    """
+
+    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
+        super().__init__()
+        self.parameter = parameter
+        self._board = board
+        self._wanted: tuple[Any, int] | None = None  # a value, and the number of the change
+        self._is_asking = False
+        self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
+        self.props.update({"reason": "", "seen": 0})
+        self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
+        self.on("change", self._changed)
+
+    def show(self, parameter: Parameter) -> None:
+        """Show another value, or another range."""
+        if parameter == self.parameter:
+            return
+        if parameter.raw != self.parameter.raw:
+            self.props["reason"] = ""  # of another value
+        self.parameter = parameter
+        self._show()
+
+    def _show(self) -> None:
+        raise NotImplementedError
+
+    async def _changed(self, event: GenericEventArguments) -> None:
+        self._wanted = event.args["value"], int(event.args["turn"])
+        if self._is_asking:
+            return
+        self._is_asking = True
+        try:
+            while self._wanted is not None:
+                (value, turn), self._wanted = self._wanted, None
+                future = self._board.set(self.parameter.node, self.parameter.name, value)
+                reason = await asyncio.wrap_future(future)
+        finally:
+            self._is_asking = False
+        if self.is_deleted:
+            return
+        known = self._board.of(self.parameter.node).parameters.get(self.parameter.name)
+        self.parameter = known or self.parameter
+        self.props["seen"], self.props["reason"] = turn, reason
+        self._show()
+
+
+class ParameterControl(Control, component="parameter_control.js"):
+    """A slider with a number field, a choice, a switch, or a text; read-only ones are shown."""
+
+    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
+        super().__init__(board, parameter, label)
+        self._span: SliderSpan | None = None
+        self._show()
+
+    def _show(self) -> None:
+        parameter = self.parameter
+        value = parameter.value
+        self._fit(value)
+        span = asdict(self._span) if self._span else None
+        self.props.update(
+            {
+                "kind": parameter.kind.value,
+                "value": list(value) if isinstance(value, tuple) else value,
+                "unit": parameter.unit,
+                "choices": list(parameter.choices),
+                "meanings": dict(parameter.meanings),
+                "optional": parameter.may_be_nothing,
+                "live": parameter.is_live,
+                "tip": tip_of(parameter),
+                "span": span,
+            }
+        )
+        self.update()
+
+    def _fit(self, value: Any) -> None:
+        """Have the slider cover the value, with room to go on where the range has some."""
+        low, high = self.parameter.low, self.parameter.high
+        if self.parameter.kind not in (Kind.NUMBER, Kind.WHOLE) or low is None or high is None:
+            self._span = None
+            return
+        span = self._span
+        is_at_the_end = span is not None and (
+            (value == span.low != low) or (value == span.high != high)
+        )
+        if span is None or not span.holds(value) or is_at_the_end:
+            self._span = slider_span(low, high, value, self.parameter.kind is Kind.WHOLE)
+
+
+def tip_of(parameter: Parameter) -> str:
+    """The description of a parameter, its range, and its full name."""
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    said = [parameter.description] if parameter.description else []
+    if parameter.low is not None and parameter.high is not None:
+        said.append(f"{parameter.low:g} to {parameter.high:g}{unit}")
+    if parameter.may_be_nothing:
+        said.append("empty for none")
+    if parameter.kind.is_list:
+        said.append("with commas between")
+    if not parameter.is_live:
+        said.append("given at the start")
+    said.append(f"{parameter.node}.{parameter.name}")
+    return "; ".join(said)
+
+
+def slider_count(gains: Sequence[float]) -> int:
+    """One slider for each gain where those are 3 to 12, else 8, as consoles have."""
+    return len(gains) if 2 < len(gains) <= 12 else 8
+
+
+def on_sliders(gains: Sequence[float], count: int) -> list[float]:
+    """Gains at evenly spaced depths, linear in between, as so many sliders show them, dB."""
+    if not gains:
+        return [0.0] * count
+    places = np.linspace(0.0, 1.0, len(gains)) if len(gains) > 1 else np.zeros(1)
+    shown = np.interp(np.linspace(0.0, 1.0, count), places, np.asarray(gains, dtype=float))
+    return [round(float(gain), 6) for gain in shown]
+
+
+class TimeGain(Control, component="time_gain.js"):
+    """One slider for the gain in dB at each of some depths, from the face to the beams' end."""
+
+    REACH = 20.0  # dB up and down that the sliders cover, as consoles have it
+
+    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
+        super().__init__(board, parameter, label)
+        self._count = slider_count(parameter.value)
+        self._name_depths(100.0, "%")
+        self._show()
+
+    def reach(self, depth: Parameter) -> None:
+        """The beams end at this depth."""
+        self._name_depths(float(depth.value), depth.unit)
+
+    def _name_depths(self, end: float, unit: str) -> None:
+        names = [f"{place:.0f} {unit}" for place in np.linspace(0.0, end, self._count)]
+        if names != self.props.get("depths"):
+            self.props["depths"] = names
+
+    def _show(self) -> None:
+        gains = on_sliders(self.parameter.value, self._count)
+        low, high = min(-self.REACH, *gains), max(self.REACH, *gains)
+        self.props.update({"gains": gains, "unit": self.parameter.unit, "low": low, "high": high})

@@ -1,0 +1,377 @@
+"""Surfaces as they go to a page: told once at rest, after which only positions travel.
+
+>>> import numpy as np
+>>> from us_sim.viewer.surfaces import Offsets, RestSurface, clustered, welded
+>>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
+>>> vertices, triangles = welded(corners)
+>>> len(vertices), triangles
+(4, array([[0, 2, 3], [0, 3, 1]]))
+>>> surface = RestSurface(vertices, triangles)
+>>> packet = surface.moved(vertices + [0, 0, 0.001], kind="skin", sequence=1, stamp=0)
+>>> packet.header["resolution"], len(packet.payload)
+(1e-06, 24)
+>>> Offsets.between(np.array([[0.0, 0.0, 0.012]]), np.zeros((1, 3))).steps
+array([[    0,     0, 12000]], dtype=int16)
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import MeshError
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.viewer.stream import Packet
+
+
+@dataclass(frozen=True, eq=False)
+class ColouredSurface:
+    """A surface, and how it is shown."""
+
+    name: str
+    colour: tuple[float, float, float]  # red, green, blue, 0 to 1
+    vertices: NDArray[np.float64]  # (V, 3) m
+    triangles: NDArray[np.integer]  # (T, 3)
+
+
+def welded(
+    corners: NDArray[np.floating],
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Vertices (V, 3), each once, and triangles (T, 3), without those that have no area left.
+
+    Args:
+        corners: (3 T, 3) m, three of each triangle in a row.
+
+    Raises:
+        MeshError: they do not make whole triangles, or one is not finite.
+    """
+    corners = np.ascontiguousarray(corners, dtype=np.float64) + 0.0  # -0 is 0
+    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) % 3:
+        raise MeshError(f"corners of shape {corners.shape} do not make whole triangles")
+    if not np.isfinite(corners).all():
+        raise MeshError("a corner of a triangle is not finite")
+    order = np.lexsort(corners.T[::-1])
+    ordered = corners[order]
+    is_new = np.ones(len(corners), dtype=bool)
+    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    numbers = np.empty(len(corners), dtype=np.intp)
+    numbers[order] = np.cumsum(is_new) - 1
+    triangles = numbers.reshape(-1, 3)
+    apart = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return ordered[is_new], triangles[apart]
+
+
+def clustered(
+    vertices: NDArray[np.floating], triangles: NDArray[np.integer], cell: float
+) -> NDArray[np.integer]:
+    """(F, 3) triangles of the same vertices that are left when vertices are merged.
+
+    Vertices are merged in the cells of a grid (J. Rossignac and P. Borrel, "Multi-resolution 3D
+    approximations for rendering complex scenes", 1993), each cell into the vertex nearest to their
+    mean: they are vertices of the surface itself, also in a deformed state. A closed surface stays
+    closed: as a sum of oriented triangles it has no edge left over.
+
+    Args:
+        vertices: (V, 3) m. triangles: (T, 3).
+        cell: m, side of the cells of the grid.
+    """
+    used, corners = np.unique(triangles, return_inverse=True)
+    points = vertices[used]
+    grid = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    shape = grid.max(axis=0) + 1
+    strides = np.array([shape[1] * shape[2], shape[2], 1])  # which number every cell
+    _, cells = np.unique(grid @ strides, return_inverse=True)
+    cells = cells.ravel()
+    count = np.bincount(cells)
+    mean = np.column_stack([np.bincount(cells, points[:, axis]) / count for axis in range(3)])
+    distance = np.linalg.norm(points - mean[cells], axis=1)
+    order = np.lexsort((distance, cells))
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    kept = used[order[first]]  # of each cell the vertex nearest to the mean
+    merged = kept[cells[corners.ravel()]].reshape(-1, 3)
+    apart = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
+    return _without_pairs(merged[apart])
+
+
+def at_most(
+    vertices: NDArray[np.floating], triangles: NDArray[np.integer], count: int
+) -> NDArray[np.integer]:
+    """About ``count`` triangles or fewer of a surface, all where it has no more.
+
+    Args:
+        vertices: (V, 3) m. triangles: (T, 3).
+    """
+    if len(triangles) <= count:
+        return triangles
+    sides = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
+    length = float(np.linalg.norm(sides, axis=2).mean())
+    low, high = np.log(0.2 * length), np.log(20.0 * length)  # of the cells' size
+    best = clustered(vertices, triangles, float(np.exp(high)))
+    for _ in range(12):  # bisection
+        middle = (low + high) / 2
+        tried = clustered(vertices, triangles, float(np.exp(middle)))
+        if len(tried) > count:
+            low = middle
+        else:
+            best, high = tried, middle
+    return best
+
+
+def _without_pairs(triangles: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Triangles without those that lie on each other and face opposite ways, first node smallest.
+
+    So many of the same three nodes are left as face one way more than the other.
+    """
+    smallest = triangles.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(triangles, (smallest + np.arange(3)) % 3, axis=1)
+    is_even = turned[:, 1] < turned[:, 2]
+    nodes = np.column_stack([turned[:, 0], np.sort(turned[:, 1:], axis=1)])
+    nodes, which = np.unique(nodes, axis=0, return_inverse=True)
+    balance = np.bincount(which.ravel(), np.where(is_even, 1, -1), minlength=len(nodes)).astype(int)
+    nodes[balance < 0, 1:] = nodes[balance < 0, :0:-1]
+    return np.repeat(nodes, np.abs(balance), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """Displacements of points in whole steps: half the bytes of single precision."""
+
+    steps: NDArray[np.int16]  # (N, 3)
+    resolution: float  # m, of a step
+
+    @classmethod
+    def between(cls, positions: NDArray[np.floating], rest: NDArray[np.floating]) -> Offsets:
+        """Of positions (N, 3) from rest (N, 3), m, to half a step of the shortest that suffices."""
+        moved = np.subtract(positions, rest, dtype=np.float64)
+        finest = 1e-6  # m: tissue may move by 33 mm before steps must be longer
+        farthest = float(np.abs(moved).max(initial=0.0))
+        resolution = finest * max(1, math.ceil(farthest / (finest * np.iinfo(np.int16).max)))
+        return cls(np.rint(moved / resolution).astype(np.int16), resolution)
+
+    def positions(self, rest: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(N, 3) m, as the page has them."""
+        return rest + self.resolution * self.steps.astype(np.float64)
+
+
+class RestSurface:
+    """Points at rest with their triangles and edges, and packets of where they are later.
+
+    Args:
+        points: (N, 3) m, at rest.
+        triangles: (T, 3) indices into points.
+        edges: (E, 2) likewise, of lines to draw.
+
+    Raises:
+        MeshError: an index is of no point, a coordinate is not finite, or the shapes are wrong.
+    """
+
+    def __init__(
+        self,
+        points: NDArray[np.floating],
+        triangles: NDArray[np.integer],
+        edges: NDArray[np.integer] | None = None,
+    ) -> None:
+        lines = np.zeros((0, 2), dtype=np.uint32) if edges is None else edges
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise MeshError(f"points of shape {points.shape} are no (N, 3) finite positions")
+        for name, indices, corners in (("triangle", triangles, 3), ("edge", lines, 2)):
+            if indices.ndim != 2 or indices.shape[1] != corners:
+                raise MeshError(f"{name}s have shape {indices.shape}: give (…, {corners})")
+            if indices.size and not 0 <= indices.min() <= indices.max() < len(points):
+                raise MeshError(
+                    f"a {name} names point {indices.max()}, but there are only {len(points)}"
+                )
+        #: (N, 3) m, as the page has them: in single precision.
+        self.points = np.ascontiguousarray(points, dtype=np.float32)
+        self._triangles = np.ascontiguousarray(triangles, dtype=np.uint32)
+        self._edges = np.ascontiguousarray(lines, dtype=np.uint32)
+        parts = (self.points, self._triangles, self._edges)
+        self._payload = b"".join(part.tobytes() for part in parts)
+        #: By which packets name the surface that they move.
+        self.number = zlib.crc32(self._payload)
+
+    @classmethod
+    def around(cls, mesh: TetrahedralMesh) -> RestSurface:
+        """All nodes of a mesh with its outer faces, and their edges, each once."""
+        faces = mesh.boundary
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        return cls(mesh.nodes, faces, np.unique(edges, axis=0))
+
+    def told(self, kind: str, sequence: int) -> Packet:
+        """All of it at rest: points as float32, then triangles and edges as uint32."""
+        header = {
+            "mesh": self.number,
+            "points": len(self.points),
+            "triangles": len(self._triangles),
+            "edges": len(self._edges),
+        }
+        return Packet(kind, sequence, header, self._payload)
+
+    def moved(
+        self, positions: NDArray[np.floating], *, kind: str, sequence: int, stamp: int
+    ) -> Packet:
+        """Where the points are now (N, 3) m, as int16 steps from rest; ``stamp`` in ns.
+
+        Raises:
+            MeshError: there are more or fewer than at rest.
+        """
+        if positions.shape != self.points.shape:
+            raise MeshError(
+                f"{len(positions)} points came, and the mesh has {len(self.points)}: start all "
+                f"nodes with the same scene"
+            )
+        offsets = Offsets.between(positions, self.points)
+        header = {
+            "stamp": str(stamp),  # more digits than a number of JavaScript has
+            "mesh": self.number,
+            "points": len(self.points),
+            "resolution": offsets.resolution,
+        }
+        return Packet(kind, sequence, header, offsets.steps.tobytes())
+
+
+class CarriedSurfaces:
+    """Surfaces that move with the tissue's nodes: in which tetrahedron each vertex lies.
+
+    A vertex is the sum of the tetrahedron's four nodes in barycentric weights, which do not change
+    while the tissue deforms. So vessels of forty thousand triangles cost nothing beyond the nodes
+    that travel for the tissue anyway, and the page computes where they are. Vertices
+    that are drawn while something moves come first.
+
+    Args:
+        mesh: of the tissue, in the state in which the surfaces are as they are here.
+        surfaces: at least one.
+        triangles: of all together, at most, while something moves.
+
+    Raises:
+        MeshError: a surface is not in the tissue.
+    """
+
+    def __init__(
+        self,
+        mesh: TetrahedralMesh,
+        surfaces: Sequence[ColouredSurface],
+        triangles: int = 20_000,
+    ) -> None:
+        from us_sim.tissue.mesh.embedding import locate  # with its kernels
+
+        whole = sum(len(surface.triangles) for surface in surfaces)
+        firsts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+        fine = [s.triangles + first for s, first in zip(surfaces, firsts, strict=False)]
+        coarse = [
+            at_most(s.vertices, s.triangles, int(triangles * len(s.triangles) / whole)) + first
+            for s, first in zip(surfaces, firsts, strict=False)
+        ]
+        first_drawn = np.unique(np.concatenate(coarse))
+        rest = np.setdiff1d(np.arange(firsts[-1]), first_drawn)
+        order = np.concatenate([first_drawn, rest])
+        number = np.empty(len(order), dtype=np.uint32)
+        number[order] = np.arange(len(order), dtype=np.uint32)
+        vertices = np.concatenate([surface.vertices for surface in surfaces])[order]
+        location = locate(mesh, vertices)
+        if (location.outside > 5e-3).any():
+            worst = int(np.argmax(location.outside))
+            part = int(np.searchsorted(firsts, order[worst], side="right")) - 1
+            raise MeshError(
+                f"{surfaces[part].name} is {1e3 * location.outside[worst]:.1f} mm outside the "
+                f"tissue, which does not carry it: take both from the same scene"
+            )
+        #: (V, 4) nodes of the tissue that carry a vertex, and (V, 4) their weights, which sum to 1.
+        self.nodes = mesh.tetrahedra[location.tetrahedra].astype(np.uint32)
+        self.weights = location.weights.astype(np.float32)
+        self.moving = len(first_drawn)  # vertices that are drawn while something moves
+        self.fine = [number[part] for part in fine]
+        self.coarse = [number[part] for part in coarse]
+        self._surfaces = [(surface.name, surface.colour) for surface in surfaces]
+
+    def carried(self, nodes: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(V, 3) m, the vertices when the tissue's nodes (N, 3) are there."""
+        return np.einsum("va,vax->vx", self.weights, nodes[self.nodes])
+
+    def told(self, kind: str, sequence: int, mesh: int) -> Packet:
+        """Nodes as uint32, weights as float32, then each part's triangles, all and fewer.
+
+        Args:
+            mesh: the number of the tissue's mesh, whose nodes move them.
+        """
+        header = {
+            "mesh": mesh,
+            "vertices": len(self.nodes),
+            "moving": self.moving,
+            "parts": [
+                {"name": name, "colour": list(colour), "fine": len(fine), "coarse": len(coarse)}
+                for (name, colour), fine, coarse in zip(
+                    self._surfaces, self.fine, self.coarse, strict=True
+                )
+            ],
+        }
+        lists = [part for pair in zip(self.fine, self.coarse, strict=True) for part in pair]
+        arrays = [self.nodes, self.weights, *lists]
+        payload = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+        return Packet(kind, sequence, header, payload)
+
+
+def transducer_packet(
+    kind: str,
+    sequence: int,
+    parts: Sequence[ColouredSurface],
+    outline: NDArray[np.floating],
+) -> Packet:
+    """Vertices as float32 and triangles as uint32 of each part, then the outline as float32.
+
+    Args:
+        parts: in frame ``probe``.
+        outline: (P, 3) m, as of `us_sim.slicing.probe.probe.image_outline`.
+    """
+    header = {
+        "parts": [
+            {
+                "name": part.name,
+                "colour": list(part.colour),
+                "vertices": len(part.vertices),
+                "triangles": len(part.triangles),
+            }
+            for part in parts
+        ],
+        "outline": len(outline),
+    }
+    arrays: list[NDArray[np.generic]] = []
+    for part in parts:
+        arrays += [part.vertices.astype(np.float32), part.triangles.astype(np.uint32)]
+    arrays.append(outline.astype(np.float32))
+    payload = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    return Packet(kind, sequence, header, payload)
+
+
+class EquivalentStrain:
+    """Equivalent (von Mises) strain of the states of one mesh, at its nodes.
+
+    sqrt(2/3 e : e) with e the deviator of the Green-Lagrange strain, which is the elongation in
+    uniaxial stretch at constant volume, to first order (Holzapfel, *Nonlinear Solid Mechanics*,
+    2000). A node has the mean of its tetrahedra, weighted by their volumes at rest.
+    """
+
+    def __init__(self, mesh: TetrahedralMesh) -> None:
+        corners = mesh.nodes[mesh.tetrahedra]
+        self._tetrahedra = mesh.tetrahedra
+        self._inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # (M, 3, 3)
+        self._volumes = mesh.volumes
+        self._around = np.bincount(
+            mesh.tetrahedra.ravel(), np.repeat(mesh.volumes, 4), minlength=len(mesh.nodes)
+        )
+
+    def of(self, nodes: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(N,) when the mesh's nodes are at (N, 3) m; 0 is without strain."""
+        corners = nodes[self._tetrahedra]
+        gradient = self._inverse @ (corners[:, 1:] - corners[:, :1])  # the transpose of F
+        strain = 0.5 * (gradient @ gradient.transpose(0, 2, 1) - np.eye(3))
+        strain -= np.trace(strain, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+        equivalent = np.sqrt(2.0 / 3.0 * np.einsum("mij,mij->m", strain, strain))
+        weighted = np.repeat(self._volumes * equivalent, 4)
+        summed = np.bincount(self._tetrahedra.ravel(), weighted, minlength=len(nodes))
+        return summed / self._around

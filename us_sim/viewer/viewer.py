@@ -1,0 +1,127 @@
+"""The node ``viewer``: shows the simulator in a browser, and lets a person there take the probe."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.parameters import declared
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.process import run_node
+from us_sim.settings.viewer import TOKEN, ViewerSettings
+from us_sim.viewer.access import is_loopback
+from us_sim.viewer.feeds import (
+    ProbeFeeds,
+    RestMesh,
+    SkinFeeds,
+    StructuresFeed,
+    TissueFeeds,
+    image_feeds,
+)
+from us_sim.viewer.hand import ViewerHand
+from us_sim.viewer.parameters import Parameter, in_words
+from us_sim.viewer.remote_parameters import RemoteParameters
+from us_sim.viewer.server import WebServer
+from us_sim.viewer.session import CONTROL, ViewerSession
+from us_sim.viewer.status import StatusListener
+from us_sim.viewer.stream import Simulator
+
+_IMAGED_WITH = ("gain", "dynamic_range", "focus")
+"""Parameters of ``slice_interpolator`` that pages are told with each image."""
+
+
+class Viewer(GuardedNode):
+    """A web server beside a node that subscribes only to topics that a page shows.
+
+    Its parameters are those of `ViewerSettings`.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("viewer", **kwargs)
+        settings = declared(self, ViewerSettings())
+        self.health = Health(self, f"{settings.host}:{settings.port}")
+        self.post = post = Posted(self)
+        folder = os.path.abspath(os.path.expanduser(settings.recordings or ""))
+        self._session = ViewerSession(
+            self,
+            post,
+            folder if settings.recordings else "",
+            is_own=is_loopback(settings.host),
+        )
+        self._remote = RemoteParameters(self, post, {CONTROL: self._session.ask})
+        self.simulator = Simulator(
+            nodes=self._remote, status=StatusListener(self, post), session=self._session
+        )
+        rest = RestMesh(self)
+        self._hand = ViewerHand(self, post, self.simulator, rest)
+        self._probe = ProbeFeeds(self, post, settings.rate)
+        self.simulator.add(
+            *image_feeds(self, post, settings.rate, self._known, self._arranged),
+            *SkinFeeds(self, post, settings.rate).feeds,
+            *self._probe.feeds,
+            *TissueFeeds(self, post, settings.rate, rest).feeds,
+            StructuresFeed(self, post, rest).feed,
+        )
+        self._server = WebServer(
+            self.simulator, settings.host, settings.port, os.environ.get(TOKEN, "")
+        )
+        self.health.state = "serving"
+        self.health.values = {"port": str(self._server.port)}
+        print(f"open {' or '.join(self._server.addresses)}", flush=True)
+        if self._server.token:
+            self.get_logger().warning(
+                f"the viewer listens at {settings.host}, for other computers, too: whoever has "
+                f"the address with its token can see and move everything, and nothing is encrypted"
+            )
+
+    @property
+    def _imaging(self) -> Mapping[str, Parameter]:
+        return self._remote.of("slice_interpolator").parameters
+
+    def _arranged(self) -> tuple[bool, bool]:
+        flip, beside = map(self._imaging.get, ("flip", "beside"))
+        return flip is not None and bool(flip.raw), beside is not None and bool(beside.raw)
+
+    def _known(self, stamp: int) -> dict[str, Any]:
+        """The scene, and how the probe was at the stamp (ns) of an image, for its header.
+
+        m and N; settings in the unit that a person reads. ``command`` is the page, and its number
+        for it, of the last command that is seen in the image, so that the page can tell how long
+        that took.
+        """
+        probe = self._probe.at(str(stamp))
+        parameters = self._imaging
+        told = {
+            "command": self._hand.asked.by(stamp),
+            "press": self._hand.press(stamp, probe.get("position")),
+            "force": float(np.linalg.norm(probe["force"])) if "force" in probe else None,
+            "scene": self._session.state.scene or None,
+            "settings": {
+                in_words(name): f"{parameter.value:g} {parameter.unit}"
+                for name in _IMAGED_WITH
+                if (parameter := parameters.get(name)) is not None and parameter.value is not None
+            },
+        }
+        return {name: value for name, value in told.items() if value is not None}
+
+    def destroy_node(self) -> None:
+        """End the web server first."""
+        self.post.close()
+        self._remote.close()
+        self._session.close()
+        self._server.close()
+        super().destroy_node()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Serve until interrupted."""
+    return run_node(Viewer, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
