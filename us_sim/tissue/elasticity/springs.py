@@ -246,7 +246,7 @@ class VolumeTerm:
     yield_area: NDArray[np.float64]
 
     @classmethod
-    def nothing(cls, count: int) -> VolumeTerm:
+    def empty(cls, count: int) -> VolumeTerm:
         """The term without a tetrahedron, for ``count`` nodes."""
         none = np.zeros(0)
         return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)

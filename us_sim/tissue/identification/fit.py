@@ -46,7 +46,7 @@ Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitResult:
     """Where the sum of squares is least."""
 
     log_moduli: NDArray[np.float64]  # (P,) of Pa
@@ -72,7 +72,7 @@ def fit(
     nuisance: NDArray[np.float64],
     start: NDArray[np.float64],
     progress: Progress | None = None,
-) -> Fitted:
+) -> FitResult:
     """The logarithms of moduli that fit best.
 
     Args:
@@ -123,9 +123,11 @@ def fit(
         if damping > _MOST_DAMPING:
             break  # rounding of the model hides what is left to gain
     residual = measured - here.values
-    others = _others(residual, nuisance, noise)
+    others = _nuisance_values(residual, nuisance, noise)
     bounded = (here.at <= bounds[0] + 1e-6) | (here.at >= bounds[1] - 1e-6)
-    return Fitted(here.at, others, residual - nuisance @ others, here.slopes, noise, bounded, steps)
+    return FitResult(
+        here.at, others, residual - nuisance @ others, here.slopes, noise, bounded, steps
+    )
 
 
 def without_nuisance(
@@ -148,7 +150,7 @@ def basis(columns: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vectors[:, values > 1e-10 * values.max(initial=0.0)])
 
 
-def _others(residual: NDArray, nuisance: NDArray, noise: NDArray) -> NDArray:
+def _nuisance_values(residual: NDArray, nuisance: NDArray, noise: NDArray) -> NDArray:
     weighted = nuisance / noise[:, None]
     return np.asarray(np.linalg.lstsq(weighted, residual / noise, rcond=None)[0])
 
@@ -247,7 +249,7 @@ _LIKE = 0.3  # Part of what a modulus does to the measurements that another one 
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class Identifiability:
     """What is known of P moduli."""
 
     half_widths: NDArray[np.float64]  # (P,) of the intervals of their logarithms, the rest given
@@ -256,7 +258,7 @@ class Verdict:
     like: list[list[int]]  # of each that is not determined, those that do the same
 
 
-def judge(
+def assess_identifiability(
     slopes: NDArray[np.float64],
     residual: NDArray[np.float64],
     noise: NDArray[np.float64],
@@ -266,7 +268,7 @@ def judge(
     *,
     widest: float = 3.0,
     confidence: float = 0.95,
-) -> Verdict:
+) -> Identifiability:
     """Tell moduli that are determined from others.
 
     Args:
@@ -301,7 +303,7 @@ def judge(
     like: list[list[int]] = [[] for _ in range(count)]
     for p in np.flatnonzero(felt & ~determined):
         like[p] = _alike(clear, int(p), kept)
-    return Verdict(widths, determined, felt, like)
+    return Identifiability(widths, determined, felt, like)
 
 
 def _deviations(clear: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -44,7 +44,7 @@ class DenseFields:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def made(
+    def compute(
         cls, nodes: NDArray[np.integer], forces: int, solve: Solve, precision: type
     ) -> DenseFields:
         """The fields at ``nodes`` (F,) of forces on S nodes.
@@ -157,16 +157,18 @@ def surface_compliance(
     require_held(model.mesh, model.fixed)
     touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
     if 9 * touched * free < _KEPT:
-        return _made(model, None)
+        return _compute(model, None)
 
     def waiting() -> None:
         if progress is not None:
             progress(0.0, "waiting for another process that computes it")
 
-    return kept(_key(model), _FORM, lambda: _made(model, progress), waiting)
+    return kept(_key(model), _FORM, lambda: _compute(model, progress), waiting)
 
 
-def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> SurfaceCompliance:
+def _compute(
+    model: TissueModel, progress: Callable[[float, str], None] | None
+) -> SurfaceCompliance:
     def show(fraction: float) -> None:
         if progress is not None:
             progress(fraction, "compliance of the surface")
@@ -201,10 +203,10 @@ def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> 
 
         found: DenseFields | LowRankFields
         if compressed:
-            found = LowRankFields.made(points, free, points[nodes], solve, _TOLERANCE)
+            found = LowRankFields.compress(points, free, points[nodes], solve, _TOLERANCE)
         else:
             precision = np.float64 if size < _DOUBLE else np.float32
-            found = DenseFields.made(free, len(nodes), solve, precision)
+            found = DenseFields.compute(free, len(nodes), solve, precision)
     matrix += matrix.T  # symmetric to the last digit
     matrix /= 2
     made = SurfaceCompliance(nodes, matrix, found, len(points), 0.0)

@@ -65,7 +65,7 @@ class LowRankFields:
             array.flags.writeable = False
 
     @classmethod
-    def made(
+    def compress(
         cls,
         points: NDArray[np.float64],
         nodes: NDArray[np.integer],

@@ -70,9 +70,9 @@ class CoarseGrid:
         self._room = np.empty((3, len(self._node)), dtype)
         self._coarse = np.zeros((2, self.size), dtype)
         self._dtype = dtype
-        self.touch(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+        self.set_contacts(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
 
-    def touch(
+    def set_contacts(
         self,
         nodes: NDArray[np.integer],
         normals: NDArray[np.float64],
@@ -333,7 +333,7 @@ _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class CgSolution:
     """What conjugate gradients found."""
 
     solution: NDArray[np.floating]  # (3, N)
@@ -399,7 +399,7 @@ class TwoLevel:
         )
         if self._grid is not None:
             # A spring softer than the tissue does not keep it from moving.
-            self._grid.touch(nodes, normals, np.minimum(own, stiffness))
+            self._grid.set_contacts(nodes, normals, np.minimum(own, stiffness))
 
     def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         """Overwrite ``out`` with the preconditioner times ``residual``."""
@@ -415,7 +415,7 @@ def conjugate_gradients(
     iterations: int,
     tolerance: float,
     add_springs: Product | None = None,
-) -> Solved:
+) -> CgSolution:
     """Solve for a displacement that balances ``residual``, starting from none.
 
     Args:
@@ -440,11 +440,11 @@ def conjugate_gradients(
             add_springs(search, whole)
         curvature = _curvature(search, whole, fixed)
         if not curvature > 0.0:
-            return Solved(solution, image, search, iteration + 1, True)
+            return CgSolution(solution, image, search, iteration + 1, True)
         left = _advance(slope / curvature, search, elastic, whole, solution, image, residual)
         if left <= tolerance * tolerance:
-            return Solved(solution, image, search, iteration + 1, False)
-    return Solved(solution, image, search, iterations, False)
+            return CgSolution(solution, image, search, iteration + 1, False)
+    return CgSolution(solution, image, search, iterations, False)
 
 
 def largest_local_eigenvalue(

@@ -26,7 +26,7 @@ drifts on at its initial speed.
 >>> positions, velocity = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.0, 0, 2], [0.0, 0, 2]])
 >>> particles = Particles(np.ones(2), positions, velocity, np.zeros((2, 3)))
 >>> away = ProbeMotion(Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)))
->>> volumes, contact = VolumeTerm.nothing(2).arrays, Contact.at(np.empty(0, np.int32))
+>>> volumes, contact = VolumeTerm.empty(2).arrays, Contact.at(np.empty(0, np.int32))
 >>> advance_frame(springs, volumes, particles, away, contact, 0.01, 1, 20)
 >>> positions.round(6).tolist()
 [[0.0, 0.0, 0.4], [1.0, 0.0, 0.4]]
@@ -42,7 +42,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.collider_distance import turned, turned_back
+from us_sim.geometry.collider_distance import rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
@@ -58,10 +58,10 @@ from us_sim.tissue.elasticity.springs import (
     volume_term,
 )
 from us_sim.tissue.elasticity.stability import (
-    ElasticBalance,
-    Tangling,
+    ElasticResidual,
+    InversionWatch,
     highest_frequency,
-    stabilised,
+    stabilise,
     step_limit,
 )
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
@@ -135,7 +135,7 @@ def spring_tissue(
         springs = fitted_springs(mesh, materials, damping, with_volume=settings.volume)
     else:
         springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
-    term = VolumeTerm.nothing(len(mesh.nodes))
+    term = VolumeTerm.empty(len(mesh.nodes))
     if settings.volume:
         term = volume_term(mesh, materials, springs, damping, yielding=yielding)
     return springs.without(model.fixed), term
@@ -232,7 +232,7 @@ class Msds(TissueSolver):
         self._damping_factor = settings.damping_factor
         self._springs, self._volume = spring_tissue(model, settings, yielding=True)
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
-        self.mass, self._substeps, self._action = stabilised(
+        self.mass, self._substeps, self._action = stabilise(
             model,
             self._factors,
             settings.time_step,
@@ -242,8 +242,8 @@ class Msds(TissueSolver):
         )  # mass: (N,) kg, as simulated
         self._time_step = settings.time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
-        self._balance = ElasticBalance.of(self._springs, self._volume, model.mesh.nodes)
-        self._tangling = Tangling(model)
+        self._residual_norm = ElasticResidual.of(self._springs, self._volume, model.mesh.nodes)
+        self._inversion = InversionWatch(model)
         self._forward = only_forward(model.collider, model.contact_spacing)
 
         self._positions = model.mesh.nodes.copy()
@@ -272,8 +272,8 @@ class Msds(TissueSolver):
         self._velocity[:] = state.velocity
         self._velocity[self.model.fixed] = 0.0
         self._contact.touched[:] = False
-        self._balance.forget()
-        self._tangling.forget()
+        self._residual_norm.reset()
+        self._inversion.reset()
 
     def _advance(self, pose: Pose | None) -> Deformation:
         if self._settled and not self._contact.touched.any() and not self._entered(pose):
@@ -342,7 +342,7 @@ class Msds(TissueSolver):
         elastic[self.model.fixed] = 0.0
         touched = self.model.movable_contact_nodes[self._contact.touched]
         normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._contact.touched]
-        residual = self._balance.residual(-elastic, touched, normal)
+        residual = self._residual_norm.residual(-elastic, touched, normal)
 
         frame = max(self._steps * self._substeps * self._time_step, _REST_TIME)
         speed = np.abs(self._velocity).max()
@@ -363,17 +363,17 @@ class Msds(TissueSolver):
                 and displaced < _NEARLY_RESTING
             ):
                 self._positions[:] = self.model.mesh.nodes
-                self._balance.forget()
+                self._residual_norm.reset()
                 residual = 0.0
         return Deformation(self._positions.copy(), touched, force, torque, residual, action)
 
     def _put_back_if_tangled(self) -> str:
         """The action of stabilisation, followed by what was done about inverted tetrahedra."""
-        words, hopeless = self._tangling.judge(self._positions, bool(self._contact.touched.any()))
+        words, hopeless = self._inversion.check(self._positions, bool(self._contact.touched.any()))
         if hopeless:
             self._positions[:] = self.model.mesh.nodes
             self._velocity[:] = 0.0
-            self._balance.forget()
+            self._residual_norm.reset()
         return "; ".join(filter(None, [self._action, words]))
 
 
@@ -422,11 +422,11 @@ def _stop_at_probe(particles, probe, step, contact, duration):
         a = positions[i, 0] - origin[0]
         b = positions[i, 1] - origin[1]
         c = positions[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
-        nx, ny, nz = turned(r, u, v, w)
+        nx, ny, nz = rotate(r, u, v, w)
         positions[i, 0] -= gap * nx
         positions[i, 1] -= gap * ny
         positions[i, 2] -= gap * nz

@@ -33,7 +33,7 @@ from us_sim.tissue.contact.probe_gap import push_out, wrench_on_probe
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm
-from us_sim.tissue.elasticity.stability import ElasticBalance, Tangling
+from us_sim.tissue.elasticity.stability import ElasticResidual, InversionWatch
 from us_sim.tissue.linear_algebra.sparse_factors import ScalarPreconditioner
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.msds import (
@@ -135,8 +135,8 @@ class MsdsImplicit(TissueSolver):
         self._preconditioner = self._factored(
             springs, term, 1.0 + damping / settings.time_step, progress
         )
-        self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
-        self._tangling = Tangling(model)
+        self._residual_norm = ElasticResidual.of(springs, term, model.mesh.nodes)
+        self._inversion = InversionWatch(model)
         self._positions = model.mesh.nodes.copy()
         self._velocity = np.zeros_like(self._positions)
         self._restore(self.state)
@@ -177,9 +177,9 @@ class MsdsImplicit(TissueSolver):
         self._velocity[self.model.fixed] = 0.0
         self._contact.clear()
         self._preconditioner.confine(np.zeros(0, np.intp), np.zeros((0, 3)))
-        self._tangling.forget()
+        self._inversion.reset()
         self._energy = self._potential.elastic(self._positions)[0]  # J, of springs and volumes
-        self._balance.forget()
+        self._residual_norm.reset()
         self._reference = 0.0  # N, what the tolerance refers to
         self._taken_over = bool(state.displacement.any())
 
@@ -286,16 +286,16 @@ class MsdsImplicit(TissueSolver):
             left = self._unconfined(force)
         self._contact.weigh(-force[self._touchable])
         load = float(np.linalg.norm(np.maximum(self._contact.push, 0.0)))
-        self._reference = load or self._balance.heaviest
+        self._reference = load or self._residual_norm.largest_load
         return start
 
     def _outcome(self, pose: Pose | None, kinetic: float, initial: float) -> Deformation:
         contact, touchable = self._contact, self._touchable
-        words, hopeless = self._tangling.judge(self._positions, bool(contact.touched.any()))
+        words, hopeless = self._inversion.check(self._positions, bool(contact.touched.any()))
         if hopeless:
             self._positions = self.model.mesh.nodes.copy()
             self._velocity[:] = 0.0
-            self._balance.forget()
+            self._residual_norm.reset()
         energy, elastic = self._potential.elastic(self._positions)
         self._limit_speed(kinetic, initial, energy)
         elastic[self.model.fixed] = 0.0
@@ -303,7 +303,7 @@ class MsdsImplicit(TissueSolver):
         normal = contact.normal_at(pose, self._surface())
         loaded = np.einsum("ij,ij->i", elastic[touchable], normal) < 0
         pushed = contact.touched & (loaded | (contact.push > 0))
-        residual = self._balance.residual(-elastic, touchable[pushed], normal[pushed])
+        residual = self._residual_norm.residual(-elastic, touchable[pushed], normal[pushed])
         self._settled = (
             bool(np.abs(self._velocity).max() * self._rest_time < self._rest_tolerance)
             and residual <= self._tolerance
@@ -314,7 +314,7 @@ class MsdsImplicit(TissueSolver):
             displaced = np.abs(self._positions - self.model.mesh.nodes).max()
             if not contact.touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
                 self._positions = self.model.mesh.nodes.copy()
-                self._balance.forget()
+                self._residual_norm.reset()
                 self._energy = residual = 0.0
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
