@@ -115,7 +115,7 @@ def _set_targets(edges, rest_length, tetrahedra, rest_volume, x, stiffening, len
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_inertia(inertia, target, positions, stiffening, force):
-    """Turns force (N, 3) into that of a step, and returns what inertia (N,) N/m adds, J."""
+    """Turns force (N, 3) into that of a step; returns the energy of inertia (N,) N/m, J."""
     value = 0.0
     for i in range(len(positions)):
         for axis in range(3):

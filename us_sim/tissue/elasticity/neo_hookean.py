@@ -83,7 +83,7 @@ class NeoHookean:
         return self.energy_and_forces(displacement, np.empty(displacement.shape, self.dtype))
 
     def forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
-        """(3, N) N, the slope of the energy: what must act on each node to hold it there."""
+        """(3, N) N, the slope of the energy: external forces that hold the nodes there."""
         out = np.empty(displacement.shape, self.dtype) if out is None else out
         self.energy_and_forces(displacement, out)
         return out
@@ -198,7 +198,7 @@ class PronyBranch:
 
 
 class Overstress:
-    """The energy of a tissue's branch, and what it remembers.
+    """The viscous overstress of a tissue: one Prony branch and its internal variable.
 
     Args:
         branch: its constants.
@@ -213,7 +213,7 @@ class Overstress:
         self.stiffness = branch.modulus * -math.expm1(-frames) / frames
         self._tissue = tissue
         self._single = single
-        self.relaxed = np.zeros((3, tissue.count))  # (3, N) m, v above
+        self.relaxed = np.zeros((3, tissue.count))  # (3, N) m, the internal variable v
         self.load = 0.0  # N, norm of the forces when last added
         self._image = np.empty((3, tissue.count), single.dtype)
 
@@ -234,15 +234,15 @@ class Overstress:
         force += own
 
     def add_product(self, change: NDArray[np.floating], image: NDArray[np.floating]) -> None:
-        """Add how that changes with the displacement, by ``change``, to ``image``, both (3, N)."""
+        """Add the tangent of `add_forces` times ``change`` to ``image``, both (3, N)."""
         self._single.tangent_product(change, self._image)
         self._image *= self._image.dtype.type(self.stiffness)
         image += self._image
 
     def relax(self, displacement: NDArray[np.float64]) -> None:
-        """Let the time from one frame to the next pass, the first of which ended as given."""
+        """Advance the internal variable by a frame that ended at a displacement (3, N) m."""
         self.relaxed = displacement + self._kept * (self.relaxed - displacement)
 
     def reset(self, displacement: NDArray[np.float64]) -> None:
-        """Be relaxed at a displacement (3, N) m."""
+        """Relax fully at a displacement (3, N) m."""
         self.relaxed = displacement.copy()

@@ -49,7 +49,7 @@ from us_sim.tissue.elasticity.nodal_sums import (
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 # Row of the constants: one over the width along x (negative where mirrored), then y and z.
-PER_WIDTH = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
+PER_WIDTH = np.int64(0)  # numba compiles callers again for each literal
 FIELD = np.int64(0)  # First row of a buffer's field, row 3 corner + axis of it
 SUMS = FIELD + 24  # First row of a buffer's nodal sums, one a corner
 # First row of a buffer's pressures in the five tetrahedra, which the nodal sums make.
@@ -297,7 +297,7 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
 
 @njit(**INLINED)
 def _pressure(h, element, wall, nodal):
-    """V times the slope by J of all energy but the shear's; nodal is what the nodes add to it."""
+    """V times the slope by J of all energy but the shear's; nodal is the nodes' part of it."""
     change = volume_change(h)
     return element * change + nodal + wall * barrier_term(change)[1]
 

@@ -309,7 +309,7 @@ CONSTANTS = 6  # Numbers that the law of a lumen needs, see `lumen_table`
 _SLACK = 0.2  # Fraction of its volume, e above, that a vein has lost when its wall is slack
 # Shear modulus of a lumen over that of the solid that stands in for it. Blood has none; this one
 # keeps the mesh inside in shape. In the arm it is a tenth of the pressure, so that flattening the
-# mesh takes a tenth of what emptying takes.
+# mesh takes a tenth of the work of emptying it.
 _SOFTNESS = 0.05
 # Volume ratio at which the walls of an empty lumen begin to touch: they have a thickness.
 _TOUCHING = 0.2
@@ -362,7 +362,7 @@ def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
 def _drained_fraction(materials: TissueMaterials) -> NDArray[np.float64]:
     """(M,), fraction of each tetrahedron that may leave it, somewhat more than that of its lumen.
 
-    What a tetrahedron contains moves as one. So of the lumen f in one that loses f of its volume,
+    A tetrahedron's contents move as one. So of the lumen f in one that loses f of its volume,
     f (1 - f) would stay to be seen: of the arm's vein, whose tetrahedra are almost as large as it
     is, a fifth. With 1 - (1 - f)^2 it is half of that.
     """

@@ -41,7 +41,7 @@ from us_sim.tissue.elasticity.nodal_sums import (
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 # First row of the constants' gradients of the shape functions of nodes 1, 2 and 3.
-SHAPE = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
+SHAPE = np.int64(0)  # numba compiles callers again for each literal
 FIELD = np.int64(0)  # First row of a buffer's field, row 3 b + axis of it at the b-th node
 SUMS = FIELD + 12  # First row of a buffer's nodal sums, one a node
 OUT = SUMS + 4  # First row of a buffer's result: a field of 3 b + axis, 6 rows a node, or fewer

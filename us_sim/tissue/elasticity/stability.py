@@ -69,7 +69,8 @@ def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
     """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
 
     For springs alone it is the sum of a node's spring constants, which holds however they turn and
-    stretch. With or without a volume term it is about 2.7 times what the undeformed tissue needs.
+    stretch. With or without a volume term it is about 2.7 times the
+    bound that the undeformed tissue needs.
 
     Args:
         factors: as in `highest_frequency`.
@@ -102,7 +103,7 @@ def stabilise(
         factors: as in `highest_frequency`.
         time_step: s, as set.
         damping_factor: s, damping constant over stiffness.
-        stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only says what it is.
+        stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only adds the remark.
         maximum_substeps: of one step.
 
     Raises:

@@ -46,14 +46,14 @@ _MOST_ITERATIONS, _UNSOLVED = 3000, 1e-3
 
 
 class Slopes(NamedTuple):
-    """How a press changes with the logarithms of P moduli."""
+    """Slopes of a press by the logarithms of P moduli."""
 
     wrench: NDArray[np.float64]  # (6, P) N and N m, frame probe
     displacement: NDArray[np.float64]  # (P, 3, N) m
 
 
 class PressedTissue:
-    """Forces, wrench and tangent of a model at a displacement that is put.
+    """Forces, wrench and tangent of a model at a given displacement.
 
     Args:
         model: of the tissue and the probe; contact is without friction.
@@ -73,7 +73,7 @@ class PressedTissue:
         return float(gap.min(initial=np.inf))
 
     def set_state(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
-        """Put the probe at a pose and the nodes at a displacement (3, N) m."""
+        """Set the probe's pose and the nodes' displacement (3, N) m."""
         self._pose, self._displacement = pose, displacement
         at = self._points.rest + self._points.moved(displacement)
         self._contact.set_pose(pose, at)
@@ -81,7 +81,7 @@ class PressedTissue:
 
     @property
     def _contact_forces(self) -> NDArray[np.float64]:
-        """(3, N) N, with which the probe pushes the nodes."""
+        """(3, N) N, of the probe on the nodes."""
         pushes = np.zeros_like(self._displacement)
         self._points.add(self._contact.force, pushes, self._contact.near)
         return pushes
@@ -103,7 +103,7 @@ class PressedTissue:
         )
 
     def solve(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(3, N) m, by which a small force (3, N) N would move the nodes, probe and all else alike.
+        """(3, N) m, the displacement by a small force (3, N) N under the unmoved probe.
 
         Raises:
             SolverError: the tissue is about to buckle, so that no force can say how it moves.
@@ -162,7 +162,7 @@ def slopes(
     pose: Pose,
     displacement: NDArray[np.float64],
 ) -> Slopes:
-    """How wrench and displacement of a balanced tissue change with each of P moduli.
+    """Slopes of wrench and displacement of a balanced tissue by each of P moduli.
 
     Args:
         tissue: whose forces balance.
@@ -191,7 +191,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True, eq=False)
 class PredictedPress:
-    """What is felt and seen at K poses, and its slopes by the logarithms of P moduli."""
+    """Wrenches at K poses, places of S points, and their slopes by the logarithms of P moduli."""
 
     wrenches: NDArray[np.float64]  # (K, 6) N and N m, on the probe about its origin, frame probe
     slopes: NDArray[np.float64]  # (K, 6, P)
@@ -201,7 +201,7 @@ class PredictedPress:
 
 @dataclass(frozen=True, eq=False)
 class CarriedPoints:
-    """Points of the tissue that are seen at some of the poses."""
+    """Points of the tissue that were observed at some of the poses."""
 
     poses: NDArray[np.intp]  # (S,) number of the pose
     rest: NDArray[np.float64]  # (S, 3) m, where they are in the undeformed tissue
@@ -243,7 +243,7 @@ class PressModel:
     def predict(
         self, moduli: Mapping[str, float], progress: Progress | None = None
     ) -> PredictedPress:
-        """What is felt with these moduli (Pa), of all structures.
+        """The press with these moduli (Pa), of all structures.
 
         Raises:
             SolverError: the tissue cannot be solved.

@@ -63,7 +63,7 @@ class LandmarkSightings:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """n numbers that were measured; those with a model come first."""
+    """n measured numbers; those with a model come first."""
 
     values: NDArray[np.float64]  # (n,) N, N m or m
     groups: NDArray[np.intp]  # (n,) into GROUPS
@@ -74,7 +74,7 @@ class Observations:
     channels: NDArray[np.intp]  # of the wrench, those used
 
     def modelled(self, felt: PredictedPress) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(n,) what a model says of these, and (n, P) its slopes by the logarithms of moduli."""
+        """(n,) modelled values of these, and (n, P) their slopes by the logarithms of moduli."""
         count = felt.slopes.shape[2]
         values = [felt.wrenches[:, self.channels].ravel(), felt.places.ravel()]
         slopes = [
@@ -142,7 +142,7 @@ _OUTSIDE = 1e-3  # m, that a point may lie outside the mesh
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """L points at rest, and S sights of them."""
+    """L points at rest, and S sightings of them."""
 
     names: tuple[str, ...]  # L
     rest: NDArray[np.float64]  # (L, 3) m, frame patient
@@ -153,7 +153,7 @@ class Landmarks:
     def at(
         self, record: PressRecord, chosen: ChosenPoses, mesh: TetrahedralMesh, tolerance: float
     ) -> tuple[ChosenPoses, LandmarkSightings, CarriedPoints]:
-        """The sights with the poses that they were had at, which are looked at as well.
+        """The sightings, with their poses added to the chosen ones.
 
         Raises:
             StiffnessError: there is no pose at the time of one, or a point is outside the mesh.
@@ -251,14 +251,14 @@ def undetermined(
     fitted: FitResult,
     settings: StiffnessSettings,
 ) -> str:
-    """The sentence.
+    """Reasons why a press does not determine moduli, and remedies, in a sentence.
 
     Args:
         names: of P structures.
-        known: on these.
+        known: which of them are determined.
         observed: the measurements.
-        fitted: what they led to.
-        settings: with which they are judged.
+        fitted: to these.
+        settings: of the fit.
     """
     reasons, unknown = [], [p for p in range(len(names)) if not known.determined[p]]
     for p in unknown:
@@ -281,7 +281,7 @@ def undetermined(
 
 
 def _effect(p: int, observed: Observations, fitted: FitResult, settings: StiffnessSettings) -> str:
-    """What a stiffer structure would do, over the noise."""
+    """Largest change by a stiffer structure beside the noise, in a sentence."""
     best, text = -1.0, ""
     for group, (name, scale, unit) in enumerate(_UNITS):
         its = observed.groups == group
@@ -304,7 +304,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Tissue:
-    """What is pressed: its mesh and probe, and how its materials follow from moduli."""
+    """The pressed tissue and probe, and how its materials follow from moduli."""
 
     model: TissueModel
     materials_for: MaterialsFor
@@ -335,7 +335,7 @@ class StiffnessFit:
 
     @property
     def modelled(self) -> NDArray[np.float64]:
-        """(n,) what the model says of the measurements, offsets included."""
+        """(n,) modelled values of the measurements, offsets included."""
         return self.observations.values - self.fitted.residual
 
     def scatter(self, kind: str) -> float | None:
@@ -356,7 +356,7 @@ def fit_stiffness(
     """The moduli that explain a press best.
 
     Args:
-        tissue: what is pressed.
+        tissue: pressed.
         record: the press.
         settings: see `StiffnessSettings`.
         landmarks: points that were seen meanwhile.
@@ -419,7 +419,7 @@ def _fitted_names(tissue: Tissue, record: PressRecord, settings: StiffnessSettin
 
 
 def _require_same_sign(observed: Observations, values: NDArray[np.float64]) -> None:
-    """Refuse forces on the tissue where those on the probe are meant."""
+    """Refuse forces on the tissue in place of those on the probe."""
     for place, channel in enumerate(observed.channels):
         if channel == 2:
             its = observed.nuisance[:, place] > 0
@@ -479,7 +479,7 @@ def _result(
 
 
 def _weights(observed: Observations, fitted: FitResult) -> NDArray[np.float64]:
-    """(P,) part of the forces (without any, of all that is measured) that each modulus makes."""
+    """(P,) share of each modulus in the forces, or, without any, in all measurements."""
     model = observed.values - fitted.residual - observed.nuisance @ fitted.nuisance
     its = observed.groups == (0 if (observed.groups == 0).any() else observed.groups.min())
     size = float(model[its] @ model[its]) or 1.0

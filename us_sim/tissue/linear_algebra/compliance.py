@@ -31,7 +31,7 @@ Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 @dataclass(frozen=True, eq=False)
 class DenseFields:
-    """What each of 3S forces does to F nodes."""
+    """Displacements of F nodes by each of 3S unit forces."""
 
     nodes: NDArray[np.integer]  # (F,)
     fields: NDArray[np.floating]  # (3S, 3, F), m/N
@@ -62,7 +62,7 @@ class DenseFields:
         return cls(nodes, fields)
 
     def add(self, forces: NDArray[np.float64], displacement: NDArray[np.floating]) -> None:
-        """Add what forces (3S,) N do to displacement (N, 3) m; zeros are not read."""
+        """Add the displacement by forces (3S,) N to displacement (N, 3) m; zeros are not read."""
         rows = np.flatnonzero(forces)
         _add_rows(self.fields, rows, forces[rows], self.nodes, displacement)
 
@@ -129,11 +129,11 @@ class SurfaceCompliance:
         self.field(np.zeros((len(self.nodes), 3)))
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
-        """Add what forces (S, 3) N do to displacement (3, N) m; those without are not read."""
+        """Add the displacement by forces (S, 3) N to displacement (3, N) m; zeros are not read."""
         self.fields.add(forces.ravel(), displacement.T)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) m, what forces (S, 3) N do to every node."""
+        """(N, 3) m, the displacement of every node by forces (S, 3) N."""
         displacement = np.zeros((self.count, 3))
         self.fields.add(forces.ravel(), displacement)
         return displacement
@@ -149,7 +149,7 @@ def surface_compliance(
 
     Args:
         model: the tissue.
-        progress: told the fraction done and what is being done, if it takes a second or more.
+        progress: called with the fraction done and a label, if it takes a second or more.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.

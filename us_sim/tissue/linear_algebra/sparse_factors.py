@@ -44,7 +44,7 @@ class ScalarPreconditioner:
         diagonal: (N,) N/m.
         free: (N,), the others do not move.
         surface: (C,) free nodes that can be confined.
-        progress: told the fraction done of the solutions for the surface, and what they are.
+        progress: called with the fraction done of the surface's solutions, and a label.
     """
 
     def __init__(

@@ -3,7 +3,7 @@
 The matrix is a stiffness and springs that are both only known by their products. Conjugate
 gradients with a local preconditioner carry a force one layer of nodes an iteration. So the
 preconditioner adds up the answers of each node by itself, its springs included, and of a coarse
-grid, on which what varies slowly is solved for directly: some hundred nodes of a regular grid
+grid, on which the smooth part is solved for directly: some hundred nodes of a regular grid
 around the mesh, between which displacements are trilinear (B. Smith, P. Bjorstad and W. Gropp,
 Domain Decomposition, 1996, section 2.1). The grid need not follow the mesh, which may be of any
 kind. Fields are (3, N).
@@ -334,13 +334,13 @@ _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "
 
 @dataclass(frozen=True, eq=False)
 class CgSolution:
-    """What conjugate gradients found."""
+    """Result of `conjugate_gradients`."""
 
     solution: NDArray[np.floating]  # (3, N)
     image: NDArray[np.floating]  # (3, N), the product without springs of the solution
     direction: NDArray[np.floating]  # (3, N), the last search direction
     iterations: int
-    curved: bool  # whether that was one of negative curvature; the solution is what came before
+    curved: bool  # whether the last direction had no positive curvature, and was not followed
 
 
 class Preconditioner(Protocol):
@@ -421,7 +421,7 @@ def conjugate_gradients(
     Args:
         product: writes the stiffness, without springs, times its first argument into the second.
         preconditioner: prepared.
-        residual: (3, N), zero at fixed nodes; overwritten with what is left.
+        residual: (3, N), zero at fixed nodes; overwritten with the remaining one.
         iterations: the most products.
         tolerance: norm of the residual at which to end.
         add_springs: adds the springs' forces for its first argument to the second.
@@ -570,9 +570,9 @@ def _dot(a, b):
 
 @njit(**_LOOP)
 def _turn(residual, conditioned, before, search):
-    """Turn the search to what is left, conditioned; returns the slope along that.
+    """Update the search direction from the preconditioned residual; returns r . z.
 
-    It was ``before`` along the search before; without one, that is zero.
+    ``before`` is the last step's r . z, or zero in the first.
     """
     slope = _dot(residual, conditioned)
     s = search.dtype.type(slope / before if before != 0.0 else 0.0)
@@ -593,7 +593,7 @@ def _curvature(search, whole, fixed):
 
 @njit(**_LOOP)
 def _advance(length, search, elastic, whole, solution, image, residual):
-    """One step along the search direction; returns the square of the residual that is left."""
+    """One step along the search direction; returns the squared residual norm."""
     s = search.dtype.type(length)
     total = 0.0
     for d in range(3):

@@ -62,14 +62,14 @@ def fitted_planes(
 def spacing_under_probe(
     wanted: Sequence[DesiredSpacing], half_length: float, half_width: float
 ) -> tuple[DesiredSpacing, DesiredSpacing, DesiredSpacing]:
-    """The spacing that is wanted, where it is less than what the probe's edges need.
+    """The desired spacing, lowered to the one that the probe's edges need.
 
     Under the probe, at the surface, that is half of the probe's half width; it grows with depth
     and beside the probe.
 
     Args:
         wanted: of x, y and z.
-        half_length, half_width: m, of what presses, along x and y.
+        half_length, half_width: m, of the probe's footprint, along x and y.
     """
     least = _UNDER_PROBE * half_width
     found = []
@@ -125,7 +125,7 @@ def spacing_by_labels(
         box: (2, 3) m, lower and upper corner.
         step: m, at which labels are looked up.
         counted: labels of the structures that count; all but 0 without it. A layer, such as skin,
-            is better left out: it moves with what is under it.
+            is better left out: it moves with the tissue under it.
         aside: m, how far from y = 0 structures count for x and z.
     """
     counts = np.maximum(2, np.ceil((box[1] - box[0]) / step - 1e-9).astype(int))
