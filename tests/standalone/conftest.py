@@ -1,6 +1,5 @@
 """A private context with an executor, for tests that run against any rclpy."""
 
-import random
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -54,46 +53,14 @@ def bench() -> Iterator[Bench]:
 
 
 @pytest.fixture
-def bench_with() -> Iterator[Callable[[list[str]], Bench]]:
-    """A bench whose context has the given command line."""
+def bench_with() -> Iterator[Callable[[str | list[str]], Bench]]:
+    """A function from a command line to a bench whose context has it."""
     made: list[Bench] = []
 
-    def make(args: list[str]) -> Bench:
-        made.append(Bench(args))
+    def make(args: str | list[str]) -> Bench:
+        made.append(Bench(args.split() if isinstance(args, str) else args))
         return made[-1]
 
     yield make
     for bench in made:
         bench.close()
-
-
-@pytest.fixture(scope="module")
-def domain() -> int:
-    return random.Random().randint(1, 100)
-
-
-@pytest.fixture
-def participant(domain: int) -> Iterator[Any]:
-    from transport_bench import LOCALHOST
-
-    from us_sim.standalone.transport import Participant
-
-    with Participant(domain, reach=LOCALHOST) as participant:
-        yield participant
-
-
-@pytest.fixture
-def neighbour(domain: int) -> Iterator[Any]:
-    from transport_bench import LOCALHOST
-
-    from us_sim.standalone.transport import Participant
-
-    with Participant(domain, reach=LOCALHOST) as participant:
-        yield participant
-
-
-@pytest.fixture
-def bell() -> Any:
-    from transport_bench import Doorbell
-
-    return Doorbell()

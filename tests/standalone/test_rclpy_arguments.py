@@ -88,19 +88,7 @@ def test_parameter_values_have_the_types_that_rcl_gives_them(
 
 def test_parameters_can_be_for_one_node_and_the_last_one_wins(bench_with) -> None:
     bench = bench_with(
-        [
-            "--ros-args",
-            "-p",
-            "rate:=1",
-            "-p",
-            "probe:rate:=2",
-            "--param",
-            "a.b:=3",
-            "-p",
-            "skin:rate:=4",
-            "-p",
-            "skin:rate:=5",
-        ]
+        "--ros-args -p rate:=1 -p probe:rate:=2 --param a.b:=3 -p skin:rate:=4 -p skin:rate:=5"
     )
     assert overrides(bench, "probe") == {"rate": 2, "a.b": 3}
     assert overrides(bench, "skin") == {"rate": 5, "a.b": 3}
@@ -119,7 +107,7 @@ def test_parameter_files_have_wildcards_namespaces_and_groups(bench_with, tmp_pa
 
 
 def test_overrides_given_in_code_come_last_and_a_nodes_own_arguments_before(bench_with) -> None:
-    bench = bench_with(["--ros-args", "-p", "a:=1", "-p", "b:=1", "-p", "c:=1"])
+    bench = bench_with("--ros-args -p a:=1 -p b:=1 -p c:=1")
     found = overrides(
         bench,
         "probe",
@@ -181,7 +169,7 @@ def test_files_that_are_no_parameter_files_are_refused(tmp_path: Path, text: str
 
 def test_log_levels_come_from_arguments(bench_with) -> None:
     try:
-        bench_with(["--ros-args", "--log-level", "probe.camera:=debug", "--log-level", "error"])
+        bench_with("--ros-args --log-level probe.camera:=debug --log-level error")
         assert get_logger("anything").get_effective_level() == LoggingSeverity.ERROR
         assert get_logger_effective_level("probe.camera.left") == LoggingSeverity.DEBUG
     finally:

@@ -140,25 +140,9 @@ def test_nodes_refuse_names_that_are_not_allowed(bench) -> None:
 
 def test_rules_of_the_command_line_rename_nodes_topics_and_services(bench_with) -> None:
     bench = bench_with(
-        [
-            "--ros-args",
-            "-r",
-            "__ns:=/right",
-            "--remap",
-            "__node:=needle",
-            "-r",
-            "image:=us/picture",
-            "-r",
-            "~/state:=/state",
-            "-r",
-            "other:image:=nowhere",
-            "-r",
-            "rostopic://reset:=reset_topic",
-            "-r",
-            "rosservice://reset:=restart",
-            "-r",
-            "image:=never_the_second",
-        ]
+        "--ros-args -r __ns:=/right --remap __node:=needle -r image:=us/picture -r "
+        "~/state:=/state -r other:image:=nowhere -r rostopic://reset:=reset_topic -r "
+        "rosservice://reset:=restart -r image:=never_the_second"
     )
     node = bench.node("probe", namespace="left")
     assert node.get_fully_qualified_name() == "/right/needle"
@@ -179,7 +163,7 @@ def test_rules_of_the_command_line_rename_nodes_topics_and_services(bench_with) 
 
 
 def test_rules_for_one_node_leave_the_others_alone(bench_with) -> None:
-    bench = bench_with(["--ros-args", "-r", "probe:image:=picture", "-r", "skin:__ns:=/arm"])
+    bench = bench_with("--ros-args -r probe:image:=picture -r skin:__ns:=/arm")
     assert bench.node("probe").resolve_topic_name("image") == "/picture"
     skin = bench.node("skin")
     assert skin.get_fully_qualified_name() == "/arm/skin"
@@ -187,7 +171,7 @@ def test_rules_for_one_node_leave_the_others_alone(bench_with) -> None:
 
 
 def test_a_nodes_own_arguments_come_first_and_it_may_ignore_the_others(bench_with) -> None:
-    bench = bench_with(["--ros-args", "-r", "image:=picture", "-r", "pose:=place"])
+    bench = bench_with("--ros-args -r image:=picture -r pose:=place")
     own = bench.node("own", cli_args=["--ros-args", "-r", "image:=own_picture"])
     assert own.resolve_topic_name("image") == "/own_picture"
     assert own.resolve_topic_name("pose") == "/place"

@@ -1,24 +1,30 @@
-"""Publishers and subscriptions, between nodes of one process and between processes."""
+"""Publishers, subscriptions, services and clients, their quality, and the parameter services."""
 
-import array
 import os
 import subprocess
 import sys
+import threading
 from typing import Any
 
-import numpy as np
 import pytest
+import rclpy
 from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.exceptions import (
     InvalidHandle,
     NoTypeSupportImportedException,
     ParameterNotDeclaredException,
 )
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import (
     DurabilityPolicy,
+    HistoryPolicy,
+    InvalidQoSProfileException,
     QoSPolicyKind,
     QoSProfile,
     ReliabilityPolicy,
@@ -26,8 +32,38 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image
 from std_msgs.msg import Int32, String
+from std_srvs.srv import SetBool, Trigger
+
+
+def test_a_profile_needs_history_or_depth() -> None:
+    with pytest.raises(InvalidQoSProfileException, match="required"):
+        QoSProfile()
+    with pytest.raises(InvalidQoSProfileException, match="without a depth"):
+        QoSProfile(history=HistoryPolicy.KEEP_LAST)
+    assert QoSProfile(history=HistoryPolicy.KEEP_ALL).depth == 10
+    assert QoSProfile(depth=3).history is HistoryPolicy.KEEP_LAST
+
+
+def test_a_profile_refuses_what_is_no_policy() -> None:
+    with pytest.raises(AssertionError):
+        QoSProfile(depth=1, colour="red")
+    with pytest.raises(AssertionError):
+        QoSProfile(depth=1, deadline=1.0)
+    with pytest.raises(AssertionError):
+        QoSProfile(depth=1.0)
+    with pytest.raises(ValueError, match="7 is not a valid"):
+        QoSProfile(depth=1, reliability=7)
+    with pytest.warns(UserWarning, match="zero depth"):
+        QoSProfile(depth=0)
+
+
+def test_profiles_are_equal_by_value_and_show_their_policies() -> None:
+    assert QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT) == qos_profile_sensor_data
+    assert QoSProfile(depth=5) != qos_profile_sensor_data
+    assert str(QoSProfile(depth=5)).startswith("QoSProfile(history=")
+    assert "deadline=0 nanoseconds" in str(QoSProfile(depth=5))
+
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -53,20 +89,6 @@ def test_messages_arrive_in_order_and_whole(bench) -> None:
         publisher.publish(message)
     assert bench.spin_until(lambda: len(received) == 5)
     assert received == sent
-
-
-def test_images_keep_their_bytes(bench) -> None:
-    received: list[Image] = []
-    node = bench.node()
-    node.create_subscription(Image, "image", received.append, 1)
-    publisher = node.create_publisher(Image, "image", 1)
-    assert connected(bench, publisher)
-    pixels = np.arange(512 * 512, dtype=np.uint8).reshape(512, 512)
-    publisher.publish(
-        Image(height=512, width=512, step=512, data=array.array("B", pixels.tobytes()))
-    )
-    assert bench.spin_until(lambda: received)
-    assert np.array_equal(np.asarray(received[0].data, np.uint8).reshape(512, 512), pixels)
 
 
 def test_serialized_messages_can_be_published_and_received(bench) -> None:
@@ -302,3 +324,140 @@ def test_processes_exchange_messages(bench) -> None:
             other.wait(timeout=10)
     assert bench.spin_until(lambda: node.count_publishers("answer") == 0)
     assert bench.spin_until(lambda: "/echo" not in node.get_fully_qualified_node_names())
+
+
+def ready(bench: Any, client: Any) -> bool:
+    return bench.spin_until(client.service_is_ready)
+
+
+def test_a_service_answers_each_request(bench) -> None:
+    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success = request.data
+        response.message = f"it is {request.data}"
+        return response
+
+    bench.node("server").create_service(SetBool, "switch", answer)
+    client = bench.node("client").create_client(SetBool, "switch")
+    assert client.wait_for_service(timeout_sec=5.0)
+    futures = [client.call_async(SetBool.Request(data=on)) for on in (True, False)]
+    assert [bench.result(future).message for future in futures] == ["it is True", "it is False"]
+    assert [future.result().success for future in futures] == [True, False]
+    assert client.service_name == "/switch"
+
+
+def test_several_clients_get_their_own_answers(bench) -> None:
+    numbers = iter(range(10))
+
+    def count(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = str(next(numbers))
+        return response
+
+    bench.node("server").create_service(Trigger, "count", count)
+    clients = [bench.node(f"client_{i}").create_client(Trigger, "count") for i in range(2)]
+    assert all(ready(bench, client) for client in clients)
+    futures = [client.call_async(Trigger.Request()) for client in clients]
+    answers = {bench.result(future).message for future in futures}
+    assert answers == {"0", "1"}
+
+
+def _with(response: Trigger.Response, message: str) -> Trigger.Response:
+    response.message = message
+    return response
+
+
+def test_a_service_that_is_not_there_is_not_ready(bench) -> None:
+    client = bench.node().create_client(Trigger, "nowhere")
+    assert not client.service_is_ready()
+    assert not client.wait_for_service(timeout_sec=0.05)
+    assert client.call(Trigger.Request(), timeout_sec=0.05) is None
+    with pytest.raises(TypeError):
+        client.call_async(SetBool.Request())
+    with pytest.raises(TypeError):
+        client.call(Trigger.Response())
+
+
+def test_destroyed_services_and_clients_are_gone(bench) -> None:
+    server, user = bench.node("server"), bench.node("user")
+    service = server.create_service(Trigger, "reset", lambda _, r: r)
+    client = user.create_client(Trigger, "reset")
+    assert ready(bench, client)
+    assert server.destroy_service(service)
+    assert not server.destroy_service(service)
+    assert bench.spin_until(lambda: not client.service_is_ready())
+    assert user.destroy_client(client)
+    with pytest.raises(InvalidHandle):
+        client.call_async(Trigger.Request())
+
+
+def test_a_wrong_response_is_an_error_of_the_server(bench) -> None:
+    bench.node("server").create_service(Trigger, "reset", lambda _request, _response: None)
+    client = bench.node("client").create_client(Trigger, "reset")
+    assert ready(bench, client)
+    client.call_async(Trigger.Request())
+    with pytest.raises(TypeError):
+        bench.spin_until(lambda: False, seconds=5)
+
+
+@pytest.mark.skipif(rclpy.__name__ == "rclpy", reason="needs the standalone client's insides")
+def test_a_request_of_another_middleware_is_not_answered_and_does_no_harm(bench, capfd) -> None:
+    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success = request.data
+        return response
+
+    bench.node("server").create_service(SetBool, "switch", answer)
+    client = bench.node("client").create_client(SetBool, "switch")
+    assert ready(bench, client)
+    client._endpoint.send_request(b"\0\1\0\0")
+    assert bench.result(client.call_async(SetBool.Request(data=True))).success
+    assert "a request for /switch is not answered" in capfd.readouterr().err
+
+
+def test_the_six_parameter_services(bench) -> None:
+    node = bench.node("probe", namespace="left")
+    node.declare_parameters("", [("rate", 60.0), ("names", ["vein", "artery"]), ("depth", 3)])
+    client = AsyncParameterClient(bench.node("user"), "/left/probe")
+    assert client.wait_for_services(timeout_sec=5.0)
+
+    values = bench.result(client.get_parameters(["rate", "names"])).values
+    assert values[0].double_value == 60.0
+    assert values[1].string_array_value == ["vein", "artery"]
+    assert not bench.result(client.get_parameters(["rate", "unknown"])).values
+    assert list(bench.result(client.get_parameter_types(["rate", "depth"])).types) == [3, 2]
+    described = bench.result(client.describe_parameters(["depth"])).descriptors
+    assert (described[0].name, described[0].type) == ("depth", 2)
+    assert "depth" in bench.result(client.list_parameters()).result.names
+    assert list(bench.result(client.list_parameters(["rate"], 1)).result.names) == ["rate"]
+
+    one_by_one = [Parameter("rate", value=30.0), Parameter("depth", value="deep")]
+    results = bench.result(client.set_parameters(one_by_one)).results
+    assert [result.successful for result in results] == [True, False]
+    assert node.get_parameter("rate").value == 30.0
+    together = [Parameter("rate", value=10.0).to_parameter_msg(), Parameter("depth", value=1.5)]
+    assert not bench.result(client.set_parameters_atomically(together)).result.successful
+    assert node.get_parameter("rate").value == 30.0
+    unknown = bench.result(client.set_parameters([ParameterMsg(name="unknown")])).results
+    assert not unknown[0].successful
+    assert "undeclared" in unknown[0].reason
+
+
+def test_a_node_may_have_no_parameter_services(bench) -> None:
+    node = bench.node("probe", start_parameter_services=False)
+    assert not [s for s in node.services if s.service_name.endswith("_parameters")]
+    assert ListParameters.Request.DEPTH_RECURSIVE == 0
+    client = bench.node("user").create_client(GetParameters, "probe/get_parameters")
+    assert not client.wait_for_service(timeout_sec=0.2)
+
+
+def test_a_synchronous_call_works_beside_an_executor_in_a_thread(bench) -> None:
+    bench.node("server").create_service(Trigger, "reset", lambda _, r: _with(r, "done"))
+    client = bench.node("client").create_client(Trigger, "reset")
+    executor: SingleThreadedExecutor = bench.executor
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    assert client.wait_for_service(timeout_sec=5.0)
+    answer = client.call(Trigger.Request(), timeout_sec=5.0)
+    assert answer is not None
+    assert answer.message == "done"
+    executor.shutdown()
+    thread.join(timeout=5)
+    assert not thread.is_alive()

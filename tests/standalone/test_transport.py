@@ -1,32 +1,118 @@
-"""Serialized samples over DDS, between participants and between processes."""
+"""Serialized samples, the graph and services over DDS, between participants and processes."""
 
 import array
 import os
+import random
+import shutil
 import signal
+import subprocess
+import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-pytest.importorskip("cyclonedds", reason="the transport needs pip install cyclonedds")
-
-from transport_bench import (
-    BEST_EFFORT,
-    HELLO,
-    IMAGE,
-    LATCHED,
-    LISTENER,
-    LOCALHOST,
-    RELIABLE,
-    STRING,
-    Child,
-    take_one,
-)
-
 from us_sim.standalone.cdr import deserialize, serialize
-from us_sim.standalone.ddsc import EndpointQos
-from us_sim.standalone.graph import Graph
+from us_sim.standalone.ddsc import EndpointQos, qos_of_profile
+from us_sim.standalone.graph import Graph, GraphNode
 from us_sim.standalone.messages import message_class
-from us_sim.standalone.transport import DdsError, Participant
+from us_sim.standalone.services import ServiceServer
+from us_sim.standalone.transport import DdsError, DiscoveryRange, Participant
+
+LOCALHOST = DiscoveryRange("LOCALHOST")
+IMAGE = "sensor_msgs::msg::dds_::Image_"
+STRING = "std_msgs::msg::dds_::String_"
+RELIABLE = EndpointQos(depth=10)
+LATCHED = EndpointQos(depth=1, durability=EndpointQos.TRANSIENT_LOCAL)
+BEST_EFFORT = EndpointQos(depth=1, reliability=EndpointQos.BEST_EFFORT)
+HELLO = serialize(message_class("std_msgs/msg/String")(data="hello"))
+
+
+class Doorbell:
+    """Rung by the transport's thread; a test waits on it until something holds."""
+
+    def __init__(self) -> None:
+        self._rung = threading.Event()
+
+    def ring(self, *_: object) -> None:
+        self._rung.set()
+
+    def wait_until(self, condition: Callable[[], object], timeout: float = 10.0) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            remaining = deadline - time.monotonic()
+            assert remaining > 0, "what was waited for did not happen"
+            self._rung.wait(min(remaining, 0.01))  # matches and the graph ring no bell
+            self._rung.clear()
+
+
+class Child:
+    """Another process that runs ``script`` with the domain as its argument."""
+
+    def __init__(self, script: str, domain: int) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", script, str(domain)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+        )
+
+    def __enter__(self) -> "Child":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.send_signal(signal.SIGCONT)
+        self.process.kill()
+        self.process.communicate()
+
+
+LISTENER = """
+import sys
+from us_sim.standalone.ddsc import EndpointQos
+from us_sim.standalone.graph import Graph, GraphNode
+from us_sim.standalone.transport import Participant
+participant = Participant(int(sys.argv[1]))
+reader = participant.create_reader(
+    "rt/ping", "sensor_msgs::msg::dds_::Image_", EndpointQos(), "typehash=RIHS01_12;"
+)
+Graph(participant).announce([GraphNode("/us", "listener", (reader.gid,))])
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def take_one(reader, bell):
+    taken = []
+    bell.wait_until(lambda: taken.append(reader.take()) or taken[-1] is not None)
+    return taken[-1]
+
+
+@pytest.fixture(scope="module")
+def domain() -> int:
+    return random.Random().randint(1, 100)
+
+
+@pytest.fixture
+def participant(domain: int) -> Iterator[Any]:
+    with Participant(domain, reach=LOCALHOST) as participant:
+        yield participant
+
+
+@pytest.fixture
+def neighbour(domain: int) -> Iterator[Any]:
+    with Participant(domain, reach=LOCALHOST) as participant:
+        yield participant
+
+
+@pytest.fixture
+def bell() -> Any:
+    return Doorbell()
+
 
 ECHO = """
 import sys, threading
@@ -237,3 +323,156 @@ def test_bytes_that_are_no_sample_are_refused(participant):
     for data in (b"", b"abc", b"\0\1\0\0", b"\xff\xff\0\0abcd"):
         with pytest.raises(DdsError, match="not a sample"):
             writer.write(data)
+
+
+def test_the_graph_shows_nodes_and_endpoints_of_other_processes(participant, domain, bell):
+    graph = Graph(participant)
+    writer = participant.create_writer("rt/ping", IMAGE, LATCHED)
+    graph.announce([GraphNode("/", "here", writer_gids=(writer.gid,))])
+    with Child(LISTENER, domain):
+        bell.wait_until(lambda: len(graph.nodes()) == 2 and len(graph.endpoints("rt/ping")) == 2)
+        here, there = graph.nodes()
+        assert (here.namespace, here.name, here.participant) == ("/", "here", participant.gid)
+        assert (there.namespace, there.name) == ("/us", "listener")
+        endpoints = {endpoint.is_writer: endpoint for endpoint in graph.endpoints("rt/ping")}
+        assert endpoints[True].gid == writer.gid
+        assert endpoints[True].qos == LATCHED
+        assert endpoints[False].gid == there.reader_gids[0]
+        assert endpoints[False].participant == there.participant
+        assert endpoints[False].type_name == IMAGE
+        assert endpoints[False].qos == RELIABLE
+        assert endpoints[False].user_data == {"typehash": "RIHS01_12"}
+
+
+ANNOUNCER_THAT_ENDS = LISTENER.replace("sys.stdin.read()", "")
+
+
+def test_who_ends_is_gone_from_the_graph_at_once(participant, domain, bell):
+    graph = Graph(participant)
+    child = Child(ANNOUNCER_THAT_ENDS, domain)
+    assert child.process.wait(10) == 0
+    bell.wait_until(lambda: not graph.nodes() and not graph.endpoints("rt/ping"), 2.0)
+    assert child.process.communicate() == ("ready\n", "")
+
+
+def test_service_endpoints_are_named_as_rmw_cyclonedds_names_them(participant):
+    server = ServiceServer(participant, "/n/get", "rcl_interfaces/srv/GetParameters", RELIABLE)
+    graph = Graph(participant)
+    request = graph.endpoints("rq/n/getRequest")[0]
+    reply = graph.endpoints("rr/n/getReply")[0]
+    assert ([request.gid], [reply.gid]) == server.gids
+    assert (request.is_writer, reply.is_writer) == (False, True)
+    assert request.type_name == "rcl_interfaces::srv::dds_::GetParameters_Request_"
+    assert reply.type_name == "rcl_interfaces::srv::dds_::GetParameters_Response_"
+    assert request.user_data["serviceid"] == reply.user_data["serviceid"]
+    assert reply.user_data["typehash"].startswith("RIHS01_")
+
+
+def test_participants_with_range_off_meet_nobody_else(domain):
+    with (
+        Participant(domain, reach=DiscoveryRange("OFF")) as alone,
+        Child(LISTENER, domain) as child,
+    ):
+        assert child.process.stdout.readline() == "ready\n"
+        graph = Graph(alone)
+        assert graph.nodes() == []
+        assert graph.endpoints("rt/ping") == []
+
+
+def test_all_policies_reach_the_other_side(participant, neighbour, bell):
+    asked = EndpointQos(
+        durability=EndpointQos.TRANSIENT_LOCAL,
+        history=EndpointQos.KEEP_ALL,
+        depth=0,
+        deadline=2_000_000_000,
+        lifespan=3_000_000_000,
+        liveliness=EndpointQos.MANUAL_BY_TOPIC,
+        liveliness_lease_duration=4_000_000_000,
+    )
+    writer = participant.create_writer("rt/policies", STRING, asked)
+    graph = Graph(neighbour)
+    bell.wait_until(lambda: graph.endpoints("rt/policies"))
+    assert graph.endpoints("rt/policies")[0].qos == asked
+    assert writer.qos == asked
+
+
+@pytest.mark.usefixtures("participant")
+def test_one_process_cannot_reach_two_ways_in_a_domain(domain):
+    with pytest.raises(DdsError, match="discovery range LOCALHOST"):
+        Participant(domain, reach=DiscoveryRange("SUBNET"))
+
+
+@pytest.mark.parametrize("number", [-1, 233])
+def test_a_domain_that_does_not_exist_is_refused(number):
+    with pytest.raises(DdsError, match="not one of 0 to 232"):
+        Participant(number, reach=LOCALHOST)
+
+
+def test_the_environment_decides_the_discovery_range():
+    assert DiscoveryRange.from_environment({}) == DiscoveryRange("SUBNET")
+    assert DiscoveryRange.from_environment({"ROS_LOCALHOST_ONLY": "1"}).name == "LOCALHOST"
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_LOCALHOST_ONLY": "0"}
+    assert DiscoveryRange.from_environment(environment).name == "OFF"
+    with pytest.raises(DdsError, match="SUBNET, LOCALHOST, OFF, SYSTEM_DEFAULT"):
+        DiscoveryRange.from_environment({"ROS_AUTOMATIC_DISCOVERY_RANGE": "localhost"})
+
+
+def test_the_configuration_follows_the_discovery_range():
+    localhost = DiscoveryRange("LOCALHOST", ("pc<2>",)).configuration()
+    assert "address='127.0.0.1'" in localhost
+    assert "<AllowMulticast>false</AllowMulticast>" in localhost
+    assert "<Peer address='localhost'/><Peer address='pc&lt;2&gt;'/>" in localhost
+    subnet = DiscoveryRange("SUBNET", ("10.0.0.5",)).configuration()
+    assert "<Peers><Peer address='10.0.0.5'/></Peers>" in subnet
+    assert "AllowMulticast" not in subnet
+    off = DiscoveryRange("OFF", ("10.0.0.5",)).configuration()
+    assert f"<Tag>ros_discovery_off_{os.getpid()}</Tag>" in off
+    assert "Peer" not in off
+    assert "Participant" not in DiscoveryRange("SYSTEM_DEFAULT", ("a",)).configuration()
+
+
+def profile(**changes):
+    values = {
+        "reliability": 1,
+        "durability": 2,
+        "history": 1,
+        "depth": 10,
+        "deadline": SimpleNamespace(nanoseconds=0),
+        "lifespan": SimpleNamespace(nanoseconds=0),
+        "liveliness": 0,
+        "liveliness_lease_duration": SimpleNamespace(nanoseconds=2**63 - 1),
+    }
+    return SimpleNamespace(**values | changes)
+
+
+def test_a_profile_of_rclpys_becomes_policies():
+    assert qos_of_profile(profile()) == EndpointQos()
+    system = profile(reliability=0, durability=0, history=0, depth=0)
+    assert qos_of_profile(system) == EndpointQos(depth=1)
+    timed = profile(deadline=SimpleNamespace(nanoseconds=5), history=2, liveliness=3)
+    assert qos_of_profile(timed) == EndpointQos(deadline=5, history=2, liveliness=3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"reliability": 3}, "reliability policy 3 cannot be asked for"),
+        ({"durability": 3}, "durability policy 3 cannot be asked for"),
+        ({"history": 3}, "history policy 3 cannot be asked for"),
+        ({"liveliness": 4}, "liveliness policy 4 cannot be asked for"),
+        ({"reliability": 4}, "reliability policy 4 cannot be asked for"),
+        ({"depth": -1}, "depth of -1"),
+    ],
+)
+def test_an_unknown_policy_is_refused(changes, sentence):
+    with pytest.raises(DdsError, match=sentence):
+        qos_of_profile(profile(**changes))
+
+
+def test_a_loopback_without_ipv4_is_named():
+    program = "import us_sim.nodes, rclpy; rclpy.init()"
+    isolated = ["unshare", "-rn", sys.executable, "-c", program]
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-rn", "true"]).returncode:
+        pytest.skip("no network namespaces here")
+    ran = subprocess.run(isolated, capture_output=True, text=True, check=False)
+    assert "IPv4" in ran.stderr

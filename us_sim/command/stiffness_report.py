@@ -19,7 +19,7 @@ from us_sim.tissue.identification.stiffness import GROUPS, StiffnessFit
 
 
 def table(found: StiffnessFit) -> str:
-    """Structures with their moduli, intervals and part in the force; then the residuals."""
+    """Structures with their moduli, intervals and part in the force, and the residuals."""
     percent = f"{100 * found.confidence:g} %"
     rows = [("structure", "E (kPa)", f"{percent} interval (kPa)", "×/÷", "part of force")]
     for name, modulus in found.moduli.items():

@@ -31,9 +31,7 @@ from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions, RenderedV
 from us_sim.tracking.camera.rigid_body import RigidBody
 
 CAMERA = WEBCAMS["640x480"]
-RATE = 30.0
-"""Images per second."""
-
+RATE = 30.0  # images per second
 _EXPOSURE = 0.008  # s
 _CODEC = "FFV1"  # lossless
 _FORM = 1  # of what is kept: another number for whatever changes the images

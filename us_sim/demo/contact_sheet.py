@@ -83,9 +83,7 @@ def _pressing(session: Session, stamps: list[int]) -> tuple[int, int] | None:
     return (stamps[first], stamps[middle]) if first >= 0 else None
 
 
-TILT = 20.0
-"""Degrees of the plane, about the array."""
-
+TILT = 20.0  # degrees of the plane, about the array
 _LET_GO = 0.35  # of the deepest press, from which on the vessels are open again
 
 
@@ -97,8 +95,6 @@ def colour_pictures(
     None of a scene without flows or without tissue, or whose vessels no image shows.
 
     Args:
-        session: that was recorded.
-        scene: of the session.
         areas: of its vessels: moments are chosen among those whose images show the vessels whole.
     """
     if not scene.flows or session.rest is None or session.tetrahedra is None:

@@ -16,6 +16,7 @@ from us_sim.demo.camera_video import PathVideo
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.nodes.topics import published_counts
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
@@ -25,18 +26,15 @@ from us_sim.tissue.elasticity.material import kind_of
 from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.volume.measure import label_area
 
-VESSELS = ("vein", "artery")
-"""Kinds of tissue whose cross-sections are measured."""
-PLAYED = ("/tracker/pose", "/camera/camera_info")
-"""What comes in, of a path and of a camera."""
+VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
+PLAYED = ("/tracker/pose", "/camera/camera_info")  # what comes in, of a path and of a camera
 STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
 OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
 _HARDLY_CUT = 0.1
 """Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
 _STEEPEST = 0.2
 """Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
-MILLISECOND = 1e6
-"""In nanoseconds."""
+MILLISECOND = 1e6  # in nanoseconds
 
 
 @dataclass(frozen=True)
@@ -119,11 +117,6 @@ class Session:
         Where the probe slides or tilts it sees other cross-sections, so each is compared with that
         of the same plane at rest, from the skin on. A vessel that no image cuts has none; of one
         that reaches the image's edge, now or at rest, nobody knows how large it is.
-
-        Args:
-            scene: that was recorded.
-            samples: images.
-            progress: called with the fraction that is done.
         """
         numbers, scanner = self.scanner_of_vessels(scene)
         if scanner is None:
@@ -213,11 +206,10 @@ class Session:
         """What each publisher last reported to have sent, beside what was recorded in the end."""
         recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         said = {
-            key.removeprefix("published "): int(value)
+            topic: count
             for node, report in self.reports.items()
             if node != "session_recorder"
-            for key, value in report.items()
-            if key.startswith("published ")
+            for topic, count in published_counts(report).items()
         }
         return {
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
@@ -300,8 +292,7 @@ def _stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
-IMAGES = "/camera/camera_info"
-"""Comes with each image, and has its stamp."""
+IMAGES = "/camera/camera_info"  # comes with each image, and has its stamp
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Bags: writing MCAP as rosbag2 does, reading what rosbag2 and this package wrote, probe paths."""
+"""Bags: writing MCAP as rosbag2 does, reading those of rosbag2 and this package, probe paths."""

@@ -68,7 +68,7 @@ HASTES: Mapping[str, Haste] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Room:
-    """How far a hand goes: the default is what fits on the scene ``upper_arm``.
+    """The room that a hand takes: by default as much as the scene ``upper_arm`` has.
 
     Lengths are those of the middle of the probe's face from the origin of ``patient``, whose xy
     plane is the skin, and angles those of the probe from upright.
@@ -228,30 +228,30 @@ def shipped_hand_path() -> ProbePath:
 
 def _hand(kind: str, haste: str, seed: int, times: _Array, room: Room) -> _Hand:
     """The motion, in its tempo at those times (K,) s."""
-    what, asked = _named(KINDS, kind, "kind"), _named(HASTES, haste, "haste")
+    motion, asked = _named(KINDS, kind, "kind"), _named(HASTES, haste, "haste")
     # The same number must not give the kinds' coordinates the same curves.
     random = np.random.default_rng([seed, zlib.crc32(f"{kind} {haste}".encode())])
-    place, turn = _place(what, room, random), _turn(what, room, random)
+    place, turn = _place(motion, room, random), _turn(motion, room, random)
     return _Hand(
         place,
         turn,
-        _tempo(lambda t: _lengths(place(t)), asked.speed, times, "m/s") if what.moves else 0.0,
-        _tempo(lambda t: _angles(turn(t)), asked.turning, times, "rad/s") if what.turns else 0.0,
+        _tempo(lambda t: _lengths(place(t)), asked.speed, times, "m/s") if motion.moves else 0.0,
+        _tempo(lambda t: _angles(turn(t)), asked.turning, times, "rad/s") if motion.turns else 0.0,
     )
 
 
-def _named(table: Mapping[str, _T], name: str, what: str) -> _T:
+def _named(table: Mapping[str, _T], name: str, subject: str) -> _T:
     if name not in table:
-        raise BagError(f"a hand's motion: {what} {unknown(name, table)}")
+        raise BagError(f"a hand's motion: {subject} {unknown(name, table)}")
     return table[name]
 
 
-def _place(what: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
-    side, across = np.array(what.aside) * room.aside, what.across * room.across
-    if what.over_the_edge:
+def _place(motion: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
+    side, across = np.array(motion.aside) * room.aside, motion.across * room.across
+    if motion.over_the_edge:
         side = np.array([0.5, _BEYOND]) * room.edge
-    low, high = (part * (room.deepest if part > 0 else room.above) for part in what.depth)
-    x, y, z = (_wander(random, what.steep) for _ in range(3))
+    low, high = (part * (room.deepest if part > 0 else room.above) for part in motion.depth)
+    x, y, z = (_wander(random, motion.steep) for _ in range(3))
 
     def place(times: _Array) -> _Array:
         ranges = ((x, *side), (y, -across, across), (z, low, high))
@@ -260,9 +260,9 @@ def _place(what: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
     return place
 
 
-def _turn(what: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
-    angles = np.array([what.yaw * room.yaw, what.fan * room.tilt, what.rock * room.tilt])
-    curves = [_wander(random, what.steep) for _ in angles]
+def _turn(motion: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
+    angles = np.array([motion.yaw * room.yaw, motion.fan * room.tilt, motion.rock * room.tilt])
+    curves = [_wander(random, motion.steep) for _ in angles]
 
     def turn(times: _Array) -> _Array:
         about = angles * (2 * np.stack([curve(times) for curve in curves], axis=1) - 1)

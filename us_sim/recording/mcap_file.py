@@ -1,4 +1,4 @@
-"""Reading one MCAP file. Of a file that was cut or damaged, what can be read is recovered.
+"""Reading one MCAP file; of one that was cut or damaged, all messages that are sound.
 
 A whole file is read by the index in its summary. Without one (the recorder was killed, the disk
 ran full, the copy broke off) the records are walked from the start. From a place where they are
@@ -145,7 +145,7 @@ class McapFile:
 
         Args:
             topics: their names.
-            damage: takes at the end what is wrong with chunks that were left out.
+            damage: takes at the end the faults of chunks that were left out.
 
         Raises:
             BagError: a chunk is damaged, and ``damage`` is None.
@@ -201,9 +201,9 @@ class McapFile:
         elif damage is not None:
             damage += broken
 
-    def _tell(self, damage: list[Fault] | None, what: str) -> None:
+    def _tell(self, damage: list[Fault] | None, place: str) -> None:
         """Note damage, or raise it as a BagError."""
-        text = f"{self._label} is damaged in {what}"
+        text = f"{self._label} is damaged in {place}"
         if damage is None:
             raise BagError(text) from None
         damage.append(Fault(text))
@@ -215,7 +215,7 @@ class McapFile:
             return memoryview(stream.read(place.length - HEADER.size))
 
     def _take(self, summary: Summary) -> None:
-        """Believes the summary of a whole file."""
+        """Take the index of a whole file."""
         assert summary.statistics is not None
         self._schemas = summary.schemas
         self._channels = summary.channels
@@ -290,7 +290,7 @@ class McapFile:
         return channel in self._channels and not any(run.chunk for run in self._runs[-1:])
 
     def _take_chunk(self, stream: BinaryIO, chunk: Chunk) -> dict[int, tuple[int, int]]:
-        """Learns what is in a chunk; for each channel the messages and their lowest log time."""
+        """Index a chunk; for each channel the messages and their lowest log time."""
         tables: dict[int, tuple[int, int]] = {}
         with contextlib.suppress(*DAMAGE):  # of one that is cut
             for opcode, content in records_in(stream, chunk):
@@ -305,7 +305,7 @@ class McapFile:
         return tables
 
     def _take_record(self, record: Record) -> None:
-        """Learns what a record outside of chunks says."""
+        """Index a record outside of chunks."""
         opcode, content = record.opcode, record.content
         length = record.end - record.offset
         if opcode == Opcode.ATTACHMENT:
@@ -326,7 +326,7 @@ class McapFile:
         return channel, time
 
     def _learn(self, opcode: int, content: memoryview) -> None:
-        """Take what a record says of types and topics."""
+        """Keep a schema or a channel."""
         if opcode == Opcode.SCHEMA:
             schema = parsed(Schema, content)
             self._schemas[schema.id] = schema
@@ -335,7 +335,7 @@ class McapFile:
             self._channels[channel.id] = channel
 
     def _learn_types(self, stream: BinaryIO, position: int, size: int) -> None:
-        """Take what a summary says of types and topics, though its checksum does not hold."""
+        """Keep schemas and channels of a summary, though its checksum does not hold."""
         while (record := record_at(stream, position, size)) is not None:
             if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 kind = parsed(Schema if record.opcode == Opcode.SCHEMA else Channel, record.content)

@@ -88,7 +88,7 @@ class McapOutput:
 
     Args:
         path: a file that is not there yet.
-        library: what writes it.
+        library: the name of the writing program.
         compression: of the chunks: ``""`` or ``"zstd"``.
         chunk_size: bytes after which a chunk is ended.
 
@@ -306,7 +306,7 @@ class McapOutput:
                 try:
                     self._notice_cut()
                     self._append(self._summary())
-                    self._file.truncate(self._size)  # of what another process has added
+                    self._file.truncate(self._size)  # cut off bytes that another process has added
                 except OSError:
                     if not self._chunks:
                         raise
@@ -384,7 +384,7 @@ class McapOutput:
         self.end = max((last for _, last, _ in spans), default=None)
 
     def _drop_last_chunk(self) -> None:
-        """Take back the last chunk, and what was written after it."""
+        """Take back the last chunk and everything after it."""
         chunk = self._chunks.pop()
         self._cut(chunk.span[2])
         self._attachments = [each for each in self._attachments if each.offset < self._size]
@@ -397,7 +397,7 @@ class McapOutput:
         return Counter({topics[id]: n for id, n in _COUNT.iter_unpack(chunk.counts)})
 
     def _summary(self) -> list[bytes]:
-        """What comes after the messages."""
+        """The records after the messages: summary, footer and magic."""
         data_end = _bytes_of(DataEnd(0))
         start = self._size + len(data_end)
         groups: list[tuple[Opcode, Iterable[bytes]]] = [

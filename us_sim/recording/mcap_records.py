@@ -1,4 +1,4 @@
-"""The records of an MCAP file: where they are, whether they are sound, and what chunks hold.
+"""The records of an MCAP file: their places, their soundness, and the contents of chunks.
 
 A record is sound when its checksum holds or, where it has none, when its fields agree with one
 another to the last byte. The length of a chunk and of an attachment is there twice, so one wrong
@@ -149,7 +149,7 @@ def record_at(stream: BinaryIO, offset: int, size: int) -> Record | None:
 def next_sound(stream: BinaryIO, offset: int, size: int) -> int | None:
     """Where sound records go on after one that is not, which begins there; None if nowhere.
 
-    Records that are parts of chunks are not meant: what they say has no checksum of its own.
+    Records that are parts of chunks are not meant: they have no checksum of their own.
     """
     stream.seek(offset)
     head = stream.read(HEADER.size)

@@ -201,7 +201,7 @@ class ProbePath:
         default_factory=lambda: np.empty(0, np.int64)
     )
     rejected: int = 0  # poses of the topic left out: not finite, or without an orientation
-    note: str = ""  # what is wrong with the recording, in a sentence; empty when nothing is
+    note: str = ""  # the recording's faults, in a sentence; empty when there are none
 
     def __post_init__(self) -> None:
         if not len(self.log_times):
@@ -241,11 +241,11 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
 
     Args:
         path: any bag that ``read_bag`` reads, or a recording.
-        topic: of the bag, or with what `recorded_poses` names a body by (``/tf:probe``); by
+        topic: of the bag, or a body's name as above (``/tf:probe``); by
             default the bag's only PoseStamped topic, among several the one named
             ``tracker/pose`` (where its poses are of several frames, ``probe/pose``), and without
             any the only body of other types. In a recording, a transform (``ProbeToReference``).
-        option: what a person names the topic by, for the sentence on several.
+        option: the option that names the topic, for the sentence on several.
 
     Raises:
         BagError: there is no such bag or topic, several come into question, the topic is of
@@ -287,7 +287,7 @@ def write_path(
     Args:
         file: as ``BagWriter`` takes it.
         path: recorded at its log times.
-        qos: what the topic's publisher offers; reliable, keep last 10 by default.
+        qos: offered by the topic's publisher; reliable, keep last 10 by default.
         sidecar: False leaves ``metadata.yaml`` away.
 
     Raises:
@@ -361,7 +361,6 @@ class _Read:
 
 
 def _read(bag: Bag, name: str) -> _Read:
-    """What is recorded of a body."""
     topic, colon, body = name.partition(":")
     name = bag.topic(topic).name + colon + body
     rows = list(pose_rows(bag, name))

@@ -169,8 +169,9 @@ class TrackerRecording:
 def read_tracker_recording(path: str | Path) -> TrackerRecording:
     """The transforms of a sequence file of Plus, or of a scene or sequence of 3D Slicer.
 
-    A transform whose status is not OK, or that is not rigid (Plus writes zeros for what it has
-    not seen), is not valid; a sample without a time is left out whole. Both are counted.
+    A transform whose status is not OK, or that is not rigid (Plus writes zeros for a tool
+    that it has not seen), is not valid; a sample without a time is left out whole. Both are
+    counted.
 
     Raises:
         TrackingError: the file is missing, is no sequence, is cut, or holds no transform or none
@@ -206,7 +207,7 @@ def read_tracker_recording(path: str | Path) -> TrackerRecording:
 
 
 def _rigid(series: FrameTransforms, which: NDArray[np.intp]) -> FrameTransforms:
-    """Some frames' transforms with the rotations that are nearest to what trackers round.
+    """Some frames' transforms with the rotations nearest to those that trackers round.
 
     What scales, shears or mirrors is not valid.
     """

@@ -127,7 +127,7 @@ if __name__ == "__main__":
 
 
 _MADE = 1
-"""Changes with what `press_and_slide` makes, so that no older file is taken for it."""
+"""Version of `press_and_slide`'s path, so that no older file is taken for it."""
 
 
 def pressing_path(depth: float, slide: float = 0.008) -> Path:

@@ -158,7 +158,7 @@ class Bag:
 
         Args:
             topics: their names; None for all.
-            damage: takes the faults of what is damaged, which is then left out.
+            damage: takes the faults of damaged parts, which are then left out.
 
         Raises:
             BagError: the bag has no such topic, or is damaged and ``damage`` is None.
@@ -250,7 +250,7 @@ class Bag:
 
 
 def _count(text: str) -> int:
-    """A number that a note holds; 0 for what is none."""
+    """A number that a note holds; 0 for any other text."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else 0
 
 

@@ -64,7 +64,7 @@ def extract(bag: Path, folder: Path) -> list[Path]:
 
 
 def versions() -> str:
-    """What this process runs on: Python, ROS 2 and the installed packages, one a line."""
+    """Versions of Python, ROS 2 and the installed packages, one a line."""
     lines = [
         f"python {platform.python_version()}",
         f"system {platform.platform()}",
@@ -82,15 +82,15 @@ def versions() -> str:
 
 @dataclass(frozen=True)
 class Repaired:
-    """What came of a repair."""
+    """Result of a repair."""
 
     path: Path  # the new file
     message_count: int
-    faults: tuple[Fault, ...]  # what was wrong with the bag; none if it was whole
+    faults: tuple[Fault, ...]  # of the bag; none if it was whole
 
 
 def repair(path: str | Path, out: str | Path) -> Repaired:
-    """Write what can be read of a bag as a new one; the bag itself is not touched.
+    """Write all that can be read of a bag as a new one; the bag itself is not touched.
 
     Args:
         path: the bag, as `read_bag` takes it.

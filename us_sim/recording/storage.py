@@ -15,7 +15,6 @@ import weakref
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
-from typing import Protocol
 
 from us_sim.errors import BagError
 from us_sim.recording.mcap_file import MCAP_MAGIC, McapFile
@@ -117,9 +116,9 @@ _USABLE = "typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
 
 
 def _address(path: Path) -> tuple[str, str]:
-    """The URI of a database, and what of it cannot be read.
+    """The URI of a database, and a sentence on a part of it that cannot be read.
 
-    What was recorded last is in a journal beside the file (``-wal``) where the recorder was killed.
+    The last messages are in a journal beside the file (``-wal``) where the recorder was killed.
     """
     uri = f"{path.resolve().as_uri()}?mode=ro"
     # Immutable, so that a bag on a read-only disk needs no lock file beside it.
@@ -133,7 +132,7 @@ def _address(path: Path) -> tuple[str, str]:
         return uri, ""
     except (sqlite3.Error, OSError) as error:
         return unlocked, (
-            f"what {journal.name} holds of it is not read ({error}): copy both files to a folder "
+            f"the part of it in {journal.name} is not read ({error}): copy both files to a folder "
             f"that can be written, and read them there"
         )
 
@@ -184,31 +183,11 @@ _PART = re.compile(r"(.*?)(?:_(\d+))?(\.(?:mcap|db3)(?:\.zstd)?)")
 """A file of a bag: FOLDER_0.mcap, FOLDER_1.mcap or session.mcap, session_1.mcap and so on."""
 
 
+Storage = McapFile | SqliteFile
+
+
 class NoBagError(BagError):
     """A file that is of another kind."""
-
-
-class Storage(Protocol):
-    """One readable file of a bag."""
-
-    topics: tuple[BagTopic, ...]
-    start: int | None  # ns, lowest log time; None without messages
-    end: int | None  # ns, highest log time
-    faults: list[Fault]  # that are found without reading its messages
-
-    def messages(
-        self, topics: Collection[str], damage: list[Fault] | None = None
-    ) -> Iterator[BagMessage]:
-        """The messages of these topics in the order of their log times."""
-        ...
-
-    def attachments(self, damage: list[Fault] | None = None) -> Iterator[BagAttachment]:
-        """The files within it."""
-        ...
-
-    def notes(self, damage: list[Fault] | None = None) -> Iterator[BagNote]:
-        """The texts beside its messages."""
-        ...
 
 
 class Scratch:

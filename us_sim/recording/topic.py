@@ -45,7 +45,7 @@ _DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 @dataclass(frozen=True)
 class QosProfile:
-    """What a publisher offered on a topic; the defaults are rclpy's.
+    """The quality of service that a publisher offered; the defaults are rclpy's.
 
     Policies are named as rmw names them in lower case.
 
@@ -106,18 +106,13 @@ class QosProfile:
 
     def lines(self) -> list[str]:
         """The lines of this profile as a YAML mapping, as rosbag2 0.26 writes it."""
-        lines = [
-            f"history: {self.history}",
-            f"depth: {self.depth}",
-            f"reliability: {self.reliability}",
-            f"durability: {self.durability}",
-        ]
-        lines += _duration_lines("deadline", self.deadline)
-        lines += _duration_lines("lifespan", self.lifespan)
-        lines.append(f"liveliness: {self.liveliness}")
-        lines += _duration_lines("liveliness_lease_duration", self.liveliness_lease_duration)
-        avoid = str(self.avoid_ros_namespace_conventions).lower()
-        lines.append(f"avoid_ros_namespace_conventions: {avoid}")
+        lines = []
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if name in _DURATIONS:
+                lines += [f"{name}:", f"  sec: {value // 10**9}", f"  nsec: {value % 10**9}"]
+            else:
+                lines.append(f"{name}: {str(value).lower() if isinstance(value, bool) else value}")
         return lines
 
 
@@ -172,10 +167,6 @@ def _nanoseconds(duration: str, value: Any) -> int:
         return int(getattr(value, "nanoseconds", value))
     except (KeyError, TypeError, ValueError, OverflowError):
         raise BagError(f"QoS {duration} is not a duration: {value!r}") from None
-
-
-def _duration_lines(name: str, nanoseconds: int) -> list[str]:
-    return [f"{name}:", f"  sec: {nanoseconds // 10**9}", f"  nsec: {nanoseconds % 10**9}"]
 
 
 LOST = "messages_lost"

@@ -1,4 +1,4 @@
-"""Unpacking what a stranger packed: as much as is said to be in it, and never more than a limit.
+"""Unpacking foreign data: as many bytes as they claim to hold, and never more than a limit.
 
 >>> import zstandard
 >>> from us_sim.recording.unpacking import unpack
@@ -34,10 +34,10 @@ _LONGEST_HEADER = 18  # bytes of a zstd frame
 
 
 def unpack(packed: bytes | memoryview, compression: str, size: int) -> bytes:
-    """The first ``size`` bytes of what is packed, and one more where there are more.
+    """The first ``size`` unpacked bytes, and one more where there are more.
 
     Args:
-        packed: of which the end may be missing; then what is before it is unpacked.
+        packed: of which the end may be missing; then the bytes before it are unpacked.
         compression: ``zstd`` or ``lz4``.
         size: bytes, as the one who packed them says.
 
@@ -56,7 +56,7 @@ def unpack(packed: bytes | memoryview, compression: str, size: int) -> bytes:
 
 
 def unpack_file(file: Path, copy: Path) -> None:
-    """Unpack a zstd file into another; of one that is cut off, what is before the cut.
+    """Unpack a zstd file into another; of one that is cut off, the bytes before the cut.
 
     Raises:
         BagError: the file is damaged, or holds more than `LARGEST_FILE` or than there is room for
@@ -82,7 +82,7 @@ def unpack_file(file: Path, copy: Path) -> None:
 
 
 def _pieces(packed: BinaryIO, size: int) -> Iterator[bytes]:
-    """What is packed by zstd, up to ``size`` bytes of it."""
+    """The bytes of zstd frames in pieces, up to ``size`` of them."""
     with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as reader:
         while size and (piece := reader.read(min(size, _STEP))):
             yield piece

@@ -36,7 +36,7 @@ class Loss(NamedTuple):
 
 
 class Losses:
-    """Counts what is lost, from any thread."""
+    """Counters of lost messages, for any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -63,7 +63,7 @@ class Losses:
 
 
 def news(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
-    """What was lost between two looks at `Losses.by_topic`, of topics that lost something."""
+    """Losses between two results of `Losses.by_topic`, of topics that lost something."""
     none = Loss(0, 0)
     return {
         topic: Loss(
@@ -93,8 +93,8 @@ class Message(NamedTuple):
 class WriteBehind:
     """A bag and the thread that writes it.
 
-    What does not fit into the queue, and what the disk does not take, is counted in `losses` and
-    noted in the bag. When the disk was full, it is tried again every second.
+    Messages that do not fit into the queue or that the disk does not take are counted in `losses`
+    and noted in the bag. When the disk was full, it is tried again every second.
 
     Args:
         bag: open, and used by nobody else from now on.
@@ -172,7 +172,7 @@ class WriteBehind:
         self._do(self._bag.split)
 
     def close(self) -> None:
-        """Write what waits, and close the bag.
+        """Write all waiting messages, and close the bag.
 
         Raises:
             BagError: as `BagWriter.close`.
@@ -257,7 +257,7 @@ class WriteBehind:
             self.untold.append((kind, problem))
 
     def _note_losses(self) -> None:
-        """Say in the file what is missing, if more is missing than it says."""
+        """Note the losses since the last note."""
         lost = self.losses.by_topic()
         if lost != self._noted and not self.problem:
             new = news(lost, self._noted)
@@ -269,7 +269,7 @@ class PreRoll:
     """A ring of messages, as rosbag2's snapshot mode keeps it.
 
     Of a latched topic the newest message is kept whatever its age: a late listener would get it,
-    and what is recorded makes no sense without it.
+    and the recording makes no sense without it.
 
     Args:
         max_bytes: of messages; the oldest go.
@@ -283,7 +283,7 @@ class PreRoll:
         self._latched: dict[str, Message] = {}
 
     def add(self, message: Message, *, latched: bool = False) -> None:
-        """Keep a message, and let go of what is too old or too much."""
+        """Keep a message, and drop those that are too old or too many."""
         if latched:
             before = self._latched.get(message.topic)
             self._latched[message.topic] = message
@@ -297,7 +297,7 @@ class PreRoll:
             self._bytes -= len(self._ring.popleft().data)
 
     def take(self) -> list[Message]:
-        """What is kept, by its time; nothing is kept afterwards."""
+        """The kept messages by their times; none are kept afterwards."""
         messages = sorted([*self._latched.values(), *self._ring], key=lambda each: each.log_time)
         self._ring.clear()
         self._latched.clear()

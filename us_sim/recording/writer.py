@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from us_sim.errors import BagError, FileTakenError
@@ -32,161 +31,17 @@ from us_sim.recording.topic import QosProfile, qos_to_yaml
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
-
-class BagNames:
-    """Names of files that are not there yet.
-
-    Args:
-        path: ``FILE.mcap``, or a new folder, as `us_sim.recording.writer.BagWriter` says.
-        sidecar: whether there is to be a ``metadata.yaml``.
-        further: where ``FILE.mcap`` exists, the first file is ``FILE_1.mcap`` or the next that is
-            free, without ``metadata.yaml``.
-
-    Raises:
-        BagError: something is there already.
-        OSError, ValueError: no file can have such a name.
-    """
-
-    def __init__(self, path: Path, *, sidecar: bool, further: bool) -> None:
-        is_folder = path.suffix != ".mcap"
-        self._stem = full_path(path).name if is_folder else path.stem
-        self.first = path / f"{self._stem}_0.mcap" if is_folder else path
-        self.metadata: Path | None = None
-        if further and self.first.exists():
-            self.first = self.further()
-            return
-        if self.first.exists():
-            raise BagError(f"{self.first} exists already: choose another name or remove it")
-        if is_folder and path.is_dir() and any(path.iterdir()):
-            raise BagError(f"{path} exists already and is not empty: choose another name")
-        if not sidecar:
-            return
-        self.metadata = self.first.with_name("metadata.yaml")
-        if self.metadata.exists():
-            own = self.first.with_suffix("") / self.first.name
-            raise BagError(
-                f"{self.metadata} belongs to another recording: record into a folder of its own, "
-                f"such as {own}"
-            )
-
-    def further(self) -> Path:
-        """The next file that is not there."""
-        return next(
-            file
-            for number in count(1)
-            if not (file := self.first.with_name(f"{self._stem}_{number}.mcap")).exists()
-        )
+_CHUNK_SIZE = 768 * 1024  # bytes, rosbag2's default
+_ROOM = 16 * 1024 * 1024  # bytes, that must be free again before a full disk is written to
+_COMPRESSIONS = {"none": "", "zstd": "zstd"}
 
 
 @dataclass
 class _Topic:
-    """A topic being written."""
-
     type_name: str
     schema: str | None  # None where nobody knows it
     qos: tuple[QosProfile, ...]
     type_hash: str
-
-
-class Contents:
-    """Topics, closed files and counts, from which a bag's metadata are made."""
-
-    def __init__(self) -> None:
-        self.files: list[FileEntry] = []  # that are closed
-        self._counts: Counter[str] = Counter()  # messages in those files, by topic
-        self._topics: dict[str, _Topic] = {}
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Names of the topics."""
-        return tuple(self._topics)
-
-    def __contains__(self, topic: str) -> bool:
-        return topic in self._topics
-
-    def add_topic(
-        self,
-        topic: str,
-        type_name: str,
-        qos: Sequence[object],
-        type_hash: str | None,
-        schema: str | None,
-        *,
-        defined: bool = True,
-    ) -> bool:
-        """Make a topic known, or add what is offered anew; whether it was not known.
-
-        Raises:
-            BagError: the name is none, or the type differs from before, or has no definition that
-                can be understood and must be ``defined``.
-        """
-        if not topic or any(character.isspace() for character in topic):
-            raise BagError(f"{topic!r} is not a topic name")
-        profiles = tuple(map(QosProfile.of, qos))
-        if (known := self._topics.get(topic)) is not None:
-            if known.type_name != type_name:
-                raise BagError(
-                    f"topic {topic} is recorded as {known.type_name}: it cannot also be {type_name}"
-                )
-            known.qos = tuple(dict.fromkeys((*known.qos, *profiles)))
-            return False
-        try:
-            schema = schema_text(type_name) if schema is None else schema
-            if type_hash is None:
-                type_hash = definitions(type_name, schema).hash_rihs01(type_name)
-        except BagError:
-            if defined:
-                raise
-        self._topics[topic] = _Topic(type_name, schema, profiles, type_hash or "")
-        return True
-
-    def introduce(self, topic: str, output: McapOutput) -> None:
-        """Make a topic known to a file."""
-        known = self._topics[topic]
-        metadata = {
-            "offered_qos_profiles": qos_to_yaml(known.qos),
-            "topic_type_hash": known.type_hash,
-        }
-        output.add_topic(topic, known.type_name, known.schema, metadata)
-
-    def keep(self, output: McapOutput) -> None:
-        """Take a closed file into account."""
-        self.files.append(_entry(output))
-        self._counts += output.counts
-
-    def metadata(self, present: McapOutput | None, custom_data: Mapping[str, str]) -> BagMetadata:
-        """Of the closed files, and of the present one."""
-        files, counts = [*self.files], self._counts
-        if present is not None:
-            files.append(_entry(present))
-            counts = counts + present.counts
-        filled = [file for file in files if file.message_count]
-        start = min((file.start for file in filled), default=files[0].start)
-        end = max((file.start + file.duration for file in filled), default=start)
-        return BagMetadata(
-            files=tuple(files),
-            topics=tuple(
-                TopicEntry(name, known.type_name, known.qos, known.type_hash, counts[name])
-                for name, known in self._topics.items()
-            ),
-            start=start,
-            duration=end - start,
-            message_count=counts.total(),
-            ros_distro=os.environ.get("ROS_DISTRO") or "jazzy",
-            custom_data=custom_data,
-        )
-
-
-def _entry(output: McapOutput) -> FileEntry:
-    if output.start is None or output.end is None:
-        return FileEntry(output.path.name)
-    duration = output.end - output.start
-    return FileEntry(output.path.name, output.start, duration, output.message_count)
-
-
-_CHUNK_SIZE = 768 * 1024  # bytes, rosbag2's default
-_ROOM = 16 * 1024 * 1024  # bytes, that must be free again before a full disk is written to
-_COMPRESSIONS = {"none": "", "zstd": "zstd"}
 
 
 class BagWriter:
@@ -196,8 +51,9 @@ class BagWriter:
     or with :meth:`flush`, and then survives the end of the process.
 
     Where the disk is full the file gets its index and is closed, :meth:`resume` goes on in another
-    one when there is room again, and :attr:`lost` tells what did not fit. Where somebody takes the
-    file or a part of it away, that is an error as well, and writing goes on in another one at once.
+    one when there is room again, and :attr:`lost` counts the messages that did not fit. Where
+    somebody takes the file or a part of it away, that is an error as well, and writing goes on in
+    another one at once.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -239,14 +95,16 @@ class BagWriter:
         self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
         self._flush_interval = round(flush_interval * 1e9)
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
-        self._contents = Contents()
+        self._files: list[FileEntry] = []  # that are closed
+        self._counts: Counter[str] = Counter()  # messages in those files, by topic
+        self._topics: dict[str, _Topic] = {}
         self._attachments: dict[str, tuple[str, bytes, int]] = {}
         self._last_flush: int | None = None
         self._closed_because = ""
-        self._taken_away: list[str] = []  # what happened to files, as nobody has been told yet
+        self._taken_away: list[str] = []  # sentences that nobody has been told yet
         self._ended = False
         try:
-            self._names = BagNames(Path(path), sidecar=sidecar, further=further)
+            self._name_files(Path(path), sidecar, further)
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._output = self._opened(self.path)
         except OSError as error:
@@ -254,21 +112,44 @@ class BagWriter:
         except ValueError as error:  # a name that no file can have
             raise BagError(f"{path} cannot be made: {error}") from None
 
-    @property
-    def path(self) -> Path:
-        """The first file."""
-        return self._names.first
+    def _name_files(self, path: Path, sidecar: bool, further: bool) -> None:
+        """Choose the names of the first file and of ``metadata.yaml``."""
+        is_folder = path.suffix != ".mcap"
+        self._stem = full_path(path).name if is_folder else path.stem
+        self.path = path / f"{self._stem}_0.mcap" if is_folder else path  # the first file
+        self._metadata_file: Path | None = None
+        if further and self.path.exists():
+            self.path = self._further_file()
+            return
+        if self.path.exists():
+            raise BagError(f"{self.path} exists already: choose another name or remove it")
+        if is_folder and path.is_dir() and any(path.iterdir()):
+            raise BagError(f"{path} exists already and is not empty: choose another name")
+        if not sidecar:
+            return
+        self._metadata_file = self.path.with_name("metadata.yaml")
+        if self._metadata_file.exists():
+            own = self.path.with_suffix("") / self.path.name
+            raise BagError(
+                f"{self._metadata_file} belongs to another recording: record into a folder of its "
+                f"own, such as {own}"
+            )
+
+    def _further_file(self) -> Path:
+        """The next file that is not there."""
+        names = (self.path.with_name(f"{self._stem}_{number}.mcap") for number in count(1))
+        return next(file for file in names if not file.exists())
 
     @property
     def message_count(self) -> int:
         """Number of messages written."""
         present = 0 if self._output.is_finished else self._output.message_count
-        return sum(file.message_count for file in self._contents.files) + present
+        return self._counts.total() + present
 
     @property
     def topics(self) -> tuple[str, ...]:
         """Names of the topics added."""
-        return self._contents.topics
+        return tuple(self._topics)
 
     def add_topic(
         self,
@@ -280,13 +161,13 @@ class BagWriter:
         schema: str | None = None,
         defined: bool = True,
     ) -> None:
-        """Makes a topic known; adding it again with the same type adds what is offered anew.
+        """Makes a topic known; adding it again with the same type adds its quality of service.
 
         Args:
             topic: full name.
             type_name: ``package/msg/Type``.
-            qos: what its publishers offer, in any form that ``QosProfile.of`` takes. What is added
-                later is in ``metadata.yaml`` and in files begun after that.
+            qos: offered by its publishers, in any form that ``QosProfile.of`` takes. Later profiles
+                are in ``metadata.yaml`` and in files begun after that.
             type_hash: RIHS01 hash; computed from the definition by default.
             schema: ``ros2msg`` text; the installed or the Jazzy definition by default.
             defined: False takes a type whose definition is not known, and writes none.
@@ -296,8 +177,34 @@ class BagWriter:
         """
         if self._ended:
             raise BagError(self._closed_because)
-        if self._contents.add_topic(topic, type_name, qos, type_hash, schema, defined=defined):
-            self._contents.introduce(topic, self._output)
+        if not topic or any(character.isspace() for character in topic):
+            raise BagError(f"{topic!r} is not a topic name")
+        profiles = tuple(map(QosProfile.of, qos))
+        if (known := self._topics.get(topic)) is not None:
+            if known.type_name != type_name:
+                raise BagError(
+                    f"topic {topic} is recorded as {known.type_name}: it cannot also be {type_name}"
+                )
+            known.qos = tuple(dict.fromkeys((*known.qos, *profiles)))
+            return
+        try:
+            schema = schema_text(type_name) if schema is None else schema
+            if type_hash is None:
+                type_hash = definitions(type_name, schema).hash_rihs01(type_name)
+        except BagError:
+            if defined:
+                raise
+        self._topics[topic] = _Topic(type_name, schema, profiles, type_hash or "")
+        self._introduce(topic, self._output)
+
+    def _introduce(self, topic: str, output: McapOutput) -> None:
+        """Make a topic known to a file."""
+        known = self._topics[topic]
+        metadata = {
+            "offered_qos_profiles": qos_to_yaml(known.qos),
+            "topic_type_hash": known.type_hash,
+        }
+        output.add_topic(topic, known.type_name, known.schema, metadata)
 
     def write(
         self,
@@ -318,9 +225,9 @@ class BagWriter:
 
         Raises:
             BagError: the topic is unknown, a time is negative, the bag is closed, or the disk is
-                full; what was written before stays readable.
+                full; earlier messages stay readable.
         """
-        if topic not in self._contents:
+        if topic not in self._topics:
             raise BagError(f"topic {topic} was not added to {self.path}: call add_topic first")
         if self._closed_because:
             self.lost[topic] += 1
@@ -403,7 +310,7 @@ class BagWriter:
             with contextlib.suppress(OSError):
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 if shutil.disk_usage(self.path.parent).free >= _ROOM:
-                    self._output = self._opened(self._names.further())
+                    self._output = self._opened(self._further_file())
                     self._closed_because = ""
         return not self._closed_because
 
@@ -411,7 +318,7 @@ class BagWriter:
         """Writes the index and ``metadata.yaml``; closing again does nothing.
 
         Raises:
-            BagError: the disk is full; what was written before stays readable.
+            BagError: the disk is full; earlier messages stay readable.
             FileTakenError: the file was removed or moved.
         """
         self._ended = True
@@ -426,12 +333,12 @@ class BagWriter:
         self._tell_taken_away()
 
     def _write_metadata_file(self) -> None:
-        metadata_file, self._names.metadata = self._names.metadata, None
-        if metadata_file is None or not self._contents.files:
+        metadata_file, self._metadata_file = self._metadata_file, None
+        if metadata_file is None or not self._files:
             return
         try:
             with metadata_file.open("x", encoding="utf-8") as file:
-                file.write(self._contents.metadata(None, self.custom_data).document())
+                file.write(self._metadata(None).document())
         except OSError as error:
             with contextlib.suppress(OSError):
                 if not isinstance(error, FileExistsError):
@@ -445,12 +352,7 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _is_long(self, time: int) -> bool:
@@ -462,12 +364,12 @@ class BagWriter:
         return bool(self._max_duration and late)
 
     def _opened(self, path: Path) -> McapOutput:
-        """A new file that knows all topics so far, with what is attached."""
+        """A new file with all topics so far and the attachments."""
         output = McapOutput(
             path, _library(), compression=self._compression, chunk_size=self._chunk_size
         )
         for topic in self.topics:
-            self._contents.introduce(topic, output)
+            self._introduce(topic, output)
         try:
             # rosbag2 does this too: readers find the distribution even in a file that is cut.
             self._add_metadata(output)
@@ -482,7 +384,7 @@ class BagWriter:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turns a failure of the disk into an error that says what is kept, and stops there."""
+        """Stop at a failure of the disk, with an error that says how much is kept."""
         if self._closed_because:
             raise BagError(self._closed_because)
         try:
@@ -506,12 +408,12 @@ class BagWriter:
         self._add_metadata(closed)
         self._finish()
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._output = self._opened(self._names.further())
+        self._output = self._opened(self._further_file())
         if self.on_split is not None:
             self.on_split(str(closed.path), str(self._output.path))
 
     def _finish(self) -> None:
-        """Give the present file its index, close it and count what is in it."""
+        """Give the present file its index, close it and count its messages."""
         file = self._output
         if file.is_finished:
             return
@@ -520,10 +422,10 @@ class BagWriter:
             file.finish()
         finally:
             self.lost += file.dropped
-            if place is Place.HERE:
-                self._contents.keep(file)
-            elif place is Place.CUT:
-                self._contents.keep(file)
+            if place in (Place.HERE, Place.CUT):
+                self._files.append(_entry(file))
+                self._counts += file.counts
+            if place is Place.CUT:
                 self._taken_away.append(
                     f"{file.path} was cut by another process while it was recorded: "
                     f"{file.dropped.total()} messages are lost, and {file.message_count} are in it"
@@ -533,7 +435,7 @@ class BagWriter:
                     f"{file.path} was moved away while it was recorded, with "
                     f"{counted(file.message_count, 'message')}"
                 )
-            else:
+            elif place is Place.REMOVED:
                 self.lost += file.counts
                 self._taken_away.append(
                     f"{file.path} was removed while it was recorded: "
@@ -547,8 +449,37 @@ class BagWriter:
             raise FileTakenError(told + then)
 
     def _add_metadata(self, output: McapOutput) -> None:
-        lines = self._contents.metadata(output, self.custom_data).lines()
+        lines = self._metadata(output).lines()
         output.add_metadata("rosbag2", {"serialized_metadata": "\n".join(lines)})
+
+    def _metadata(self, present: McapOutput | None) -> BagMetadata:
+        """Metadata of the closed files, and of the present one."""
+        files, counts = [*self._files], self._counts
+        if present is not None:
+            files.append(_entry(present))
+            counts = counts + present.counts
+        filled = [file for file in files if file.message_count]
+        start = min((file.start for file in filled), default=files[0].start)
+        end = max((file.start + file.duration for file in filled), default=start)
+        return BagMetadata(
+            files=tuple(files),
+            topics=tuple(
+                TopicEntry(name, known.type_name, known.qos, known.type_hash, counts[name])
+                for name, known in self._topics.items()
+            ),
+            start=start,
+            duration=end - start,
+            message_count=counts.total(),
+            ros_distro=os.environ.get("ROS_DISTRO") or "jazzy",
+            custom_data=self.custom_data,
+        )
+
+
+def _entry(output: McapOutput) -> FileEntry:
+    if output.start is None or output.end is None:
+        return FileEntry(output.path.name)
+    duration = output.end - output.start
+    return FileEntry(output.path.name, output.start, duration, output.message_count)
 
 
 def _library() -> str:

@@ -44,7 +44,6 @@ class BMode:
         imaging: the console's settings.
         acoustics: what sound meets along the beams; None for no more than the volume holds.
         method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
-        threads: number of threads that cut a slice.
         settings: of the method's own class, or None for the defaults.
 
     Raises:
@@ -171,7 +170,6 @@ class BMode:
             nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is. Kept, not
                 copied.
             skin: (V, 3) m, where the vertices given to `touch` are.
-            number: of the poses so far.
             time: s since 1970, of the pose.
         """
         touches = self._formation.needs_contact

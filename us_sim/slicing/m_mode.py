@@ -106,12 +106,7 @@ _ROWS, _COLUMNS = 384, 512
 
 
 class MMode:
-    """The echoes along a line of one probe's images.
-
-    Args:
-        probe: its geometry.
-        settings: of the line.
-    """
+    """The echoes along a line of one probe's images."""
 
     def __init__(self, probe: Probe, settings: MModeSettings) -> None:
         self.settings = settings

@@ -50,14 +50,11 @@ STRIPS = {
 }
 """Pictures that run over time, by the prefix of their parameters."""
 
-TISSUE_PARAMETERS = "acoustics.tissues."
-"""Prefix of the parameters of a label's acoustics."""
-
+TISSUE_PARAMETERS = "acoustics.tissues."  # prefix of the parameters of a label's acoustics
 ECHO_RANGE = 60.0
 """dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
 
 GREY_MAPS = ("linear", "soft", "contrast")
-
 _GAIN = Quantity("level", -60.0, 60.0)
 _RESOLUTION = Quantity("length", 0.0, 0.01)
 
@@ -213,7 +210,6 @@ class MModeSettings(Settings):
 _PRESSURE = Quantity("pressure", 10.0, 40e3)
 _RATE = Quantity("rate", 0.02, 5.0)
 _VENOUS = ("kind", ("venous",))
-
 _ARTERIAL_PRESSURE, _VENOUS_PRESSURE = 12.4e3, 1.0e3
 """Pa, mean pressures in a vessel of the arm at the height of the heart: 93 and 8 mmHg
 (Hall, Guyton and Hall Textbook of Medical Physiology, 13th ed., 2016, chapters 14 and 15)."""

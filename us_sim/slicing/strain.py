@@ -65,8 +65,7 @@ def displacement(frame: Frame) -> NDArray[np.float32]:
     return evaluate(across @ (now - rest), located.elements, threads=frame.threads)
 
 
-_PARTS = 5
-"""Of an edge: the points that are looked up lie evenly, 56 in each tetrahedron."""
+_PARTS = 5  # of an edge: the points that are looked up lie evenly, 56 in each tetrahedron
 
 
 def main_labels(
@@ -300,7 +299,6 @@ class AxialStrain:
         """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
 
         Args:
-            frame: of this mesh.
             before: (N, 3) m, where the nodes were; None for at rest.
 
         Returns:
@@ -422,7 +420,6 @@ def compression(strain: NDArray[np.floating]) -> Compression:
 
 
 _COLOURS = ((215, 48, 39), (253, 174, 97), (48, 48, 48), (116, 173, 209), (69, 117, 180))
-
 _ENDS = tuple(step / power for power in (100, 10, 1) for step in (1, 2, 3, 5))
 """Round values at which a bar may end; strain beyond the last has its colour."""
 _HELD = 95.0  # percent of the pixels that lie within the bar; a vein that collapses need not

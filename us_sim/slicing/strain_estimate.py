@@ -67,16 +67,14 @@ def slope(values: ArrayLike, weight: ArrayLike, length: int) -> NDArray[np.float
     return found.astype(np.float32)
 
 
-_PASSES = 2
-"""How often the image is warped and what remains is looked for."""
+_PASSES = 2  # how often the image is warped and what remains is looked for
 _FLAT = 6.0**2
 """Variance of grey values (in squared levels) below which a window has nothing to be found by.
 
 Full speckle has four times that deviation where 60 dB are shown; a shadow's noise has less.
 """
 
-Field = NDArray[Any]
-"""float32."""
+Field = NDArray[Any]  # float32
 Window = tuple[Field, Field, Field]
 """An image, and the mean and standard deviation around each of its samples."""
 
@@ -237,8 +235,7 @@ def _smoothed(moved: Field, correlation: Field, size: tuple[int, int]) -> Field:
     return np.asarray(cv2.GaussianBlur(weight * moved, small, 0.0) / total, dtype=np.float32)
 
 
-_STEEPEST = 0.5
-"""Of displacement along a beam: what is found steeper than that is not tissue."""
+_STEEPEST = 0.5  # of displacement along a beam: what is found steeper than that is not tissue
 
 
 class Estimate(NamedTuple):
@@ -336,11 +333,7 @@ def _to_pixels(values: NDArray[np.float32], probe: Probe) -> NDArray[np.float32]
 
 
 class Earlier:
-    """The last frames of one probe and one mesh, as far as they follow one another.
-
-    Args:
-        kept: what is kept of each.
-    """
+    """The last frames of one probe and one mesh, as far as they follow one another."""
 
     def __init__(self, kept: Callable[[Frame], Any]) -> None:
         self._kept = kept

@@ -40,7 +40,7 @@ def install() -> bool:
     """Make `rclpy` and message packages importable, unless the real rclpy is there.
 
     Returns:
-        True when what can be imported is this package's subset.
+        True when `rclpy` is this package's subset.
     """
     if any(isinstance(finder, AliasFinder) for finder in sys.meta_path):
         return True

@@ -39,7 +39,7 @@ Pointer = ct.c_void_p
 
 
 class DdsError(Exception):
-    """The transport refuses what it was asked for."""
+    """The transport refuses a request."""
 
 
 class RawSampleInfo(ct.Structure):
@@ -209,7 +209,7 @@ for _line in _SIGNATURES.strip().splitlines():
 
 
 def check(returned: int, sentence: str) -> int:
-    """What a C function returned, or a DdsError with this sentence if it was an error."""
+    """The returned number; raises a DdsError with this sentence if it is an error code."""
     if returned < 0:
         reason = lib.dds_strretcode(returned).decode()
         raise DdsError(f"{sentence} (Cyclone DDS says: {reason})")

@@ -65,7 +65,7 @@ class GraphNode:
 
 
 class Graph:
-    """What is known of a domain, always up to date with what has been received."""
+    """The endpoints and nodes of a domain, as far as they have been received."""
 
     def __init__(self, participant: Participant) -> None:
         self._participant = participant
@@ -135,7 +135,6 @@ class Graph:
             self._nodes.clear()
 
     def _refresh(self) -> None:
-        """Take in what was received."""
         with self._lock:
             if self._closed:
                 return

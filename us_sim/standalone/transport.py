@@ -78,7 +78,7 @@ class DiscoveryRange:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> DiscoveryRange:
-        """What the environment asks for; SUBNET if nothing.
+        """The range that the environment asks for; SUBNET by default.
 
         Raises:
             DdsError: ROS_AUTOMATIC_DISCOVERY_RANGE has another value.
@@ -153,7 +153,7 @@ def acquire_domain(domain_id: int, reach: DiscoveryRange) -> None:
             configuration = f"{reach.configuration()},{os.environ.get('CYCLONEDDS_URI', '')}"
             handle = check(
                 lib.dds_create_domain(domain_id, configuration.encode()),
-                f"DDS domain {domain_id} cannot be set up; {_what_to_check()}",
+                f"DDS domain {domain_id} cannot be set up; {_setup_hint()}",
             )
             _domains[domain_id] = _Domain(handle, reach)
         elif domain.reach != reach:
@@ -165,8 +165,8 @@ def acquire_domain(domain_id: int, reach: DiscoveryRange) -> None:
             domain.users += 1
 
 
-def _what_to_check() -> str:
-    """What may keep DDS from being set up here."""
+def _setup_hint() -> str:
+    """A hint at the likely reason why DDS cannot be set up here."""
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
@@ -287,7 +287,7 @@ class SampleInfo(NamedTuple):
 
 
 class Endpoint:
-    """What readers and writers have in common.
+    """Base of readers and writers.
 
     ``on_incompatible`` is called, from another thread, with the name of the policy by which an
     endpoint on the other side was refused (``RELIABILITY``).
@@ -314,7 +314,7 @@ class Endpoint:
         self._on_incompatible = on_incompatible
         self._mask = self._incompatible[0] | _DATA_AVAILABLE * isinstance(self, Reader)
         self._token = dispatcher.attach(handle, self._mask, self._status_changed)
-        self._status_changed()  # what happened before it was attached is not told again
+        self._status_changed()  # changes before it was attached are not told again
 
     def matched_count(self) -> int:
         return max(0, self._matched(None, 0))
@@ -522,7 +522,7 @@ class Participant:
             qos: a QoSProfile of rclpy's, or an EndpointQos.
             user_data: for example ``typehash=RIHS01_…;``.
             on_incompatible: called with the name of the policy by which the other side was refused.
-            ignore_own: leave out what this participant's own writers write.
+            ignore_own: leave out samples of this participant's own writers.
 
         Raises:
             DdsError: the topic or the quality of service is refused.

@@ -19,12 +19,9 @@ if TYPE_CHECKING:
     from us_sim.to_rerun.converters import Shown
 
 
-OLDEST = "0.41"
-"""Of the versions of rerun, the oldest with which this works."""
-STAMP = "stamp"
-"""Timeline of the poses that messages come from."""
-RECORDED = "recorded"
-"""Timeline of when messages came to the recorder."""
+OLDEST = "0.41"  # of the versions of rerun, the oldest with which this works
+STAMP = "stamp"  # timeline of the poses that messages come from
+RECORDED = "recorded"  # timeline of when messages came to the recorder
 
 
 def require_rerun() -> None:

@@ -93,8 +93,7 @@ class Clouds:
         file.log(entity, rerun.Points3D(vectors_from(message), radii=_RADIUS, colors=_COLOUR))
 
 
-SKIN = "skin"
-"""Its entity."""
+SKIN = "skin"  # its entity
 _SKIN_COLOUR = (217, 166, 140, 90)
 
 
@@ -130,8 +129,7 @@ class Skin:
 
 
 REST, TETRAHEDRA = "/tissue/rest", "/tissue/tetrahedra"
-STRUCTURES = "tissue/structures"
-"""The entity that holds one for each."""
+STRUCTURES = "tissue/structures"  # the entity that holds one for each
 _TRIANGLES = 6_000
 
 
@@ -179,12 +177,9 @@ class Structures:
         self._shown = True
 
 
-FORCE = "force"
-"""What a topic's name is followed by in the entity of the curves."""
-METRES_A_NEWTON = 0.002
-"""Of the arrow's length."""
-_ARROW_RADIUS = 0.0008
-"""m, of the arrow's shaft."""
+FORCE = "force"  # what a topic's name is followed by in the entity of the curves
+METRES_A_NEWTON = 0.002  # of the arrow's length
+_ARROW_RADIUS = 0.0008  # m, of the arrow's shaft
 _AXES = ("x", "y", "z")
 _COLOURS = ((224, 108, 117), (152, 195, 121), (97, 175, 239))
 
@@ -250,11 +245,9 @@ def _number(text: str) -> float | None:
 
 
 IMAGE = "ultrasound/image"
-PLANE = "ultrasound/plane"
-"""Entity of the image in three dimensions."""
+PLANE = "ultrasound/plane"  # entity of the image in three dimensions
 _WHERE = "ultrasound/image_to_probe"
-_FINEST = 256
-"""Pixels across the texture in three dimensions, where the image itself is beside it."""
+_FINEST = 256  # pixels across the texture in three dimensions, where the image itself is beside it
 
 
 class Images:

@@ -1,7 +1,4 @@
-"""What is drawn over an image stands at its millimetres, is legible, and stays in the picture.
-
-Colours over an image, and the bar that says what they mean.
-"""
+"""Scales, outlines, colours and their bar, drawn over an image."""
 
 import math
 import time

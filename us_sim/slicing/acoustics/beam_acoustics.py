@@ -37,20 +37,13 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
 from us_sim.volume.volume import Volume
 
-SPEED_OF_SOUND = 1540.0
-"""m/s, that scanners take for all soft tissue."""
-
+SPEED_OF_SOUND = 1540.0  # m/s, that scanners take for all soft tissue
 _PULSE = 2.0  # wavelengths, the length of a surface's echo
 _CROSSINGS = 16  # of each beam there is room for
 
 
 class BeamAcoustics:
     """Loss, shadows, surfaces and fibres, as one probe's beams meet them in one volume.
-
-    Args:
-        volume: its labels say what is where.
-        probe: its geometry, and the frequencies that it has.
-        acoustics: the settings.
 
     Raises:
         ProbeError: a volume without labels, a label without constants, constants of a label that
@@ -236,7 +229,10 @@ _GRAIN = (0.8, 1.4)  # standard deviations in pixels, along columns and rows
 
 
 class Noise:
-    """Images of noise that is ``level`` dB at the face, and rises by ``rise`` dB/m."""
+    """Electronic noise of Rayleigh distribution, ``level`` dB at the face, rising by ``rise`` dB/m.
+
+    It is another one from pose to pose, and the same whenever a pose is the same.
+    """
 
     def __init__(self, probe: Probe, level: float, rise: float) -> None:
         distance = probe.pixel_beams[1]
@@ -267,7 +263,7 @@ class Noise:
 
 
 class Fibres:
-    """The directions of fibres at rest, carried by a mesh.
+    """The directions of fibres at rest, carried by a mesh: t = F t0 of the deformation gradient F.
 
     Args:
         directions: (D, 3) unit vectors in ``patient``.

@@ -20,13 +20,9 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.trilinear import SLACK
 
-NOTHING = 0
-"""The medium where there is no tissue."""
-
+NOTHING = 0  # the medium where there is no tissue
 _BEGIN = -0.5 - SLACK
-END = -0.5 + SLACK
-"""Of a volume, in voxels from its side."""
-
+END = -0.5 + SLACK  # of a volume, in voxels from its side
 _BITS = 24  # of a fixed-point coordinate, behind its point
 _PER_VOXEL = float(1 << _BITS)
 _UNIT = 1.0 / _PER_VOXEL

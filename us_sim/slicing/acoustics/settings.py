@@ -13,8 +13,7 @@ from us_sim.errors import ProbeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-AROUND = "tissue"
-"""The name of what is in no structure."""
+AROUND = "tissue"  # the name of what is in no structure
 
 # Szabo, Diagnostic Ultrasound Imaging: Inside Out (2nd ed., 2014), Appendix B, table B.1.
 _BLOOD = (0.14, 1.679e6)
@@ -98,7 +97,8 @@ _TABLE: dict[str, tuple[float, float]] = {
 def table_constants(name: str) -> tuple[float, float] | None:
     """Attenuation (dB/cm/MHz) and impedance (Rayl) of what a label's name says.
 
-    Of several known words in a name the last one counts; None where there is none.
+    Of several known words in a name the last one counts; None where there is none. Attenuation is
+    taken as proportional to the frequency: the source's coefficient at 1 MHz.
     """
     words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _TABLE]
     return _TABLE[words[-1]] if words else None

@@ -24,9 +24,7 @@ from us_sim.volume.volume import Volume
 MIRROR = 11.0
 """dB: echo of a plane that reflects everything at a right angle, where the strongest shown is 0."""
 
-ROUGHNESS = 0.35
-"""Standard deviation of the slopes of a border's facets."""
-
+ROUGHNESS = 0.35  # standard deviation of the slopes of a border's facets
 _DIFFUSE = -25.0  # dB, of what a rough border sends in all directions, at a right angle
 _GRAZING = 0.3  # least cosine for the slope with which an echo is drawn
 _GRAIN_SIDE = 16  # voxels
@@ -237,9 +235,7 @@ def _carry_normal(normal, element, rest_index, tetrahedra, corners, nodes, rigid
 
 
 BLOCK = 8
-DISTANCE = 40.0
-"""Parts of a voxel in which the distance of a surface is kept."""
-
+DISTANCE = 40.0  # parts of a voxel in which the distance of a surface is kept
 _REACH = 3  # voxels
 _SIGMA = 1.5  # voxels
 _PARTS = 256  # of the weighted mean that are told apart

@@ -29,8 +29,7 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 
 _STEEP = 1e3
 """Voxels per pixel beyond which a map is so steep that rounding may lead it out of the volume."""
-_MARGIN = 1e-6
-"""Pixels by which a cut may lie outside the image and still be considered."""
+_MARGIN = 1e-6  # pixels by which a cut may lie outside the image and still be considered
 
 
 class Cuts(NamedTuple):
@@ -431,8 +430,7 @@ CUT_SHIFT, END_SHIFT = 26, 13
 """A span is one number: bits by which its cut and its end are shifted there. The lowest bits are
 its first column. A column is at most 4096."""
 
-_CLOSE = 1e-8
-"""Pixels from an outline within which a place is on it: rounding of positions."""
+_CLOSE = 1e-8  # pixels from an outline within which a place is on it: rounding of positions
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -7,13 +7,11 @@ first that holds it says where it lay at rest.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.kernels import njit
-from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.resampling import (
     BLACK,
     Located,
@@ -21,13 +19,10 @@ from us_sim.slicing.cutting.resampling import (
     parallel_rows,
     pixel_to_index,
 )
-from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes
+from us_sim.slicing.cutting.section import INSIDE, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
-
-if TYPE_CHECKING:
-    from us_sim.volume.volume import Volume
 
 _ON_PLANE = 1e-9  # pixels off the plane that count as on it, as for a section
 _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
@@ -35,22 +30,6 @@ _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat
 
 class PerPixel(Slicer):
     """Locates every pixel by brute force."""
-
-    def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
-        settings: Settings | None = None,
-    ) -> None:
-        del settings  # there is nothing to set
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
-        self._volume = volume
-        self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
-        self._threads = threads
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
         inside, index = self._voxels(nodes, plane)

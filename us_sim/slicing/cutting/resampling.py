@@ -20,11 +20,7 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.cut_polygons import END_SHIFT, NO_OUTLINE
-from us_sim.slicing.cutting.span_sampling import (
-    MOST_VOXELS,
-    MOST_VOXELS_A_SIDE,
-    sample_spans,
-)
+from us_sim.slicing.cutting.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans
 from us_sim.slicing.cutting.trilinear import inside_volume
 from us_sim.slicing.probe.plane import SlicePlane
 
@@ -64,8 +60,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="rows")
 
 
-BLACK = -1
-"""The element of a pixel that shows nothing, as where tissue moved away."""
+BLACK = -1  # the element of a pixel that shows nothing, as where tissue moved away
 
 
 class Located(NamedTuple):

@@ -42,15 +42,13 @@ from us_sim.slicing.cutting.resampling import (
     pixel_to_index,
     voxels_of,
 )
-from us_sim.slicing.cutting.section import INSIDE, RestMesh, finite_nodes, row_span
+from us_sim.slicing.cutting.section import INSIDE, finite_nodes, row_span
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import sample_linear
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from us_sim.volume.volume import Volume
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -244,31 +242,12 @@ class RowSubdivisionSettings(Settings):
 
 
 class RowSubdivision(Slicer):
-    """The paper's method, for comparison. Every cell has a list of the tetrahedra that cross it.
-
-    Raises:
-        ValueError: fewer than one thread.
-    """
+    """The paper's method, for comparison. Every cell has a list of the tetrahedra that cross it."""
 
     Settings = RowSubdivisionSettings
 
-    def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
-        settings: RowSubdivisionSettings | None = None,
-    ) -> None:
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
-        self._volume = volume
-        self._mesh = RestMesh(
-            np.asarray(rest_nodes), np.asarray(tetrahedra), volume.patient_to_index
-        )
+    def _prepare(self, settings: RowSubdivisionSettings | None) -> None:
         self._regions = (settings or RowSubdivisionSettings()).regions
-        self._threads = threads
         self._latest: tuple[ArrayLike, SlicePlane, Located] | None = None  # of an image
 
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:

@@ -23,8 +23,6 @@ array([ 4, 12, 20, 28, 36], dtype=uint8)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -46,7 +44,7 @@ from us_sim.slicing.cutting.resampling import (
     parallel_rows,
     pixel_to_index,
 )
-from us_sim.slicing.cutting.section import Clusters, RestMesh, finite_nodes
+from us_sim.slicing.cutting.section import Clusters, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.span_sampling import (
     INNER_MARGIN,
@@ -56,28 +54,12 @@ from us_sim.slicing.cutting.span_sampling import (
 )
 from us_sim.slicing.probe.plane import SlicePlane
 
-if TYPE_CHECKING:
-    from us_sim.volume.volume import Volume
-
 
 class ScanConversion(Slicer):
     """Cuts exact images, and fast."""
 
-    def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: ArrayLike,
-        tetrahedra: ArrayLike,
-        *,
-        threads: int = 1,
-        settings: Settings | None = None,
-    ) -> None:
-        del settings  # there is nothing to set
-        if threads < 1:
-            raise ValueError(f"give at least one thread, not {threads}")
-        self._threads = threads
-        self._volume = volume
-        mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+    def _prepare(self, _: Settings | None) -> None:
+        volume, mesh = self._volume, self._mesh
         self._clusters = Clusters(mesh.nodes, mesh.tetrahedra)
         self._determinants = mesh.determinants[self._clusters.order]
         self._rest_index = mesh.rest_index

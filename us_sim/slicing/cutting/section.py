@@ -288,15 +288,12 @@ def _invert(pixel, tetrahedra, e, form):
     return determinant
 
 
-ON_PLANE = 1e-9
-"""Pixels off the plane within which a node counts as on it: rounding."""
-
+ON_PLANE = 1e-9  # pixels off the plane within which a node counts as on it: rounding
 _SIZE = 128
 """Tetrahedra of a cluster: few enough to follow the plane, many enough to have most nodes in
 common."""
 _BLOCK = 256  # nodes that are tested together
-_MARGIN = 1e-3
-"""Pixels beyond the image's border at which a tetrahedron may be left out."""
+_MARGIN = 1e-3  # pixels beyond the image's border at which a tetrahedron may be left out
 
 
 class Clusters:

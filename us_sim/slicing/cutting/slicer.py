@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.settings.setting import Settings
-from us_sim.slicing.cutting.resampling import label_voxels, parallel_rows, sample_nearest
+from us_sim.slicing.cutting.resampling import (
+    label_voxels,
+    parallel_rows,
+    sample_labels,
+    sample_nearest,
+    sample_plane,
+)
+from us_sim.slicing.cutting.section import RestMesh
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
@@ -35,13 +42,9 @@ class Slicer(ABC):
     skipped: int = 0
     """Inverted or flat tetrahedra on the latest image, which were left out."""
 
-    _volume: Volume
-    _threads: int
-
     Settings: ClassVar[type[Settings]] = Settings
     """The class of this method's settings."""
 
-    @abstractmethod
     def __init__(
         self,
         volume: Volume,
@@ -56,6 +59,14 @@ class Slicer(ABC):
         The image does not depend on the number of threads. ``settings`` are of the class's own
         kind, or None for the defaults.
         """
+        if threads < 1:
+            raise ValueError(f"give at least one thread, not {threads}")
+        self._volume, self._threads = volume, threads
+        self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
+        self._prepare(settings)
+
+    def _prepare(self, settings: Any) -> None:  # noqa: B027
+        """Make what is needed for every image of the mesh, which is there."""
 
     @abstractmethod
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:
@@ -130,20 +141,14 @@ def create_slicer(
     threads: int = 1,
     settings: Settings | None = None,
 ) -> Slicer:
-    """The slicer of that name.
-
-    Args:
-        name: one of `SLICERS`.
-        volume, rest_nodes, tetrahedra, threads: as for every `Slicer`.
-        settings: of the method's own class.
+    """The slicer of that name among `SLICERS`; further arguments as for `Slicer`.
 
     Raises:
         SettingsError: there is no method of that name; the sentence says which there are.
         MeshError: the mesh cannot be used.
     """
-    slicer: Slicer = SLICERS.load(name)(
-        volume, rest_nodes, tetrahedra, threads=threads, settings=settings
-    )
+    made = SLICERS.load(name)
+    slicer: Slicer = made(volume, rest_nodes, tetrahedra, threads=threads, settings=settings)
     return slicer
 
 
@@ -152,7 +157,6 @@ def warm_up(name: str, threads: int = 1) -> None:
 
     The kernels for a volume without tissue are included.
     """
-    from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
     from us_sim.slicing.probe.probe import LinearProbe
     from us_sim.volume.volume import Volume
 

@@ -134,7 +134,6 @@ def fill_some_elements(
 
     Args:
         steps: (2,) rows and columns of the image from one element to the next.
-        columns: of the image.
     """
     rows, places = elements.shape
     row_step = steps[0]

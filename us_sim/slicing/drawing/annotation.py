@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 _SCALE: Colour = (205, 215, 215)
 _FOCUS: Colour = (255, 210, 60)
 _SHADOW: Colour = (0, 0, 0)
-_FINE = 4
-"""Bits of the fraction of a pixel in the coordinates of outlines."""
-
+_FINE = 4  # bits of the fraction of a pixel in the coordinates of outlines
 Box = tuple[int, int, int, int]  # left, top, right, bottom
 
 
@@ -96,7 +94,6 @@ class Annotation:
         Args:
             pixels: (rows, columns) grey.
             labels: (rows, columns), where outlines are wanted.
-            badge: for an image that is not live.
             overlay: colours over the grey, below all else, and their bar.
             lines: (N, 2) column and row, such as a gate's.
             settle: of the labels' outlines, as for `label_outlines`.

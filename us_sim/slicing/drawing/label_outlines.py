@@ -21,8 +21,7 @@ from us_sim.volume.volume import Volume
 Settle = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Moves points (P, 2) of a label's outline, see `us_sim.slicing.drawing.label_outlines`."""
 
-_MOST = 64
-"""Most outlines of one label; the longest are taken."""
+_MOST = 64  # most outlines of one label; the longest are taken
 
 
 def label_outlines(

@@ -20,17 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Colour = tuple[int, int, int]
-"""Red, green and blue, 0 to 255."""
-
-_FINER = 4
-"""Letters are drawn this much larger and averaged, as OpenCV's own small ones are ragged."""
-
-_CAPITAL = 21
-"""Height of a capital letter of OpenCV's font at scale 1, px, without its strokes."""
-
-_HALO = 2
-"""Width of the halo around letters, px."""
+Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
+_FINER = 4  # letters are drawn this much larger and averaged, as OpenCV's own small ones are ragged
+_CAPITAL = 21  # height of a capital letter of OpenCV's font at scale 1, px, without its strokes
+_HALO = 2  # width of the halo around letters, px
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +132,6 @@ class Overlay:
 
     Args:
         values: (rows, columns), NaN where the image is left as it is.
-        scale: which colour each has.
         opacity: of the colours over the grey, 0 to 1.
         note: a line of text below the bar; empty for none.
         outline: corners (N, 2) column and row of a closed line around where values are wanted; None
@@ -174,15 +166,13 @@ def mirrored(line: NDArray[np.floating], columns: int) -> NDArray[np.floating]:
 
 
 _TEXT: Colour = (205, 215, 215)
-_HEIGHT = 9
-"""Of the bar, in heights of a letter."""
+_HEIGHT = 9  # of the bar, in heights of a letter
 
 
 class ColourBar:
     """Drawn over a picture, as far as that has room.
 
     Args:
-        scale: which colour each value has.
         text: px, height of its letters.
         note: a line below it; empty for none.
     """

@@ -20,7 +20,6 @@ class Window:
     """Places in an image, and the directions of the beams there.
 
     Args:
-        probe: whose image it is.
         angles: rad, of the beams from the probe's z towards its x; of pixels (rows, columns) of the
             window, or of places (P,).
         places: (P, 2) column and row; None for the pixels of the window.
@@ -51,11 +50,7 @@ class Window:
 
 
 class Blood:
-    """The vessels of a scene that have a flow.
-
-    Args:
-        vessels: they are advanced from frame to frame.
-    """
+    """The vessels of a scene that have a flow."""
 
     def __init__(self, vessels: Sequence[Vessel]) -> None:
         self.vessels = tuple(vessels)
@@ -191,7 +186,6 @@ def absence(
     """Why flow cannot be seen at the places of a window.
 
     Args:
-        blood: in it.
         lines: of the probe, as many as places in the window, whose echoes come from there.
         wall_filter: m/s.
     """

@@ -21,11 +21,8 @@ from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-_RINGS = 4
-"""Rings around a station that share its area at rest evenly."""
-
+_RINGS = 4  # rings around a station that share its area at rest evenly
 _FRACTIONS = np.sqrt(np.arange(_RINGS + 1) / _RINGS)
-
 _REACH = 2e-3
 """m outside the tissue beyond which a vessel stays where it is, as the volume does there."""
 
@@ -43,7 +40,6 @@ class CarriedLumen:
     """Carries a lumen with the tissue.
 
     Args:
-        lumen: at rest.
         mesh: of the tissue at rest; None for a lumen that stays as it is.
     """
 
@@ -127,8 +123,7 @@ def _measure(points, nodes, weights, moved, tangents, polygons):
             )
 
 
-_WAY = 1
-"""Raised when another lumen or map is made of the same voxels."""
+_WAY = 1  # raised when another lumen or map is made of the same voxels
 _OUTSIDE = 3.0  # radial coordinate that is well outside the wall
 _MARGIN = 2  # voxels beyond the wall in which coordinates are known
 

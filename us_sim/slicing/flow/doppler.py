@@ -52,7 +52,10 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def uniform(seed, place):
-    """A number above 0, and at most 1, for two numbers of type uint64."""
+    """A number above 0, and at most 1, for two numbers of type uint64: the same in every run.
+
+    By the finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
+    """
     x = (seed * _STEP) ^ (place + _STEP)
     for _ in range(2):
         x = (x ^ (x >> np.uint64(30))) * _FIRST
@@ -69,9 +72,7 @@ def normal_pair(seed, place):
     return size * np.cos(angle), size * np.sin(angle)
 
 
-_SHOWN = 0.3
-"""Size of R, over that of fast blood, from which colour is shown with a gain of 0 dB."""
-
+_SHOWN = 0.3  # size of R, over that of fast blood, from which colour is shown with a gain of 0 dB
 _BROADENING, _RECEIVER = 0.35, 0.15
 """Standard deviation of the noise for one pulse, over R and over that of fast blood."""
 
@@ -88,10 +89,6 @@ _EDGE = 24  # points along each side of the box
 
 class ColourDoppler:
     """Estimates velocities in the colour box of one probe's images.
-
-    Args:
-        probe: its geometry.
-        settings: of the box.
 
     Raises:
         ProbeError: the box is outside the image, or this probe cannot be steered.
@@ -267,29 +264,19 @@ def _show(turned, noise, within, nyquist, least, broadening, receiver, shown):
 
 
 _ROWS, _COLUMNS = 256, 512
-_ALONG, _ACROSS = 15, 7
-"""Places in the gate along the beam and across it."""
-
-_BEAM = 1e-3
-"""Width of the gate across the beam, m: that of a beam of 5 to 8 MHz at its focus."""
-
+_ALONG, _ACROSS = 15, 7  # places in the gate along the beam and across it
+_BEAM = 1e-3  # width of the gate across the beam, m: that of a beam of 5 to 8 MHz at its focus
 _LEAST_BROADENING, _TRANSIT = 0.012, 0.06
 """Standard deviation of what one velocity is spread over: of the Nyquist velocity, and of the
 velocity itself."""
 
-_DRAWN = 3e-3
-"""Length of the lines that show the gate, m."""
-
+_DRAWN = 3e-3  # length of the lines that show the gate, m
 _NOISE = 1e-4
 """The receiver's power in a bin, over that of a gate full of blood of one slow velocity."""
 
 
 class Spectrum:
     """The spectrum at a gate of one probe's images.
-
-    Args:
-        probe: its geometry.
-        settings: of the gate.
 
     Raises:
         ProbeError: the gate is outside the image, or this probe cannot be steered.
@@ -425,7 +412,6 @@ def nearest_vessel(
     """Where the middle is, in the image, of the lumen nearest to a place; None without any.
 
     Args:
-        blood: in the vessels.
         lateral, depth: of the place, fraction of the face and m, as of `pixels_of`.
         steering: rad, of beams that lead to places.
     """

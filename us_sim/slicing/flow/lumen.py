@@ -19,17 +19,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from us_sim.errors import VolumeError
 
-DIRECTIONS = 24
-"""Directions from a section's centre in which its wall is known."""
-
+DIRECTIONS = 24  # directions from a section's centre in which its wall is known
 _ANGLES = np.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
-
-_SOFTENED = 0.7
-"""Standard deviation, in voxels, of what softens the steps of a label's surface."""
-
-_INTERPOLATED = 1 / 6
-"""Variance, in voxels squared, of what linear interpolation averages over."""
-
+_SOFTENED = 0.7  # standard deviation, in voxels, of what softens the steps of a label's surface
+_INTERPOLATED = 1 / 6  # variance, in voxels squared, of what linear interpolation averages over
 _WALL_STEP = 0.25  # voxels between the places along a ray where its wall is looked for
 _REFINED = 4  # times that the centre line is moved into its sections' centres
 _WIDEST = 2.5  # farthest that a wall is looked for, over the vessel's mean width
@@ -111,8 +104,6 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
     Raises:
         VolumeError: they are no tube; the sentence begins with what they are instead.
     """
-    from us_sim.slicing.flow.lumen import centreline, resampled
-
     inside = np.argwhere(lumen)
     if not len(inside):
         raise VolumeError("is nowhere in the volume")
@@ -270,17 +261,12 @@ def _between(values: NDArray[np.float64], station: NDArray[np.float64]) -> NDArr
     return np.asarray(values[low] * (1.0 - part) + values[low + 1] * part)
 
 
-_MOST = 60_000
-"""Voxels of a lumen that are walked; of more, every second along each axis is."""
-
-_SLENDER = 3.0
-"""Least length of a vessel over its width."""
-
+_MOST = 60_000  # voxels of a lumen that are walked; of more, every second along each axis is
+_SLENDER = 3.0  # least length of a vessel over its width
 _PIECE = 0.05
 """Fraction of its voxels that may lie apart from a vessel, as segmentations have crumbs."""
 
-_BRANCH = 0.2
-"""Fraction of a slice from which a part that lies apart from the rest is a branch."""
+_BRANCH = 0.2  # fraction of a slice from which a part that lies apart from the rest is a branch
 
 _HALF = [
     (i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) > (0, 0, 0)

@@ -27,8 +27,7 @@ from us_sim.slicing.settings import FlowSettings
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
-_ALONG = 0.25
-"""Least cosine between the direction that is set and the vessel's own."""
+_ALONG = 0.25  # least cosine between the direction that is set and the vessel's own
 
 
 class Vessel:
@@ -38,10 +37,8 @@ class Vessel:
     the square of the radial coordinate there at rest, which `map` knows.
 
     Args:
-        name: of it, for sentences.
         volume: in frame ``patient``, with labels.
         label: of the vessel's lumen.
-        settings: of the flow.
 
     Raises:
         SceneError: the label is no tube, or the flow's direction is across it.
@@ -151,10 +148,18 @@ def open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.flo
 
 
 class Circulation:
-    """Flow along a vessel as its lumen narrows and opens, averaged over the pulse.
+    """Flow along a vessel as its lumen narrows and opens, averaged over the pulse: a Windkessel.
+
+        q = p / (D + R),    T dp/dt = (P - p) - S q
+
+    Blood comes from capillaries at pressure P through a resistance S into an elastic reservoir at
+    pressure p, and flows on through the vessel's own resistance R, and D downstream (N. Westerhof,
+    J.-W. Lankhaar, B. E. Westerhof, Med. Biol. Eng. Comput. 47, 2009). R is Poiseuille's, the sum
+    of 8 π μ ds / a² of the open area a; T is the time constant of filling. An artery has p = P.
+    Inertia and turbulence are left out. A vessel is closed at 0.27 of its area at rest, as elastic
+    tubes are (Flaherty, Keller, Rubinow, SIAM J. Appl. Math. 23, 1972).
 
     Args:
-        settings: of the flow.
         rest_areas: (S,) m², of the lumen at rest, at places evenly spaced along it.
         spacing: m, between them.
         before: the same vessel with other settings, whose reservoir this one takes over.
@@ -217,14 +222,17 @@ class Circulation:
 _BELLS = ((0.13, 0.045, 1.0), (0.33, 0.06, -0.32), (0.52, 0.09, 0.10))
 """Middle and standard deviation, in beats, and height of the arterial pulse's three waves."""
 
-_CARDIAC = 0.25
-"""Fraction of the swing of a vein's flow that is the heart's; the rest is breathing."""
-
+_CARDIAC = 0.25  # fraction of the swing of a vein's flow that is the heart's; the rest is breathing
 _FINE = 4096  # places at which the pulse's shape is measured
 
 
 class Waveform:
     """Flow over its mean, as a function of time; its mean over a beat and a breath is 1.
+
+    An artery of a limb at rest has a triphasic pulse (McDicken and Hoskins, in Hoskins, Martin and
+    Thrush, Diagnostic Ultrasound: Physics and Equipment, 2nd ed., 2010, chapter 9): three bells,
+    scaled to the peak and mean that are set. Flow in a vein swings with breathing, and a little
+    with the heart (Baekgaard and Strandberg, Phlebolymphology, 2016).
 
     Args:
         settings: of the vessel's flow.

@@ -246,9 +246,7 @@ def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, p
             press[line] = moved[line] - entered[line]
 
 
-_THICKEST = 5e-3
-"""m, of a layer that is filled: what is more is not the mesh's coarseness."""
-
+_THICKEST = 5e-3  # m, of a layer that is filled: what is more is not the mesh's coarseness
 _TRIES, _NEARER = 4, 0.8
 _BESIDE = (0, 1, -1)  # columns
 _NOT_FILLED = -1.0  # in place of how thick the layer is
@@ -278,7 +276,6 @@ class GelLayer:
         """The slice (rows, columns) with the layer filled; the slice itself where there is none.
 
         Args:
-            image: the slice.
             gap: (lines,) m, from the face to the surface of the mesh along each line.
             coupling: (lines,); lines without stay as they are.
         """
@@ -421,7 +418,6 @@ def _lose(coupled, reach, losses, out):
     Args:
         coupled: (places,) fraction of the amplitude transmitted in one direction.
         reach: (steps,) places on either side whose elements form a line.
-        losses: the table of losses.
         out: (steps, places), set: the tissue's loss, and that of the face's echo times 256.
     """
     places = len(coupled)

@@ -57,8 +57,6 @@ class ImageFormation:
         self._reverberation: Reverberation | None = None
         self._grey_levels: GreyLevels | None = None
         if imaging.elevation_planes > 1:
-            from us_sim.slicing.formation.image_formation import Elevation
-
             self._elevation = Elevation(probe, imaging)
         if imaging.lateral_resolution > 0.0 or imaging.axial_resolution > 0.0:
             from us_sim.slicing.formation.resolution import Resolution
@@ -70,8 +68,6 @@ class ImageFormation:
             self._gel_layer = GelLayer(probe)
             self._reverberation = Reverberation(probe, imaging)
         if imaging.changes_grey_levels:
-            from us_sim.slicing.formation.image_formation import GreyLevels
-
             self._grey_levels = GreyLevels(probe, imaging)
 
     @property

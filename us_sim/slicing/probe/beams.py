@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import ProbeError
 from us_sim.slicing.probe.probe import LinearProbe, Probe
 
-DEPTH_STEPS = 512
-"""Steps of depth in which tables of what changes with depth are made."""
+DEPTH_STEPS = 512  # steps of depth in which tables of what changes with depth are made
 
 
 def focus_of(probe: Probe) -> float:

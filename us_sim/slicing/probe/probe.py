@@ -32,25 +32,21 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.slicing.probe.plane import SlicePlane, require_pixel_counts
 
 
-def image_depth() -> Any:
-    """The setting of how deep an image is."""
+def _depth() -> Any:
     return setting(
         Quantity("length", 5e-3, 0.4), "of the image along the beams from the face", live=True
     )
 
 
-def beam_lines(default: int) -> Any:
-    """The setting of how many beams there are."""
+def _lines(default: int) -> Any:
     return setting(Quantity("number", 1, 4096), "beams", default=default, kw_only=True)
 
 
-def beam_samples() -> Any:
-    """The setting of how many samples a beam has."""
+def _samples() -> Any:
     return setting(Quantity("number", 1, 16384), "of each beam", default=512, kw_only=True)
 
 
-def beam_focus() -> Any:
-    """The setting of where beams are focused."""
+def _focus() -> Any:
     return setting(
         Quantity("length", 1e-3, 0.4),
         "along the beams from the face; not given: the middle of the depth",
@@ -60,8 +56,7 @@ def beam_focus() -> Any:
     )
 
 
-def beam_frequencies(low: float, high: float) -> Any:
-    """The setting of which frequencies the transducer has."""
+def _frequencies(low: float, high: float) -> Any:
     return setting(
         Quantity("frequency", 0.5e6, 50e6),
         "lowest and highest that the pulse's middle can have",
@@ -135,16 +130,12 @@ class Probe(Settings, ABC):
         """
 
     @abstractmethod
-    def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Start (n, 2) m and unit direction (n, 2), as x and z, of the beams at parts (n,)."""
-
     def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Start (n, 2) m and unit direction (n, 2), as x and z, of beams between the probe's own.
+        """Start (n, 2) m and unit direction (n, 2), as x and z, of beams, also between the lines.
 
         Args:
             part: (n,) of the face, or of the opening angle where beams spread: 0 to 1.
         """
-        return self._rays(part)
 
     @cached_property
     def width(self) -> float:
@@ -177,12 +168,12 @@ class Probe(Settings, ABC):
     @cached_property
     def beam_starts(self) -> NDArray[np.float64]:
         """(lines, 2) m: x and z of each beam on the face."""
-        return _kept(self._rays(self._line_parts)[0])
+        return _kept(self.rays(self._line_parts)[0])
 
     @cached_property
     def beam_directions(self) -> NDArray[np.float64]:
         """(lines, 2): x and z of each beam's unit direction."""
-        return _kept(self._rays(self._line_parts)[1])
+        return _kept(self.rays(self._line_parts)[1])
 
     @cached_property
     def pixel_beams(self) -> NDArray[np.float32]:
@@ -204,7 +195,7 @@ class Probe(Settings, ABC):
         NaN where no beam reaches.
         """
         part = (self.pixel_beams[0].ravel() + 0.5) / self.lines
-        directions = self._rays(part.astype(np.float64))[1]
+        directions = self.rays(part.astype(np.float64))[1]
         directions[np.isnan(part)] = np.nan
         return _kept(directions.T.reshape(2, self.rows, self.columns).astype(np.float32))
 
@@ -232,13 +223,9 @@ class Probe(Settings, ABC):
             spans=self._spans,
         )
 
-    @property
+    @cached_property
     def _spans(self) -> NDArray[np.int32] | None:
         """(rows, 2, 2): runs of columns of each row that beams reach, None when they reach all."""
-        return self._reached_runs
-
-    @cached_property
-    def _reached_runs(self) -> NDArray[np.int32]:
         return _kept(np.concatenate([_runs(reached) for *_, reached in self._bands()]))
 
     def _bands(
@@ -295,28 +282,26 @@ class LinearProbe(Probe):
     """
 
     aperture: float = setting(Quantity("length", 3e-3, 0.2), "of the face along the array")
-    depth: float = image_depth()
+    depth: float = _depth()
     columns: int = 512
     rows: int = 512
-    lines: int = beam_lines(192)
-    samples: int = beam_samples()
-    focus: float | None = beam_focus()
-    frequencies: tuple[float, float] = beam_frequencies(4e6, 16e6)
+    lines: int = _lines(192)
+    samples: int = _samples()
+    focus: float | None = _focus()
+    frequencies: tuple[float, float] = _frequencies(4e6, 16e6)
 
     @property
     def _outline(self) -> tuple[float, float, float]:
         return 0.5 * self.aperture, 0.0, self.depth
 
-    @property
-    def _spans(self) -> None:
-        """Beams reach every pixel."""
+    _spans = None  # beams reach every pixel
 
     def _beam(
         self, x: NDArray[np.float64], z: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return tuple(np.broadcast_arrays(x / self.aperture + 0.5, z))  # type: ignore[return-value]
 
-    def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         starts = np.zeros((len(part), 2))
         starts[:, 0] = (part - 0.5) * self.aperture
         return starts, np.tile([0.0, 1.0], (len(part), 1))
@@ -354,13 +339,13 @@ class ConvexProbe(Probe):
     opening_angle: float = setting(
         Quantity("angle", math.radians(1), math.pi), "between the outermost beams"
     )
-    depth: float = image_depth()
+    depth: float = _depth()
     columns: int = 512
     rows: int = 512
-    lines: int = beam_lines(192)
-    samples: int = beam_samples()
-    focus: float | None = beam_focus()
-    frequencies: tuple[float, float] = beam_frequencies(1.5e6, 6e6)
+    lines: int = _lines(192)
+    samples: int = _samples()
+    focus: float | None = _focus()
+    frequencies: tuple[float, float] = _frequencies(1.5e6, 6e6)
 
     @property
     def _outline(self) -> tuple[float, float, float]:
@@ -377,7 +362,7 @@ class ConvexProbe(Probe):
         below = z + self.radius
         return np.arctan2(x, below) / self.opening_angle + 0.5, np.hypot(x, below) - self.radius
 
-    def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         angle = (part - 0.5) * self.opening_angle
         directions = np.column_stack([np.sin(angle), np.cos(angle)])
         return self.radius * (directions - [0.0, 1.0]), directions
@@ -401,13 +386,13 @@ class SectorProbe(Probe):
     opening_angle: float = setting(
         Quantity("angle", math.radians(1), math.radians(150)), "between the outermost beams"
     )
-    depth: float = image_depth()
+    depth: float = _depth()
     columns: int = 512
     rows: int = 512
-    lines: int = beam_lines(128)
-    samples: int = beam_samples()
-    focus: float | None = beam_focus()
-    frequencies: tuple[float, float] = beam_frequencies(1e6, 5e6)
+    lines: int = _lines(128)
+    samples: int = _samples()
+    focus: float | None = _focus()
+    frequencies: tuple[float, float] = _frequencies(1e6, 5e6)
     radius: float = setting(
         Quantity("length", 0.0, 0.05),
         "how far behind the face is the apex from which beams radiate",
@@ -439,14 +424,13 @@ class SectorProbe(Probe):
         # Of the distance from the apex only the part beyond the face counts.
         return np.arctan2(x, below) / self.opening_angle + 0.5, np.hypot(x, below) * z / below
 
-    def _rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rays(self, part: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         angle = (part - 0.5) * self.opening_angle
         starts = np.column_stack([self.radius * np.tan(angle), np.zeros_like(angle)])
         return starts, np.column_stack([np.sin(angle), np.cos(angle)])
 
 
-OUTLINE_POINTS = 33
-"""Of each of the two arcs that an outline has."""
+OUTLINE_POINTS = 33  # of each of the two arcs that an outline has
 
 
 def image_outline(probe: Probe, points: int = OUTLINE_POINTS) -> NDArray[np.float64]:

@@ -223,7 +223,7 @@ _SHORT = {"-p": "--param", "-r": "--remap", "-e": "--enclave"}
 
 @dataclass(frozen=True)
 class Arguments:
-    """What was asked for on a command line."""
+    """The ROS arguments of a command line."""
 
     remap_rules: tuple[RemapRule, ...] = ()
     parameters: tuple[NodeParameter, ...] = ()  # later ones override earlier ones
@@ -231,7 +231,7 @@ class Arguments:
     logger_levels: tuple[tuple[str, LoggingSeverity], ...] = ()
     enclave: str = "/"
     disabled_outputs: frozenset[str] = frozenset()  # of rosout, stdout, external-lib
-    others: tuple[str, ...] = ()  # what is not for ROS, in order
+    others: tuple[str, ...] = ()  # those that are not for ROS, in order
 
     def overrides_for(self, node: str) -> dict[str, Any]:
         """Parameter values for a node given by its absolute name; wildcards match it."""
@@ -281,18 +281,18 @@ def parse_arguments(args: Sequence[str]) -> Arguments:
         elif argument == "--":
             for_ros = False
         elif (flag := _SHORT.get(argument, argument)) in takers:
-            what, take = takers[flag]
+            kind, take = takers[flag]
             value = next(remaining, None)
             if value is None:
                 raise RCLInvalidROSArgsError(
                     f"Failed to parse ROS arguments: Couldn't parse trailing {argument} flag. "
-                    f"No {what} found."
+                    f"No {kind} found."
                 )
             try:
                 take(value)
             except (ParameterSyntaxError, RemapSyntaxError, ValueError) as error:
                 raise RCLInvalidROSArgsError(
-                    f"Failed to parse ROS arguments: Couldn't parse {what}: "
+                    f"Failed to parse ROS arguments: Couldn't parse {kind}: "
                     f"'{argument} {value}'. Error: {error}"
                 ) from None
         elif switch := _SWITCH.fullmatch(argument):

@@ -20,90 +20,79 @@ from .exceptions import (
     InvalidTopicNameException,
 )
 
-Fault = tuple[str, int] | None
+Fault = tuple[str, int] | None  # the sentence that rcl writes, and the index of the character
 
-_LONGEST_TOPIC = 247
-_LONGEST_NAMESPACE = 245
-_LONGEST_NODE_NAME = 255
-
-_TOPIC_FAULTS = (  # each ends with the offending character
-    (r"^[0-9]", "token must not start with a number"),
-    (r"[{}]", "must not have a {substitution}, not known without ROS 2"),
+# Patterns that end with the offending character, and rcl's words.
+_NODE_NAME = (
+    (r"[^A-Za-z0-9_]", "node name must not contain characters other than alphanumerics or '_'"),
+    (r"^[0-9]", "node name must not start with a number"),
+    (r"^.{255}(?=.)", "node name length should not exceed '255'"),
+)
+_TOPIC_NAME = (
+    (r"/\Z", "topic name must not end with a forward slash"),
+    (r"^[0-9]", "topic name token must not start with a number"),
+    (r"[{}]", "topic name must not have a {substitution}, not known without ROS 2"),
     (
         r"[^A-Za-z0-9_/~]",
-        "must not contain characters other than alphanumerics, '_', '~', '{', or '}'",
+        "topic name must not contain characters other than alphanumerics, '_', '~', '{', or '}'",
     ),
-    (r".~", "must not have tilde '~' unless it is the first character"),
-    (r"^~[^/](?=.)", "must not have a tilde '~' that is not followed by a forward slash '/'"),
-    (r"/[0-9]", "token must not start with a number"),
+    (r".~", "topic name must not have tilde '~' unless it is the first character"),
+    (
+        r"^~[^/](?=.)",
+        "topic name must not have a tilde '~' that is not followed by a forward slash '/'",
+    ),
+    (r"/[0-9]", "topic name token must not start with a number"),
 )
 
 
-def error_in_node_name(name: str) -> Fault:
-    """What is wrong with a node name, if anything."""
+def _absolute(kind: str, exception: str, longest: int, subject: str) -> tuple[tuple[str, str], ...]:
+    return (
+        (r"^[^/]", f"{kind} must be absolute, it must lead with a '/'"),
+        (r"/\Z", f"{kind} must not end with a '/'{exception}"),
+        (
+            r"[^A-Za-z0-9_/]",
+            f"{kind} must not contain characters other than alphanumerics, '_', or '/'",
+        ),
+        (r"^(?:[^/]|/(?![/0-9]))*//", f"{kind} must not contain repeated '/'"),
+        (r"/[0-9]", f"{kind} must not have a token that starts with a number"),
+        (rf"^.{{{longest}}}(?=.)", f"{subject} should not exceed '{longest}'"),
+    )
+
+
+_NAMESPACE = _absolute("namespace", ", unless only a '/'", 245, "namespace")
+_FULL_TOPIC_NAME = _absolute("topic name", "", 247, "topic length")
+
+
+def _first_fault(name: str, kind: str, rules: tuple[tuple[str, str], ...]) -> Fault:
     if not name:
-        return "node name must not be empty", 0
-    if bad := re.search(r"[^A-Za-z0-9_]", name):
-        return (
-            "node name must not contain characters other than alphanumerics or '_'",
-            bad.start(),
-        )
-    if name[0].isdigit():
-        return "node name must not start with a number", 0
-    if len(name) > _LONGEST_NODE_NAME:
-        return f"node name length should not exceed '{_LONGEST_NODE_NAME}'", _LONGEST_NODE_NAME - 1
+        return f"{kind} must not be empty", 0
+    for pattern, sentence in rules:
+        if bad := re.search(pattern, name, re.DOTALL):
+            return sentence, bad.end() - 1
     return None
+
+
+def error_in_node_name(name: str) -> Fault:
+    return _first_fault(name, "node name", _NODE_NAME)
 
 
 def error_in_namespace(name: str) -> Fault:
-    """What is wrong with an absolute namespace, if anything."""
-    if name == "/":
-        return None
-    if error := _error_in_absolute_name(name, "namespace", ", unless only a '/'"):
-        return error
-    if len(name) > _LONGEST_NAMESPACE:
-        return f"namespace should not exceed '{_LONGEST_NAMESPACE}'", _LONGEST_NAMESPACE - 1
-    return None
+    """The fault of an absolute namespace, if any."""
+    return None if name == "/" else _first_fault(name, "namespace", _NAMESPACE)
 
 
 def error_in_full_topic_name(name: str) -> Fault:
-    """What is wrong with an expanded topic or service name, if anything."""
-    if error := _error_in_absolute_name(name, "topic name", ""):
-        return error
-    if len(name) > _LONGEST_TOPIC:
-        return f"topic length should not exceed '{_LONGEST_TOPIC}'", _LONGEST_TOPIC - 1
-    return None
-
-
-def _error_in_absolute_name(name: str, kind: str, exception: str) -> Fault:
-    if not name:
-        return f"{kind} must not be empty", 0
-    if name[0] != "/":
-        return f"{kind} must be absolute, it must lead with a '/'", 0
-    if name[-1] == "/":
-        return f"{kind} must not end with a '/'{exception}", len(name) - 1
-    if bad := re.search(r"[^A-Za-z0-9_/]", name):
-        return (
-            f"{kind} must not contain characters other than alphanumerics, '_', or '/'",
-            bad.start(),
-        )
-    if bad := re.search(r"/[/0-9]", name):
-        if bad.group() == "//":
-            return f"{kind} must not contain repeated '/'", bad.start() + 1
-        return f"{kind} must not have a token that starts with a number", bad.start() + 1
-    return None
+    """The fault of an expanded topic or service name, if any."""
+    return _first_fault(name, "topic name", _FULL_TOPIC_NAME)
 
 
 def error_in_topic_name(name: str) -> Fault:
-    """What is wrong with a topic or service name as a person writes it, if anything."""
-    if not name:
-        return "topic name must not be empty string", 0
-    if name[-1] == "/":
-        return "topic name must not end with a forward slash", len(name) - 1
-    for pattern, sentence in _TOPIC_FAULTS:
-        if bad := re.search(pattern, name):
-            return f"topic name {sentence}", bad.end() - 1
-    return None
+    """The fault of a topic or service name as a person writes it, if any."""
+    return (
+        ("topic name must not be empty string", 0)
+        if not name
+        else _first_fault(name, "topic name", _TOPIC_NAME)
+    )
 
 
 def require_node_name(name: str) -> None:
@@ -167,7 +156,7 @@ class RemapSyntaxError(ValueError):
 
 @dataclass(frozen=True)
 class RemapRule:
-    """One rule: what kind of name it replaces, for which node (None: all), and by what."""
+    """One rule: the kinds of names it replaces, for which node (None: all), and the new name."""
 
     kinds: int  # bits of TOPIC, SERVICE, NODE_NAME, NAMESPACE
     node: str | None

@@ -25,6 +25,7 @@ ParameterEvent: Any = message_class("rcl_interfaces/msg/ParameterEvent")
 SetParametersResult: Any = message_class("rcl_interfaces/msg/SetParametersResult")
 ListParametersResult: Any = message_class("rcl_interfaces/msg/ListParametersResult")
 
+NOT_SET = Parameter.Type.NOT_SET
 _RECURSIVE = 0  # ListParameters.Request.DEPTH_RECURSIVE
 
 
@@ -91,12 +92,12 @@ class NodeParameters:
         if declared:
             raise ParameterAlreadyDeclaredException(declared)
         for parameter in values:
+            descriptor = descriptors[parameter.name]
+            expected = Parameter.Type(descriptor.type)
+            if not descriptor.dynamic_typing and parameter.type_ not in (expected, NOT_SET):
+                raise InvalidParameterTypeException(parameter, expected.name)
             result = self._rcl_set_all([parameter], descriptors)
             if not result.successful:
-                if result.reason.startswith("Wrong parameter type"):
-                    raise InvalidParameterTypeException(
-                        parameter, Parameter.Type(descriptors[parameter.name].type).name
-                    )
                 raise InvalidParameterValueException(parameter.name, parameter.value, result.reason)
         return [self._parameters[parameter.name] for parameter in values]
 
@@ -137,7 +138,7 @@ class NodeParameters:
             )
             descriptor.dynamic_typing = True
         if isinstance(second, Parameter.Type):
-            if second is Parameter.Type.NOT_SET:
+            if second is NOT_SET:
                 raise ValueError(
                     f"Cannot declare parameter {{{name}}} as statically typed of type NOT_SET"
                 )
@@ -189,7 +190,7 @@ class NodeParameters:
         if name in self._parameters:
             return self._parameters[name].type_.value
         if self._allow_undeclared_parameters:
-            return Parameter.Type.NOT_SET
+            return NOT_SET
         raise ParameterNotDeclaredException(name)
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:
@@ -200,19 +201,17 @@ class NodeParameters:
         """A parameter; raises ParameterUninitializedException when it has a type and no value."""
         parameter = self._parameters.get(name)
         if parameter is not None:
-            if parameter.type_ is Parameter.Type.NOT_SET and not (
-                self._descriptors[name].dynamic_typing
-            ):
+            if parameter.type_ is NOT_SET and not (self._descriptors[name].dynamic_typing):
                 raise ParameterUninitializedException(name)
             return parameter
         if self._allow_undeclared_parameters:
-            return Parameter(name, Parameter.Type.NOT_SET, None)
+            return Parameter(name, NOT_SET, None)
         raise ParameterNotDeclaredException(name)
 
     def get_parameter_or(self, name: str, alternative_value: Parameter | None = None) -> Parameter:
         """A parameter, or the alternative when it is not known or has no value."""
         parameter = self._parameters.get(name)
-        if parameter is not None and parameter.type_ is not Parameter.Type.NOT_SET:
+        if parameter is not None and parameter.type_ is not NOT_SET:
             return parameter
         return Parameter(name) if alternative_value is None else alternative_value
 
@@ -293,8 +292,19 @@ class NodeParameters:
                 return result
         event = ParameterEvent(node=self.get_fully_qualified_name())
         for parameter in parameters:
-            changes = self._rcl_set_one(parameter, descriptors)
-            getattr(event, changes).append(parameter.to_parameter_msg())
+            name, is_new = parameter.name, self.get_parameter_or(parameter.name).type_ is NOT_SET
+            changes = event.new_parameters if is_new else event.changed_parameters
+            if descriptors is None and parameter.type_ is NOT_SET:
+                self._parameters.pop(name, None)
+                self._descriptors.pop(name, None)
+                changes = event.deleted_parameters
+            else:
+                self._parameters[name] = parameter
+                if descriptors is not None:
+                    self._descriptors[name] = descriptors[name]
+                elif name not in self._descriptors:
+                    self._descriptors[name] = ParameterDescriptor(name=name, dynamic_typing=True)
+            changes.append(parameter.to_parameter_msg())
         event.stamp = self._clock.now().to_msg()
         if self._parameter_event_publisher is not None:
             self._parameter_event_publisher.publish(event)
@@ -302,30 +312,15 @@ class NodeParameters:
             callback(parameters)
         return SetParametersResult(successful=True)
 
-    def _rcl_set_one(self, parameter: Parameter, descriptors: dict[str, Any] | None) -> str:
-        """Set what was checked; returns which part of a parameter event tells it."""
-        name = parameter.name
-        if descriptors is None and parameter.type_ is Parameter.Type.NOT_SET:
-            self._parameters.pop(name, None)
-            self._descriptors.pop(name, None)
-            return "deleted_parameters"
-        if descriptors is not None:
-            self._descriptors[name] = descriptors[name]
-        elif name not in self._descriptors:
-            self._descriptors[name] = ParameterDescriptor(name=name, dynamic_typing=True)
-        is_new = self.get_parameter_or(name).type_ is Parameter.Type.NOT_SET
-        self._parameters[name] = parameter
-        return "new_parameters" if is_new else "changed_parameters"
-
     def _rcl_reason_against(self, parameter: Parameter, descriptors: dict[str, Any] | None) -> str:
-        """Why a descriptor does not allow a value, '' when it does; completes the descriptor."""
+        """The reason why a descriptor forbids a value, or ""; completes the descriptor."""
         descriptor = (descriptors or self._descriptors).get(parameter.name)
         if descriptor is None:
             return ""
         descriptor.name = parameter.name
         if descriptors is None and descriptor.read_only:
             return f"Trying to set a read-only parameter: {parameter.name}."
-        not_set = parameter.type_ is Parameter.Type.NOT_SET
+        not_set = parameter.type_ is NOT_SET
         if descriptor.dynamic_typing:
             descriptor.type = parameter.type_.value
         elif not_set and parameter.name in self._parameters:

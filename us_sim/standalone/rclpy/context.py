@@ -128,7 +128,7 @@ Callback = Callable[[], None]
 
 @dataclass(eq=False)
 class LocalNode:
-    """What others learn about a node of this process: its name, its readers and its writers."""
+    """A node of this process as others see it: its name, its readers and its writers."""
 
     name: str
     namespace: str
@@ -206,7 +206,7 @@ class Context(AbstractContextManager["Context"]):
             release()
 
     def destroy(self) -> None:
-        """Leave the network. What the nodes still hold does nothing from now on."""
+        """Leave the network; endpoints that nodes still hold do nothing from now on."""
         if self._initialized:
             self._graph.close()
             self._participant.close()
@@ -240,9 +240,9 @@ class Context(AbstractContextManager["Context"]):
     def __exit__(self, *_: object) -> None:
         self.try_shutdown()
 
-    def _require_init(self, what: str) -> None:
+    def _require_init(self, thing: str) -> None:
         if not self._initialized:
-            raise NotInitializedException(f"cannot create {what}")
+            raise NotInitializedException(f"cannot create {thing}")
 
     def _invalidate(self) -> None:
         """Mark the context as shut down and wake whoever waits on its behalf.
@@ -337,7 +337,7 @@ def try_shutdown(*, context: Context | None = None) -> None:
 
 
 def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
-    """A command line (`sys.argv` when None) without what is between --ros-args and --."""
+    """A command line (`sys.argv` when None) without the part between --ros-args and --."""
     return list(parse_arguments(sys.argv if args is None else args).others)
 
 

@@ -117,10 +117,10 @@ class GuardCondition(Destroyable):
         super().destroy()
         self._triggered = False
 
-    def _stirred(self) -> bool:
+    def _may_be_ready(self) -> bool:
         return self._triggered
 
-    _fetch = _stirred
+    _fetch = _may_be_ready
 
     def _take(self) -> Callable[..., Any] | None:
         self._triggered = False
@@ -171,7 +171,7 @@ class Timer(Destroyable):
 
     def is_ready(self) -> bool:
         self._require_existence()
-        return self._stirred()
+        return self._may_be_ready()
 
     def is_canceled(self) -> bool:
         self._require_existence()
@@ -202,7 +202,7 @@ class Timer(Destroyable):
         self._canceled = True
         self._clock._timers.discard(self)
 
-    def _stirred(self) -> bool:
+    def _may_be_ready(self) -> bool:
         return not self._canceled and self._next_call <= self._clock._now()
 
     def _fetch(self) -> bool:
@@ -249,14 +249,14 @@ def deserialize_message(serialized_message: bytes, message_type: Any) -> Any:
 
 
 def require_message_class(cls: Any) -> None:
-    """Raise NoTypeSupportImportedException for what is no class of messages."""
+    """Raise NoTypeSupportImportedException for anything but a class of messages."""
     if not isinstance(cls, type) or not hasattr(cls, "__msgtype__") or hasattr(cls, "Request"):
         raise NoTypeSupportImportedException()
 
 
 @dataclass(frozen=True)
 class NodeLink:
-    """What an endpoint needs of its node, without keeping the node alive."""
+    """A node's context, logger name and wake-up, without keeping the node alive."""
 
     context: Context
     logger_name: str
@@ -325,20 +325,20 @@ class Inbox:
     def fetch(self) -> bool:
         """Whether there is something to take."""
         if self._fetched is None:
-            self.ready = False  # before looking, so that what comes meanwhile is noticed
+            self.ready = False  # before looking, so that data that come meanwhile are noticed
             self._fetched = self._take()
             self.ready = self.ready or self._fetched is not None
         return self._fetched is not None
 
     def take(self) -> Any:
-        """What was fetched, or is waiting now; None when there is nothing."""
+        """The data that were fetched or are waiting now; None when there are none."""
         self.fetch()
         fetched, self._fetched = self._fetched, None
         return fetched
 
 
 class Connected(Destroyable):
-    """What is on the network under an absolute name until `destroy`."""
+    """An endpoint that is on the network under an absolute name until `destroy`."""
 
     def __init__(self, link: NodeLink, full_name: str, endpoint: Any, qos: QoSProfile) -> None:
         self._context = link.context
@@ -371,7 +371,7 @@ class Receiver(Connected, ABC):
         self._inbox = Inbox(endpoint.take, link.wake)
         endpoint.set_on_data(self._inbox.notify)
 
-    def _stirred(self) -> bool:
+    def _may_be_ready(self) -> bool:
         return self._inbox.ready
 
     def _fetch(self) -> bool:
@@ -595,7 +595,7 @@ def wait_until(condition: Callable[[], bool], context: Context, timeout_sec: flo
 
 
 class Service(Receiver):
-    """Calls back with each request, and answers with what the callback returns."""
+    """Calls back with each request, and sends the returned response."""
 
     service_name = Receiver._existing_name
 

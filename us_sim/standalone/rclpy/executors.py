@@ -58,7 +58,7 @@ class ExternalShutdownException(Exception):
 
 
 class Executor(AbstractContextManager["Executor"]):
-    """What SingleThreadedExecutor and MultiThreadedExecutor have in common."""
+    """Base of SingleThreadedExecutor and MultiThreadedExecutor."""
 
     _runs_elsewhere = False  # callbacks run in other threads than the one that waits
     context = property(attrgetter("_context"))
@@ -154,7 +154,7 @@ class Executor(AbstractContextManager["Executor"]):
             self._run(entity)
 
     def _next_ready(self, timeout_sec: float | None, condition: Callable[[], bool]) -> Any:
-        """What is to be run next; None when there is nothing in time, or the wait is ended.
+        """The entity to run next; None when none is ready in time, or the wait is ended.
 
         Whatever is ready at once runs in one round, each once, before anything runs again.
 
@@ -179,12 +179,12 @@ class Executor(AbstractContextManager["Executor"]):
         return None if self._is_shutdown else entity
 
     def _ready(self) -> Iterator[Any]:
-        """What may start, each looked at when its turn comes, in rclpy's order."""
+        """The entities that may start, each examined when its turn comes, in rclpy's order."""
         for node in self.get_nodes():
             for entity in node._rcl_entities():
                 if node not in self._nodes:
                     break
-                if entity._stirred() and self._may_start(entity) and entity._fetch():
+                if entity._may_be_ready() and self._may_start(entity) and entity._fetch():
                     entity._executor_event = True
                     yield entity
 
@@ -198,7 +198,7 @@ class Executor(AbstractContextManager["Executor"]):
         """
         rest = None if deadline is None else deadline - time.monotonic()
         for node in self.get_nodes():
-            if any(e._stirred() and self._may_start(e) for e in node._rcl_entities()):
+            if any(e._may_be_ready() and self._may_start(e) for e in node._rcl_entities()):
                 return 0.0
             for timer in list(node.timers):
                 until_due = timer._real_time_left()

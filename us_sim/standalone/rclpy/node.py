@@ -513,7 +513,7 @@ class Node(NodeParameters):
         ]
 
     def _rcl_entities(self) -> Iterator[Any]:
-        """What executors run, in the order in which rclpy looks at it."""
+        """The entities that executors run, in rclpy's order."""
         return iter(
             [*self._timers, *self._subscriptions, *self._guards, *self._clients, *self._services]
         )
@@ -558,7 +558,7 @@ class Node(NodeParameters):
             executor.wake()
 
     def _rcl_full_or_refused(self, name: str, is_service: bool = False) -> str:
-        """The absolute, remapped name, or the error that says what is wrong with the given one."""
+        """The absolute, remapped name; raises the error that explains an invalid one."""
         try:
             return self._rcl_resolve(name, SERVICE if is_service else TOPIC, only_expand=False)
         except RuntimeError:

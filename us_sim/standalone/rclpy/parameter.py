@@ -10,9 +10,11 @@ ValueError: Type 'Type.INTEGER' and value '60.0' do not agree
 
 import array
 import math
+import operator
 import weakref
 from collections.abc import Callable, Sequence
 from enum import Enum
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -130,50 +132,45 @@ def _field(type_: Parameter.Type) -> str:
 
 
 def reason_against(parameter: Parameter, descriptor: Any, tolerance: float) -> str:
-    """Why a value is outside its descriptor's range or between its steps.
+    """The reason why a value is outside its descriptor's range or between its steps, or "".
 
     Args:
         parameter: the value to be set.
         descriptor: a `rcl_interfaces/msg/ParameterDescriptor`.
         tolerance: relative, for comparing floating-point numbers.
     """
-    if parameter.type_ is Parameter.Type.INTEGER and descriptor.integer_range:
-        return _against_integers(parameter, descriptor.integer_range[0])
-    if parameter.type_ is Parameter.Type.DOUBLE and descriptor.floating_point_range:
-        return _against_floats(parameter, descriptor.floating_point_range[0], tolerance)
-    return ""
-
-
-def _against_integers(parameter: Parameter, limits: Any) -> str:
-    value = parameter.value
+    is_integer = parameter.type_ is Parameter.Type.INTEGER
+    if is_integer and descriptor.integer_range:
+        limits, same, dot, fault = descriptor.integer_range[0], operator.eq, ".", "is not a"
+    elif parameter.type_ is Parameter.Type.DOUBLE and descriptor.floating_point_range:
+        limits, same = descriptor.floating_point_range[0], partial(math.isclose, rel_tol=tolerance)
+        dot, fault = "", "is not close enough to a"
+    else:
+        return ""
+    name, value, step = parameter.name, parameter.value, limits.step
     least, most = sorted((limits.from_value, limits.to_value))
-    if value in (least, most):
+    if same(value, least) or same(value, most):
         return ""
     if not least < value < most:
-        return f"Parameter {parameter.name} out of range. Min: {least}, Max: {most}, value: {value}"
-    if limits.step and (value - least) % limits.step:
-        return (
-            f"The parameter value for {parameter.name} is not a valid step. "
-            f"Min: {least}, max: {most}, value: {value}, step: {limits.step}"
-        )
-    return ""
-
-
-def _against_floats(parameter: Parameter, limits: Any, tolerance: float) -> str:
-    value = parameter.value
-    least, most = sorted((limits.from_value, limits.to_value))
-    if any(math.isclose(value, limit, rel_tol=tolerance) for limit in (least, most)):
-        return ""
-    if not least < value < most:
-        return f"Parameter {parameter.name} out of range Min: {least}, Max: {most}, value: {value}"
-    if limits.step:
-        nearest = least + round((value - least) / limits.step) * limits.step
-        if not math.isclose(nearest, value, rel_tol=tolerance):
+        return f"Parameter {name} out of range{dot} Min: {least}, Max: {most}, value: {value}"
+    if step:
+        steps = (value - least) // step if is_integer else round((value - least) / step)
+        if not same(least + steps * step, value):
             return (
-                f"The parameter value for {parameter.name} is not close enough to a valid step. "
-                f"Min: {least}, max: {most}, value: {value}, step: {limits.step}"
+                f"The parameter value for {name} {fault} valid step. "
+                f"Min: {least}, max: {most}, value: {value}, step: {step}"
             )
     return ""
+
+
+_SERVICES = {
+    "describe_parameters": "DescribeParameters",
+    "get_parameters": "GetParameters",
+    "get_parameter_types": "GetParameterTypes",
+    "list_parameters": "ListParameters",
+    "set_parameters": "SetParameters",
+    "set_parameters_atomically": "SetParametersAtomically",
+}
 
 
 class ParameterService:
@@ -181,18 +178,11 @@ class ParameterService:
 
     def __init__(self, node: Any):
         self._node = weakref.ref(node)
-        for name, callback in {
-            "DescribeParameters": self._describe_parameters,
-            "GetParameters": self._get_parameters,
-            "GetParameterTypes": self._get_parameter_types,
-            "ListParameters": self._list_parameters,
-            "SetParameters": self._set_parameters,
-            "SetParametersAtomically": self._set_parameters_atomically,
-        }.items():
+        for service, type_name in _SERVICES.items():
             node.create_service(
-                service_class(f"rcl_interfaces/srv/{name}"),
-                f"{node.get_name()}/{_snake_case(name)}",
-                callback,
+                service_class(f"rcl_interfaces/srv/{type_name}"),
+                f"{node.get_name()}/{service}",
+                getattr(self, f"_{service}"),
                 qos_profile=qos_profile_parameters,
             )
 
@@ -259,10 +249,6 @@ def _set_atomically(node: Any, messages: list[Any]) -> Any:
         )
 
 
-def _snake_case(name: str) -> str:
-    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name)[1:]
-
-
 Callback = Callable[[Future], Any]
 
 
@@ -288,14 +274,7 @@ class AsyncParameterClient:
                 qos_profile=qos_profile,
                 callback_group=callback_group,
             )
-            for service, type_name in (
-                ("get_parameters", "GetParameters"),
-                ("list_parameters", "ListParameters"),
-                ("set_parameters", "SetParameters"),
-                ("get_parameter_types", "GetParameterTypes"),
-                ("describe_parameters", "DescribeParameters"),
-                ("set_parameters_atomically", "SetParametersAtomically"),
-            )
+            for service, type_name in _SERVICES.items()
         }
 
     def services_are_ready(self) -> bool:

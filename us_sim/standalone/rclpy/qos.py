@@ -42,7 +42,7 @@ class InvalidQoSProfileException(Exception):
 
 
 class QoSPolicyEnum(IntEnum):
-    """A policy; its values in lower case are what parameters call them."""
+    """A policy; parameters name its values in lower case."""
 
 
 class HistoryPolicy(QoSPolicyEnum):
@@ -64,7 +64,7 @@ class ReliabilityPolicy(QoSPolicyEnum):
 
 
 class DurabilityPolicy(QoSPolicyEnum):
-    """Whether late subscriptions receive what was published before."""
+    """Whether late subscriptions receive earlier messages."""
 
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1

@@ -84,7 +84,7 @@ class Future:
             self._cancelled = False
 
     def _set_result_in_executor(self, result: Any) -> None:
-        """Be done, with a result; what a callback raises reaches who spins."""
+        """Be done, with a result; errors of callbacks reach whoever spins."""
         self._conclude(result, None)
         for callback in self._taken_callbacks():
             callback(self)

@@ -236,7 +236,7 @@ class ROSClock(Clock):
         self._change(enabled, self._override)
 
     def _change(self, active: bool, override: int) -> None:
-        """Show another time, and let the timers know what was shown before."""
+        """Show another time, and tell the timers the time before."""
         before, is_other_time = self._now(), active != self._active
         self._active, self._override = active, override
         if active or is_other_time:

@@ -1,4 +1,4 @@
-"""Strain along the beams against closed forms, VTK's derivatives, and laws."""
+"""Strain along the beams against closed forms, VTK's derivatives, and laws; its colour bar."""
 
 import math
 
@@ -11,7 +11,7 @@ from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
-from us_sim.slicing.strain import AxialStrain, displacement
+from us_sim.slicing.strain import AxialStrain, FollowingEnd, displacement, strain_scale
 from us_sim.slicing.strain_estimate import warm_up
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
@@ -205,7 +205,7 @@ def test_tetrahedra_that_are_inside_out_do_not_count():
     nodes[np.argmin(np.linalg.norm(mesh.nodes - [0, 0, 0.03], axis=1))] += [0, 0, 0.03]
     frame = framed(PROBES[0], Pose(), nodes, mesh)
     found = AxialStrain.of(frame).image(frame)
-    assert frame._slicer.skipped > 0
+    assert frame.slicer.skipped > 0
     there = found[np.isfinite(found)]
     assert there.size
     assert (there > -1.0).all()
@@ -270,3 +270,31 @@ def test_sharp_borders_keep_the_strains_of_two_layers_apart():
     smooth = AxialStrain.of(frame).image(frame)
     assert np.abs(np.diff(smooth, axis=0)).max() < 0.02
     np.testing.assert_allclose(smooth[depth < 0.019], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mean", [-0.002, -0.03, -0.14, -0.45])
+def test_a_press_of_any_strength_has_colours_that_tell_its_parts_apart(mean):
+    """Strain that differs by a third of the mean, as in layers of unlike stiffness."""
+    values = mean * np.linspace(2 / 3, 4 / 3, 100 * 80).reshape(100, 80)
+    end = FollowingEnd().of(values)
+    assert end > np.percentile(np.abs(values), 94)
+    levels = strain_scale("strain", end).levels(values)
+    assert (levels == 0).mean() <= 0.06
+    assert np.ptp(levels.astype(float)) > (20 if mean < -0.01 else 5)
+
+
+def test_a_vein_that_collapses_does_not_take_the_colours_from_all_else():
+    values = np.full((200, 200), -0.14)
+    values[80:88, 50:150] = -0.9
+    assert FollowingEnd().of(values) == 0.2
+
+
+def test_the_bar_stays_while_tissue_breathes_and_follows_a_release():
+    end = FollowingEnd()
+    breath = [end.of(np.full((40, 40), -0.14 - 0.05 * np.sin(t))) for t in np.linspace(0, 20, 60)]
+    assert set(breath) == {0.2}
+    assert end.of(np.full((40, 40), -0.001)) == 0.01
+
+
+def test_an_image_without_strain_has_a_bar_too():
+    assert FollowingEnd().of(np.full((40, 40), np.nan)) == 0.01
