@@ -149,11 +149,11 @@ def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]
     if any(each.name == static for each in bag.topics):
         for row, (frame, *_) in _each(bag, bag.topic(static)):
             with contextlib.suppress(PoseError):  # a way through it is then none
-                tree.place(frame, row.frame_id.lstrip("/"), _pose(row))
+                tree.set_pose(frame, row.frame_id.lstrip("/"), _pose(row))
     is_there = False
     for row, (frame, *_) in _each(bag, topic):
         try:
-            tree.place(frame, row.frame_id.lstrip("/"), _pose(row))
+            tree.set_pose(frame, row.frame_id.lstrip("/"), _pose(row))
         except PoseError:
             yield row._replace(frame_id=parent, pose=_NOWHERE)
             continue
