@@ -16,6 +16,7 @@ from us_sim.demo.camera_video import PathVideo
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.nodes.topics import published_counts
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
@@ -204,11 +205,10 @@ class Session:
         """What each publisher last reported to have sent, beside what was recorded in the end."""
         recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         said = {
-            key.removeprefix("published "): int(value)
+            topic: count
             for node, report in self.reports.items()
             if node != "session_recorder"
-            for key, value in report.items()
-            if key.startswith("published ")
+            for topic, count in published_counts(report).items()
         }
         return {
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}

@@ -269,9 +269,10 @@ class ParameterBoard:
             return self._known.get(node) or NodeParameters(node)
 
     def tell(self, known: NodeParameters) -> None:
-        """There is something newer of a node."""
+        """Keep what is newest of a node; another object only if it differs."""
         with self._lock:
-            self._known[known.node] = known
+            if self._known.get(known.node) != known:
+                self._known[known.node] = known
 
     def set(self, node: str, name: str, value: Any) -> Future[str]:
         """Set a parameter to a value in the unit that is shown; None is nothing.

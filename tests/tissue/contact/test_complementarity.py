@@ -49,6 +49,20 @@ def test_gaps_and_pushes_are_complementary_even_with_redundant_rows(count, rank,
     assert np.abs(opened[active]).max(initial=0) <= 1e-6 * scale
 
 
+def test_a_problem_that_takes_too_many_pivots_is_solved_by_relaxation():
+    """Y. Fathi, Computational complexity of LCPs associated with positive definite symmetric
+    matrices, Math. Programming 17 (1979): the least index first takes 2^n - 1 pivots.
+    """
+    count = 20
+    root = np.tril(np.full((count, count), 2.0), -1) + np.eye(count)
+    delassus = (root @ root.T)[::-1, ::-1]
+    gap = -np.cumsum(2.0 ** np.arange(count, 0, -1))[::-1]
+    force, active = unilateral(delassus, gap, np.zeros(count, dtype=bool))
+    # The node of the smallest gap carries all, and opens the others by more than they need.
+    np.testing.assert_allclose(force, [*[0.0] * (count - 1), 2.0**count], rtol=1e-12)
+    np.testing.assert_array_equal(active, force > 0.0)
+
+
 def test_does_not_depend_on_the_guess():
     random = np.random.default_rng(3)
     points = random.uniform(-1, 1, (60, 2))

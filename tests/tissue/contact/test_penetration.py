@@ -189,24 +189,24 @@ REST = np.array([[0.0, 0, 0], [0.004, 0, 0], [0.1, 0, 0]])
 def test_touched_nodes_lie_on_the_probe():
     contact, displacement = ActiveSet(SPHERE, REST, FINE), np.zeros((3, 3))
     pose = Pose(np.array([0.0, 0.0, 0.01]))
-    assert contact.revise(pose, displacement)
+    assert contact.update(pose, displacement)
     np.testing.assert_array_equal(contact.touched, [True, True, False])
     distance, _ = signed_distance(SPHERE, pose, REST + displacement)
     np.testing.assert_allclose(distance[:2], 0, atol=1e-9)
     np.testing.assert_array_equal(displacement[2], 0)
-    assert not contact.revise(pose, displacement)
-    assert contact.consistent(pose, displacement)
+    assert not contact.update(pose, displacement)
+    assert contact.is_consistent(pose, displacement)
 
 
 def test_a_node_that_would_be_pulled_is_let_go():
     contact, displacement = ActiveSet(SPHERE, REST, FINE), np.zeros((3, 3))
     pose = Pose(np.array([0.0, 0.0, 0.01]))
-    contact.revise(pose, displacement)
-    contact.weigh(np.array([[0.0, 0, 1], [0.0, 0, -1], [0.0, 0, 5]]))
-    assert contact.push[0] == pytest.approx(1)
-    assert contact.push[2] == 0
-    assert not contact.consistent(pose, displacement)
-    assert contact.revise(pose, displacement)
+    contact.update(pose, displacement)
+    contact.set_forces(np.array([[0.0, 0, 1], [0.0, 0, -1], [0.0, 0, 5]]))
+    assert contact.normal_force[0] == pytest.approx(1)
+    assert contact.normal_force[2] == 0
+    assert not contact.is_consistent(pose, displacement)
+    assert contact.update(pose, displacement)
     np.testing.assert_array_equal(contact.touched, [True, False, False])
 
 
@@ -214,10 +214,10 @@ def test_a_probe_that_is_taken_away_holds_nothing():
     pose = Pose(np.array([0.0, 0.0, 0.01]))
     for elsewhere in (None, Pose(np.array([0.0, 0.0, -0.05]))):
         contact, displacement = ActiveSet(SPHERE, REST, FINE), np.zeros((3, 3))
-        contact.revise(pose, displacement)
-        assert contact.revise(elsewhere, displacement)
+        contact.update(pose, displacement)
+        assert contact.update(elsewhere, displacement)
         assert not contact.touched.any()
-        assert not contact.revise(elsewhere, displacement)
+        assert not contact.update(elsewhere, displacement)
 
 
 def test_adopted_nodes_are_those_on_the_surface():

@@ -6,7 +6,7 @@
 >>> from us_sim.tissue.contact.active_set import ActiveSet
 >>> contact = ActiveSet(Sphere(0.03), np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), 0.01)
 >>> displacement = np.zeros((2, 3))
->>> contact.revise(Pose(position=[0.0, 0.0, 0.01]), displacement)
+>>> contact.update(Pose(position=[0.0, 0.0, 0.01]), displacement)
 True
 >>> contact.touched, displacement[0]
 (array([ True, False]), array([0.  , 0.  , 0.01]))
@@ -55,21 +55,21 @@ class ActiveSet:
         self._spacing = spacing
         self.touched = np.zeros(len(rest), dtype=bool)  # (C,)
         self.normal = np.zeros((len(rest), 3))  # (C, 3), of the probe at touched nodes
-        self.push = np.zeros(len(rest))  # (C,), N, of the probe along the normal
+        self.normal_force = np.zeros(len(rest))  # (C,) N, along the normal
 
     def clear(self) -> None:
         """Touch nothing."""
         self.touched[:] = False
         self.normal[:] = 0.0
-        self.push[:] = 0.0
+        self.normal_force[:] = 0.0
 
     def adopt(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
         """Take nodes on the probe's surface as touched; a revision lets go the pulled ones."""
         gap, self.normal = self._gap(pose, self._rest + displacement)
         self.touched = gap < _NEAR
-        self.push[:] = 0.0
+        self.normal_force[:] = 0.0
 
-    def revise(
+    def update(
         self,
         pose: Pose | None,
         displacement: NDArray[np.float64],
@@ -93,7 +93,7 @@ class ActiveSet:
             self.clear()
             return changed
         gap, normal = self._gap(pose, self._rest + displacement)
-        touched = self.touched & (self.push >= 0) & np.isfinite(gap)
+        touched = self.touched & (self.normal_force >= 0) & np.isfinite(gap)
         departed = touched & (gap > _CLEARANCE)
         if moved and departed.any():
             rest_gap, _ = push_out(self._collider, pose, self._rest[departed], self._spacing)
@@ -105,12 +105,12 @@ class ActiveSet:
         if not (off.any() or turned.any() or (touched != self.touched).any()):
             return False
         displacement[touched] -= gap[touched, None] * normal[touched]
-        self.push[~touched] = 0.0
+        self.normal_force[~touched] = 0.0
         self.touched = touched
         self.normal = np.where(touched[:, None], normal, 0.0)
         return True
 
-    def consistent(self, pose: Pose | None, displacement: NDArray[np.float64]) -> bool:
+    def is_consistent(self, pose: Pose | None, displacement: NDArray[np.float64]) -> bool:
         """Whether a revision would change nothing."""
         if pose is None:
             return not self.touched.any()
@@ -118,7 +118,7 @@ class ActiveSet:
         return not (
             (gap < -GAP_TOLERANCE).any()
             or (np.abs(gap[self.touched]) > GAP_TOLERANCE).any()
-            or (self.push[self.touched] < 0).any()
+            or (self.normal_force[self.touched] < 0).any()
         )
 
     def normal_at(
@@ -130,9 +130,9 @@ class ActiveSet:
         _, normal = self._gap(pose, self._rest + displacement)
         return np.where(self.touched[:, None], normal, 0.0)
 
-    def weigh(self, force: NDArray[np.float64]) -> None:
+    def set_forces(self, force: NDArray[np.float64]) -> None:
         """Set the push: the part along the normal of the forces (C, 3) N that hold the nodes."""
-        self.push = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
+        self.normal_force = np.where(self.touched, np.einsum("ij,ij->i", force, self.normal), 0.0)
 
     def _margin(self) -> NDArray[np.float64]:
         return np.where(self.touched, _SKIRT * self._spacing, 0.0)

@@ -1,4 +1,4 @@
-"""Frictionless contact as a linear complementarity problem between pushes p and gaps W p + g.
+"""Frictionless contact as a linear complementarity problem between forces p and gaps W p + g.
 
 The linear complementarity problem 0 <= p, W p + g >= 0, p . (W p + g) = 0 is solved exactly by
 principal pivoting: nodes are released by the sign of their force and added by their true gap, all
@@ -8,24 +8,9 @@ Operations Research 21, 1994), and one at a time, the least index first, when it
 cannot cycle (K. G. Murty, Note on a Bard-type scheme for solving the complementarity problem,
 Opsearch 11, 1974).
 
->>> import numpy as np
->>> from us_sim.tissue.contact.complementarity import unilateral
 >>> delassus = np.array([[2.0, 1.0], [1.0, 2.0]])
 >>> unilateral(delassus, np.array([-2.0, 1.0]), np.zeros(2, dtype=bool))
 (array([1., 0.]), array([ True, False]))
-
-The linear answer of touched tissue to a probe that has moved.
-
->>> import numpy as np
->>> from us_sim.tissue.contact.complementarity import predict_forces
->>> compliance = np.eye(6)  # of two nodes that do not know of each other
->>> down = np.array([[0.0, 0.0, 1.0]] * 2)
->>> gap = np.array([-0.5, 0.2])  # the probe has come down onto the first, and off the second
->>> held = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
->>> predict_forces(compliance, gap, down, held, np.zeros(2), 1.0)[:, 2]
-array([ 0.5, -0.2])
->>> predict_forces(compliance, gap, down, held, np.ones(2), 1.0)[:, 2]  # as soft itself
-array([ 0.2 , -0.25])
 """
 
 from __future__ import annotations
@@ -35,7 +20,7 @@ from numpy.typing import NDArray
 
 from us_sim.kernels import njit
 
-_PATIENCE = 5
+_BLOCK_FAILURES = 5
 """Block pivots that may fail to improve before pivots are made one at a time."""
 
 _ROUNDING = 1e-12
@@ -46,7 +31,7 @@ _GIVE = 1e-12
 others have a solution; the gaps change by no larger fraction."""
 
 _SINGLE_PIVOTS = 20  # for each unknown, before relaxation takes over
-_SWEEPS = 2000
+_SWEEPS = 2000  # of relaxation
 
 
 def unilateral(
@@ -55,7 +40,7 @@ def unilateral(
     """Solve 0 <= push, delassus push + gap >= 0, one of the two zero at each node.
 
     Redundant rows are allowed: where pushes are not unique, one solution is returned. Should
-    rounding keep a solution from being recognised, projected Gauss-Seidel takes over from there.
+    pivots become too many, projected Gauss-Seidel takes over from there.
 
     Args:
         delassus: (k, k) m/N, symmetric positive semidefinite, how pushes open gaps.
@@ -111,7 +96,7 @@ def pivot(delassus, gap, push, active):
     index = np.empty(k, dtype=np.int64)
     opened = np.empty(k)
     tolerance = _ROUNDING * np.abs(gap).max()
-    fewest, patience, single = k + 1, _PATIENCE, 0
+    fewest, failures_left, single = k + 1, _BLOCK_FAILURES, 0
     while single <= _SINGLE_PIVOTS * k:
         count = np.int64(0)  # a literal would have the callees compiled for it, too
         for i in range(k):
@@ -138,10 +123,10 @@ def pivot(delassus, gap, push, active):
                 active[i] = push[i] > 0.0
             return
         if wrong < fewest:
-            fewest, patience = wrong, _PATIENCE
+            fewest, failures_left = wrong, _BLOCK_FAILURES
         else:
-            patience -= 1
-        if patience > 0:
+            failures_left -= 1
+        if failures_left > 0:
             for i in range(k):
                 if push[i] < -_ROUNDING * heaviest if active[i] else opened[i] < -tolerance:
                     active[i] = not active[i]
@@ -197,6 +182,13 @@ def predict_forces(
     reach: float,
 ) -> NDArray[np.float64]:
     """How the contact forces change, so that linear tissue obeys the law of contact again.
+
+    >>> compliance = np.eye(6)  # of two nodes that do not know of each other
+    >>> down = np.array([[0.0, 0.0, 1.0]] * 2)
+    >>> gap = np.array([-0.5, 0.2])  # the probe has come down onto the first, and off the second
+    >>> held = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
+    >>> predict_forces(compliance, gap, down, held, np.ones(2), 1.0)[:, 2]  # as soft itself
+    array([ 0.2 , -0.25])
 
     Args:
         compliance: (3C, 3C) m/N of the nodes that the probe can touch.

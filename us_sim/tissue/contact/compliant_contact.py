@@ -1,46 +1,23 @@
-"""A probe without friction on an elastic surface of known compliance, solved to rounding.
+"""A probe on an elastic surface of known compliance, solved to rounding.
 
-Newton's method: at every round the probe is replaced by its tangent planes where the nodes now are,
-the linear complementarity problem between pushes and gaps is solved exactly, and the nodes are
-moved. On a curved probe the planes turn with them, which Anderson's mixing of the last rounds
-takes into account (D. G. Anderson, Iterative procedures for nonlinear integral equations, J. ACM
-12, 1965), so that a few rounds bring the gaps below a nanometre.
+Without friction by Newton's method: at every round the probe is replaced by its tangent planes
+where the nodes now are, the linear complementarity problem between forces and gaps is solved
+exactly, and the nodes are moved. On a curved probe the planes turn with them, which Anderson's
+mixing of the last rounds takes into account (D. G. Anderson, Iterative procedures for nonlinear
+integral equations, J. ACM 12, 1965), so that a few rounds bring the gaps below a nanometre.
 
->>> import numpy as np
+With friction a touched node stays where it is on the probe as long as its force is in the friction
+cone; beyond, it slips, and the force along the surface is the coefficient times the normal force,
+against the slip. Each node in turn gets the force that satisfies this while the others hold theirs,
+until nothing changes any more (nonlinear Gauss-Seidel: M. Jean, The non-smooth contact dynamics
+method, Comput. Methods Appl. Mech. Eng. 177, 1999); around it the tangent planes are renewed.
+
 >>> from us_sim.geometry.collider import Sphere
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.compliant_contact import CompliantContact
->>> rest = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
->>> springs = np.eye(6) / 50.0  # m/N, each node on springs of its own
->>> contact = CompliantContact(Sphere(0.03), rest, 0.02, springs)
->>> contact.press(Pose(position=[0.0, 0.0, 0.01]))
-True
->>> bool(abs(contact.forces[0, 2] - 0.5) < 1e-9)  # N, 10 mm on 50 N/m
-True
-
-What may hold between probe and tissue along the surface, as solvers' settings name it.
-
->>> from us_sim.tissue.contact.compliant_contact import COEFFICIENT, CONTACTS
->>> CONTACTS, COEFFICIENT.parse(0.07)
-(('frictionless', 'coulomb', 'sticking'), 0.07)
-
-A probe with friction on an elastic surface of known compliance: Coulomb's law, or sticking.
-
-A touched node stays where it is on the probe as long as its force is in the friction cone; beyond,
-it slips, and the force along the surface is the coefficient times the push, against the slip. Each
-node in turn gets the force that satisfies this while the others hold theirs, until nothing changes
-any more (nonlinear Gauss-Seidel: M. Jean, The non-smooth contact dynamics method, Comput. Methods
-Appl. Mech. Eng. 177, 1999); around it, as without friction, the probe's tangent planes are renewed.
-
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.compliant_contact import FrictionalContact
 >>> springs = np.eye(3) / 50.0  # m/N, one node
 >>> contact = FrictionalContact(Sphere(0.03), np.zeros((1, 3)), 0.02, springs, 0.5)
 >>> contact.press(Pose(position=[0.0, 0.0, 0.01])), contact.press(Pose([0.001, 0.0, 0.01]))
 (True, True)
->>> contact.forces.round(3)  # dragged along by 1 mm
+>>> contact.forces.round(3)  # 10 mm on 50 N/m, dragged along by 1 mm
 array([[0.05, 0.  , 0.5 ]])
 """
 
@@ -50,14 +27,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import turned, turned_back
+from us_sim.geometry.collider_distance import rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.tissue.contact.complementarity import pivot, solve_active
 from us_sim.tissue.contact.probe_gap import only_forward, pushing_gap
 
-CLOSED = 1e-9
+CONTACTS = ("frictionless", "coulomb", "sticking")
+
+COEFFICIENT = Quantity("number", 1e-9, 10.0)
+"""Coulomb's: the greatest force along the surface over the normal force."""
+
+_CLOSED = 1e-9
 """A gap up to this is closed, and so is one of a node this deep in the probe, m."""
 
 _MIXED, _ROUNDS = 30, 250
@@ -78,10 +60,22 @@ _SLIDING = 1e-7
 """The normals have converged when the force along the surface over the contact force is below
 this."""
 
-SKIRT = 0.25
+_SKIRT = 0.25
 """Fraction of the spacing by which a pushed node must be beside the probe to be let go; it grows
 each time that the node comes back. A node at the rim that is pressed down moves sideways; let go at
 once, it would come up, get under the probe again, and so on without end."""
+
+_FRICTION_ROUNDS, _SWEEPS = 30, 100
+"""Renewals of the tangent planes with friction, and sweeps over the nodes in each."""
+
+_STILL = 2e-11
+"""Sweeps go on until no node moves by more, m."""
+
+_LOCAL_STEPS = 10
+"""Steps towards a node's force when its turn comes."""
+
+_TURN = 1e-8
+"""A normal that turns by less (rad) has converged."""
 
 
 class CompliantContact:
@@ -130,7 +124,7 @@ class CompliantContact:
         """
         gap = self._gaps(pose)
         self.near = (gap < _NEAR * self._spacing) | self.forces.any(axis=1)
-        return self._solve(pose)
+        return self.solve(pose)
 
     def overlooked(self, pose: Pose, displacement: NDArray[np.float64]) -> bool:
         """Whether nodes that the last press did not consider are in the probe.
@@ -140,20 +134,16 @@ class CompliantContact:
             displacement: (S, 3) m, of all nodes under the forces found.
         """
         self.displacement[~self.near] = displacement[~self.near]
-        entered = (self._gaps(pose) < -CLOSED) & ~self.near
+        entered = (self._gaps(pose) < -_CLOSED) & ~self.near
         self.near |= entered
         return bool(entered.any())
-
-    def press_again(self, pose: Pose) -> bool:
-        """As `press`, with the nodes that `overlooked` found."""
-        return self._solve(pose)
 
     def _gaps(self, pose: Pose) -> NDArray[np.float64]:
         gap = np.empty(len(self._rest))
         normal = np.empty_like(self._rest)
-        skirt = np.where(self.forces.any(axis=1), SKIRT * self._spacing, 0.0)
+        skirt = np.where(self.forces.any(axis=1), _SKIRT * self._spacing, 0.0)
         everyone = np.arange(len(self._rest))
-        gaps(
+        _gaps_of(
             self._box,
             self._forward,
             pose.rotation,
@@ -167,7 +157,8 @@ class CompliantContact:
         )
         return gap
 
-    def _solve(self, pose: Pose) -> bool:
+    def solve(self, pose: Pose) -> bool:
+        """As `press`, with the nodes that `overlooked` found besides."""
         near = np.flatnonzero(self.near)
         displacement = self.displacement[near]
         forces = self.forces[near]
@@ -187,210 +178,6 @@ class CompliantContact:
         self.forces[near] = forces
         self.displacement[near] = displacement
         return bool(converged)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather(compliance, near):
-    """(3k, 3k) m/N, the compliance between the nodes ``near`` (k,)."""
-    k = len(near)
-    block = np.empty((3 * k, 3 * k))
-    for m in range(k):
-        for axis in range(3):
-            row = compliance[3 * near[m] + axis]
-            for n in range(k):
-                for other in range(3):
-                    block[3 * m + axis, 3 * n + other] = row[3 * near[n] + other]
-    return block
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def gaps(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
-    """Fills gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
-    r = rotation
-    for m in range(len(index)):
-        i = index[m]
-        a = rest[i, 0] + displacement[m, 0] - origin[0]
-        b = rest[i, 1] + displacement[m, 1] - origin[1]
-        c = rest[i, 2] + displacement[m, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
-        g, nx, ny, nz = pushing_gap(box, forward, skirt[m], x, y, z)
-        gap[m] = g
-        normal[m, 0], normal[m, 1], normal[m, 2] = turned(r, nx, ny, nz)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, displacement, forces):
-    """Revises displacement (k, 3) and forces (k, 3) of the nodes ``near``.
-
-    Returns whether it converged, and the norm of the forces along the surface.
-    """
-    k = len(near)
-    block = gather(compliance, near)
-    gap, normal = np.empty(k), np.empty((k, 3))
-    active, was = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
-    joined, skirt = np.zeros(k, np.int64), np.zeros(k)
-    for m in range(k):
-        if forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0:
-            active[m] = True
-            joined[m] = 1
-            skirt[m] = SKIRT * spacing
-    point = displacement.copy()  # where the planes touch the probe
-    step, last_step = np.empty((k, 3)), np.empty((k, 3))
-    last_point = np.empty((k, 3))
-    points, steps = np.empty((_MEMORY, k, 3)), np.empty((_MEMORY, k, 3))
-    remembered = 0
-    converged, sliding = False, 0.0
-    for iteration in range(_ROUNDS):
-        gaps(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
-        for m in range(k):
-            was[m] = active[m]
-        _push(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
-        same = iteration > 0
-        for m in range(k):
-            if active[m] != was[m]:
-                same = False
-                if active[m]:
-                    joined[m] += 1
-                    skirt[m] = SKIRT * joined[m] * spacing
-        yielded(block, active, forces, displacement)
-        for m in range(k):
-            for axis in range(3):
-                step[m, axis] = displacement[m, axis] - point[m, axis]
-        gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
-        converged, sliding = _check(gap, normal, active, forces)
-        if converged or iteration == _ROUNDS - 1:
-            break
-        if same:
-            slot = remembered % _MEMORY
-            for m in range(k):
-                for axis in range(3):
-                    points[slot, m, axis] = point[m, axis] - last_point[m, axis]
-                    steps[slot, m, axis] = step[m, axis] - last_step[m, axis]
-            remembered += 1
-        else:
-            remembered = 0
-        if iteration >= _MIXED:
-            point += _SHORT * step
-            continue
-        for m in range(k):
-            for axis in range(3):
-                last_point[m, axis] = point[m, axis]
-                last_step[m, axis] = step[m, axis]
-        _mix(active, step, points, steps, min(remembered, _MEMORY), point)
-    return converged, sliding
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _push(block, point, gap, normal, limit, first, active, forces):
-    """Fills active (k,), which comes in as a guess, and forces (k, 3), with the planes of the probe
-    at point (k, 3) displaced nodes, where their gap is (k,) and its normal (k, 3).
-    """
-    k = len(gap)
-    chosen = np.flatnonzero((gap < limit) | (active & np.isfinite(gap)))
-    count = len(chosen)
-    delassus = np.empty((count, count))
-    offset, push, guess = np.empty(count), np.zeros(count), np.empty(count, np.bool_)
-    for p in range(count):
-        m = chosen[p]
-        x, y, z = normal[m, 0], normal[m, 1], normal[m, 2]
-        offset[p] = gap[m] - (x * point[m, 0] + y * point[m, 1] + z * point[m, 2])
-        guess[p] = active[m] or (first and gap[m] < 0.0)
-        a, b, c = block[3 * m], block[3 * m + 1], block[3 * m + 2]
-        for q in range(p + 1):
-            n = chosen[q]
-            value = 0.0
-            for axis in range(3):
-                j = 3 * n + axis
-                value += (x * a[j] + y * b[j] + z * c[j]) * normal[n, axis]
-            delassus[p, q] = value
-            delassus[q, p] = value
-    if count > 0:
-        pivot(delassus, offset, push, guess)
-    for m in range(k):
-        active[m] = False
-        forces[m, 0] = forces[m, 1] = forces[m, 2] = 0.0
-    for p in range(count):
-        m = chosen[p]
-        active[m] = push[p] > 0.0
-        for axis in range(3):
-            forces[m, axis] = push[p] * normal[m, axis]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def yielded(block, active, forces, displacement):
-    """Fills displacement (k, 3) that forces (k, 3) at active nodes cause."""
-    load = np.zeros(len(block))
-    for m in np.flatnonzero(active):
-        for axis in range(3):
-            load[3 * m + axis] = forces[m, axis]
-    for i in range(len(block)):
-        row = block[i]
-        value = 0.0
-        for j in range(len(load)):  # reading zeros in line is faster than skipping them
-            value += row[j] * load[j]
-        displacement[i // 3, i % 3] = value
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _check(gap, normal, active, forces):
-    """Whether gaps and normals have converged, and the norm of the forces along the surface."""
-    fits = True
-    load, sliding = 0.0, 0.0
-    for m in range(len(gap)):
-        if not active[m]:
-            fits &= gap[m] >= -CLOSED
-            continue
-        fits &= abs(gap[m]) <= CLOSED
-        along = 0.0
-        for axis in range(3):
-            along += forces[m, axis] * normal[m, axis]
-        for axis in range(3):
-            load += forces[m, axis] ** 2
-            sliding += (forces[m, axis] - along * normal[m, axis]) ** 2
-    return fits and sliding <= _SLIDING**2 * load, np.sqrt(sliding)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _mix(active, step, points, steps, count, point):
-    """Anderson's mixing: moves point (k, 3) by its step less the part the last changes explain."""
-    gram = np.zeros((count, count))
-    weight = np.zeros(count)
-    for m in range(len(active)):
-        if active[m]:
-            for axis in range(3):
-                for a in range(count):
-                    weight[a] += steps[a, m, axis] * step[m, axis]
-                    for b in range(count):
-                        gram[a, b] += steps[a, m, axis] * steps[b, m, axis]
-    everyone = np.arange(count)
-    coefficient = np.zeros(count)
-    if count > 0:
-        solve_active(gram, weight, everyone, count, np.empty((count, count)), coefficient)
-    for m in range(len(active)):
-        for axis in range(3):
-            value = step[m, axis]
-            for a in range(count):
-                value -= coefficient[a] * (points[a, m, axis] + steps[a, m, axis])
-            point[m, axis] += value
-
-
-CONTACTS = ("frictionless", "coulomb", "sticking")
-
-COEFFICIENT = Quantity("number", 1e-9, 10.0)
-"""Coulomb's: the greatest force along the surface over the push."""
-
-
-_FRICTION_ROUNDS = 30
-_SWEEPS = 100
-
-_STILL = 2e-11
-"""Sweeps go on until no node moves by more, m."""
-
-_LOCAL_STEPS = 10
-"""Steps towards a node's force when its turn comes."""
-
-_TURN = 1e-8
-"""A normal that turns by less (rad) has converged."""
 
 
 class FrictionalContact(CompliantContact):
@@ -426,7 +213,8 @@ class FrictionalContact(CompliantContact):
         self._anchor, self._anchored = self._next
         return super().press(pose)
 
-    def _solve(self, pose: Pose) -> bool:
+    def solve(self, pose: Pose) -> bool:
+        """As `press`, with the nodes that `overlooked` found besides."""
         near = np.flatnonzero(self.near)
         rest = self._rest[near]
         displacement = self.displacement[near]
@@ -440,7 +228,7 @@ class FrictionalContact(CompliantContact):
             np.array(pose.position),
             self._rest,
             self._spacing,
-            gather(self._compliance, near),
+            _gather(self._compliance, near),
             near,
             self._friction,
             anchored,
@@ -459,6 +247,191 @@ class FrictionalContact(CompliantContact):
         held[near[pushed]] = True
         self._next = (anchor, held)
         return bool(converged)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather(compliance, near):
+    """(3k, 3k) m/N, the compliance between the nodes ``near`` (k,)."""
+    k = len(near)
+    block = np.empty((3 * k, 3 * k))
+    for m in range(k):
+        for axis in range(3):
+            row = compliance[3 * near[m] + axis]
+            for n in range(k):
+                for other in range(3):
+                    block[3 * m + axis, 3 * n + other] = row[3 * near[n] + other]
+    return block
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gaps_of(box, forward, rotation, origin, rest, index, displacement, skirt, gap, normal):
+    """Fills gap (k,) and normal (k, 3) of the nodes ``index`` of rest, displaced by (k, 3)."""
+    r = rotation
+    for m in range(len(index)):
+        i = index[m]
+        a = rest[i, 0] + displacement[m, 0] - origin[0]
+        b = rest[i, 1] + displacement[m, 1] - origin[1]
+        c = rest[i, 2] + displacement[m, 2] - origin[2]
+        x, y, z = rotate_back(r, a, b, c)
+        g, nx, ny, nz = pushing_gap(box, forward, skirt[m], x, y, z)
+        gap[m] = g
+        normal[m, 0], normal[m, 1], normal[m, 2] = rotate(r, nx, ny, nz)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _newton(box, forward, rotation, origin, rest, spacing, compliance, near, displacement, forces):
+    """Revises displacement (k, 3) and forces (k, 3) of the nodes ``near``.
+
+    Returns whether it converged, and the norm of the forces along the surface.
+    """
+    k = len(near)
+    block = _gather(compliance, near)
+    gap, normal = np.empty(k), np.empty((k, 3))
+    active, was = np.zeros(k, np.bool_), np.zeros(k, np.bool_)
+    joined, skirt = np.zeros(k, np.int64), np.zeros(k)
+    for m in range(k):
+        if forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0:
+            active[m] = True
+            joined[m] = 1
+            skirt[m] = _SKIRT * spacing
+    point = displacement.copy()  # where the planes touch the probe
+    step, last_step = np.empty((k, 3)), np.empty((k, 3))
+    last_point = np.empty((k, 3))
+    points, steps = np.empty((_MEMORY, k, 3)), np.empty((_MEMORY, k, 3))
+    remembered = 0
+    converged, sliding = False, 0.0
+    for iteration in range(_ROUNDS):
+        _gaps_of(box, forward, rotation, origin, rest, near, point, skirt, gap, normal)
+        for m in range(k):
+            was[m] = active[m]
+        _solve_planes(block, point, gap, normal, _AHEAD * spacing, iteration == 0, active, forces)
+        same = iteration > 0
+        for m in range(k):
+            if active[m] != was[m]:
+                same = False
+                if active[m]:
+                    joined[m] += 1
+                    skirt[m] = _SKIRT * joined[m] * spacing
+        _displace(block, active, forces, displacement)
+        for m in range(k):
+            for axis in range(3):
+                step[m, axis] = displacement[m, axis] - point[m, axis]
+        _gaps_of(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
+        converged, sliding = _check(gap, normal, active, forces)
+        if converged or iteration == _ROUNDS - 1:
+            break
+        if same:
+            slot = remembered % _MEMORY
+            for m in range(k):
+                for axis in range(3):
+                    points[slot, m, axis] = point[m, axis] - last_point[m, axis]
+                    steps[slot, m, axis] = step[m, axis] - last_step[m, axis]
+            remembered += 1
+        else:
+            remembered = 0
+        if iteration >= _MIXED:
+            point += _SHORT * step
+            continue
+        for m in range(k):
+            for axis in range(3):
+                last_point[m, axis] = point[m, axis]
+                last_step[m, axis] = step[m, axis]
+        _mix(active, step, points, steps, min(remembered, _MEMORY), point)
+    return converged, sliding
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _solve_planes(block, point, gap, normal, limit, first, active, forces):
+    """Fills active (k,), which comes in as a guess, and forces (k, 3), with the planes of the probe
+    at point (k, 3) displaced nodes, where their gap is (k,) and its normal (k, 3).
+    """
+    k = len(gap)
+    chosen = np.flatnonzero((gap < limit) | (active & np.isfinite(gap)))
+    count = len(chosen)
+    delassus = np.empty((count, count))
+    offset, push, guess = np.empty(count), np.zeros(count), np.empty(count, np.bool_)
+    for p in range(count):
+        m = chosen[p]
+        x, y, z = normal[m, 0], normal[m, 1], normal[m, 2]
+        offset[p] = gap[m] - (x * point[m, 0] + y * point[m, 1] + z * point[m, 2])
+        guess[p] = active[m] or (first and gap[m] < 0.0)
+        a, b, c = block[3 * m], block[3 * m + 1], block[3 * m + 2]
+        for q in range(p + 1):
+            n = chosen[q]
+            value = 0.0
+            for axis in range(3):
+                j = 3 * n + axis
+                value += (x * a[j] + y * b[j] + z * c[j]) * normal[n, axis]
+            delassus[p, q] = value
+            delassus[q, p] = value
+    if count > 0:
+        pivot(delassus, offset, push, guess)
+    for m in range(k):
+        active[m] = False
+        forces[m, 0] = forces[m, 1] = forces[m, 2] = 0.0
+    for p in range(count):
+        m = chosen[p]
+        active[m] = push[p] > 0.0
+        for axis in range(3):
+            forces[m, axis] = push[p] * normal[m, axis]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _displace(block, active, forces, displacement):
+    """Fills displacement (k, 3) that forces (k, 3) at active nodes cause."""
+    load = np.zeros(len(block))
+    for m in np.flatnonzero(active):
+        for axis in range(3):
+            load[3 * m + axis] = forces[m, axis]
+    for i in range(len(block)):
+        row = block[i]
+        value = 0.0
+        for j in range(len(load)):  # reading zeros in line is faster than skipping them
+            value += row[j] * load[j]
+        displacement[i // 3, i % 3] = value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _check(gap, normal, active, forces):
+    """Whether gaps and normals have converged, and the norm of the forces along the surface."""
+    fits = True
+    load, sliding = 0.0, 0.0
+    for m in range(len(gap)):
+        if not active[m]:
+            fits &= gap[m] >= -_CLOSED
+            continue
+        fits &= abs(gap[m]) <= _CLOSED
+        along = 0.0
+        for axis in range(3):
+            along += forces[m, axis] * normal[m, axis]
+        for axis in range(3):
+            load += forces[m, axis] ** 2
+            sliding += (forces[m, axis] - along * normal[m, axis]) ** 2
+    return fits and sliding <= _SLIDING**2 * load, np.sqrt(sliding)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mix(active, step, points, steps, count, point):
+    """Anderson's mixing: moves point (k, 3) by its step less the part the last changes explain."""
+    gram = np.zeros((count, count))
+    weight = np.zeros(count)
+    for m in range(len(active)):
+        if active[m]:
+            for axis in range(3):
+                for a in range(count):
+                    weight[a] += steps[a, m, axis] * step[m, axis]
+                    for b in range(count):
+                        gram[a, b] += steps[a, m, axis] * steps[b, m, axis]
+    everyone = np.arange(count)
+    coefficient = np.zeros(count)
+    if count > 0:
+        solve_active(gram, weight, everyone, count, np.empty((count, count)), coefficient)
+    for m in range(len(active)):
+        for axis in range(3):
+            value = step[m, axis]
+            for a in range(count):
+                value -= coefficient[a] * (points[a, m, axis] + steps[a, m, axis])
+            point[m, axis] += value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -497,18 +470,18 @@ def _coulomb(
         load = 0.0
         for m in range(k):
             pushed = forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0
-            skirt[m] = SKIRT * spacing if pushed else skirt[m]
+            skirt[m] = _SKIRT * spacing if pushed else skirt[m]
             load += pushed
-        gaps(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
+        _gaps_of(box, forward, rotation, origin, rest, near, displacement, skirt, gap, normal)
         turn, fits = 0.0, iteration > 0
         for m in range(k):
             pushed = forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0
             if pushed:
-                fits &= abs(gap[m]) <= CLOSED
+                fits &= abs(gap[m]) <= _CLOSED
                 for axis in range(3):
                     turn = max(turn, abs(normal[m, axis] - last[m, axis]))
             else:
-                fits &= gap[m] >= -CLOSED
+                fits &= gap[m] >= -_CLOSED
         converged = fits and turn <= _TURN and unsettled == 0.0
         if converged:
             break
@@ -530,7 +503,7 @@ def _coulomb(
         active = np.zeros(k, np.bool_)
         for m in range(k):
             active[m] = forces[m, 0] != 0.0 or forces[m, 1] != 0.0 or forces[m, 2] != 0.0
-        yielded(block, active, forces, displacement)
+        _displace(block, active, forces, displacement)
     return converged, slips, unsettled
 
 

@@ -1,31 +1,10 @@
-"""The gap between nodes and the probe, and the direction in which the probe pushes them.
+"""The gap between points and the probe, and the direction in which the probe pushes them.
 
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.probe_gap import push_out
+>>> from us_sim.geometry.collider import RoundedBox, Sphere
 >>> pressed = Pose(position=[0.0, 0.0, 0.01])
 >>> gap, normal = push_out(Sphere(0.03), pressed, np.zeros((1, 3)), spacing=0.01)
 >>> gap.round(3), normal
 (array([-0.01]), array([[0., 0., 1.]]))
-
-The shape with which a probe presses a surface that is coarser than the probe's edges.
-
-It is the collider, with a front that is the collider's own, and flanks that lean outward behind it,
-at 60 degrees to the face, until they are a little wider than the collider; from there they go
-straight back. A surface whose nodes are farther apart than the rounding of an edge cannot lie along
-upright flanks: it would be swallowed by the edge. A collider whose rounding the nodes resolve keeps
-its own flanks.
-
-The shape is convex, so that its signed distance is a convex function; so a spring along it has an
-energy (S. Boyd and L. Vandenberghe, Convex Optimization, 2004, section 8.1). Outside the core the
-distance has a continuous slope, but for the four edges where two leaning flanks meet: there the
-normal turns by 29 degrees at once.
-
->>> import numpy as np
->>> from us_sim.geometry.collider import RoundedBox
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.contact.probe_gap import FlaredProbe
 >>> probe = FlaredProbe(RoundedBox(0.04, 0.014, 0.03, 0.004), spacing=0.006)
 >>> gap, normal = probe.distance(Pose(), np.array([[0.0, 0.0, -0.001], [0.022, 0.0, -0.005]]))
 >>> gap.round(6), normal.round(3)
@@ -41,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import curved_box_distance, turned, turned_back
+from us_sim.geometry.collider_distance import curved_box_distance, rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 
@@ -51,6 +30,19 @@ GAP_TOLERANCE = 1e-5
 _GRIP = 0.1
 """Length by which a collider continues behind the face, m, as where a hand holds the probe. Nodes
 cannot slip past it there, and are found in it even after a jump beyond the collider's thickness."""
+
+_LEAN = math.radians(60)
+"""Angle of the leaning flanks to the face."""
+
+_FLARE = 0.6
+"""How much wider than the collider the flanks become at each side, over the nodes' spacing."""
+
+_RESOLVED = 2.0
+"""Rounding, over the nodes' spacing, from which on they resolve it."""
+
+_CLOSE = 1e-6  # m, from the surface, where a point that is traced to it has arrived
+
+_TRACED = 400  # steps on a point's way in; a grazing one takes many
 
 
 def only_forward(collider: Collider, spacing: float) -> bool:
@@ -208,33 +200,25 @@ def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
         gap[i] = g
-        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)
-
-
-_LEAN = math.radians(60)
-"""Angle of the leaning flanks to the face."""
-
-_FLARE = 0.6
-"""How much wider than the collider the flanks become at each side, over the nodes' spacing."""
-
-_RESOLVED = 2.0
-"""Rounding, over the nodes' spacing, from which on they resolve it."""
-
-_FLARED_GRIP = 0.1
-"""Length by which the shape continues behind the collider, m, as where a hand holds the probe."""
-
-_REACH = 1.0
-"""Gap of points that may come to touch, over what is deep and the nodes' spacing together."""
-
-_CLOSE = 1e-6  # m
-_TRACED = 400  # steps of a point's way in, of which a grazing one takes many
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
 
 
 class FlaredProbe:
-    """The shape, and how far points are from it.
+    """The shape with which a probe presses a surface that is coarser than the probe's edges.
+
+    It is the collider, with a front that is the collider's own, and flanks that lean outward behind
+    it, at 60 degrees to the face, until they are a little wider than the collider; from there they
+    go straight back. A surface whose nodes are farther apart than the rounding of an edge cannot
+    lie along upright flanks: it would be swallowed by the edge. A collider whose rounding the nodes
+    resolve keeps its own flanks.
+
+    The shape is convex, so that its signed distance is a convex function; so a spring along it has
+    an energy (S. Boyd and L. Vandenberghe, Convex Optimization, 2004, section 8.1). Outside the
+    core the distance has a continuous slope, but for the four edges where two leaning flanks meet:
+    there the normal turns by 29 degrees at once.
 
     Args:
         collider: the probe's shape.
@@ -247,13 +231,13 @@ class FlaredProbe:
         if box[3] >= _RESOLVED * spacing:
             lean, flare = math.pi / 2, 0.0
         bent = box[4] if len(box) > 4 else 0.0
-        length = 2 * box[2] + _FLARED_GRIP
+        length = 2 * box[2] + _GRIP
         cosine = math.cos(lean) if flare > 0.0 else 0.0
         self._shape = np.array([*box[:2], length, box[3], bent, math.sin(lean), cosine, flare])
         #: m, half of the smallest half width: deeper, the nearest surface may be the wrong one.
         self.deep = 0.5 * (float(box[:2].min()) + float(box[3]))
         #: m, gap up to which a point may come to touch while the probe stays where it is.
-        self.reach = _REACH * (self.deep + spacing)
+        self.reach = self.deep + spacing
 
     def distance(
         self, pose: Pose, points: NDArray[np.float64], near: NDArray[np.integer] | None = None
@@ -263,7 +247,7 @@ class FlaredProbe:
         Args:
             pose: of the probe in the points' frame.
             points: (P, 3) m.
-            near: numbers of the points to look at; all others are infinitely far.
+            near: indices of the points that are measured; all others are infinitely far.
 
         Returns:
             (P,) m, negative inside, infinite behind the shape, and (P, 3).
@@ -378,9 +362,9 @@ def _distances(shape, r, origin, points, near, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         gap[i], nx, ny, nz = _distance(shape, x, y, z)
-        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,28 +1,16 @@
 """Points spread over the surface that a probe can touch, and what they share with its nodes.
 
-They are in the middles of the triangles' parts (`us_sim.geometry.triangles`) and at the nodes.
-A node that the probe can touch, but no triangle's, is a point by itself.
+They are in the middles of the triangles' parts (`TriangleParts`) and at the nodes. A node that the
+probe can touch, but no triangle's, is a point by itself.
 
->>> import numpy as np
->>> from us_sim.tissue.contact.surface_points import SurfacePoints
 >>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.block((0.1, 0.1, 0.1), (2, 2, 2))
->>> points = SurfacePoints(model, size=0.08)
+>>> points = SurfacePoints(TissueModel.block((0.1, 0.1, 0.1), (2, 2, 2)), size=0.08)
 >>> len(points.rest), float(points.spread(np.ones(8)).sum())  # of the top's four nodes
 (12, 4.0)
 >>> sunk = np.zeros((3, 8))
 >>> sunk[2] = 0.01
 >>> points.moved(sunk)[0]
 array([0.  , 0.  , 0.01])
-
-The springs between a tissue's surface and a probe: where they are, and how firm.
-
->>> from us_sim.tissue.contact.surface_points import surface_contact
->>> from us_sim.tissue.model import TissueModel
->>> model = TissueModel.block()
->>> points, contact = surface_contact(model)
->>> len(points.rest), len(contact.gap)
-(236, 236)
 """
 
 from __future__ import annotations
@@ -38,7 +26,7 @@ from us_sim.kernels import njit
 from us_sim.tissue.contact.penalty_contact import PenaltyContact, PenaltyFriction
 from us_sim.tissue.contact.probe_gap import FlaredProbe
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
-from us_sim.tissue.elasticity.neo_hookean_material import withstood_force
+from us_sim.tissue.elasticity.neo_hookean_material import barrier_strength
 from us_sim.tissue.model import TissueModel
 
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
@@ -55,6 +43,36 @@ this proportion to one in the middle, what changes with the square of the place 
 
 _WEAK = 0.2
 """A spring at a node that is weaker than this part of all there is left out."""
+
+_FIRMNESS = 30.0
+"""Stiffness of the springs of a node, over the shear stiffness of the tissue there. The softer, the
+deeper the probe sinks in; the firmer, the worse conditioned the equations, and the more a surface
+counts that is flat where it should be bent. From 25 to 40 nodes are nearest to a fine mesh's."""
+
+_STIFFENING = 0.2
+"""Depth at which a spring pushes twice as much as if it were linear, over the nodes' spacing."""
+
+_GREATEST_FORCE = 25.0
+"""Greatest force of a node's springs, over `barrier_strength` there: less than what a crushed
+tetrahedron resists, so that no probe turns one inside out."""
+
+
+def surface_contact(
+    model: TissueModel, friction: float = 0.0
+) -> tuple[SurfacePoints, PenaltyContact]:
+    """Points on the surface of a tissue, and the contact at these.
+
+    Args:
+        model: of the tissue and the probe.
+        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
+    """
+    # A lone node has no neighbour to be apart from.
+    spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
+    points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
+    stiffness = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
+    greatest = _GREATEST_FORCE * points.spread(barrier_strength(model.mesh, model.materials))
+    law = (FlaredProbe(model.collider, spacing), stiffness, greatest, _STIFFENING * spacing)
+    return points, PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)
 
 
 class SurfacePoints:
@@ -308,34 +326,3 @@ def add_turns(nodes, weights, turn, change, image):
             image[d, i] += weights[p, 0] * force
             image[d, j] += weights[p, 1] * force
             image[d, k] += weights[p, 2] * force
-
-
-_FIRMNESS = 30.0
-"""Stiffness of the springs of a node, over the shear stiffness of the tissue there. The softer, the
-deeper the probe sinks in; the firmer, the worse conditioned the equations, and the more a surface
-counts that is flat where it should be bent. From 25 to 40 nodes are nearest to a fine mesh's."""
-
-_STIFFENING = 0.2
-"""Depth at which a spring pushes twice as much as if it were linear, over the nodes' spacing."""
-
-_GREATEST_PUSH = 25.0
-"""Greatest force of a node's springs, over `withstood_force` there: less than what a crushed
-tetrahedron resists, so that no probe turns one inside out."""
-
-
-def surface_contact(
-    model: TissueModel, friction: float = 0.0
-) -> tuple[SurfacePoints, PenaltyContact]:
-    """Points on the surface of a tissue, and the contact at these.
-
-    Args:
-        model: of the tissue and the probe.
-        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
-    """
-    # A lone node has no neighbour to be apart from.
-    spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
-    points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
-    firm = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
-    strongest = _GREATEST_PUSH * points.spread(withstood_force(model.mesh, model.materials))
-    law = (FlaredProbe(model.collider, spacing), firm, strongest, _STIFFENING * spacing)
-    return points, PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)

@@ -19,7 +19,6 @@ displacement, and only the surface is solved to rounding.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -40,7 +39,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
 from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
 from us_sim.tissue.linear_algebra.compliance import DenseFields, surface_compliance
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
-from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver
+from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver
 
 _ROUNDING = 1e-8
 """Rounding error of full fields, over the force, above which it is measured in every frame: where
@@ -96,7 +95,7 @@ class Fem(TissueSolver):
         self,
         model: TissueModel,
         settings: FemSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         settings = settings or FemSettings()
         self._compliance = surface_compliance(model, progress)
@@ -156,7 +155,7 @@ class Fem(TissueSolver):
             for _ in range(_EXTENSIONS):
                 if not contact.overlooked(pose, displacement[self._reached]):
                     break
-                solved = contact.press_again(pose)
+                solved = contact.solve(pose)
                 displacement = compliance.field(contact.forces)
             else:
                 solved = False

@@ -18,7 +18,6 @@ D. Baraff and A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, section
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -35,6 +34,7 @@ from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,
+    Progress,
     SolverSettings,
     TissueSolver,
     same_pose,
@@ -89,7 +89,7 @@ class FemCg(TissueSolver):
         self,
         model: TissueModel,
         settings: FemCgSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         require_held(model.mesh, model.fixed)
         settings = settings or FemCgSettings()
@@ -149,7 +149,7 @@ class FemCg(TissueSolver):
     def _advance(self, pose: Pose | None) -> Deformation:
         contact, displacement = self._contact, self._displacement
         untouched = self._settled and not contact.touched.any()
-        if untouched and contact.consistent(pose, displacement[self._touchable]):
+        if untouched and contact.is_consistent(pose, displacement[self._touchable]):
             return self._resting()
         if self._taken_over and pose is not None:
             contact.adopt(pose, displacement[self._touchable])
@@ -160,7 +160,7 @@ class FemCg(TissueSolver):
             surface = displacement[self._touchable]
             enough = 0.5 * self._tolerance * self._reference
             exactly = self._norm <= max(self._refine_at, enough)
-            if contact.revise(pose, surface, exactly=exactly, moved=round_number == 0 and moved):
+            if contact.update(pose, surface, exactly=exactly, moved=round_number == 0 and moved):
                 displacement[self._touchable] = surface
                 self._renew_equations()
             anew = self._slope < 0.0
@@ -180,8 +180,8 @@ class FemCg(TissueSolver):
             )
             if anew:
                 self._refine_at = _REFINEMENT * before
-            contact.weigh(product_rows(*self._matrix, displacement, self._touchable))
-            load = float(np.linalg.norm(np.maximum(contact.push, 0.0)))
+            contact.set_forces(product_rows(*self._matrix, displacement, self._touchable))
+            load = float(np.linalg.norm(np.maximum(contact.normal_force, 0.0)))
             self._reference = load or self._heaviest
         return self._outcome(pose)
 
@@ -201,7 +201,7 @@ class FemCg(TissueSolver):
         self._reference = load or self._heaviest
         residual = imbalance / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance
-        self._settled = balanced and contact.consistent(pose, displacement[self._touchable])
+        self._settled = balanced and contact.is_consistent(pose, displacement[self._touchable])
         nodes = self.model.mesh.nodes.copy()
         nodes[self._free] += displacement
         resting = self._settled or np.array_equal(nodes, self.model.mesh.nodes)

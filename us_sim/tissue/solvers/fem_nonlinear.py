@@ -19,7 +19,6 @@ a probe at rest, until the forces balance. A tissue that is inside out is worked
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -43,7 +42,14 @@ from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.frame_budget import FrameBudget
 from us_sim.tissue.solvers.newton import Newton
-from us_sim.tissue.solvers.solver import COUNT, TOLERANCE, SolverSettings, TissueSolver, same_pose
+from us_sim.tissue.solvers.solver import (
+    COUNT,
+    TOLERANCE,
+    Progress,
+    SolverSettings,
+    TissueSolver,
+    same_pose,
+)
 from us_sim.tissue.solvers.tuning import TUNING
 
 
@@ -134,7 +140,7 @@ class FemNonlinear(TissueSolver):
         self,
         model: TissueModel,
         settings: FemNonlinearSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         require_held(model.mesh, model.fixed)
         require_solid(model.mesh, model.materials)
@@ -204,7 +210,7 @@ class FemNonlinear(TissueSolver):
             if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
                 self._newton.set_displacement(displacement)
                 if self._newton.overstress is not None:
-                    self._newton.overstress.forget(displacement)
+                    self._newton.overstress.reset(displacement)
         self._recovery.reset(self._newton.displacement)
 
     def _rehearse(self) -> None:
@@ -430,11 +436,11 @@ def load_steps(last: Pose | None, pose: Pose, depth: float, arm: float) -> list[
     """Poses on the way of a probe, so that tissue is swept aside and not left where it was hit.
 
     >>> steps = load_steps(Pose(), Pose([0.0, 0.0, 0.008]), depth=0.008, arm=0.02)
-    >>> [round(pose.position[2], 4) for pose in steps]
-    [0.0027, 0.0053]
+    >>> [f"{pose.position[2]:.4f}" for pose in steps]
+    ['0.0027', '0.0053']
     >>> leap = load_steps(None, Pose([0, 0, 0.03]), depth=0.006, arm=0.02)
-    >>> [round(pose.position[2], 4) for pose in leap]
-    [0.027]
+    >>> [f"{pose.position[2]:.4f}" for pose in leap]
+    ['0.0270']
 
     Args:
         last: where the probe was, if it touched the tissue.

@@ -1,48 +1,21 @@
 """The paper's mass-spring-damper system: Algorithm 1, symplectic Euler, 20 steps a frame.
 
->>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.msds import Msds
 >>> solver = Msds(TissueModel.block())
 >>> print(solver.deform(Pose(position=[0.0, 0.0, 0.01])).action)
 masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
-
-Settings and forces that the mass-spring solvers have in common.
-
-The paper's time integration (eqs. 3 to 5) of a spring network that a moving probe enters.
-
-Forces change velocities, and the new velocities move the nodes: here a kilogram of free springs
-drifts on at its initial speed.
-
->>> import numpy as np
->>> from us_sim.geometry.collider import Sphere
->>> from us_sim.tissue.elasticity.springs import SpringArrays
->>> from us_sim.tissue.elasticity.springs import VolumeTerm
->>> from us_sim.tissue.solvers.msds import (
-...     Contact, Particles, ProbeMotion, advance_frame,
-... )
->>> edges, one = np.array([[0, 1]], dtype=np.int32), np.ones(1)
->>> springs = SpringArrays(edges, 100.0 * one, 0.1 * one, one)
->>> positions, velocity = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.array([[0.0, 0, 2], [0.0, 0, 2]])
->>> particles = Particles(np.ones(2), positions, velocity, np.zeros((2, 3)))
->>> away = ProbeMotion(Sphere(0.03).offset_box, False, np.empty((0, 3, 3)), np.empty((0, 3)))
->>> volumes, contact = VolumeTerm.nothing(2).arrays, Contact.at(np.empty(0, np.int32))
->>> advance_frame(springs, volumes, particles, away, contact, 0.01, 1, 20)
->>> positions.round(6).tolist()
-[[0.0, 0.0, 0.4], [1.0, 0.0, 0.4]]
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.collider_distance import turned, turned_back
+from us_sim.geometry.collider_distance import rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
@@ -58,18 +31,17 @@ from us_sim.tissue.elasticity.springs import (
     volume_term,
 )
 from us_sim.tissue.elasticity.stability import (
-    ElasticBalance,
-    Tangling,
+    ElasticResidual,
+    InversionWatch,
     highest_frequency,
-    stabilised,
+    stabilise,
     step_limit,
 )
-from us_sim.tissue.model import Deformation, TissueModel, TissueState
-from us_sim.tissue.solvers.solver import COUNT, SolverSettings, TissueSolver
+from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
+from us_sim.tissue.solvers.solver import COUNT, Progress, SolverSettings, TissueSolver
 
-_REST_TIME = 0.2
+REST_TIME = 0.2
 """Shortest time for which motion is watched before the tissue counts as settled, s."""
-
 
 _NEARLY_RESTING = 1e-4
 """Distance from its rest state up to which a released, settled tissue is put to rest, m."""
@@ -135,7 +107,7 @@ def spring_tissue(
         springs = fitted_springs(mesh, materials, damping, with_volume=settings.volume)
     else:
         springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
-    term = VolumeTerm.nothing(len(mesh.nodes))
+    term = VolumeTerm.empty(len(mesh.nodes))
     if settings.volume:
         term = volume_term(mesh, materials, springs, damping, yielding=yielding)
     return springs.without(model.fixed), term
@@ -174,6 +146,57 @@ class Contact(NamedTuple):
         return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
 
 
+class SpringTissue(TissueSolver):
+    """State, residual and rest that every mass-spring solver has."""
+
+    def __init__(
+        self,
+        model: TissueModel,
+        settings: SpringSettings,
+        progress: Progress | None,
+        *,
+        yielding: bool = False,
+    ) -> None:
+        super().__init__(model, settings, progress)
+        self._springs, self._volume = spring_tissue(model, settings, yielding=yielding)
+        self._residual_norm = ElasticResidual.of(self._springs, self._volume, model.mesh.nodes)
+        self._inversion = InversionWatch(model)
+        self._positions = model.mesh.nodes.copy()
+        self._velocity = np.zeros_like(self._positions)
+
+    @property
+    def state(self) -> TissueState:
+        """Where the tissue is and how fast it moves."""
+        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
+
+    def _restore(self, state: TissueState) -> None:
+        self._positions[:] = self.model.mesh.nodes + state.displacement
+        self._velocity[:] = state.velocity
+        self._velocity[self.model.fixed] = 0.0
+        self._residual_norm.reset()
+        self._inversion.reset()
+
+    def _untangle(self, touched: bool) -> tuple[str, Intervention]:
+        """Put tissue to rest that stayed inside out without a probe; says what was found."""
+        words, hopeless = self._inversion.check(self._positions, touched)
+        if not hopeless:
+            return words, Intervention.NONE
+        self._positions[:] = self.model.mesh.nodes
+        self._velocity[:] = 0.0
+        self._residual_norm.reset()
+        return words, Intervention.PUT_TO_REST
+
+    def _stop(self, touched: bool) -> bool:
+        """End the motion of settled tissue; returns whether it was put to rest entirely."""
+        self._velocity[:] = 0.0
+        displaced = np.abs(self._positions - self.model.mesh.nodes).max()
+        if touched or not self.model.fixed.any() or not displaced < _NEARLY_RESTING:
+            return False
+        self._positions[:] = self.model.mesh.nodes
+        self._residual_norm.reset()
+        return True
+
+
 @dataclass(frozen=True)
 class MsdsSettings(SpringSettings):
     """The settings of the solver ``msds``."""
@@ -191,7 +214,7 @@ class MsdsSettings(SpringSettings):
     maximum_substeps: int = setting(COUNT, "of one step; more are refused", default=100)
 
 
-class Msds(TissueSolver):
+class Msds(SpringTissue):
     """Point masses joined by Voigt elements (the paper's eqs. 1 to 5).
 
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
@@ -223,16 +246,15 @@ class Msds(TissueSolver):
         self,
         model: TissueModel,
         settings: MsdsSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         settings = settings or MsdsSettings()
-        super().__init__(model, settings, progress)
+        super().__init__(model, settings, progress, yielding=True)
         self._steps = settings.steps
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
-        self._springs, self._volume = spring_tissue(model, settings, yielding=True)
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
-        self.mass, self._substeps, self._action = stabilised(
+        self.mass, self._substeps, self._action = stabilise(
             model,
             self._factors,
             settings.time_step,
@@ -242,12 +264,7 @@ class Msds(TissueSolver):
         )  # mass: (N,) kg, as simulated
         self._time_step = settings.time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
-        self._balance = ElasticBalance.of(self._springs, self._volume, model.mesh.nodes)
-        self._tangling = Tangling(model)
         self._forward = only_forward(model.collider, model.contact_spacing)
-
-        self._positions = model.mesh.nodes.copy()
-        self._velocity = np.zeros_like(self._positions)
         self._particles = Particles(
             self._inverse_mass, self._positions, self._velocity, np.zeros_like(self._positions)
         )
@@ -262,18 +279,9 @@ class Msds(TissueSolver):
         frequency = highest_frequency(self._factors, self.mass, self.model.fixed)
         return step_limit(frequency, self._damping_factor)
 
-    @property
-    def state(self) -> TissueState:
-        """Where the tissue is and how fast it moves."""
-        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
-
     def _restore(self, state: TissueState) -> None:
-        self._positions[:] = self.model.mesh.nodes + state.displacement
-        self._velocity[:] = state.velocity
-        self._velocity[self.model.fixed] = 0.0
+        super()._restore(state)
         self._contact.touched[:] = False
-        self._balance.forget()
-        self._tangling.forget()
 
     def _advance(self, pose: Pose | None) -> Deformation:
         if self._settled and not self._contact.touched.any() and not self._entered(pose):
@@ -335,16 +343,17 @@ class Msds(TissueSolver):
     def _outcome(
         self, pose: Pose | None, force: NDArray[np.float64], torque: NDArray[np.float64]
     ) -> Deformation:
-        action = self._put_back_if_tangled()
+        is_touched = bool(self._contact.touched.any())
+        words, interventions = self._untangle(is_touched)
         still = np.zeros_like(self._velocity)
         elastic = self._springs.forces(self._positions, still)
         elastic += self._volume.forces(self._positions, still)
         elastic[self.model.fixed] = 0.0
         touched = self.model.movable_contact_nodes[self._contact.touched]
         normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._contact.touched]
-        residual = self._balance.residual(-elastic, touched, normal)
+        residual = self._residual_norm.residual(-elastic, touched, normal)
 
-        frame = max(self._steps * self._substeps * self._time_step, _REST_TIME)
+        frame = max(self._steps * self._substeps * self._time_step, REST_TIME)
         speed = np.abs(self._velocity).max()
         along = np.einsum("ij,ij->i", elastic[touched], normal)
         elastic[touched] -= np.minimum(along, 0.0)[:, None] * normal
@@ -354,27 +363,18 @@ class Msds(TissueSolver):
             < self._rest_tolerance
             and not self._entered(pose)
         )
-        if self._settled:
-            self._velocity[:] = 0.0
-            displaced = np.abs(self._positions - self.model.mesh.nodes).max()
-            if (
-                not self._contact.touched.any()
-                and self.model.fixed.any()
-                and displaced < _NEARLY_RESTING
-            ):
-                self._positions[:] = self.model.mesh.nodes
-                self._balance.forget()
-                residual = 0.0
-        return Deformation(self._positions.copy(), touched, force, torque, residual, action)
-
-    def _put_back_if_tangled(self) -> str:
-        """The action of stabilisation, followed by what was done about inverted tetrahedra."""
-        words, hopeless = self._tangling.judge(self._positions, bool(self._contact.touched.any()))
-        if hopeless:
-            self._positions[:] = self.model.mesh.nodes
-            self._velocity[:] = 0.0
-            self._balance.forget()
-        return "; ".join(filter(None, [self._action, words]))
+        if self._settled and self._stop(is_touched):
+            residual = 0.0
+        action = "; ".join(filter(None, [self._action, words]))
+        return Deformation(
+            self._positions.copy(),
+            touched,
+            force,
+            torque,
+            residual,
+            action,
+            interventions=interventions,
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -422,11 +422,11 @@ def _stop_at_probe(particles, probe, step, contact, duration):
         a = positions[i, 0] - origin[0]
         b = positions[i, 1] - origin[1]
         c = positions[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
-        nx, ny, nz = turned(r, u, v, w)
+        nx, ny, nz = rotate(r, u, v, w)
         positions[i, 0] -= gap * nx
         positions[i, 1] -= gap * ny
         positions[i, 2] -= gap * nz

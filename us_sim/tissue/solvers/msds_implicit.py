@@ -18,7 +18,6 @@ that no energy comes from nowhere and no time step is too long.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -33,27 +32,21 @@ from us_sim.tissue.contact.probe_gap import push_out, wrench_on_probe
 from us_sim.tissue.elasticity.incremental_potential import IncrementalPotential
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm
-from us_sim.tissue.elasticity.stability import ElasticBalance, Tangling
 from us_sim.tissue.linear_algebra.sparse_factors import ScalarPreconditioner
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.msds import (
+    REST_TIME,
     SpringSettings,
+    SpringTissue,
     spring_stiffness,
-    spring_tissue,
     spring_volume,
 )
 from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,
-    TissueSolver,
+    Progress,
     same_pose,
 )
-
-_REST_TIME = 0.2
-"""Shortest time for which motion is watched before the tissue counts as settled, s."""
-
-_NEARLY_RESTING = 1e-4
-"""Distance from its rest state up to which a released, settled tissue is put to rest, m."""
 
 _SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
 """Weights of springs and volumes in the preconditioner, where they resist in all directions alike:
@@ -86,7 +79,7 @@ class MsdsImplicitSettings(SpringSettings):
     volume: bool = spring_volume(True)
 
 
-class MsdsImplicit(TissueSolver):
+class MsdsImplicit(SpringTissue):
     """Point masses joined by springs and dampers, and tetrahedra that keep their volume.
 
     Nodes that the probe enters are moved onto its surface and slide on it; they are let go when
@@ -112,7 +105,7 @@ class MsdsImplicit(TissueSolver):
         self,
         model: TissueModel,
         settings: MsdsImplicitSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         settings = settings or MsdsImplicitSettings()
         super().__init__(model, settings, progress)
@@ -122,8 +115,8 @@ class MsdsImplicit(TissueSolver):
         self._time_step = settings.time_step
         self._rest_tolerance = settings.rest_tolerance
         damping = settings.damping_factor
-        self._rest_time = max(settings.time_step, damping, _REST_TIME)
-        springs, term = spring_tissue(model, settings)
+        self._rest_time = max(settings.time_step, damping, REST_TIME)
+        springs, term = self._springs, self._volume
         self.mass = model.lumped_mass
         self._potential = IncrementalPotential(
             springs, term, self.mass, settings.time_step, damping
@@ -135,10 +128,6 @@ class MsdsImplicit(TissueSolver):
         self._preconditioner = self._factored(
             springs, term, 1.0 + damping / settings.time_step, progress
         )
-        self._balance = ElasticBalance.of(springs, term, model.mesh.nodes)
-        self._tangling = Tangling(model)
-        self._positions = model.mesh.nodes.copy()
-        self._velocity = np.zeros_like(self._positions)
         self._restore(self.state)
 
     def _factored(
@@ -146,7 +135,7 @@ class MsdsImplicit(TissueSolver):
         springs: SpringNetwork,
         term: VolumeTerm,
         stiffening: float,
-        progress: Callable[[float, str], None] | None,
+        progress: Progress | None,
     ) -> ScalarPreconditioner:
         mesh = self.model.mesh
         ends, weights = [springs.edges], [_SPRING_WEIGHT * springs.stiffness]
@@ -166,20 +155,11 @@ class MsdsImplicit(TissueSolver):
             edges, weight, inertia, ~self.model.fixed, self._touchable, progress
         )
 
-    @property
-    def state(self) -> TissueState:
-        """Where the tissue is and how fast it moves."""
-        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
-
     def _restore(self, state: TissueState) -> None:
-        self._positions[:] = self.model.mesh.nodes + state.displacement
-        self._velocity[:] = state.velocity
-        self._velocity[self.model.fixed] = 0.0
+        super()._restore(state)
         self._contact.clear()
         self._preconditioner.confine(np.zeros(0, np.intp), np.zeros((0, 3)))
-        self._tangling.forget()
         self._energy = self._potential.elastic(self._positions)[0]  # J, of springs and volumes
-        self._balance.forget()
         self._reference = 0.0  # N, what the tolerance refers to
         self._taken_over = bool(state.displacement.any())
 
@@ -190,7 +170,7 @@ class MsdsImplicit(TissueSolver):
     def _advance(self, pose: Pose | None) -> Deformation:
         contact = self._contact
         untouched = self._settled and not contact.touched.any()
-        if self.model.fixed.all() or (untouched and contact.consistent(pose, self._surface())):
+        if self.model.fixed.all() or (untouched and contact.is_consistent(pose, self._surface())):
             residual = self._last.residual
             return Deformation(
                 self._positions.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), residual
@@ -232,7 +212,7 @@ class MsdsImplicit(TissueSolver):
         """Renew the set of touched nodes and put them onto the probe; the others go along."""
         surface = self._surface()
         was = surface.copy()
-        if not self._contact.revise(pose, surface, moved=moved):
+        if not self._contact.update(pose, surface, moved=moved):
             return
         self._confine()
         touched = self._contact.touched
@@ -284,45 +264,43 @@ class MsdsImplicit(TissueSolver):
                 break
             self._positions, value = tried, lower
             left = self._unconfined(force)
-        self._contact.weigh(-force[self._touchable])
-        load = float(np.linalg.norm(np.maximum(self._contact.push, 0.0)))
-        self._reference = load or self._balance.heaviest
+        self._contact.set_forces(-force[self._touchable])
+        load = float(np.linalg.norm(np.maximum(self._contact.normal_force, 0.0)))
+        self._reference = load or self._residual_norm.largest_load
         return start
 
     def _outcome(self, pose: Pose | None, kinetic: float, initial: float) -> Deformation:
         contact, touchable = self._contact, self._touchable
-        words, hopeless = self._tangling.judge(self._positions, bool(contact.touched.any()))
-        if hopeless:
-            self._positions = self.model.mesh.nodes.copy()
-            self._velocity[:] = 0.0
-            self._balance.forget()
+        is_touched = bool(contact.touched.any())
+        words, interventions = self._untangle(is_touched)
         energy, elastic = self._potential.elastic(self._positions)
         self._limit_speed(kinetic, initial, energy)
         elastic[self.model.fixed] = 0.0
         # Nodes that slid, or were moved onto planes, are now pushed in another direction.
         normal = contact.normal_at(pose, self._surface())
         loaded = np.einsum("ij,ij->i", elastic[touchable], normal) < 0
-        pushed = contact.touched & (loaded | (contact.push > 0))
-        residual = self._balance.residual(-elastic, touchable[pushed], normal[pushed])
+        pushed = contact.touched & (loaded | (contact.normal_force > 0))
+        residual = self._residual_norm.residual(-elastic, touchable[pushed], normal[pushed])
         self._settled = (
             bool(np.abs(self._velocity).max() * self._rest_time < self._rest_tolerance)
             and residual <= self._tolerance
-            and contact.consistent(pose, self._surface())
+            and contact.is_consistent(pose, self._surface())
         )
-        if self._settled:
-            self._velocity[:] = 0.0
-            displaced = np.abs(self._positions - self.model.mesh.nodes).max()
-            if not contact.touched.any() and self.model.fixed.any() and displaced < _NEARLY_RESTING:
-                self._positions = self.model.mesh.nodes.copy()
-                self._balance.forget()
-                self._energy = residual = 0.0
+        if self._settled and self._stop(is_touched):
+            self._energy = residual = 0.0
         force, torque = np.zeros(3), np.zeros(3)
         if pose is not None:
-            pushes = np.maximum(contact.push[pushed, None], 0.0) * contact.normal[pushed]
+            pushes = np.maximum(contact.normal_force[pushed, None], 0.0) * contact.normal[pushed]
             rows = touchable[pushed]
             force, torque = wrench_on_probe(pose, self._positions[rows], pushes)
         return Deformation(
-            self._positions.copy(), touchable[pushed], force, torque, residual, words
+            self._positions.copy(),
+            touchable[pushed],
+            force,
+            torque,
+            residual,
+            words,
+            interventions=interventions,
         )
 
     def _kinetic(self) -> float:

@@ -38,6 +38,9 @@ from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 
+Progress = Callable[[float, str], None]
+"""Told the fraction done of what takes long, and what is being made."""
+
 COUNT = Quantity("number", 1, 10_000)
 """Iterations, updates or steps in a frame."""
 TOLERANCE = Quantity("number", 1e-15, 1.0)
@@ -85,7 +88,7 @@ class TissueSolver(ABC):
         self,
         model: TissueModel,
         settings: SolverSettings | None = None,
-        progress: Callable[[float, str], None] | None = None,  # noqa: ARG002
+        progress: Progress | None = None,  # noqa: ARG002
     ) -> None:
         self.model = model
         self.settings = settings if settings is not None else self.Settings()
@@ -234,7 +237,7 @@ def create_solver(
     name: str,
     model: TissueModel,
     settings: SolverSettings | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | None = None,
     **values: Any,
 ) -> TissueSolver:
     """A solver by the name that scenes and reports use.

@@ -1,31 +1,17 @@
-"""One tissue, the solver that deforms it, and a second one beside it for comparison.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.elasticity.material import Material
->>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.switching import SwitchableTissue
->>> model = TissueModel.block(material=Material(10e3, 0.3, 1000.0))
->>> tissue = SwitchableTissue(model, "fem_cg")
->>> tissue.compare_with("fem")
->>> for _ in range(20):
-...     deformation = tissue.deform(Pose(position=[0.0, 0.0, 0.01]))
->>> tissue.difference.maximum < 1e-5  # m: the same equations below Poisson's ratio 0.4
-True
-
-Making a solver with its kernels compiled, where frames must go on in another process.
+"""One tissue and the solver that deforms it: changed, compiled and compared while frames go on.
 
 Numba's compiler holds the interpreter's lock for most of its time, so that a frame in another
 thread takes many times as long. Another process has a lock of its own: it makes the same solver
 once, which leaves the kernels in numba's cache on disk, from where this one loads them. Where that
 cache cannot be written, or the process fails, they are compiled here.
 
->>> from us_sim.tissue.model import TissueModel
->>> from us_sim.tissue.solvers.switching import compiled_solver
->>> from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
->>> compiled_solver(FemCg, TissueModel.block(), FemCgSettings()).name
-'fem_cg'
-
-Making the next solver in a thread, while the present one goes on deforming the tissue.
+>>> from us_sim.tissue.elasticity.material import Material
+>>> tissue = SwitchableTissue(TissueModel.block(material=Material(10e3, 0.3, 1000.0)), "fem_cg")
+>>> tissue.compare_with("fem")
+>>> for _ in range(20):
+...     deformation = tissue.deform(Pose(position=[0.0, 0.0, 0.01]))
+>>> tissue.difference.maximum < 1e-5  # m: the same equations below Poisson's ratio 0.4
+True
 """
 
 from __future__ import annotations
@@ -50,7 +36,9 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.solver import SolverSettings, TissueSolver, rehearsal_model
+from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver, rehearsal_model
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -89,6 +77,14 @@ class Prepared:
     solvers: dict[str, TissueSolver]
 
 
+@dataclass(frozen=True)
+class Failed:
+    """A plan that cannot be carried out, and why."""
+
+    plan: Plan
+    problem: str
+
+
 class SwitchableTissue:
     """Deforms a tissue with one solver by name, and with another on the same poses if asked.
 
@@ -108,7 +104,7 @@ class SwitchableTissue:
         model: TissueModel,
         name: str,
         settings: Mapping[str, SolverSettings] | None = None,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self._model = model
         self._solvers: dict[str, TissueSolver] = {}
@@ -152,7 +148,7 @@ class SwitchableTissue:
     def make(
         self,
         plan: Plan,
-        progress: Callable[[float, str], None] | None = None,
+        progress: Progress | None = None,
         *,
         beside: bool = False,
     ) -> Prepared:
@@ -184,7 +180,7 @@ class SwitchableTissue:
         name: str,
         model: TissueModel,
         settings: SolverSettings | None,
-        progress: Callable[[float, str], None] | None,
+        progress: Progress | None,
         beside: bool,
     ) -> TissueSolver:
         cls: type[TissueSolver] = SOLVERS.load(name)
@@ -221,7 +217,7 @@ class SwitchableTissue:
         compared = "" if name == self.compared else self.compared
         self.adopt(self.make(replace(self._plan, solver=name, compared=compared)))
 
-    def compare_with(self, name: str, progress: Callable[[float, str], None] | None = None) -> None:
+    def compare_with(self, name: str, progress: Progress | None = None) -> None:
         """Run a second solver on the same poses from here on; '' ends it.
 
         Args:
@@ -248,12 +244,76 @@ class SwitchableTissue:
         return deformation
 
 
-Progress = Callable[[float, str], None]
+class Preparation:
+    """Makes what a plan needs in a thread; the newest plan wins.
 
-_NICENESS = 5
-"""By how much the process that compiles gives way to the one that deforms."""
+    Args:
+        tissue: that goes on meanwhile, and that adopts what was made.
+    """
 
-_logger = logging.getLogger(__name__)
+    def __init__(self, tissue: SwitchableTissue) -> None:
+        self._tissue = tissue
+        self._lock = threading.Lock()
+        self._wanted: Plan | None = None  # that no thread has begun with
+        self._newest: Plan | None = None
+        self._outcome: Prepared | Failed | None = None
+        self._thread: threading.Thread | None = None
+        self._began = 0.0
+        self._progress = ""
+
+    @property
+    def state(self) -> str:
+        """The plan that is being made, for how long already, and how far it is; '' without any."""
+        with self._lock:
+            if self._thread is None or self._newest is None:
+                return ""
+            seconds = time.monotonic() - self._began
+            return f"preparing {self._newest.reason} for {seconds:.0f} s{self._progress}"
+
+    def want(self, plan: Plan) -> None:
+        """Begin to make what a plan needs; what is still being made for another is then dropped."""
+        with self._lock:
+            self._wanted = self._newest = plan
+            self._outcome = None
+            if self._thread is None:
+                self._began = time.monotonic()
+                self._thread = threading.Thread(target=self._work, name="solver", daemon=True)
+                self._thread.start()
+
+    def drop(self) -> None:
+        """Want nothing any more; a thread ends with what it is making."""
+        with self._lock:
+            self._wanted = self._newest = self._outcome = None
+
+    def take(self) -> Prepared | Failed | None:
+        """The outcome of the newest plan, once; None until there is one."""
+        with self._lock:
+            outcome, self._outcome = self._outcome, None
+            return outcome
+
+    def _show(self, fraction: float, text: str) -> None:
+        with self._lock:
+            share = f"{100 * fraction:.0f} % of " if fraction > 0.0 else ""
+            self._progress = f", {share}{text}"
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                plan, self._wanted, self._progress = self._wanted, None, ""
+                if plan is None:
+                    self._thread = None
+                    return
+            outcome: Prepared | Failed
+            try:
+                outcome = self._tissue.make(plan, self._show, beside=True)
+            except UsSimError as error:
+                outcome = Failed(plan, str(error))
+            except Exception as error:  # so that the thread does not end silently
+                _logger.exception("preparing %s", plan.solver)
+                outcome = Failed(plan, f"{type(error).__name__}: {error}")
+            with self._lock:
+                if self._newest is plan:
+                    self._outcome = outcome
 
 
 def compiled_solver(
@@ -377,7 +437,7 @@ def _make_elsewhere(
 def _main() -> None:
     """Make what comes in at stdin; a line on stdout for each word of progress."""
     if hasattr(os, "nice"):
-        os.nice(_NICENESS)
+        os.nice(5)  # it gives way to the process that deforms
     solver, model, settings = pickle.load(sys.stdin.buffer)
 
     def show(fraction: float, text: str) -> None:
@@ -390,83 +450,3 @@ def _main() -> None:
 
 if __name__ == "__main__":
     _main()
-
-
-@dataclass(frozen=True)
-class Failed:
-    """A plan that cannot be carried out, and why."""
-
-    plan: Plan
-    problem: str
-
-
-class Preparation:
-    """Makes what a plan needs in a thread; the newest plan wins.
-
-    Args:
-        tissue: that goes on meanwhile, and that adopts what was made.
-    """
-
-    def __init__(self, tissue: SwitchableTissue) -> None:
-        self._tissue = tissue
-        self._lock = threading.Lock()
-        self._wanted: Plan | None = None  # that no thread has begun with
-        self._newest: Plan | None = None
-        self._outcome: Prepared | Failed | None = None
-        self._thread: threading.Thread | None = None
-        self._began = 0.0
-        self._progress = ""
-
-    @property
-    def state(self) -> str:
-        """What is being made, for how long already, and how far it is; '' when nothing is."""
-        with self._lock:
-            if self._thread is None or self._newest is None:
-                return ""
-            seconds = time.monotonic() - self._began
-            return f"preparing {self._newest.reason} for {seconds:.0f} s{self._progress}"
-
-    def want(self, plan: Plan) -> None:
-        """Begin to make what a plan needs; what is still being made for another is then dropped."""
-        with self._lock:
-            self._wanted = self._newest = plan
-            self._outcome = None
-            if self._thread is None:
-                self._began = time.monotonic()
-                self._thread = threading.Thread(target=self._work, name="solver", daemon=True)
-                self._thread.start()
-
-    def drop(self) -> None:
-        """Want nothing any more; a thread ends with what it is making."""
-        with self._lock:
-            self._wanted = self._newest = self._outcome = None
-
-    def take(self) -> Prepared | Failed | None:
-        """The outcome of the newest plan, once; None until there is one."""
-        with self._lock:
-            outcome, self._outcome = self._outcome, None
-            return outcome
-
-    def _show(self, fraction: float, text: str) -> None:
-        with self._lock:
-            share = f"{100 * fraction:.0f} % of " if fraction > 0.0 else ""
-            self._progress = f", {share}{text}"
-
-    def _work(self) -> None:
-        while True:
-            with self._lock:
-                plan, self._wanted, self._progress = self._wanted, None, ""
-                if plan is None:
-                    self._thread = None
-                    return
-            outcome: Prepared | Failed
-            try:
-                outcome = self._tissue.make(plan, self._show, beside=True)
-            except UsSimError as error:
-                outcome = Failed(plan, str(error))
-            except Exception as error:  # so that the thread does not end silently
-                _logger.exception("preparing %s", plan.solver)
-                outcome = Failed(plan, f"{type(error).__name__}: {error}")
-            with self._lock:
-                if self._newest is plan:
-                    self._outcome = outcome

@@ -1,8 +1,6 @@
-"""Which parameters of a node stand together under one title, and in which order.
+"""The parameters of one node in sections, as its descriptors say them: new ones come by themselves.
 
-The parameters of one node in sections, as its descriptors say them: new ones come by themselves.
-
-A section's controls are made when it is opened first.
+The controls of a section are made when it is first opened.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from dataclasses import dataclass, field
 from nicegui import ui
 from nicegui.element import Element
 
-from us_sim.viewer.panels.controls import ParameterControl, TimeGain
+from us_sim.viewer.panels.controls import Control, ParameterControl, TimeGain
 from us_sim.viewer.parameters import NodeParameters, Parameter, ParameterBoard, State, in_words
 
 Arrange = Callable[[Mapping[str, Parameter]], list["Section"]]
@@ -114,7 +112,6 @@ def title_of(group: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-Control = ParameterControl | TimeGain
 MakeControl = Callable[[ParameterBoard, Parameter, str], Control]
 
 
@@ -236,7 +233,6 @@ class _ShownSection:
             if place != len(self._controls):
                 control.move(target_index=place)
             self._controls[name] = control
-        if "time_gain" in self._controls and "depth" in wanted:
-            control = self._controls["time_gain"]
-            if isinstance(control, TimeGain):
-                control.reach(wanted["depth"])
+        gains = self._controls.get("time_gain")
+        if isinstance(gains, TimeGain) and "depth" in wanted:
+            gains.reach(wanted["depth"])

@@ -1,7 +1,4 @@
-"""Scenes and cases to load, each with what its probe sees.
-
-Recording the session, and replaying what was recorded.
-"""
+"""Panels of the session: scenes and cases to load, recording, and replaying recordings."""
 
 from __future__ import annotations
 
@@ -57,7 +54,7 @@ class _Cases:
             self._shown = shown
             self._draw(state)
         for origin, picture in self._pictures.items():
-            jpeg = board.thumbnail(origin)
+            jpeg = board.thumbnails.get(origin)
             if jpeg is not None and not picture.source:
                 picture.set_source(f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}")
 

@@ -34,9 +34,9 @@ def console(bench: Bench, name: str = "console") -> Node:
 
 
 def looked_at(bench: Bench, remote: RemoteParameters, name: str) -> dict[str, Any]:
-    remote.board.watch(name)
-    bench.spin_until(lambda: remote.board.of(name).state is State.THERE)
-    return dict(remote.board.of(name).parameters)
+    remote.watch(name)
+    bench.spin_until(lambda: remote.of(name).state is State.THERE)
+    return dict(remote.of(name).parameters)
 
 
 def answered(bench: Bench, future: "Future[str]") -> str:
@@ -81,40 +81,40 @@ def test_a_node_says_what_each_method_is_good_for(bench, remote):
 def test_a_value_is_set_in_the_unit_that_is_shown(bench, remote):
     node = console(bench)
     looked_at(bench, remote, "console")
-    assert answered(bench, remote.board.set("console", "elevation_width", 7)) == ""
+    assert answered(bench, remote.set("console", "elevation_width", 7)) == ""
     assert node.get_parameter("elevation_width").value == 0.007
-    assert answered(bench, remote.board.set("console", "time_gain", [0, 3, 6])) == ""
+    assert answered(bench, remote.set("console", "time_gain", [0, 3, 6])) == ""
     assert list(node.get_parameter("time_gain").value) == [0.0, 3.0, 6.0]
-    assert answered(bench, remote.board.set("console", "colour.depth", 20)) == ""
+    assert answered(bench, remote.set("console", "colour.depth", 20)) == ""
     assert node.get_parameter("colour.depth").value == 0.02
-    assert answered(bench, remote.board.set("console", "colour.depth", None)) == ""
+    assert answered(bench, remote.set("console", "colour.depth", None)) == ""
     assert node.get_parameter("colour.depth").value == 0.0
-    assert remote.board.of("console").parameters["elevation_width"].value == 7.0
+    assert remote.of("console").parameters["elevation_width"].value == 7.0
 
 
 def test_a_refused_value_says_why_and_stays_what_it_was(bench, remote):
     console(bench)
     looked_at(bench, remote, "console")
-    reason = answered(bench, remote.board.set("console", "gain", 99))
+    reason = answered(bench, remote.set("console", "gain", 99))
     assert reason == "99 dB is outside -60 to 60 dB"
-    reason = answered(bench, remote.board.set("console", "grey_map", "purple"))
+    reason = answered(bench, remote.set("console", "grey_map", "purple"))
     assert "'purple' is not one of linear, soft, contrast" in reason
-    assert "is not a number" in answered(bench, remote.board.set("console", "gain", "much"))
-    assert "no parameter gian" in answered(bench, remote.board.set("console", "gian", 1))
-    assert remote.board.of("console").parameters["gain"].value == 0.0
+    assert "is not a number" in answered(bench, remote.set("console", "gain", "much"))
+    assert "no parameter gian" in answered(bench, remote.set("console", "gian", 1))
+    assert remote.of("console").parameters["gain"].value == 0.0
 
 
 def test_a_change_made_elsewhere_reaches_the_page(bench, remote):
     node = console(bench)
     looked_at(bench, remote, "console")
-    before = remote.board.of("console")
+    before = remote.of("console")
     bench.spin_until(lambda: bench.peer.count_subscribers("/parameter_events") > 0)
     bench.spin_for(5)
     node.set_parameters([RosParameter("gain", value=6.0)])
-    bench.spin_until(lambda: remote.board.of("console").parameters["gain"].value == 6.0)
+    bench.spin_until(lambda: remote.of("console").parameters["gain"].value == 6.0)
     assert before.parameters["gain"].value == 0.0  # what was told is not changed
     node.declare_parameter("added_later", 3)
-    bench.spin_until(lambda: "added_later" in remote.board.of("console").parameters)
+    bench.spin_until(lambda: "added_later" in remote.of("console").parameters)
     node.set_parameters([RosParameter("added_later", RosParameter.Type.NOT_SET, None)])
 
 
@@ -125,12 +125,12 @@ def test_a_node_that_goes_is_gone_and_one_that_restarts_is_read_anew(bench, remo
     bench.executor.remove_node(node)
     bench._nodes.remove(node)
     node.destroy_node()
-    bench.spin_until(lambda: remote.board.of("console").state is State.ABSENT)
-    assert not remote.board.of("console").parameters
+    bench.spin_until(lambda: remote.of("console").state is State.ABSENT)
+    assert not remote.of("console").parameters
     again = bench.add(Node("console", context=bench.context))
     again.declare_parameter("other", 2.5)
-    bench.spin_until(lambda: "other" in remote.board.of("console").parameters)
-    assert set(remote.board.of("console").parameters) == {"other"}
+    bench.spin_until(lambda: "other" in remote.of("console").parameters)
+    assert set(remote.of("console").parameters) == {"other"}
 
 
 def test_a_restart_between_two_looks_is_noticed(bench, remote):
@@ -141,8 +141,8 @@ def test_a_restart_between_two_looks_is_noticed(bench, remote):
     node.destroy_node()
     again = bench.add(Node("console", context=bench.context))
     again.declare_parameter("gain", 12.0)
-    bench.spin_until(lambda: set(remote.board.of("console").parameters) == {"gain"})
-    assert remote.board.of("console").parameters["gain"].value == 12.0
+    bench.spin_until(lambda: set(remote.of("console").parameters) == {"gain"})
+    assert remote.of("console").parameters["gain"].value == 12.0
 
 
 def test_a_foreign_node_s_plain_descriptors_will_do(bench, remote):
@@ -170,10 +170,10 @@ def test_a_foreign_node_s_plain_descriptors_will_do(bench, remote):
     assert (known["turns"].description, known["turns"].unit) == ("a minute (rpm)", "")
     assert not known["turns"].is_live
     assert (known["unset"].kind, known["unset"].is_live) == (Kind.OTHER, False)
-    assert answered(bench, remote.board.set("motor", "speed", 4)) == ""
+    assert answered(bench, remote.set("motor", "speed", 4)) == ""
     assert node.get_parameter("speed").value == 4.0
     node.add_on_set_parameters_callback(lambda _: SetParametersResult(successful=False))
-    assert answered(bench, remote.board.set("motor", "speed", 5)) == "motor refuses it"
+    assert answered(bench, remote.set("motor", "speed", 5)) == "motor refuses it"
 
 
 def test_a_parameter_without_a_value_does_not_hide_the_others(bench, remote):
@@ -184,16 +184,16 @@ def test_a_parameter_without_a_value_does_not_hide_the_others(bench, remote):
     bench.spin_until(lambda: bench.peer.count_subscribers("/parameter_events") > 0)
     bench.spin_for(5)
     node.set_parameters([RosParameter("torque", value=1.5)])
-    bench.spin_until(lambda: "torque" in remote.board.of("motor").parameters)
-    assert remote.board.of("motor").parameters["torque"].value == 1.5
+    bench.spin_until(lambda: "torque" in remote.of("motor").parameters)
+    assert remote.of("motor").parameters["torque"].value == 1.5
 
 
 def test_a_node_without_parameter_services_is_silent(bench, remote, monkeypatch):
     monkeypatch.setattr("us_sim.viewer.remote_parameters.SERVICES_S", 0.0)
     bench.add(Node("mute", context=bench.context, start_parameter_services=False))
-    remote.board.watch("mute")
-    bench.spin_until(lambda: remote.board.of("mute").state is State.SILENT)
-    assert "no parameter" in answered(bench, remote.board.set("mute", "gain", 1))
+    remote.watch("mute")
+    bench.spin_until(lambda: remote.of("mute").state is State.SILENT)
+    assert "no parameter" in answered(bench, remote.set("mute", "gain", 1))
 
 
 def test_a_node_that_does_not_answer_is_told_so(bench, remote, monkeypatch):
@@ -201,18 +201,18 @@ def test_a_node_that_does_not_answer_is_told_so(bench, remote, monkeypatch):
     looked_at(bench, remote, "console")
     monkeypatch.setattr("us_sim.viewer.remote_parameters.ANSWER_S", 0.0)
     bench.executor.remove_node(node)  # it hangs
-    reason = answered(bench, remote.board.set("console", "gain", 3))
+    reason = answered(bench, remote.set("console", "gain", 3))
     assert reason == "console did not answer within 0 s"
 
 
 def test_nothing_is_asked_while_nobody_looks(bench, remote):
     console(bench)
     looked_at(bench, remote, "console")
-    remote.board.watch("console")
-    remote.board.unwatch("console")
+    remote.watch("console")
+    remote.unwatch("console")
     bench.spin_for(3)
     assert bench.peer.count_subscribers("/parameter_events") > 0
-    remote.board.unwatch("console")
+    remote.unwatch("console")
     bench.spin_until(lambda: bench.peer.count_subscribers("/parameter_events") == 0)
     assert "gain" in looked_at(bench, remote, "console")  # read anew when somebody does again
 
@@ -230,6 +230,6 @@ def test_a_node_with_a_door_is_set_through_that_alone(bench):
     remote = RemoteParameters(asking, Posted(asking), {"console": door})
     node = console(bench)
     looked_at(bench, remote, "console")
-    assert answered(bench, remote.board.set("console", "gain", 3.0)) == "not from here"
+    assert answered(bench, remote.set("console", "gain", 3.0)) == "not from here"
     assert asked == [{"gain": 3.0}]
     assert node.get_parameter("gain").value == 0.0

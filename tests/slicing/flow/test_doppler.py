@@ -1,4 +1,4 @@
-"""Colour Doppler against velocities that are known: aliasing, wall filter, noise, and its box."""
+"""Colour Doppler and spectra against velocities that are known."""
 
 import dataclasses
 
@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path
-from tubes import ARTERY, SIDES, block, tube_vessel, tube_volume
+from tubes import ARTERY, SIDES, VEIN, block, tube_vessel, tube_volume
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.flow.blood import Absence, Blood
-from us_sim.slicing.flow.doppler import ColourDoppler
-from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
+from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import ColourSettings, Imaging, SpectrumSettings
 
 PROBE = LinearProbe(aperture=0.018, depth=0.02, columns=90, rows=100)
@@ -47,7 +47,7 @@ def wrapped(velocity, nyquist):
     return (velocity + nyquist) % (2 * nyquist) - nyquist
 
 
-def between(estimate, truth, nyquist):
+def apart(estimate, truth, nyquist):
     """How far apart two velocities are on the circle that aliasing makes of them."""
     return np.abs(wrapped(estimate - truth, nyquist))
 
@@ -61,7 +61,7 @@ def test_velocities_turn_over_at_the_nyquist_velocity(scanner, blood, nyquist):
     shown = ~np.isnan(estimate) & ~np.isnan(truth)
     assert np.count_nonzero(shown) > 0.95 * np.count_nonzero(~np.isnan(truth))
     assert np.nanmax(np.abs(truth)) == pytest.approx(0.4, rel=0.03)  # 0.8 m/s at 60 degrees
-    error = between(estimate, truth, nyquist)[shown]
+    error = apart(estimate, truth, nyquist)[shown]
     assert np.sqrt(np.mean(error**2)) < 0.04 * nyquist
     assert np.nanmax(np.abs(estimate)) <= nyquist * (1 + 1e-6)
     assert (np.abs(estimate[shown] - truth[shown]) > nyquist).any() == (nyquist < 0.4)
@@ -269,3 +269,120 @@ def test_beams_whose_face_is_in_the_air_show_nothing():
     dead = coupling[np.linspace(0, PROBE.lines - 1, PROBE.columns).round().astype(int)] < 0.1
     assert free[:, dead].any()
     assert not coupled[:, dead].any()
+
+
+GATE_PROBE = LinearProbe(aperture=0.018, depth=0.024, columns=90, rows=120)
+MIDDLE = 0.5 * SIDES[2] / np.cos(TILT)
+GATE = SpectrumSettings(depth=MIDDLE, size=1e-3, nyquist_velocity=0.6, wall_filter=0.0)
+ROWS = 256
+
+
+@pytest.fixture(scope="module")
+def gate_scanner():
+    made = BMode(tube_volume(), GATE_PROBE)
+    made.carry(block().nodes, block().tetrahedra)
+    return made
+
+
+@pytest.fixture(scope="module")
+def artery():
+    return tube_vessel(ARTERY)
+
+
+def velocities(settings):
+    """m/s along the beam that the rows stand for, from the top."""
+    nyquist = settings.nyquist_velocity
+    low = nyquist * (settings.baseline - 1.0)
+    return low + (ROWS - 0.5 - np.arange(ROWS)) * (2 * nyquist / ROWS)
+
+
+def middles(columns, settings):
+    """The mean velocity of each column, by what is bright in it."""
+    bright = np.where(columns > 100, columns.astype(float), 0.0)
+    return velocities(settings) @ bright / bright.sum(axis=0)
+
+
+def test_its_middle_follows_the_pulse(gate_scanner, artery):
+    """The axis at the gate's middle is a little faster than what else is in the gate."""
+    blood = Blood([artery])
+    frame = gate_scanner.frame(POSE, block().nodes, time=0.0)
+    moments = np.arange(100) / 110
+    found = middles(Spectrum(GATE_PROBE, GATE).columns(blood, frame, moments), GATE)
+    blood.at(frame)
+    sign = -np.sign(POSE.rotation[1, 2])
+    axis = 2 * sign * ARTERY.mean_velocity * artery.pulse(moments) * np.sin(TILT)
+    assert np.corrcoef(found, axis)[0, 1] > 0.995
+    fast = np.abs(axis) > 0.1
+    assert (found[fast] / axis[fast]).mean() == pytest.approx(0.98, abs=0.04)
+    assert np.abs(axis).max() == pytest.approx(0.4, rel=0.02)
+
+
+def test_what_is_beyond_the_nyquist_velocity_comes_in_at_the_other_end(gate_scanner, artery):
+    settings = dataclasses.replace(GATE, nyquist_velocity=0.3)
+    blood, frame = Blood([artery]), gate_scanner.frame(POSE, block().nodes, time=0.0)
+    systole = np.full(8, 0.13 / 1.1)
+    true = middles(Spectrum(GATE_PROBE, GATE).columns(blood, frame, systole), GATE).mean()
+    seen = middles(Spectrum(GATE_PROBE, settings).columns(blood, frame, systole), settings).mean()
+    assert abs(true) > 0.3
+    assert seen == pytest.approx(true - np.sign(true) * 0.6, abs=0.03)
+    moved = dataclasses.replace(settings, baseline=0.5 * np.sign(true))
+    again = middles(Spectrum(GATE_PROBE, moved).columns(blood, frame, systole), moved).mean()
+    assert again == pytest.approx(true, abs=0.03)
+
+
+def test_no_column_depends_on_when_frames_come(gate_scanner, artery):
+    """Two frames or forty between the same times: the same picture, byte for byte."""
+    pictures = []
+    for times in (np.linspace(2.0, 3.0, 3), np.linspace(2.0, 3.0, 41)):
+        blood, spectrum = Blood([artery]), Spectrum(GATE_PROBE, GATE)
+        for time in times:
+            picture = spectrum.show(blood, gate_scanner.frame(POSE, block().nodes, time=time))
+        pictures.append(picture)
+    assert np.array_equal(*pictures)
+    assert pictures[0].any()
+
+
+def test_the_wall_filter_and_an_empty_gate_are_dark(gate_scanner, artery):
+    blood, frame = Blood([artery]), gate_scanner.frame(POSE, block().nodes, time=0.0)
+    moments = np.arange(20) / 22
+    filtered = dataclasses.replace(GATE, wall_filter=0.1)
+    slow = np.abs(velocities(GATE)) < 0.015
+    assert Spectrum(GATE_PROBE, GATE).columns(blood, frame, moments)[slow].max() > 150
+    assert Spectrum(GATE_PROBE, filtered).columns(blood, frame, moments)[slow].max() < 60
+    beside = dataclasses.replace(GATE, lateral=0.4)
+    assert Spectrum(GATE_PROBE, beside).columns(blood, frame, moments).max() < 60
+
+
+def test_a_vein_under_a_full_press_shows_none(gate_scanner):
+    vein = tube_vessel(VEIN)
+    pressed = block().nodes.copy()
+    pressed[:, 2] = 0.5 * SIDES[2] + 0.2 * (pressed[:, 2] - 0.5 * SIDES[2])
+    frame = gate_scanner.frame(POSE, pressed, time=4.0)
+    columns = Spectrum(GATE_PROBE, GATE).columns(Blood([vein]), frame, np.arange(10) / 5)
+    lit = columns.max(axis=1) > 100
+    assert np.abs(velocities(GATE)[lit]).max(initial=0.0) < 0.04  # blood that stands
+
+
+@pytest.mark.parametrize(
+    ("probe", "settings", "sentence"),
+    [
+        (
+            GATE_PROBE,
+            {"depth": 0.03},
+            "spectrum.depth: the gate at 30 mm lies outside the image, which",
+        ),
+        (
+            GATE_PROBE,
+            {"lateral": 0.5, "steering": 0.4},
+            "spectrum.steering: the gate lies beside the",
+        ),
+        (
+            SectorProbe(aperture=0.02, opening_angle=1.0, depth=0.05, columns=80, rows=80),
+            {"steering": 0.1},
+            "spectrum.steering: is for linear probes only",
+        ),
+    ],
+)
+def test_a_gate_outside_the_image_is_refused(probe, settings, sentence):
+    with pytest.raises(ProbeError, match=sentence):
+        Spectrum(probe, SpectrumSettings(**settings))
