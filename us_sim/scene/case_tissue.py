@@ -29,7 +29,7 @@ from us_sim.settings.reading import document_of
 from us_sim.settings.registry import COLLIDERS, PROBES
 from us_sim.tissue.elasticity.material import LAYERS, kind_of
 from us_sim.tissue.elasticity.materials import label_fractions
-from us_sim.tissue.mesh.box_planes import fitted_planes, wanted_by_labels, wanted_under_probe
+from us_sim.tissue.mesh.box_planes import fitted_planes, spacing_by_labels, spacing_under_probe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.cases.case import LABELS, TISSUE, Case, read_case
 from us_sim.volume.cases.settings import AROUND, SLIDE, CaseSettings
@@ -160,11 +160,11 @@ def box_planes(
     labels = volume.labels
     if labels is None:
         labels, counted = np.zeros((1, 1, 1), np.uint8), []
-    wanted = wanted_by_labels(
+    wanted = spacing_by_labels(
         labels, volume.patient_to_index, box, step, counted=counted, aside=_IN_REACH
     )
     pressed = footprint(scene.probe.collider.settings(COLLIDERS))
-    return fitted_planes(wanted_under_probe(wanted, *pressed), given.nodes)
+    return fitted_planes(spacing_under_probe(wanted, *pressed), given.nodes)
 
 
 def counts(scene: Scene, label: str) -> bool:
