@@ -74,7 +74,7 @@ def write_moduli(file: Path, found: StiffnessFit, base: Mapping[str, str], name:
     Args:
         file: of the new scene.
         found: the moduli.
-        base: the key that names what was fitted: ``based_on`` a scene, or a ``case``.
+        base: key and value that name the fitted scene: ``based_on`` a scene, or a ``case``.
         name: of that scene.
 
     Raises:
