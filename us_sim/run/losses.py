@@ -77,12 +77,9 @@ class Outcome:
                 of = f" of {self.made} that were made"
             told.append(f"{self.recorded} images were recorded{of}")
         if self.files:
-            told.append(f"the recording is in {_listed([file.name for file in self.files])}")
-        return "; ".join(told) if self.losses or self.awaited or self._lacks_images else ""
-
-    @property
-    def _lacks_images(self) -> bool:
-        return bool(self.files) and self.recorded < self.made
+            told.append(f"the recording is in {', '.join(file.name for file in self.files)}")
+        lacks_images = bool(self.files) and self.recorded < self.made
+        return "; ".join(told) if self.losses or self.awaited or lacks_images else ""
 
     def summary(self) -> dict[str, Any]:
         """As one JSON-like mapping."""
@@ -114,10 +111,6 @@ def images_in(files: Sequence[Path]) -> int:
             continue
         count += sum(topic.message_count for topic in topics if topic.name == IMAGES)
     return count
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 class Recordings:
