@@ -16,7 +16,7 @@ from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, spri
 from us_sim.tissue.elasticity.stability import (
     highest_frequency,
     node_stiffness,
-    stabilised,
+    stabilise,
     step_limit,
 )
 from us_sim.tissue.model import TissueState
@@ -156,7 +156,7 @@ def test_beyond_the_limit_the_last_good_state_is_kept_and_it_is_said():
 def test_a_stable_step_leaves_the_masses_alone():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilised(model, factors, 1e-6, 0.1, "mass_scaling", 100)
+    mass, substeps, action = stabilise(model, factors, 1e-6, 0.1, "mass_scaling", 100)
     np.testing.assert_array_equal(mass, model.lumped_mass)
     assert (substeps, action) == (1, "")
 
@@ -164,7 +164,7 @@ def test_a_stable_step_leaves_the_masses_alone():
 def test_masses_are_scaled_where_needed_and_it_is_said():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilised(model, factors, 0.01, 0.1, "mass_scaling", 100)
+    mass, substeps, action = stabilise(model, factors, 0.01, 0.1, "mass_scaling", 100)
     assert substeps == 1
     assert (mass >= model.lumped_mass).all()
     frequency = highest_frequency(factors, mass, model.fixed)
@@ -176,14 +176,14 @@ def test_masses_are_scaled_where_needed_and_it_is_said():
 def test_substeps_are_counted_or_refused():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilised(model, factors, 0.01, 0.1, "substeps", 100)
+    mass, substeps, action = stabilise(model, factors, 0.01, 0.1, "substeps", 100)
     np.testing.assert_array_equal(mass, model.lumped_mass)
     assert substeps > 1
     frequency = highest_frequency(factors, mass, model.fixed)
     assert 0.01 / substeps < step_limit(frequency, 0.1) < 4 * 0.01 / substeps
     assert action.startswith(f"{substeps} sub-steps a step")
     with pytest.raises(SolverError, match=f"needs {substeps} sub-steps"):
-        stabilised(model, factors, 0.01, 0.1, "substeps", substeps - 1)
+        stabilise(model, factors, 0.01, 0.1, "substeps", substeps - 1)
 
 
 def test_where_nothing_is_free_any_step_is_stable():

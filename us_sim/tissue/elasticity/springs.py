@@ -122,8 +122,8 @@ def fitted_springs(
     Args:
         mesh, materials: of the tissue.
         damping_factor: s, damping constant over spring constant.
-        with_volume: match mu, since a volume term will add what lambda lacks. Otherwise, and below
-            Poisson's ratio 1/4, match Young's modulus, at the springs' own ratio of 1/4.
+        with_volume: match mu, since a volume term will add the missing part of lambda. Otherwise,
+            and below Poisson's ratio 1/4, match Young's modulus, at the springs' own ratio of 1/4.
     """
     ratio = np.maximum(materials.poisson_ratio, 0.25) if with_volume else 0.25
     shear = materials.young_modulus / (2 * (1 + ratio))
@@ -246,7 +246,7 @@ class VolumeTerm:
     yield_area: NDArray[np.float64]
 
     @classmethod
-    def nothing(cls, count: int) -> VolumeTerm:
+    def empty(cls, count: int) -> VolumeTerm:
         """The term without a tetrahedron, for ``count`` nodes."""
         none = np.zeros(0)
         return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)
@@ -400,7 +400,7 @@ def _measure(tetrahedra, nodes, volume):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_volume_forces(volumes, positions, velocity, force):
-    """Adds to force (N, 3) what the volume term does at positions and velocity (N, 3).
+    """Adds to force (N, 3) that of the volume term at positions and velocity (N, 3).
 
     Its `change` is left with volumes above those at rest, as if moved on for the damping time.
     """
