@@ -137,7 +137,7 @@ def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored
 
 
 def _shown(plan: Plan) -> tuple[float | None, str]:
-    """What a bar shows the run's progress in: its end, and the unit."""
+    """The end of a progress bar, and its unit."""
     if plan.poses is None:
         return plan.duration, "s"
     return None if plan.loops else plan.poses, "poses" if plan.player == "path_player" else "images"

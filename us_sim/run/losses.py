@@ -65,7 +65,7 @@ class Outcome:
     awaited: str = ""  # why nothing was played
 
     def sentence(self) -> str:
-        """What was lost, for a person; empty when nothing was."""
+        """The losses, for a person; empty when there are none."""
         told = [str(loss) for loss in self.losses[:TOLD]]
         if self.awaited:
             told.append(f"nothing was played: it waited for {self.awaited}")
@@ -127,7 +127,7 @@ class Recordings:
         self._begun.setdefault(file, time.monotonic())
 
     def progress(self, file: Path) -> dict[str, str]:
-        """What diagnostics say of a recording: its age, its size, and the room that is left."""
+        """Age and size of a recording and the room that is left, as values of diagnostics."""
         if file not in self._begun:
             return {}
         try:
@@ -144,7 +144,7 @@ class Recordings:
         }
 
     def files(self) -> list[Path]:
-        """What is there by now, in the order in which it was begun."""
+        """The files that are there by now, in the order in which they were begun."""
         return [
             found
             for file, older in self._older.items()

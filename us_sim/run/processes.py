@@ -320,7 +320,7 @@ class ProcessGroup:
 
 
 def ending(status: int) -> str:
-    """What an exit status says, for a person: negative ones are signals."""
+    """An exit status in words; negative ones are signals."""
     if status == INTERRUPTED:
         return "was told to end by a signal"
     if status >= 0:

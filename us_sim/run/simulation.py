@@ -164,7 +164,7 @@ class Simulation:
 
     @property
     def _kept_here(self) -> Kept:
-        """What was set of the nodes of this scene: they get it back whenever they start again."""
+        """Parameters set of the nodes of this scene, which get them back when they start again."""
         return self._kept.setdefault(_identity(self._request.scene), {})
 
     def _take_what_was_set(self) -> None:
