@@ -1,17 +1,4 @@
-"""Writing a bag from a thread of its own, so that whoever has messages never waits for the disk.
-
->>> import tempfile
->>> from us_sim.recording.reader import read_bag
->>> from us_sim.recording.writer import BagWriter
->>> file = tempfile.mkdtemp() + "/session.mcap"
->>> bag = WriteBehind(BagWriter(file), max_cache_size=1_000_000)
->>> bag.add_topic("/note", "std_msgs/msg/String")
->>> bag.put("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
-True
->>> bag.close()
->>> read_bag(file).message_count
-1
-"""
+"""Writing a bag from a thread of its own, so that whoever has messages never waits for the disk."""
 
 from __future__ import annotations
 
