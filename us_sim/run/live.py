@@ -453,7 +453,7 @@ def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
 
 def _require_a_cache() -> None:
     """Raise VolumeError when what is made would be lost, and made again by every node."""
-    from us_sim.volume.phantom.phantom import cache_folder
+    from us_sim.cache import cache_folder
 
     folder = cache_folder()
     try:
