@@ -25,7 +25,7 @@ from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_services
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, news
+from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, losses_between
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
@@ -231,7 +231,7 @@ class SessionRecorder(GuardedNode):
 
     def _tell_losses(self, bag: WriteBehind) -> None:
         lost = bag.losses.by_topic()
-        new = news(lost, self._told)
+        new = losses_between(lost, self._told)
         self._told = lost
         self.health.dropped = bag.losses.total
         while bag.untold:
