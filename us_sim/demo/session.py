@@ -202,7 +202,7 @@ class Session:
         return summary
 
     def _recorded(self) -> dict[str, dict[str, int]]:
-        """What each publisher last reported to have sent, beside what was recorded in the end."""
+        """Messages that each publisher last reported, beside those recorded, by topic."""
         recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         said = {
             topic: count

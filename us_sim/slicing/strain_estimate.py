@@ -239,7 +239,7 @@ _STEEPEST = 0.5  # of displacement along a beam: what is found steeper than that
 
 
 class Estimate(NamedTuple):
-    """What two images tell of the tissue's strain between them."""
+    """An estimate of strain between two images."""
 
     strain: NDArray[np.float32]  # (rows, columns), defined as `AxialStrain`'s; NaN where not found
     correlation: float
@@ -331,7 +331,7 @@ class Earlier:
         self._frames: deque[tuple[int, Any]] = deque()
 
     def before(self, frame: Frame, interval: int) -> Any:
-        """What was kept of the frame so many before, or None; this one is kept, too.
+        """The value kept of the frame ``interval`` before, or None; this frame's is kept, too.
 
         A frame may be asked about again.
         """

@@ -342,7 +342,7 @@ def _entity(entity: str, marker: Any) -> str:
 
 
 def _shape_of(marker: Any) -> Any:
-    """What rerun draws.
+    """The shape of a marker for rerun.
 
     Raises:
         MessageError: the type is another one, or a number is not finite.

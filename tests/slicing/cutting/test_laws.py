@@ -1,4 +1,4 @@
-"""What every slicing method must do, whatever its way: laws, and numbers known beforehand."""
+"""Laws of every slicing method, and numbers known beforehand."""
 
 import subprocess
 import sys

@@ -35,7 +35,7 @@ def black(probe):
 
 
 def thread_seconds(work):
-    """What ``work()`` takes of this thread's processor time."""
+    """Processor time of this thread in ``work()``."""
     start = time.thread_time()
     work()
     return time.thread_time() - start

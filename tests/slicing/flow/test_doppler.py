@@ -43,7 +43,7 @@ def frame_at(scanner, time):
 
 
 def wrapped(velocity, nyquist):
-    """What a scanner takes it for: between -nyquist and nyquist."""
+    """The aliased velocity, between -nyquist and nyquist."""
     return (velocity + nyquist) % (2 * nyquist) - nyquist
 
 

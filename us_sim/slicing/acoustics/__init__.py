@@ -1,1 +1,1 @@
-"""What the sound meets on its way: loss, shadows, surfaces and fibres along the current beams."""
+"""Sound along the current beams: loss, shadows, surfaces and fibres."""

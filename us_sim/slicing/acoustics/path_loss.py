@@ -37,7 +37,7 @@ _DARK = 30.0  # dB after which it does not matter where more is lost
 
 
 class Media(NamedTuple):
-    """What the labels of a volume are to sound at one frequency; medium 0 is `NOTHING`."""
+    """The media of a volume's labels at one frequency; medium 0 is `NOTHING`."""
 
     of_label: NDArray[np.uint8]  # (256,) the medium of each label
     loss: NDArray[np.float32]  # (media,) dB, of an echo in a sample's length, as of soft tissue

@@ -182,7 +182,7 @@ class TissueAcoustics(Settings):
 
 @dataclass(frozen=True)
 class SoundSettings(Settings):
-    """What of sound's artefacts is made along the current beams; a part that is off costs nothing.
+    """Artefacts of sound that are made along the current beams; a part that is off costs nothing.
 
     Raises:
         ProbeError: a value is out of range, with its name and the range.
@@ -251,7 +251,7 @@ class SoundSettings(Settings):
 
 @dataclass(frozen=True)
 class Acoustics(SoundSettings):
-    """What sound meets along the current beams, and the acoustic constants of each tissue."""
+    """Artefacts of sound along the current beams, and the acoustic constants of each tissue."""
 
     tissues: Mapping[str, TissueAcoustics] = setting(
         description="constants by label; of what is not said, the textbook's", default_factory=dict

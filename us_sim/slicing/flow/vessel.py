@@ -143,7 +143,7 @@ and what is left of the flow not to be seen."""
 
 
 def open_fraction(area: NDArray[np.float64], closed_at: float) -> NDArray[np.float64]:
-    """What is open of a lumen over what is at rest, from areas over those at rest."""
+    """Open fraction of a lumen, from its area over that at rest and the fraction at closure."""
     return np.asarray(np.maximum(area - closed_at, 0.0) / (1.0 - closed_at))
 
 

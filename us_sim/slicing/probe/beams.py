@@ -108,7 +108,7 @@ def fractions_and_depths(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 def _at(probe: Probe, fraction: NDArray[Any], of_lines: NDArray[np.float64]) -> NDArray[Any]:
-    """What is known of each line, between lines, and on beyond the outermost two."""
+    """Values of lines, linear between them and on beyond the outermost two."""
     if probe.lines == 1:
         return np.full(np.shape(fraction), of_lines[0])
     line = (np.asarray(fraction) + 0.5) * probe.lines - 0.5
