@@ -51,7 +51,10 @@ setup(
     license="Apache-2.0",
     author="us_sim developers",
     packages=find_packages(include=["us_sim", "us_sim.*"]),
-    package_data={"us_sim.viewer": ["assets/**/*", "panels/*.js"]},
+    package_data={
+        "us_sim.evaluation": ["*/*.md"],
+        "us_sim.viewer": ["assets/**/*", "panels/*.js"],
+    },
     python_requires=">=3.11",
     install_requires=[  # .ci/ubuntu tests the versions of Ubuntu 24.04, which are the oldest here
         *([] if BY_COLCON else ["cyclonedds>=11.0,<12"]),  # which stands in for ROS 2

@@ -134,7 +134,7 @@ class Supervised:
                         for node, action in self.actions.items()
                         if "pid" in (action.process_details or {})
                     }
-                    for node, how in self.hang.look(pids, self.monitor.node.heard).items():
+                    for node, how in self.hang.hung(pids, self.monitor.node.heard).items():
                         self.why[node] = how
                         await self.end(self.actions[node], context)
         except asyncio.CancelledError:

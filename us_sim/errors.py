@@ -1,4 +1,4 @@
-"""Errors that reach a person: each carries one sentence saying what, where and what to do."""
+"""Errors that reach a person: each is one sentence with the fault, its place, and a remedy."""
 
 LONGEST = 2000
 """Characters of a sentence: it may quote a file or a message."""
@@ -95,7 +95,7 @@ class FileTakenError(BagError):
 
 
 class TrackingError(UsSimError):
-    """A tracker's data, or what describes its bodies, cannot be used."""
+    """A tracker's data, or the file of its bodies, cannot be used."""
 
 
 class CalibrationError(UsSimError):

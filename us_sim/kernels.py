@@ -82,7 +82,7 @@ class _Locator(_UserProvidedCacheLocator):
         return cls(py_func, py_file) if os.path.isfile(py_file) else None
 
     def ensure_cache_path(self) -> None:
-        """Nothing: what is kept sees to its folder."""
+        """Do nothing: `save` makes the folder."""
 
 
 class _Implementation(CompileResultCacheImpl):
@@ -128,7 +128,7 @@ class _CheckedFiles:
         self._last = folder
 
     def load(self, key: object) -> Any:
-        """What was kept under a key; None where nothing was, or nothing that can be used."""
+        """The data kept under a key; None where there is none that can be used."""
         path = self._last = self._path(key)
         try:
             with path.open("rb") as file:
@@ -155,7 +155,7 @@ class _CheckedFiles:
             self._last.unlink()
 
     def save(self, key: object, data: object) -> None:
-        """Keep ``data``, and nothing of what the source file was before.
+        """Keep ``data``, and remove the data of earlier versions of the source file.
 
         Raises:
             OSError: it cannot be written.

@@ -62,7 +62,7 @@ class Progress:
         self._bar.update(done - self._bar.n)
 
     def tell(self, text: str) -> None:
-        """Show what is being done where nobody knows how much of it there is."""
+        """Show the step of work whose amount is unknown."""
         self._bar.bar_format = _UNMEASURED
         self._bar.set_postfix_str(printable(text, _LONGEST), refresh=False)
         self._bar.update(0)

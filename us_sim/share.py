@@ -11,7 +11,7 @@ from us_sim.errors import UsSimError
 
 
 def full_path(name: str | Path) -> Path:
-    """The absolute path of what a person wrote: with their home for ``~``, and links followed.
+    """The absolute path of a text, with ``~`` expanded and links followed.
 
     Unlike `Path.resolve` and `Path.expanduser` it never fails: links that lead in a circle, and
     the home of nobody, are left for whoever opens the file to refuse.

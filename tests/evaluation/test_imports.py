@@ -1,10 +1,13 @@
-"""The evaluation stands on top: nothing below imports it, and nothing in it in a circle."""
+"""The evaluation stands on top, without circles, and fills every place of its templates."""
 
 import ast
 import graphlib
 from pathlib import Path
 
+import pytest
+
 import us_sim
+from us_sim.evaluation.report import filled
 
 PACKAGE = Path(us_sim.__file__).parent
 
@@ -37,3 +40,11 @@ def test_the_evaluation_imports_nothing_in_a_circle():
     }
     graph = {name: {m for m in imported(file) if m in files} for name, file in files.items()}
     list(graphlib.TopologicalSorter(graph).static_order())  # raises where there is a circle
+
+
+def test_a_place_of_a_template_that_is_not_filled_is_an_error():
+    assert filled("tissue", "locking", nodes="8,192", table="").startswith("## Locking\n\nError of")
+    with pytest.raises(ValueError, match="table"):
+        filled("tissue", "locking", nodes="8,192")
+    with pytest.raises(ValueError, match="more"):
+        filled("tissue", "locking", nodes="8,192", table="", more="")

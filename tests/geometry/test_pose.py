@@ -74,15 +74,15 @@ def test_the_pose_along_a_way_is_the_product_of_its_matrices():
     tree, product = FrameTree(), np.eye(4)
     for number in range(5):
         pose = Pose(random.normal(size=3), random.normal(size=4))
-        tree.place(f"{number + 1}", f"{number}", pose)
+        tree.set_pose(f"{number + 1}", f"{number}", pose)
         product = product @ pose.matrix
     np.testing.assert_allclose(tree.pose(tree.chain("5", "0")).matrix, product, atol=1e-12)
 
 
 def test_frames_that_do_not_meet_or_go_round_have_no_chain():
     tree = FrameTree()
-    tree.place("a", "b", Pose())
-    tree.place("b", "a", Pose())
+    tree.set_pose("a", "b", Pose())
+    tree.set_pose("b", "a", Pose())
     assert tree.chain("a", "world") is None
     assert tree.chain("nowhere", "world") is None
     assert tree.chain("world", "world") == []
@@ -90,6 +90,6 @@ def test_frames_that_do_not_meet_or_go_round_have_no_chain():
 
 def test_a_flood_of_frames_ends():
     tree = FrameTree()
-    taken = [tree.place(f"{n}", "world", Pose()) for n in range(1001)]
+    taken = [tree.set_pose(f"{n}", "world", Pose()) for n in range(1001)]
     assert (taken.count(True), taken[-1]) == (1000, False)
-    assert tree.place("5", "world", Pose([1.0, 0, 0]))  # one that is known still moves
+    assert tree.set_pose("5", "world", Pose([1.0, 0, 0]))  # one that is known still moves

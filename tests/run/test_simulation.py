@@ -33,7 +33,7 @@ class Supervisor:
         self.started = set(plan.nodes)
         self.plans.append(plan)
 
-    def look(self):
+    def update(self):
         why, self.why = self.why, ""
         if why:
             raise UsSimError(why)
@@ -76,7 +76,7 @@ def running(small_scene):
     supervisor, control = Supervisor(plan_of(request)), Control()
     monitor = SimpleNamespace(control=lambda: control, node=SimpleNamespace(reports={}))
     simulation = Simulation(request, supervisor, monitor)
-    simulation.look()
+    simulation.update()
     yield simulation, supervisor, control
     simulation.close()
 
@@ -93,7 +93,7 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     monkeypatch.chdir(tmp_path)
     ask(simulation, control, record="a.mcap")
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder"}
-    simulation.look()
+    simulation.update()
     assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
     assert control.told[-1][1]["record_note"] == ""
     supervisor.recordings.begin(supervisor.plan.processes[0])
@@ -101,7 +101,7 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     (tmp_path / "a_1.mcap").write_bytes(bytes(500))
     simulation._recording_at = 0.0
     simulation._monitor.node.reports["session_recorder"] = {"note": "it lies beside another"}
-    simulation.look()
+    simulation.update()
     told = control.told[-1][1]
     assert told["record_note"] == "it lies beside another"
     assert (told["record_bytes"], told["record_seconds"]) == ("1500", "0")
@@ -115,7 +115,7 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     ask(simulation, control, replay_paused=True)
     assert control.to_player[-1] == ("path_player", {"paused": True})
     assert supervisor.kept["path_player"] == {"paused": True}
-    simulation.look()
+    simulation.update()
     assert control.told[-1][1]["replay"] == PATH
     ask(simulation, control, record=None, replay=None)
     assert set(supervisor.plan.nodes) == nodes
@@ -139,7 +139,7 @@ SET = {"tissue_deformer": {"materials.fat.young_modulus": 45e3, "solver": "xpbd"
 def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
     simulation, supervisor, control = running
     of = lambda: {each.node: each.kept for each in supervisor.plan.processes if each.kept}  # noqa: E731
-    problem = lambda: (simulation.look(), control.told[-1][2])[1]  # noqa: E731
+    problem = lambda: (simulation.update(), control.told[-1][2])[1]  # noqa: E731
     supervisor.set = SET
     assert problem() == ""
     # All as recorded takes the nodes' place, and they come back.
@@ -157,7 +157,7 @@ def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
     supervisor.dropped = SET
     assert "ended twice" in problem()
     supervisor.set = {"slice_interpolator": {"gain": 3.0}}
-    simulation.look()
+    simulation.update()
     assert simulation._kept_here == {"slice_interpolator": {"gain": 3.0}}
     simulation._begin("")
     assert of() == {}
@@ -188,10 +188,10 @@ def test_what_turns_out_not_to_work_is_taken_back(running):
     supervisor.waiting = ["path_player"]
     ask(simulation, control, replay=PATH)
     supervisor.why = "path_player cannot work"
-    simulation.look()
+    simulation.update()
     assert supervisor.plan.processes == before.processes
     assert control.told[-1][2] == "path_player cannot work; small runs as before"
     assert control.values.replay is None
     supervisor.why = "tissue_deformer cannot work"
     with pytest.raises(UsSimError, match="tissue_deformer"):
-        simulation.look()  # there is nothing more to go back to
+        simulation.update()  # there is nothing more to go back to

@@ -67,6 +67,8 @@ class Monitor:
         self.node = SimpleNamespace(
             reports={}, messages={}, heard={}, tell_lost=self.told.append, count=lambda *_: 7
         )
+        self.node.rejected = lambda node, kind: self.problems.get((node, kind), 0)
+        self.problems = {}
         self.set = {}
         self.node.take_set = lambda: self.set
 
@@ -99,9 +101,9 @@ def session(tmp_path):
 
 def test_a_player_at_its_end_is_no_loss(session):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     group.ended = {"path_player": 0}
-    supervisor.look()
+    supervisor.update()
     assert supervisor.finished
     assert not supervisor.losses
     assert supervisor.outcome(1.0).sentence() == ""
@@ -137,13 +139,13 @@ def test_a_path_that_was_never_played_is_a_loss(session):
 @pytest.mark.parametrize("status", [0, 1, 3, -15, -9, INTERRUPTED])
 def test_any_other_end_is(session, status):
     supervisor, group, monitor = session
-    supervisor.look()
+    supervisor.update()
     group.ended = {"slice_interpolator": status}
-    supervisor.look()
+    supervisor.update()
     (loss,) = supervisor.losses
     assert (loss.node, loss.said) == ("slice_interpolator", "slice_interpolator was here")
     assert [process.node for process in group.started[3:]] == ["slice_interpolator"]
-    supervisor.look()
+    supervisor.update()
     assert loss.back_after is not None
     assert not supervisor.finished
     assert monitor.told[-1] == [str(loss)]
@@ -151,14 +153,14 @@ def test_any_other_end_is(session, status):
 
 def test_what_was_set_is_given_back_unless_a_node_ends_of_it(session):
     supervisor, group, monitor = session
-    supervisor.look()
+    supervisor.update()
     of = {"slice_interpolator": {"gain": 3.0}}
     monitor.set = of | {"stranger": {"a": 1}, "path_player": {"time": 3.0}}
     for given, kept, dropped in (({"gain": 3.0}, of, {}), ({}, {}, of)):
         group.ended = {"slice_interpolator": -9}
-        supervisor.look()
+        supervisor.update()
         monitor.set = {}
-        supervisor.look()
+        supervisor.update()
         assert group.started[-1].all_parameters == given
         assert supervisor.take_set() == (kept, dropped)
 
@@ -166,23 +168,23 @@ def test_what_was_set_is_given_back_unless_a_node_ends_of_it(session):
 def test_one_that_was_never_ready_ends_all_unless_a_signal_ended_it(session):
     supervisor, group, monitor = session
     monitor.silent = {"slice_interpolator"}
-    supervisor.look()
+    supervisor.update()
     for status in (-15, 0, INTERRUPTED):
         if len(supervisor.losses) < 2:
             group.ended = {"slice_interpolator": status}
-            supervisor.look()
+            supervisor.update()
     assert supervisor.waiting == ["slice_interpolator"]
     group.ended = {"slice_interpolator": 1}
     with pytest.raises(UsSimError, match="slice_interpolator cannot work"):
-        supervisor.look()
+        supervisor.update()
 
 
 def test_the_rest_goes_on_without_one_that_is_given_up(session):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     for _ in range(3):
         group.ended = {"slice_interpolator": -11}
-        supervisor.look()
+        supervisor.update()
     assert len(group.started) == 3 + 2
     assert supervisor.losses[-1].given_up == "is not started again after 2 restarts"
     assert "was ended by SIGSEGV" in supervisor.outcome(1.0).sentence()
@@ -191,22 +193,22 @@ def test_the_rest_goes_on_without_one_that_is_given_up(session):
 
 def test_without_its_player_the_run_is_over(session):
     supervisor, group, monitor = session
-    supervisor.look()
+    supervisor.update()
     monitor.node.reports["path_player"] |= {"begun": "1700000000.5", "played": "120"}
     for _ in range(3):
         assert not supervisor.finished
         group.ended = {"path_player": INTERRUPTED}
-        supervisor.look()
+        supervisor.update()
     assert supervisor.finished
     assert group.started[3].given == {"begun": 1700000000.5}
 
 
 def test_a_recorder_goes_on_in_a_further_file_and_all_are_found(session, tmp_path):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     (tmp_path / "session.mcap").touch()
     group.ended = {"session_recorder": -9}
-    supervisor.look()
+    supervisor.update()
     again = group.started[3].all_parameters
     assert (again["file"], again["if_exists"]) == (str(tmp_path / "session.mcap"), "further")
     (tmp_path / "session_1.mcap").touch()
@@ -217,16 +219,16 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_are_found(session, tmp_pat
 def test_a_full_disk_is_told_once(session):
     supervisor, _, monitor = session
     monitor.node.messages["session_recorder"] = "no space left"
-    monitor.node.reports["session_recorder"] = {"rejected disk": "1"}
-    supervisor.look()
-    supervisor.look()
+    monitor.problems["session_recorder", "disk"] = 1
+    supervisor.update()
+    supervisor.update()
     (loss,) = supervisor.losses
     assert loss.what == "could not write any more (no space left)"
 
 
 def test_a_recorder_that_had_to_be_killed_is_a_loss(session):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     group.killed = ["path_player"]
     supervisor.end()
     assert not supervisor.losses
@@ -237,7 +239,7 @@ def test_a_recorder_that_had_to_be_killed_is_a_loss(session):
 
 def test_another_plan_ends_what_it_lacks_and_starts_what_is_new_when_that_has_gone(session):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     before = dict(group.pids)
     scene = NodeProcess("slice_interpolator", {"scene": "other"})
     skin = NodeProcess("skin_deformer", {"scene": "other"})
@@ -248,10 +250,10 @@ def test_another_plan_ends_what_it_lacks_and_starts_what_is_new_when_that_has_go
     assert len(group.started) == 3  # while the old still publishes
     assert set(supervisor.waiting) == {"slice_interpolator", "skin_deformer"}
     group.dismissed.clear()
-    supervisor.look()
+    supervisor.update()
     assert group.started[3:] == [scene, skin]
     assert group.pids["session_recorder"] == before["session_recorder"]
-    supervisor.look()
+    supervisor.update()
     assert supervisor.waiting == []
     assert not supervisor.losses
     # How many images were made while something was recorded is not known then.
@@ -260,21 +262,21 @@ def test_another_plan_ends_what_it_lacks_and_starts_what_is_new_when_that_has_go
 
 def test_a_recorder_that_takes_long_to_end_holds_up_nobody_else(session):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     skin = NodeProcess("skin_deformer")
     supervisor.change(Plan([*group.started[1:], skin]))
     assert group.started[3:] == [skin]
     group.dismissed["session_recorder"] = True  # it had to be killed
-    supervisor.look()
+    supervisor.update()
     assert supervisor.losses[-1].given_up == "its last messages may be missing"
 
 
 def test_parameters_that_were_set_meanwhile_are_those_of_the_next_process(session):
     supervisor, group, _ = session
-    supervisor.look()
+    supervisor.update()
     supervisor.keep("path_player", {"rate": 0.5})
     group.ended = {"path_player": -9}
-    supervisor.look()
+    supervisor.update()
     assert group.started[3].all_parameters["rate"] == 0.5
 
 

@@ -23,8 +23,8 @@ class Machine:
         self.reports = 0
         self.watch = Watch(10.0, clock=lambda: self.now, state=lambda _: self.state)
 
-    def look(self):
-        return self.watch.look({NODE: PID}, {(NODE, PID): self.reports}).get(NODE, "")
+    def hung(self):
+        return self.watch.hung({NODE: PID}, {(NODE, PID): self.reports}).get(NODE, "")
 
     def pass_time(self, seconds, *, step=0.1, works=0.0, reporting=False, **state):
         """Until something is told, looked at again and again; when that was, and what."""
@@ -36,7 +36,7 @@ class Machine:
                 state.get("is_stopped", False), state.get("is_waiting", False), cpu
             )
             self.reports += reporting
-            if told := self.look():
+            if told := self.hung():
                 break
         return self.now, told
 
@@ -44,9 +44,9 @@ class Machine:
 @pytest.fixture
 def machine():
     machine = Machine()
-    machine.look()
+    machine.hung()
     machine.reports = 1
-    machine.look()
+    machine.hung()
     return machine
 
 
@@ -76,11 +76,11 @@ def test_one_that_is_stopped_is_told_at_once(machine):
 def test_time_in_which_nobody_looked_is_no_silence(machine):
     for _ in range(15):
         machine.now += 3600.0  # a laptop that was closed
-        assert machine.look() == ""
+        assert machine.hung() == ""
     machine.now += 3600.0
     for _ in range(20):
         machine.now += 0.5
-        told = machine.look()
+        told = machine.hung()
         if told:
             break
     assert told
@@ -89,15 +89,15 @@ def test_time_in_which_nobody_looked_is_no_silence(machine):
 def test_the_first_report_has_five_minutes(machine):
     machine.reports = 0
     fresh = Machine()
-    fresh.look()
+    fresh.hung()
     assert fresh.pass_time(299.0, step=0.5) == (299.0, "")
     assert fresh.pass_time(2.0, step=0.5)[1] == "has not reported for 300 s"
 
 
 def test_another_process_of_the_node_starts_anew(machine):
     machine.pass_time(9.0)
-    assert machine.watch.look({NODE: PID + 1}, {(NODE, PID): 1}) == {}
-    assert machine.watch.look({NODE: PID + 1}, {(NODE, PID): 2}) == {}
+    assert machine.watch.hung({NODE: PID + 1}, {(NODE, PID): 1}) == {}
+    assert machine.watch.hung({NODE: PID + 1}, {(NODE, PID): 2}) == {}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")

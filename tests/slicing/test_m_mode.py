@@ -1,7 +1,4 @@
-"""M-mode shows what is along its line, when it was there.
-
-A moving picture has every moment once, however frames come.
-"""
+"""M-mode, and moving pictures that have every moment once."""
 
 import numpy as np
 import pytest

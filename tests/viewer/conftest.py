@@ -4,9 +4,18 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from bench import Bench
 from chromium import watched
 
 from us_sim.viewer.stream import Simulator
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    """A bench of nodes that is taken down after the test."""
+    bench = Bench()
+    yield bench
+    bench.close()
 
 
 @pytest.fixture(scope="session")

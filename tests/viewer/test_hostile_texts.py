@@ -53,9 +53,9 @@ def stranger(simulator: Simulator) -> Iterator[None]:
     bench = Bench()
     viewer = bench.add(GuardedNode("viewer", context=bench.context))
     post = Posted(viewer)
-    simulator.session = ViewerSession(viewer, post).board
-    simulator.nodes = RemoteParameters(viewer, post).board
-    simulator.status = StatusListener(viewer, post).board
+    simulator.session = ViewerSession(viewer, post)
+    simulator.nodes = RemoteParameters(viewer, post)
+    simulator.status = StatusListener(viewer, post)
     for name in NODES:
         node = bench.add(Node(name, context=bench.context))
         about = ParameterDescriptor(

@@ -329,7 +329,7 @@ def test_of_another_scene_no_image_is_kept_frozen_or_on_the_plane(
     page: Any, images: Images, simulator: Simulator
 ) -> None:
     def scene(name: str) -> None:
-        simulator.session.tell_state(SessionState(is_there=True, scene=name))
+        simulator.session.state = SessionState(is_there=True, scene=name)
         page.locator(f"#us-scene[data-scene={name}]").wait_for(state="attached")
 
     plane = "import('/us_sim/assets/scene/probe.js').then(m => m.probe.image.visible)"

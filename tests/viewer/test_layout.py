@@ -37,12 +37,10 @@ def hand(simulator: Simulator) -> FakeHand:
     simulator.nodes = ParameterBoard()
     known = {parameter.name: parameter for parameter in PARAMETERS}
     simulator.nodes.tell(NodeParameters(NODE, State.THERE, known))
-    simulator.session.tell_state(SessionState(True, "running", "upper_arm", "/arm.yaml"))
-    simulator.session.tell_scenes(
-        (
-            LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
-            LoadableScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
-        )
+    simulator.session.state = SessionState(True, "running", "upper_arm", "/arm.yaml")
+    simulator.session.scenes = (
+        LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+        LoadableScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
     )
     now = time.monotonic()
     simulator.status.tell(NodeStatus(NODE, Level.WELL, "runs"), now)

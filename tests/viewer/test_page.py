@@ -174,13 +174,13 @@ def test_the_header_says_what_runs_and_what_is_done_with_it(
     page: Any, simulator: Simulator
 ) -> None:
     loading = SessionState(is_there=True, scene="upper_arm", state="loading liver", fraction=0.25)
-    simulator.session.tell_state(loading)
+    simulator.session.state = loading
     page.goto(page.address)
     page.get_by_text("loading liver, 25 %").wait_for()
     done = SessionState(is_there=True, scene="liver", state="running", record="press.mcap")
-    simulator.session.tell_state(done)
+    simulator.session.state = done
     page.get_by_text("recording press.mcap").wait_for()
-    simulator.session.tell_state(dataclasses.replace(done, problem="the gain is lost"))
+    simulator.session.state = dataclasses.replace(done, problem="the gain is lost")
     lost = page.get_by_role("alert").filter(has_text="the gain is lost")
     lost.wait_for()
     assert lost.evaluate("each => getComputedStyle(each).color") == "rgb(229, 115, 92)"

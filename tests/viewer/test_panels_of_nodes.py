@@ -28,7 +28,7 @@ def graph(simulator: Simulator) -> Iterator[Node]:
     bench = Bench()
     node = bench.add(Node(NODE, context=bench.context))
     asking = bench.add(GuardedNode("viewer", context=bench.context))
-    simulator.nodes = RemoteParameters(asking, Posted(asking)).board
+    simulator.nodes = RemoteParameters(asking, Posted(asking))
     ended = threading.Event()
 
     def spin() -> None:

@@ -25,8 +25,8 @@ def session(simulator):
         asked.append(dict(values))
         return told
 
-    simulator.session = SessionBoard(ask=ask)
-    simulator.session.tell_state(RUNNING)
+    simulator.session = SessionBoard(send=ask)
+    simulator.session.state = RUNNING
     return simulator.session, asked
 
 
@@ -40,22 +40,20 @@ def opened(page, tab):
 def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     board, asked = session
     _, picture = cv2.imencode(".jpg", np.full((180, 240), 90, np.uint8))
-    board.tell_scenes(
-        (
-            LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
-            LoadableScene("liver", "case:/liver", "case", region="abdomen"),
-            LoadableScene("sweep", "/sweep.yaml", problem="volume.file: is missing"),
-        )
+    board.scenes = (
+        LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+        LoadableScene("liver", "case:/liver", "case", region="abdomen"),
+        LoadableScene("sweep", "/sweep.yaml", problem="volume.file: is missing"),
     )
-    board.tell_thumbnail("case:/liver", bytes(picture))
+    board.thumbnails["case:/liver"] = bytes(picture)
     opened(page, "Cases")
     page.get_by_text("volume.file: is missing").wait_for()
     assert page.get_by_role("button", name="Load sweep").is_disabled()
     page.locator('img[src^="data:image/jpeg"]').first.wait_for()
     page.get_by_role("button", name="Load liver").click()
     until(lambda: asked == [{"scene": "case:/liver"}], "it is asked for", 30.0)
-    board.tell_state(
-        dataclasses.replace(RUNNING, state="loading liver: reading the volume", fraction=0.4)
+    board.state = dataclasses.replace(
+        RUNNING, state="loading liver: reading the volume", fraction=0.4
     )
     page.get_by_text("upper arm: loading liver: reading the volume, 40 %").wait_for()
     until(
@@ -63,7 +61,7 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
         "nothing else can be loaded meanwhile",
         30.0,
     )
-    board.tell_state(dataclasses.replace(RUNNING, record="a.mcap"))
+    board.state = dataclasses.replace(RUNNING, record="a.mcap")
     until(page.get_by_role("button", name="Load liver").is_enabled, "it can be loaded again", 30.0)
     page.get_by_role("button", name="Load liver").click()
     page.get_by_role("button", name="Go on recording").click()
@@ -74,7 +72,7 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
 
 def test_a_session_is_recorded_and_replayed(page, session):
     board, asked = session
-    board.tell_bags({"hand.mcap": "/bags/hand.mcap"})
+    board.bags = {"hand.mcap": "/bags/hand.mcap"}
     opened(page, "Session")
     file = page.get_by_label("file")
     until(lambda: file.input_value().startswith("session_"), "a name is proposed", 30.0)
@@ -82,20 +80,20 @@ def test_a_session_is_recorded_and_replayed(page, session):
     file.fill("nowhere.mcap")
     page.get_by_role("button", name="Record", exact=True).click()
     page.get_by_text("there is no such file").wait_for()
-    board.tell_state(dataclasses.replace(RUNNING, record="/home/a/mine.mcap"))
+    board.state = dataclasses.replace(RUNNING, record="/home/a/mine.mcap")
     page.get_by_text("recording to /home/a/mine.mcap").wait_for()
     page.get_by_text("recording mine.mcap").wait_for()
     note = "metadata.yaml in this folder belongs to another recording"
     assert not page.get_by_text(note).is_visible()
-    board.tell_state(
-        dataclasses.replace(RUNNING, record="/home/a/mine.mcap", record_note=f"{note}, so …")
+    board.state = dataclasses.replace(
+        RUNNING, record="/home/a/mine.mcap", record_note=f"{note}, so …"
     )
     page.get_by_text(note).wait_for()
     until(lambda: file.input_value() == "mine.mcap", "the field names what is written", 30.0)
     page.get_by_role("button", name="Stop", exact=True).click()
     until(lambda: asked[-1] == {"record": ""}, "it is ended", 30.0)
     page.get_by_text("recorded to /home/a/mine.mcap").wait_for()
-    board.tell_state(RUNNING)
+    board.state = RUNNING
     page.get_by_text(note).wait_for(state="hidden")
     until(lambda: file.input_value().startswith("session_"), "another is proposed", 30.0)
     assert file.input_value() >= proposed
@@ -104,10 +102,8 @@ def test_a_session_is_recorded_and_replayed(page, session):
     page.get_by_role("button", name="Play or pause").click()
     until(lambda: asked[-1].get("replay") == "/bags/hand.mcap", "it is played", 30.0)
     assert asked[-1]["replay_as"] == "path"
-    board.tell_state(
-        dataclasses.replace(
-            RUNNING, replay="/bags/hand.mcap", replay_state="playing", position=3.2, duration=12.0
-        )
+    board.state = dataclasses.replace(
+        RUNNING, replay="/bags/hand.mcap", replay_state="playing", position=3.2, duration=12.0
     )
     page.get_by_text("3.2 of 12.0 s, playing").wait_for()
     count = len(asked)
@@ -122,17 +118,17 @@ def test_a_session_is_recorded_and_replayed(page, session):
 @pytest.mark.parametrize("typed", ["/data/other.mcap", "hand.mcap"])
 def test_a_path_or_a_name_that_is_typed_is_replayed_and_stays(page, session, typed):
     board, asked = session
-    board.tell_bags({"hand.mcap": "/bags/hand.mcap", "hand.mcap.old": "/bags/old"})
+    board.bags = {"hand.mcap": "/bags/hand.mcap", "hand.mcap.old": "/bags/old"}
     file = board.bags.get(typed, typed)
     opened(page, "Session")
     field = page.get_by_label("recording or path")
     field.fill(typed)
     field.press("Enter")
-    board.tell_bags({**board.bags, "new.mcap": "/bags/new.mcap"})
+    board.bags = {**board.bags, "new.mcap": "/bags/new.mcap"}
     page.get_by_role("button", name="Play or pause").click()
     until(lambda: asked, "it is asked for", 30.0)
     assert asked[-1].get("replay") == file
-    board.tell_state(dataclasses.replace(RUNNING, replay=file, replay_state="playing"))
+    board.state = dataclasses.replace(RUNNING, replay=file, replay_state="playing")
     page.get_by_text("s, playing").wait_for()
     assert field.input_value() == typed
     page.get_by_role("button", name="Play or pause").click()
@@ -157,7 +153,7 @@ def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session
 
 def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recorded(page, session):
     board, asked = session
-    board.tell_bags({"hand.mcap": "/bags/hand.mcap"})
+    board.bags = {"hand.mcap": "/bags/hand.mcap"}
     opened(page, "Session")
     kind = page.get_by_role("button", name="All as recorded")
     page.get_by_title("start again, with what was set before").wait_for()
@@ -167,7 +163,7 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
     page.get_by_role("button", name="Play or pause").click()
     until(lambda: asked and asked[-1]["replay_as"] == "recording", "it is asked for", 30.0)
     replay = {"replay": "/bags/hand.mcap", "replay_as": "recording", "replay_state": "playing"}
-    board.tell_state(dataclasses.replace(RUNNING, **replay))
+    board.state = dataclasses.replace(RUNNING, **replay)
     until(kind.is_disabled, "it cannot be changed now", 30.0)
     page.get_by_title("cannot be changed: end the replay first").wait_for()
 
@@ -175,12 +171,12 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
 def test_how_long_and_how_large_a_recording_is_and_what_room_is_left_is_said(page, session):
     board, _ = session
     state = dataclasses.replace(RUNNING, record="/a.mcap", record_seconds=61.0, record_bytes=61e6)
-    board.tell_state(dataclasses.replace(state, record_room=36e9))
+    board.state = dataclasses.replace(state, record_room=36e9)
     opened(page, "Session")
     recorded = page.get_by_text("recording to /a.mcap: 1:01 min, 61 MB, room for 10 h")
     recorded.wait_for()
     assert "us-wrong" not in recorded.get_attribute("class")
-    board.tell_state(dataclasses.replace(state, record_room=5e8))
+    board.state = dataclasses.replace(state, record_room=5e8)
     page.locator(".us-wrong", has_text="room for 8 min").wait_for()
 
 
@@ -200,8 +196,10 @@ def test_how_long_and_how_large_a_recording_is_and_what_room_is_left_is_said(pag
 def test_pages_of_others_name_what_is_listed_and_record_to_one_folder(asked, file):
     for is_own in (True, False):
         sent = []
-        board = SessionBoard(ask=lambda v, s=sent: s.append(v), folder="/recordings", is_own=is_own)
-        board.tell_state(RUNNING)
+        board = SessionBoard(
+            send=lambda v, s=sent: s.append(v), folder="/recordings", is_own=is_own
+        )
+        board.state = RUNNING
         told = board.ask(**asked)
         if is_own or file:
             assert sent
@@ -213,6 +211,6 @@ def test_pages_of_others_name_what_is_listed_and_record_to_one_folder(asked, fil
 
 def test_where_us_sim_does_not_run_the_simulation_that_is_said(page, session):
     board, _ = session
-    board.tell_state(SessionState())
+    board.state = SessionState()
     opened(page, "Session")
     page.get_by_text("us-sim does not run this simulation").wait_for()

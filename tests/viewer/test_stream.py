@@ -1,10 +1,147 @@
-"""How fast a page of a real browser takes what streams."""
+"""Feeds: watched or not, the newest wins, and each is packed once.
+
+How fast a page of a real browser takes what streams.
+"""
 
 from typing import Any
 
 from awaiting import until
+from hypothesis import given
+from hypothesis import strategies as st
 
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, PageStream, Simulator
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(
+    st.text(min_size=1),
+    st.integers(0, 2**53),
+    st.dictionaries(st.text().filter(lambda key: key not in ("kind", "sequence")), JSON),
+    st.binary(max_size=50),
+)
+def test_a_packet_comes_back(kind: str, sequence: int, header: dict, payload: bytes) -> None:
+    packet = Packet(kind, sequence, header, payload)
+    assert Packet.decoded(packet.encoded) == packet
+    assert (len(packet.encoded) - len(payload)) % 8 == 0
+
+
+def packed(feed: Feed, payload: bytes, made: list[int] | None = None) -> None:
+    def pack(sequence: int) -> Packet:
+        if made is not None:
+            made.append(sequence)
+        return Packet(feed.kind, sequence, {}, payload)
+
+    feed.offer(pack)
+
+
+def test_who_watches_first_and_leaves_last_is_told() -> None:
+    told: list[bool] = []
+    feed = Feed("image", told.append)
+    one, two = (lambda: None), (lambda: None)
+    feed.watch(one)
+    feed.watch(two)
+    feed.unwatch(one)
+    assert told == [True]
+    feed.unwatch(two)
+    assert told == [True, False]
+    assert not feed.is_watched
+
+
+def test_only_what_is_taken_is_packed_and_that_once() -> None:
+    feed, made = Feed("image"), []
+    for _ in range(5):
+        packed(feed, b"x", made)
+    assert feed.newest() is feed.newest()
+    assert made == [5]
+
+
+def test_what_cannot_be_packed_is_none_and_not_tried_again() -> None:
+    feed, tried = Feed("image"), []
+    feed.offer(lambda sequence: tried.append(sequence))
+    assert feed.newest() is None
+    assert feed.newest() is None
+    assert tried == [1]
+
+
+def stream_of(*feeds: Feed) -> tuple[PageStream, list[None]]:
+    simulator, woken = Simulator(), []
+    simulator.add(*feeds)
+    return PageStream(simulator, lambda: woken.append(None)), woken
+
+
+def test_a_page_gets_the_newest_when_it_has_drawn_the_last() -> None:
+    feed = Feed("image", rate=None)
+    page, woken = stream_of(feed)
+    page.take('{"watch": ["image"]}')
+    packed(feed, b"1")
+    assert [Packet.decoded(data).payload for data in page.due(0.0)[0]] == [b"1"]
+    packed(feed, b"2")
+    packed(feed, b"3")
+    assert page.due(1.0) == ([], None)  # it has not drawn yet
+    before = len(woken)
+    page.take('{"next": "image"}')
+    assert len(woken) == before + 1
+    assert [Packet.decoded(data).payload for data in page.due(2.0)[0]] == [b"3"]
+    page.take('{"next": "image"}')
+    assert page.due(3.0) == ([], None)  # it has that one
+
+
+def test_no_more_than_the_rate_and_the_wait_is_told() -> None:
+    feed = Feed("image", rate=10.0)
+    page, _ = stream_of(feed)
+    page.take('{"watch": ["image"]}')
+    packed(feed, b"1")
+    assert len(page.due(0.0)[0]) == 1
+    page.take('{"next": "image"}')
+    packed(feed, b"2")
+    packets, later = page.due(0.06)
+    assert packets == []
+    assert later is not None
+    assert abs(later - 0.04) < 1e-9
+    assert len(page.due(0.1)[0]) == 1
+
+
+def test_two_pages_of_different_speed_each_get_their_newest() -> None:
+    feed = Feed("image", rate=None)
+    fast, _ = stream_of(feed)
+    slow, _ = stream_of(feed)
+    for page in (fast, slow):
+        page.take('{"watch": ["image"]}')
+    counts = {fast: 0, slow: 0}
+    for i in range(30):
+        packed(feed, bytes([i]))
+        for page, patience in ((fast, 1), (slow, 5)):
+            if i % patience == 0:
+                page.take('{"next": "image"}')
+            packets, _ = page.due(float(i))
+            counts[page] += len(packets)
+            assert all(Packet.decoded(data).payload == bytes([i]) for data in packets)
+    assert counts == {fast: 30, slow: 6}
+
+
+def test_what_a_page_may_not_say_is_one_sentence() -> None:
+    page, _ = stream_of(Feed("image"))
+    for text in ("", "[1]", "{", "7", '{"a": 1}', '{"watch": 3}', '{"next": []}', "[" * 60000):
+        wrong = page.take(text)
+        assert wrong is not None
+        assert "load the page again" in wrong
+    assert page.take('{"watch": ["unknown", 3, null]}') is None
+    assert page.due(0.0) == ([], None)
+
+
+def test_a_page_that_has_gone_watches_nothing() -> None:
+    feed = Feed("image")
+    page, _ = stream_of(feed)
+    page.take('{"watch": ["image"]}')
+    assert feed.is_watched
+    page.watch([])
+    assert not feed.is_watched
+
 
 TAKE = """async () => {
     const { stream } = await import('/us_sim/assets/stream.js');

@@ -169,7 +169,7 @@ def _read(photo: Path) -> NDArray[np.uint8]:
 def _notes(
     found: CameraCalibration, board: Board, names: Sequence[str], views: Sequence[BoardView]
 ) -> dict[str, object]:
-    """What the file says in addition to the camera; ROS' readers ignore it."""
+    """Further keys of the camera info, which ROS' readers ignore."""
     return {
         "method": f"{board.kind} board {board.columns}x{board.rows}, Zhang",
         "residuals": {
@@ -258,7 +258,7 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
 
 
 def _remarks(found: ProbeCalibration, features: int) -> str:
-    """What makes the result less certain than it could be."""
+    """Remarks on data that leave the result uncertain."""
     said = ""
     if found.turned < _LITTLE_TURN:
         said += (

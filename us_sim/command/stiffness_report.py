@@ -19,7 +19,7 @@ from us_sim.tissue.identification.stiffness import GROUPS, StiffnessFit
 
 
 def table(found: StiffnessFit) -> str:
-    """Structures with their moduli, intervals and part in the force; then what is left over."""
+    """Structures with their moduli, intervals and part in the force, and the residuals."""
     percent = f"{100 * found.confidence:g} %"
     rows = [("structure", "E (kPa)", f"{percent} interval (kPa)", "×/÷", "part of force")]
     for name, modulus in found.moduli.items():
@@ -74,7 +74,7 @@ def write_moduli(file: Path, found: StiffnessFit, base: Mapping[str, str], name:
     Args:
         file: of the new scene.
         found: the moduli.
-        base: the key that names what was fitted: ``based_on`` a scene, or a ``case``.
+        base: key and value that name the fitted scene: ``based_on`` a scene, or a ``case``.
         name: of that scene.
 
     Raises:

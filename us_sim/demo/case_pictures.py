@@ -1,10 +1,10 @@
-"""One picture of several cases: the probe's first image of each."""
+"""Outlines in a figure, and one picture of several cases: the first image of each."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ from us_sim.scene.building import colour_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
+from us_sim.slicing.frame import Frame
+from us_sim.volume.structure_names import Colour
 
 _COLUMNS = 4
 _INCHES = 3.2  # of a picture's side
@@ -56,17 +58,29 @@ def _draw(axes: Any, scene: Scene, name: str) -> None:
     extent = (-width / 2, width / 2, top + height, top)
     axes.imshow(scanner.image(Pose()), cmap="gray", vmin=0, vmax=255, extent=extent)
     if volume.labels is not None:
-        frame = scanner.frame(Pose())
-        settle = partial(onto_border, frame)
         numbers = {label: number for number, label in volume.label_names.items()}
-        scale = np.array([width, height]) / (scanner.probe.columns, scanner.probe.rows)
-        for structure, given in scene.structures.items():
-            number = numbers[given.label or structure]
-            for outline in label_outlines(frame.labels, number, settle=settle):
-                x, y = ((outline + 0.5) * scale + (-width / 2, top)).T
-                axes.plot(
-                    np.append(x, x[0]), np.append(y, y[0]), color=colour_of(scene, structure), lw=1
-                )
+        colours = {
+            numbers[given.label or name]: colour_of(scene, name)
+            for name, given in scene.structures.items()
+        }
+        draw_outlines(axes, scanner.frame(Pose()), colours, extent)
     axes.set_title(name, fontsize=10)
     axes.set_xlabel("mm", fontsize=8)
     axes.tick_params(labelsize=7)
+
+
+def draw_outlines(
+    axes: Any,
+    frame: Frame,
+    colours: Mapping[int, Colour],
+    extent: tuple[float, float, float, float],
+) -> None:
+    """Draw the outlines of labels over a frame's image whose extent is in mm."""
+    left, right, bottom, top = extent
+    scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
+    settle = partial(onto_border, frame)
+    for label, colour in colours.items():
+        for outline in label_outlines(frame.labels, label, settle=settle):
+            x, y = ((outline + 0.5) * scale + (left, top)).T
+            axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
+    axes.set(xlim=(left, right), ylim=(bottom, top))

@@ -19,17 +19,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from us_sim.demo.case_pictures import draw_outlines
 from us_sim.demo.session import LumenAreas, Session
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.slicing.drawing.annotation import Annotation
-from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
+from us_sim.slicing.drawing.label_outlines import onto_border
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.doppler import ColourDoppler
-from us_sim.slicing.frame import Frame
 from us_sim.slicing.strain import AxialStrain, compression, strain_scale
 from us_sim.slicing.strain_estimate import estimate_strain, require_short_windows
 from us_sim.volume.structure_names import Colour, anatomical_colour
@@ -206,7 +206,9 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
         if scanner is not None and seen:  # through air nothing is
             frame = scanner.frame(session.poses[stamp], session.nodes[stamp])
-            _outline(axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent)
+            draw_outlines(
+                axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent
+            )
         where = _place(session.poses[stamp])
         axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
@@ -271,23 +273,6 @@ def _caption(areas: LumenAreas | None, time: float) -> str:
         of_rest = f"{area[sample] * 1e6:.1f} mm² ({percent:.0f} %)"
         said.append(f"{name} {'not whole in the image' if np.isnan(percent) else of_rest}")
     return ",   ".join(said)
-
-
-def _outline(
-    axes: Any,
-    frame: Frame,
-    colours: Mapping[int, Colour],
-    extent: tuple[float, float, float, float],
-) -> None:
-    """Draw the outlines of labels over a frame's image whose extent is in mm."""
-    left, right, bottom, top = extent
-    scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
-    settle = partial(onto_border, frame)
-    for label, colour in colours.items():
-        for outline in label_outlines(frame.labels, label, settle=settle):
-            x, y = ((outline + 0.5) * scale + (left, top)).T
-            axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
-    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def _colour(scene: Scene, name: str) -> Colour:

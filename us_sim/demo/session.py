@@ -16,6 +16,7 @@ from us_sim.demo.camera_video import PathVideo
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.nodes.topics import published_counts
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
@@ -23,7 +24,6 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.elasticity.material import kind_of
 from us_sim.tracking.camera.body_pose import rotation_angle
-from us_sim.volume.measure import label_area
 
 VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
 PLAYED = ("/tracker/pose", "/camera/camera_info")  # what comes in, of a path and of a camera
@@ -137,7 +137,7 @@ class Session:
             pose = self.poses[stamp]
             seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
             for i, labels in enumerate(seen):
-                found[i, :, k] = [label_area(labels, numbers[name], pixel) for name in vessels]
+                found[i, :, k] = [pixel * (labels == numbers[name]).sum() for name in vessels]
                 whole[:, k] &= [not (labels[edge] == numbers[name]).any() for name in vessels]
             if progress is not None:
                 progress((k + 1) / len(chosen))
@@ -205,11 +205,10 @@ class Session:
         """What each publisher last reported to have sent, beside what was recorded in the end."""
         recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         said = {
-            key.removeprefix("published "): int(value)
+            topic: count
             for node, report in self.reports.items()
             if node != "session_recorder"
-            for key, value in report.items()
-            if key.startswith("published ")
+            for topic, count in published_counts(report).items()
         }
         return {
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}

@@ -1,22 +1,11 @@
-"""The block of tissue that solvers press and slicers cut, and its meshes.
+"""The block of tissue that solvers press and slicers cut, its meshes, and SciPy's linear solver.
 
->>> from us_sim.evaluation.block import MESHES, block
+>>> from us_sim.evaluation.block import MESHES, block, graded_planes
 >>> mesh = block(MESHES[0])
 >>> len(mesh.nodes), len(mesh.tetrahedra)
 (2000, 7695)
-
-Planes that are near each other where a probe touches, and farther apart elsewhere.
-
->>> from us_sim.evaluation.block import graded_planes
 >>> graded_planes(0.0, 0.05, 0.0, 0.02, 0.01, 1.2).round(4).tolist()
 [0.0, 0.01, 0.02, 0.0336, 0.05]
-
-SciPy's conjugate gradients for the references, whatever SciPy calls their tolerance.
-
->>> import numpy as np
->>> from us_sim.evaluation.block import solved
->>> solved(np.diag([2.0, 4.0]), np.array([2.0, 2.0]), 1e-12, np.eye(2), 10)
-array([1. , 0.5])
 """
 
 from __future__ import annotations
@@ -56,29 +45,24 @@ def graded_planes(
     Each distance outside is about ``growth`` (above 1) times the one before.
     """
     count = max(1, round((fine_high - fine_low) / size))
-    fine = np.linspace(fine_low, fine_high, count + 1)
-    parts = [fine]
+    parts = [np.linspace(fine_low, fine_high, count + 1)]
     for length, end, direction in (
         (fine_low - low, fine_low, -1),
         (high - fine_high, fine_high, 1),
     ):
-        if length <= 0:
-            continue
-        number = max(1, round(np.log1p(length / size * (1 - 1 / growth)) / np.log(growth)))
-        steps = growth ** np.arange(1, number + 1)
-        parts.append(end + direction * length * np.cumsum(steps) / steps.sum())
+        if length > 0:
+            number = max(1, round(np.log1p(length / size * (1 - 1 / growth)) / np.log(growth)))
+            steps = growth ** np.arange(1, number + 1)
+            parts.append(end + direction * length * np.cumsum(steps) / steps.sum())
     planes = np.unique(np.concatenate(parts))
     planes[[0, -1]] = low, high
     return planes
 
 
-_TOLERANCE = "rtol" if "rtol" in inspect.signature(cg).parameters else "tol"  # before SciPy 1.12
-
-
-def solved(
+def conjugate_gradients(
     matrix: Any, right: NDArray[np.float64], tolerance: float, inverse: Any, limit: int
 ) -> NDArray[np.float64]:
-    """(N,) x of the symmetric positive definite system ``matrix @ x = right``.
+    """(N,) x of the symmetric positive definite system ``matrix @ x = right``, by SciPy.
 
     Args:
         matrix: (N, N), or a ``LinearOperator``, as ``inverse``.
@@ -90,7 +74,8 @@ def solved(
     Raises:
         SolverError: it did not converge.
     """
-    found, failed = cg(matrix, right, maxiter=limit, M=inverse, **{_TOLERANCE: tolerance})
+    name = "rtol" if "rtol" in inspect.signature(cg).parameters else "tol"  # before SciPy 1.12
+    found, failed = cg(matrix, right, maxiter=limit, M=inverse, **{name: tolerance})
     if failed:
         raise SolverError(f"the independent reference did not converge in {limit} steps")
     return np.asarray(found)

@@ -1,7 +1,9 @@
-"""The rows of a report's CSV file: each a dataclass whose fields are the columns.
+"""The one way in which every evaluation writes rows (CSV), tables (Markdown), pictures and text.
 
->>> from dataclasses import dataclass
->>> from us_sim.evaluation.report import Row, not_a_column
+The prose of a report stands in templates beside its subject's code, ``report.md`` and others, with
+places such as ``$opening`` for what was measured.
+
+>>> from us_sim.evaluation.report import Row, markdown_table
 >>> @dataclass(frozen=True)
 ... class Point(Row):
 ...     method: str
@@ -10,53 +12,31 @@
 >>> row = Point("fem", 0.123456)
 >>> list(row.values), row.cells
 (['method', 'ms'], ['fem', '0.1235'])
-
-Tables that can be read in Markdown and in a terminal.
-
->>> from us_sim.evaluation.report import markdown_table
->>> print(markdown_table(("method", "ms"), [("fem", "0.75"), ("msds", "12")]))
-| method | ms   |
-| ------ | ---- |
-| fem    | 0.75 |
-| msds   | 12   |
-
-What is asked of a measure, against what was seen in one run.
-
->>> from us_sim.evaluation.report import Target
+>>> print(markdown_table(("method", "ms"), [row.cells, ("msds", "12")]))
+| method | ms     |
+| ------ | ------ |
+| fem    | 0.1235 |
+| msds   | 12     |
 >>> Target.at_most("an image", 2.0, 1.5, "ms").cells
 ('an image', 'at most 2 ms', '1.5 ms', 'yes')
-
-Figures of the reports: one size of letters, one kind of grid, one place for keys.
-
-The machine that a report's times were measured on.
-
->>> from us_sim.evaluation.report import machine
->>> machine("numpy", "no-such-library")
-'..., ... cores, ..., Python 3..., numpy ...'
-
-How a cost grows with a size.
-
->>> from us_sim.evaluation.report import exponent
 >>> round(exponent({10: 2.0, 20: 8.0, 40: 32.0}), 3)
 2.0
-
-The folder that a run's rows, pictures and report are written to.
-
-A folder that holds a report is refused before anything is measured, so that nothing that took
-hours is lost; what a run that was interrupted left there is written over.
 """
 
 from __future__ import annotations
 
 import csv
 import platform
+import re
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from os import cpu_count
 from pathlib import Path
+from string import Template
 from typing import Any, ClassVar
 
 import numpy as np
@@ -70,7 +50,7 @@ from us_sim.errors import UsSimError
 
 @dataclass(frozen=True)
 class Row:
-    """Base of the dataclasses of which each instance is a row."""
+    """Base of the dataclasses of which each instance is a row of a CSV file."""
 
     digits: ClassVar[int] = 4
     """Significant digits of the numbers in the file."""
@@ -90,7 +70,7 @@ class Row:
 
     @property
     def title(self) -> str:
-        """What the row is about, in a sentence about a failure."""
+        """The measured case, in a sentence about a failure."""
         return ", ".join(self.cells[:2])
 
     def _cell(self, value: object) -> str:
@@ -111,7 +91,7 @@ def not_a_column(default: Any) -> Any:
 
 
 def failures(rows: Iterable[Row]) -> list[str]:
-    """What went wrong in which rows: those whose ``failure`` is not empty."""
+    """Title and error of the rows whose ``failure`` is not empty."""
     failed = ((row.title, getattr(row, "failure", "")) for row in rows)
     return [f"{title}: {failure}" for title, failure in failed if failure]
 
@@ -119,6 +99,14 @@ def failures(rows: Iterable[Row]) -> list[str]:
 def words_of(error: Exception) -> str:
     """An error in one line."""
     return f"{type(error).__name__}: {error}".replace("\n", " ")
+
+
+def write_rows(file: Path, rows: Sequence[Row]) -> None:
+    """Write a CSV file whose first line names its columns."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(rows[0].values)
+        writer.writerows(row.cells for row in rows)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -129,6 +117,27 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         "| " + " | ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) + " |"
         for line in lines
     )
+
+
+def number(value: Any, form: str = ".3g", unknown: str = "") -> str:
+    """A number in a table; ``unknown`` where it is not finite."""
+    return f"{value:{form}}" if np.isfinite(value) else unknown
+
+
+def percentile(values: Sequence[float] | np.ndarray, percent: float) -> float:
+    """A percentile; NaN of no values."""
+    return float(np.percentile(values, percent)) if len(values) else float("nan")
+
+
+def exponent(cost_of_size: Mapping[float, float]) -> float:
+    """k in cost ~ size^k, by least squares of the logarithms; NaN with fewer than two sizes.
+
+    Costs that are not positive and finite are left out.
+    """
+    known = {n: cost for n, cost in cost_of_size.items() if np.isfinite(cost) and cost > 0}
+    if len(known) < 2:
+        return float("nan")
+    return float(np.polyfit(np.log(list(known)), np.log(list(known.values())), 1)[0])
 
 
 @dataclass(frozen=True)
@@ -166,26 +175,42 @@ class Target:
 
     @property
     def cells(self) -> tuple[str, str, str, str]:
-        """Its cells in the table."""
+        """Cells in the table."""
         return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
 
 
 def target_table(targets: Sequence[Target]) -> str:
-    """All of them in Markdown."""
+    """All targets in Markdown."""
     return markdown_table(("", "asked", "seen", "met"), [target.cells for target in targets])
 
 
-def new_figure(width: float, height: float, title: str) -> Figure:
-    """An empty figure (inches) with its title at the left."""
+@contextmanager
+def picture(file: Path, width: float, height: float, title: str) -> Iterator[Figure]:
+    """An empty figure (inches) with its title at the left, written as PNG when it is drawn."""
     figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12, x=0.01, ha="left")
-    return figure
-
-
-def save(figure: Figure, file: Path) -> None:
-    """Write it as PNG, as many pixels as it has been laid out for."""
+    yield figure
     figure.savefig(file, dpi=figure.dpi)
+
+
+def panel_grid(figure: Figure, titles: Iterable[str], x: str, y: str) -> list[Axes]:
+    """A panel for each title, three in a row, with common axes that have these labels."""
+    names = list(titles)
+    columns = min(3, len(names))
+    rows = -(-len(names) // columns)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for at, panel in enumerate(axes.flat):
+        if at >= len(names):
+            panel.set_visible(False)
+            continue
+        panel.set_title(names[at], fontsize=11, loc="left")
+        if at + columns >= len(names):
+            panel.set_xlabel(x)
+            panel.tick_params(labelbottom=True)
+    for panel in axes[:, 0]:
+        panel.set_ylabel(y)
+    return list(axes.flat[: len(names)])
 
 
 def plain(panel: Axes) -> None:
@@ -198,13 +223,19 @@ def plain(panel: Axes) -> None:
     panel.tick_params(labelsize=8.5)
 
 
+def plain_bars(panel: Axes) -> None:
+    """As `plain`, of horizontal bars with names."""
+    panel.grid(True, axis="x", color="0.93")
+    panel.set_axisbelow(True)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.tick_params(labelsize=8.5)
+
+
 def key_beside(panel: Axes, handles: list | None = None) -> None:  # type: ignore[type-arg]
-    """What colours and marks mean, to the right of a panel; nothing where it has none."""
-    if handles is None and not panel.get_legend_handles_labels()[0]:
-        return
-    panel.legend(
-        handles=handles, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5)
-    )
+    """Key of colours and marks to the right of a panel; none where it has nothing with a label."""
+    if handles is not None or panel.get_legend_handles_labels()[0]:
+        beside: Any = {"loc": "center left", "bbox_to_anchor": (1.01, 0.5)}
+        panel.legend(handles=handles, fontsize=8, frameon=False, **beside)
 
 
 def machine(*libraries: str) -> str:
@@ -227,23 +258,24 @@ def machine(*libraries: str) -> str:
     return ", ".join(parts)
 
 
-def exponent(cost_of_size: Mapping[float, float]) -> float:
-    """k in cost ~ size^k, by least squares of the logarithms; NaN with fewer than two sizes.
+def filled(subject: str, name: str, **values: str) -> str:
+    """The template ``subject/name.md`` with its places filled; empty paragraphs are left out.
 
-    Costs that are not positive and finite are left out.
+    Raises:
+        ValueError: the template's places are not those of ``values``.
     """
-    known = {n: cost for n, cost in cost_of_size.items() if np.isfinite(cost) and cost > 0}
-    if len(known) < 2:
-        return float("nan")
-    return float(np.polyfit(np.log(list(known)), np.log(list(known.values())), 1)[0])
-
-
-_PRINTED = 10  # failures, at the end of a run
-_LISTED = 60  # failures, in the report
+    file = Path(__file__).with_name(subject) / f"{name}.md"
+    template = Template(file.read_text(encoding="utf-8"))
+    if wrong := set(template.get_identifiers()) ^ set(values):
+        raise ValueError(f"{file}: {', '.join(sorted(wrong))} stand in the template or are given")
+    return re.sub(r"\n{3,}", "\n\n", template.substitute(values)).strip()
 
 
 class ReportFolder:
-    """Where one run of ``us-sim evaluate`` writes.
+    """Folder that one run of ``us-sim evaluate`` writes to.
+
+    One that holds a report is refused before anything is measured, so that nothing that took hours
+    is lost; files of a run that was interrupted are written over.
 
     Args:
         subject: that is evaluated.
@@ -258,6 +290,7 @@ class ReportFolder:
         self.subject, self.quick = subject, quick
         self._out, self._begun = out, time.perf_counter()
         self._pictures: list[Path] = []
+        self._tables: list[str] = []
         try:
             out.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=out):
@@ -281,38 +314,36 @@ class ReportFolder:
 
     def write_rows(self, name: str, rows: Sequence[Row]) -> None:
         """Write ``name``.csv."""
+        self._tables.append(f"[{name}.csv]({name}.csv)")
         write_rows(self._out / f"{name}.csv", rows)
 
-    def opening(self, *libraries: str, tables: Sequence[str] = ()) -> str:
-        """The report's first words: what was run, for how long, on what, and where the rows are."""
-        command = f"us-sim evaluate {self.subject}{' --quick' if self.quick else ''}"
-        files = " and ".join(f"[{name}.csv]({name}.csv)" for name in tables or [self.subject])
-        seconds = time.perf_counter() - self._begun
-        return f"`{command}`, {seconds:.0f} s, on {machine(*libraries)}. Every row is in {files}."
+    def write_report(
+        self, failures: Sequence[str], libraries: Sequence[str], **values: str
+    ) -> None:
+        """Fill the subject's template ``report``, and list the first sixty failures below.
 
-    def write_report(self, parts: Iterable[str], failures: Sequence[str]) -> None:
-        """Write the report: its paragraphs but for empty ones, and what failed."""
-        lines = [f"- {failure}" for failure in failures[:_LISTED]]
-        if len(failures) > _LISTED:
-            lines.append(f"- and {len(failures) - _LISTED} more")
-        failed = ["## Failed", "\n".join(lines)] if failures else []
-        text = "\n\n".join(part for part in (*parts, *failed) if part) + "\n"
-        self.report.write_text(text, encoding="utf-8")
+        The place ``$opening`` says how long the run took, on which machine with which versions of
+        ``libraries``, and where its rows are.
+        """
+        command = f"us-sim evaluate {self.subject}{' --quick' if self.quick else ''}"
+        seconds = time.perf_counter() - self._begun
+        opening = (
+            f"`{command}`, {seconds:.0f} s, on {machine(*libraries)}. "
+            f"Every row is in {' and '.join(self._tables)}."
+        )
+        text = filled(self.subject, "report", opening=opening, **values)
+        if failures:
+            more = [f"and {len(failures) - 60} more"] if len(failures) > 60 else []
+            text += "\n\n## Failed\n\n"
+            text += "\n".join(f"- {failure}" for failure in [*failures[:60], *more])
+        self.report.write_text(text + "\n", encoding="utf-8")
 
     def finish(self, table: str, failures: Sequence[str]) -> int:
         """Print a table, where everything is, and what failed; 1 if anything did, else 0."""
         print(table)
         print(f"Report: {self.report}; pictures: {', '.join(map(str, self._pictures))}")
-        for failure in failures[:_PRINTED]:
+        for failure in failures[:10]:
             print(f"failed: {failure}")
-        if len(failures) > _PRINTED:
-            print(f"and {len(failures) - _PRINTED} more, see {self.report}")
+        if len(failures) > 10:
+            print(f"and {len(failures) - 10} more, see {self.report}")
         return 1 if failures else 0
-
-
-def write_rows(file: Path, rows: Sequence[Row]) -> None:
-    """Write a CSV file whose first line names its columns."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(rows[0].values)
-        writer.writerows(row.cells for row in rows)

@@ -21,7 +21,7 @@ from us_sim.kernels import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turned(r, x, y, z):
+def rotate(r, x, y, z):
     """The matrix r (3, 3) times a vector: from the child's frame to the parent's."""
     return (
         r[0, 0] * x + r[0, 1] * y + r[0, 2] * z,
@@ -31,7 +31,7 @@ def turned(r, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turned_back(r, x, y, z):
+def rotate_back(r, x, y, z):
     """Its transpose times a vector: from the parent's frame to the child's."""
     return (
         r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
@@ -143,7 +143,7 @@ def _signed_distances(box, rotation, origin, points, distance, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         d, nx, ny, nz = offset_box_distance(box, x, y, z)
         distance[i] = d
-        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)

@@ -25,7 +25,7 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
 
     Raises:
         MeshError: it cannot be read, or not within bounded memory, a second file that goes with it
-            is missing, or meshio or what that needs is not installed.
+            is missing, or meshio or a package that it needs is missing.
     """
     try:
         import meshio
@@ -78,7 +78,7 @@ def _has_ply_header(path: Path) -> bool:
 
 @contextlib.contextmanager
 def _bounded_memory(more: int) -> Iterator[None]:
-    """This process takes no more than so many bytes more, where the system can see to that."""
+    """Limit this process to so many bytes more, where the system can."""
     try:
         import resource
 

@@ -188,7 +188,7 @@ class FrameTree:
     def __len__(self) -> int:
         return len(self._parents)
 
-    def place(self, frame: str, parent: str, pose: Pose) -> bool:
+    def set_pose(self, frame: str, parent: str, pose: Pose) -> bool:
         """Put a frame at a pose in its parent; False where there are too many frames."""
         if frame not in self._parents and len(self._parents) >= _MOST:
             return False

@@ -52,7 +52,7 @@ Colour = tuple[float, float, float]
 # Parts of a ring's long sides, of each of its corners, and of the rounding from front to side.
 _ALONG, _ROUND, _LATITUDES = 16, 6, 6
 _NOSE = 0.006  # m, of the face's part that is straight behind its rounding
-# m, how long the taper is, the grip, what keeps the cable from kinking, and the cable's stub.
+# m, lengths of the taper, the grip, the strain relief, and the cable's stub.
 _SHOULDER, _GRIP, _RELIEF, _CABLE = 0.022, 0.058, 0.020, 0.045
 _NARROWEST, _WIDEST = 0.024, 0.034  # m, a grip across its flat, as a hand holds it
 _CABLE_RADIUS, _RELIEF_RADIUS = 0.0028, 0.0055
@@ -72,7 +72,7 @@ class TransducerPart:
 
 
 def transducer_mesh(collider: Collider) -> list[TransducerPart]:
-    """The parts of a transducer that presses with ``collider``, one beside the other."""
+    """The parts of a transducer whose face has the shape of ``collider``."""
     box = collider.offset_box
     half_x, half_y, rounding = float(box[0]), float(box[1]), float(box[3])
     curvature = float(box[4]) if len(box) > 4 else 0.0

@@ -33,7 +33,7 @@ def vertex_normals(vertices: NDArray[_Real], triangles: ArrayLike) -> NDArray[_R
     normals = np.zeros(vertices.shape, dtype=vertices.dtype)
     whole = np.ascontiguousarray(vertices).view()
     corners = np.ascontiguousarray(triangles, dtype=np.int32).view()
-    # Read-only always, since numba would compile the kernel again for what is not.
+    # Always read-only: numba compiles the kernel again for arrays that are not.
     whole.flags.writeable = corners.flags.writeable = False
     _sum_normals(whole, corners, normals)
     return normals

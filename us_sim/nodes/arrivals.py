@@ -26,8 +26,7 @@ HOPS = {
 EYE = {"tissue/structures": MarkerArray, "ultrasound/image_annotated": Image}
 """What is computed only where somebody looks."""
 
-_HEADER = struct.Struct("<4xiI")
-"""Where a serialized message with a header has its stamp."""
+_HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
 
 
 class Arrivals(GuardedNode):

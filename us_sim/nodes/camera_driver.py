@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,8 @@ from us_sim.share import full_path
 from us_sim.tracking.camera.model import CameraModel, read_camera_info
 from us_sim.tracking.camera.source import VideoSource
 
-RETRY_S = 1.0
-"""How long a camera that is not there is left alone."""
-PATIENCE_S = 1.0
-"""How long an image that is awaited may hold up the node's end."""
+RETRY_S = 1.0  # how long a camera that is not there is left alone
+END_S = 1.0  # how long an image that is awaited may hold up the node's end
 
 
 class CameraDriver(GuardedNode):
@@ -76,7 +75,7 @@ class CameraDriver(GuardedNode):
     def destroy_node(self) -> None:
         """Let go of the camera."""
         self._closing.set()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(END_S)
         if not self._thread.is_alive():  # a camera that hangs is left to the process's end
             self._video.close()
         super().destroy_node()
@@ -101,7 +100,6 @@ class CameraDriver(GuardedNode):
                 self._closing.wait(RETRY_S)
 
     def _follow(self) -> None:
-        """A camera or stream, each time that it is there."""
         while not self._closing.is_set():
             if self._video.open():
                 while not self._closing.is_set():
@@ -203,7 +201,6 @@ class CameraDriver(GuardedNode):
 def _info(
     camera: CameraModel | None, size: tuple[int, int], stamp: TimeMessage, frame: str
 ) -> CameraInfo:
-    """The camera as ROS describes it: all zeros but the size where it is not calibrated."""
     message = CameraInfo()
     message.header.stamp = stamp
     message.header.frame_id = frame
@@ -218,9 +215,7 @@ def _info(
     return message
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted, or the video ends."""
-    return run_node(CameraDriver, args)
+main = partial(run_node, CameraDriver)
 
 
 if __name__ == "__main__":

@@ -53,17 +53,13 @@ def _is_sequence(kind: Nodetype, of: Any) -> bool:
     return kind is Nodetype.SEQUENCE or (kind is Nodetype.NAME and _has_sequences(of))
 
 
-CLOCK_S = 5.0
-"""For simulated time to begin, before it is said that it does not."""
-SAY_S = 1.0
-"""How long the same failure is not said again."""
-HEADER_SIZE = 4
-"""Bytes that every serialized message begins with."""
+CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
+SAY_S = 1.0  # how long the same failure is not said again
+HEADER_SIZE = 4  # bytes that every serialized message begins with
 FAILED = "it failed; see the node's log"
 _DONE, _CODE, _REASON = ("success", "successful"), ("return_code",), ("error_string", "message")
 """Fields by which responses usually say whether what was asked for was done, and why not."""
-LONGEST = 500
-"""Characters of a sentence: an error may quote all of a message."""
+LONGEST = 500  # characters of a sentence: an error may quote all of a message
 
 
 class GuardedNode(Node):
@@ -266,8 +262,7 @@ def shown(sentence: str) -> str:
 
 REPEAT_S = 5.0
 """How long a problem of the same kind is not said again; each time it is twice as long."""
-SAY_AT_LEAST_S = 300.0
-"""How long at most."""
+SAY_AT_LEAST_S = 300.0  # how long at most
 ANOTHER_CLOCK_S = 10.0
 """From the present to a stamp: from there on it is of another clock, or of an earlier day."""
 
@@ -316,7 +311,6 @@ class Health:
             self._latencies.append(1e3 * self._age(nanoseconds_of(stamp)))
 
     def _age(self, stamp: int) -> float:
-        """s, of something with that stamp in ns."""
         age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
         if abs(age) < ANOTHER_CLOCK_S:
             return age
@@ -344,7 +338,6 @@ class Health:
         return self._problems[kind]
 
     def _report_first(self) -> None:
-        """As soon as the node takes part: somebody waits for it."""
         self._first.cancel()
         self.report()
 
@@ -376,7 +369,6 @@ class Health:
         self._last_problem = ""
 
     def _failures(self) -> Counter[str]:
-        """Exceptions that nobody expected, by where they happened."""
         return Counter(getattr(self._node, "failures", ()))
 
     def _message(self, stamp: TimeMessage, values: dict[str, str]) -> DiagnosticArray:

@@ -29,11 +29,9 @@ from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.scene.building import haptic_rendering_of, source_settings
 
-_MEASURED = 2000
-"""Ticks of which the jitter is told."""
+_MEASURED = 2000  # ticks of which the jitter is told
 
-TICK_PRIORITY = 20
-"""Among real-time threads: ordinary ones are at 0, the kernel's at 50."""
+TICK_PRIORITY = 20  # among real-time threads: ordinary ones are at 0, the kernel's at 50
 
 
 class PeriodicThread:
@@ -91,14 +89,13 @@ def be_punctual(priority: int = TICK_PRIORITY) -> None:
         os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO, os.sched_param(priority))
 
 
-LOOKS, REPORTS = 5.0, 1.0
+CHECKS, REPORTS = 5.0, 1.0
 """Times a second that it is seen who listens, and that diagnostics are told how regular it is.
 
 The latter keeps the interpreter from rendering for two ticks.
 """
 
-_PRIORITY = 10
-"""Of the executor, among real-time threads: below the one that renders."""
+_PRIORITY = 10  # of the executor, among real-time threads: below the one that renders
 
 
 class HapticRenderer(SceneNode):
@@ -123,9 +120,9 @@ class HapticRenderer(SceneNode):
         self.listen(Bool, "haptic/clutch", self._take_clutch, FOREIGN)
         self.listen(Float64MultiArray, "tissue/contact_model", self._take_model)
         self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
-        self._look()
+        self._check_doubt()
         self._report()
-        self.create_timer(1.0 / LOOKS, self._look)
+        self.create_timer(1.0 / CHECKS, self._check_doubt)
         self.create_timer(1.0 / REPORTS, self._report)
         self._thread.start()
 
@@ -170,7 +167,6 @@ class HapticRenderer(SceneNode):
         self._stops = 0
 
     def _render(self, now: int) -> None:
-        """One tick, in the thread of its own."""
         rendering = self._rendering
         if not self._is_taken:
             rendering.distrust("nobody takes the wrench")
@@ -193,8 +189,7 @@ class HapticRenderer(SceneNode):
             return  # rclpy was shut down meanwhile, as by a signal
         self.health.published("haptic/wrench")
 
-    def _look(self) -> None:
-        """See who listens, and whether the wrench is as it should be."""
+    def _check_doubt(self) -> None:
         self._is_taken = self._wrenches.get_subscription_count() > 0
         doubt, stops = self._rendering.doubt, self._rendering.stops
         if stops > self._stops:
@@ -203,7 +198,6 @@ class HapticRenderer(SceneNode):
         self.health.state = f"zero: {doubt}" if doubt else "rendering"
 
     def _report(self) -> None:
-        """Tell diagnostics how it goes."""
         self.health.values = {
             "stops": str(self._rendering.stops),
             "stopped": self._rendering.stopped,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,6 @@ class ImageWriter(GuardedNode):
 
 
 def _made(name: str) -> Path:
-    """The folder, which is there now."""
     folder = Path(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -121,9 +121,7 @@ def _made(name: str) -> Path:
     return folder
 
 
-def main(args: list[str] | None = None) -> int:
-    """Write until interrupted."""
-    return run_node(ImageWriter, args)
+main = partial(run_node, ImageWriter)
 
 
 if __name__ == "__main__":

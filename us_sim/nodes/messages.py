@@ -37,8 +37,7 @@ from us_sim.errors import (
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.haptic import ContactModel
 
-CDR_LITTLE_ENDIAN = b"\0\1\0\0"
-"""What serialized messages begin with."""
+CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # what serialized messages begin with
 
 
 def packed(code: str, values: NDArray[Any]) -> array[Any]:
@@ -395,8 +394,7 @@ def _points(vertices: NDArray[np.floating]) -> list[Point]:
 
 
 _FIELD = re.compile(r"32FC([1-4])")
-_LARGEST_OFFSET = 1e6
-"""m, of a pixel, or to the first one."""
+_LARGEST_OFFSET = 1e6  # m, of a pixel, or to the first one
 
 
 def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
@@ -533,8 +531,7 @@ Surface = tuple[str, tuple[float, float, float, float], NDArray[np.floating], ND
 MarkedTriangles = tuple[str, tuple[float, float, float], NDArray[np.float64]]
 """A marker's namespace, its red, green and blue, and three (3 T, 3) m corners of each triangle."""
 
-_LINE_WIDTH = 4e-4
-"""m, of an image's outline."""
+_LINE_WIDTH = 4e-4  # m, of an image's outline
 _OUTLINE_COLOUR = (0.31, 0.70, 0.75, 1.0)
 
 _FIRST_STAMP = 8

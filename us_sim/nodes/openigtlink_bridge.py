@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,8 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
 from us_sim.tracking.openigtlink import OpenIGTLinkServer, image_message, transform_message
 
-REMEMBERED = 256
-"""Poses kept for the images that carry their stamps."""
-LOOK_S = 0.5
-"""How often it is looked who is connected."""
+REMEMBERED = 256  # poses kept for the images that carry their stamps
+CLIENTS_S = 0.5  # between two counts of the connected clients
 
 
 class OpenIGTLinkBridge(SceneNode):
@@ -52,7 +51,7 @@ class OpenIGTLinkBridge(SceneNode):
         self.listen(Float64MultiArray, "ultrasound/image_to_probe", self._take_place, LATCHED)
         self.listen(PoseStamped, "probe/pose", self._take_pose)
         self.newest(Image, "ultrasound/image", self._take_image)
-        self.create_timer(LOOK_S, self._look)
+        self.create_timer(CLIENTS_S, self._count_clients)
         self.get_logger().info(f"serving OpenIGTLink on port {self.port}")
 
     @property
@@ -65,7 +64,7 @@ class OpenIGTLinkBridge(SceneNode):
         self._server.close()
         super().destroy_node()
 
-    def _look(self) -> None:
+    def _count_clients(self) -> None:
         clients = self._server.clients
         if clients != self._connected:
             self._connected = clients
@@ -115,9 +114,7 @@ class OpenIGTLinkBridge(SceneNode):
             self.health.published(name)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(OpenIGTLinkBridge, args)
+main = partial(run_node, OpenIGTLinkBridge)
 
 
 if __name__ == "__main__":

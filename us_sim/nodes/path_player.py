@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -63,7 +64,7 @@ class PathPlayer(GuardedNode):
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
             )
         self._awaited = Awaited(self, self._poses)
-        self.health.state = "waiting for the simulation"
+        self.health.state = "waiting"
         self._starting = self.create_timer(CHECK_S, self._begin)
         self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
         self._playhead = self._playback.head
@@ -84,7 +85,6 @@ class PathPlayer(GuardedNode):
         return settings
 
     def _begin(self) -> None:
-        """Start once somebody listens and what is awaited is there."""
         if not self._awaited.has_come():
             return
         self._starting.cancel()
@@ -121,7 +121,6 @@ class PathPlayer(GuardedNode):
         self._next = min(int(due.sum()), self.pose_count - 1)
 
     def _say_progress(self) -> None:
-        """Tell diagnostics where this is, and what it takes to go on in another process."""
         position = min(self._playhead.position(self._playback.now), int(self._ages[-1]))
         self.health.values = {
             "played": str(self._next),
@@ -131,7 +130,6 @@ class PathPlayer(GuardedNode):
         }
 
     def _use(self, _: object = None) -> None:
-        """Go on at the rate that was set, or hold still."""
         if self._ticking is not None and self._settings.rate != self._playhead.rate:
             self._tick_at_its_pace()
         self._playback.use()
@@ -218,9 +216,7 @@ def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:
     )
 
 
-def main(args: list[str] | None = None) -> int:
-    """Play the path, then end."""
-    return run_node(PathPlayer, args)
+main = partial(run_node, PathPlayer)
 
 
 if __name__ == "__main__":

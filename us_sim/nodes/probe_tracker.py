@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import functools
-import math
 import sys
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from rclpy.qos import QoSProfile
-from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.errors import PoseError, UsSimError
-from us_sim.geometry.pose import Pose
 from us_sim.geometry.transducer import transducer_mesh
-from us_sim.nodes.guarded_node import kind_of
 from us_sim.nodes.messages import (
-    nanoseconds_of,
-    pose_from,
     pose_message,
     pose_text,
     stamp_message,
@@ -32,10 +23,8 @@ from us_sim.nodes.messages import (
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import EVERY, FOREIGN
-from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ProbeTrackerSettings
-from us_sim.nodes.tracker_inputs.device import TrackerInput
+from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
 from us_sim.settings.registry import FILTERS, TRACKERS
 from us_sim.slicing.probe.probe import image_outline
@@ -43,12 +32,8 @@ from us_sim.tracking.filters import PoseFilter, create_filter
 from us_sim.tracking.measurement import PATIENT, Measurement, TrackingState
 
 OWN = "probe_tracker"
-FARTHEST = 100.0
-"""m from the device's origin, beyond which a pose is in another unit, or nonsense."""
-ROUNDED = 1e-2
-"""How far from 1 a quaternion's length may be by rounding."""
-CHECKS = 20.0
-"""Times a second that the state is looked at when nothing comes."""
+FARTHEST = 100.0  # m from the device's origin, beyond which a pose is in another unit, or nonsense
+CHECKS = 20.0  # times a second that the state is looked at when nothing comes
 LEVELS = {
     TrackingState.WAITING: DiagnosticStatus.STALE,
     TrackingState.TRACKED: DiagnosticStatus.OK,
@@ -57,15 +42,14 @@ LEVELS = {
 }
 
 
-class ProbeTracker(SceneNode):
+class ProbeTracker(Device):
     """A source's measurements in; ``probe/pose``, ``tf`` and ``probe/status`` out.
 
-    What it listens to is up to ``tracker.source`` of the scene, or the parameter ``source``, see
-    `tracker_inputs`. A pose goes
-    out once, with the stamp of its measurement. ``probe/status``, latched, says whether the probe
-    is ``tracked``, ``coasting`` or ``lost``, each time that changes, and where it was last when it
-    is tracked no more. ``probe/marker``, latched, is
-    the transducer to look at. The filter and its settings may change while running.
+    The source is ``tracker.source`` of the scene, or the parameter ``source``, see
+    `tracker_inputs`. A pose goes out once, with the stamp of its measurement. ``probe/status``,
+    latched, says whether the probe is ``tracked``, ``coasting`` or ``lost``, each time that
+    changes, and where it was last when it is tracked no more. ``probe/marker``, latched, is the
+    transducer to look at. The filter and its settings may change while running.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -103,7 +87,6 @@ class ProbeTracker(SceneNode):
         return transducer_markers(surfaces, outline, TimeMessage(), "probe")
 
     def _use(self, values: dict[str, Any]) -> None:
-        """Filter as was set from the next pose on; what another filter knew is forgotten."""
         self._tracking.filter = _filter(values)
 
     def destroy_node(self) -> None:
@@ -111,117 +94,6 @@ class ProbeTracker(SceneNode):
         if hasattr(self, "_input"):  # it may have refused to be made
             self._input.close()
         super().destroy_node()
-
-    def listen_to_device(
-        self,
-        message_type: Any,
-        topic: str,
-        callback: Callable[[Any], None],
-        quality: QoSProfile | None = None,
-    ) -> None:
-        """Subscribe as drivers may publish, best effort; all that come count as received."""
-
-        qos = EVERY if self.lockstep else quality or FOREIGN
-        work = self._of_source(callback)
-
-        def count(message: Any) -> None:
-            self.health.received += 1
-            work(message)
-
-        self.listen(message_type, topic, count, qos)
-
-    def listen_to_newest(self, message_type: Any, topic: str, work: Callable[[Any], None]) -> None:
-        """Likewise, but ``work`` gets the newest alone where it is slower than messages come."""
-        qos = EVERY if self.lockstep else FOREIGN
-        self.newest(message_type, topic, self._of_source(work), qos)
-
-    def in_tracker(self, work: Callable[[], None]) -> Callable[[], None]:
-        """What another thread calls to have ``work`` done in this node's own."""
-        guard = self.create_guard_condition(self._of_source(work))
-        trigger: Callable[[], None] = guard.trigger
-        return trigger
-
-    def _of_source(self, work: Callable[..., None]) -> Callable[..., None]:
-        """The source's ``work``; should it fail, the source is reset, for it may be of no use."""
-
-        @functools.wraps(work)
-        def call(*arguments: Any) -> None:
-            try:
-                work(*arguments)
-            except UsSimError:
-                raise
-            except Exception:
-                self._input.reset()
-                self._tracking.reset()
-                raise
-
-        return call
-
-    def is_awaited(self) -> bool:
-        """Whether the simulation's other nodes are there and listen to the probe."""
-        return bool(self.count_subscribers("probe/pose")) and all(
-            self.count_publishers(topic) for topic in self.scene.ready_topics
-        )
-
-    def every(self, seconds: float, work: Callable[[], None]) -> Any:
-        """A timer, which has ``cancel``."""
-        return self.create_timer(seconds, self._of_source(work))
-
-    def say(self, sentence: str) -> None:
-        """Tell a person."""
-        self.get_logger().info(sentence)
-
-    def warn(self, sentence: str) -> None:
-        """Tell a person that something is amiss."""
-        self.get_logger().warning(sentence)
-
-    def is_in_frame(self, header: Header, topic: str, frame: str | None = None) -> bool:
-        """Whether a device's message is in a frame, that of the scene's; said when it is not."""
-        frame = frame or self.scene.tracker.frame
-        if header.frame_id == frame:
-            return True
-        self.refuse(
-            "frame",
-            f"{self.resolve_topic_name(topic)} is in frame '{header.frame_id}', not '{frame}': set "
-            f"the tracker's frame, or tracker.frame in the scene",
-        )
-        return False
-
-    def stamp_of(self, header: Header, topic: str) -> int:
-        """When a device's message was measured, ns; its arrival where it does not say."""
-        stamp = nanoseconds_of(header.stamp)
-        if stamp == 0:
-            name = self.resolve_topic_name(topic)
-            self.health.problem("stamp", f"{name} has no stamp: its time of arrival is used")
-            stamp = self.now()
-        return stamp
-
-    def pose_in(self, message: PoseStamped, topic: str, frame: str | None = None) -> Pose | None:
-        """A device's pose, if it is one and in a frame, that of the scene's; said when not."""
-        if not self.is_in_frame(message.header, topic, frame):
-            return None
-        try:
-            pose = pose_from(message)
-        except PoseError as error:
-            self.refuse("pose", f"{self.resolve_topic_name(topic)}: {error}; it is not used")
-            return None
-        q = message.pose.orientation
-        length = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-        if abs(length - 1.0) > ROUNDED:
-            self.health.problem(
-                "quaternion", f"{topic}: the quaternion's length is {length:.4g}, taken as 1"
-            )
-        return pose
-
-    def refused(self, where: str, error: UsSimError) -> None:
-        """Count and say what cannot be used, in the probe's status too."""
-        self._tracking.refuse(kind_of(error), str(error))
-        super().refused(where, error)
-
-    def refuse(self, kind: str, sentence: str) -> None:
-        """Count and say, now and then, why a device's message is not used."""
-        self._tracking.refuse(kind, sentence)
-        self.health.problem(kind, sentence)
 
     def take(self, measurement: Measurement) -> None:
         """Publish the probe's pose, if the measurement can be believed."""
@@ -258,7 +130,6 @@ class ProbeTracker(SceneNode):
         self._check()
 
     def _note_rivals(self) -> None:
-        """Say so where the probe jumps to and fro between the poses of two sources."""
         jump = self._tracking.jump
         if bool(jump) != self._is_contested:
             self._is_contested = bool(jump)
@@ -274,7 +145,6 @@ class ProbeTracker(SceneNode):
             )
 
     def _report(self, probe: Measurement) -> None:
-        """What diagnostics say of a measurement that was believed."""
         deviation = probe.position_deviation
         self.health.values |= {
             "filter_lag_ms": f"{1e3 * self._tracking.filter.lag:.1f}",
@@ -316,20 +186,13 @@ class ProbeTracker(SceneNode):
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         self._status.publish(status)
 
-    def now(self) -> int:
-        """The present, ns."""
-        return int(self.get_clock().now().nanoseconds)
-
 
 def _filter(values: dict[str, Any]) -> PoseFilter:
-    """The filter that was set."""
     name = values[OWN].filter
     return create_filter(name, values[name])
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(ProbeTracker, args)
+main = partial(run_node, ProbeTracker)
 
 
 if __name__ == "__main__":

@@ -22,10 +22,8 @@ from rclpy.signals import SignalHandlerOptions
 from us_sim.errors import UsSimError, memory_limit
 from us_sim.nodes.guarded_node import GuardedNode
 
-STANDBY = "US_SIM_STANDBY"
-"""Set in the environment of a process that is to wait."""
-STANDING_BY = "standing by"
-"""What it says when it is ready."""
+STANDBY = "US_SIM_STANDBY"  # set in the environment of a process that is to wait
+STANDING_BY = "standing by"  # what it says when it is ready
 
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _NICE = 19
@@ -63,8 +61,7 @@ def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
     gc.collect()
 
 
-_PRIORITY = 1
-"""The lowest of those that go first: drivers of devices may go before."""
+_PRIORITY = 1  # the lowest of those that go first: drivers of devices may go before
 
 
 def go_first() -> str:
@@ -108,8 +105,7 @@ def scheduling_of(pid: int) -> str:
     )
 
 
-INTERRUPTED = 130
-"""The exit status of a node that was told to end before its work was done."""
+INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
 
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""
@@ -225,7 +221,6 @@ class _Executor(SingleThreadedExecutor):
 
 
 def _interrupted(node: Any) -> int:
-    """The exit status of a node that ends without an error, or was told to end."""
     finished = getattr(node, "finished", None)
     return 0 if node is not None and (finished is None or finished.done()) else INTERRUPTED
 
@@ -239,6 +234,5 @@ def _interrupt_once(*_: object) -> None:
 
 
 def _refused(error: Exception) -> int:
-    """One sentence on stderr; the exit status for bad input."""
     print(f"us_sim: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
     return 1

@@ -12,9 +12,9 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.qos import EVERY
+from us_sim.nodes.topics import published_counts
 
-TOLD = 50
-"""Losses that a report tells one by one, the newest."""
+TOLD = 50  # losses that a report tells one by one, the newest
 
 
 class SessionMonitor(GuardedNode):
@@ -51,11 +51,7 @@ class SessionMonitor(GuardedNode):
             self.messages[name] = status.message
             process = name, _number(report.get("pid", ""))
             self.heard[process] += 1
-            self._published[process] = {
-                key.removeprefix("published "): _number(value)
-                for key, value in report.items()
-                if key.startswith("published ")
-            }
+            self._published[process] = published_counts(report)
 
     def _note_set(self, event: ParameterEvent) -> None:
         space, _, name = event.node.rpartition("/")

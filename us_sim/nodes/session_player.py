@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from rclpy.exceptions import NameValidationException
@@ -23,11 +24,9 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
 from us_sim.share import find_bag
 
-_MOST_SAID = 10
-"""Topics that are left out, of which a person is told each."""
+_MOST_SAID = 10  # topics that are left out, of which a person is told each
 
-START_S = 0.5
-"""For subscribers to find the publishers before the first message."""
+START_S = 0.5  # for subscribers to find the publishers before the first message
 _SHOWN = 100_000_000
 """ns of a recording that are published at once where it is gone to, so that there is an image."""
 
@@ -78,7 +77,6 @@ class SessionPlayer(GuardedNode):
         return settings
 
     def _offer(self, topic: BagTopic) -> str:
-        """Publish a topic, or say why it cannot be published."""
         if topic.encoding != "cdr":
             return f"{topic.name} ({topic.encoding} is not CDR)"
         try:
@@ -141,7 +139,6 @@ class SessionPlayer(GuardedNode):
             self.finished.set_result(None)
 
     def _say_progress(self) -> None:
-        """Tell diagnostics how far it is."""
         position = min(max(self._playhead.position(self._playback.now), 0), self._length)
         self.health.values = {
             "position": f"{1e-9 * position:.3f}",
@@ -149,7 +146,6 @@ class SessionPlayer(GuardedNode):
         }
 
     def _use(self, _: object = None) -> None:
-        """Go on at the rate that was set, or publish nothing."""
         self._playback.use()
 
     def _go_to(self, position: int) -> None:
@@ -183,7 +179,6 @@ class SessionPlayer(GuardedNode):
 
 
 def _joined(sentences: list[str]) -> str:
-    """As many of them as a person reads; the number of the others."""
     more = len(sentences) - _MOST_SAID
     shown = "; ".join(sentences[:_MOST_SAID]) or "no topic of it has a message"
     return f"{shown}; and {more} more" if more > 0 else shown
@@ -193,9 +188,7 @@ def _is_latched(topic: BagTopic) -> bool:
     return bool(topic.qos) and all(q.durability == "transient_local" for q in topic.qos)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Play the recording, then end."""
-    return run_node(SessionPlayer, args)
+main = partial(run_node, SessionPlayer)
 
 
 if __name__ == "__main__":

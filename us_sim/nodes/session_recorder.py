@@ -25,13 +25,12 @@ from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_services
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, news
+from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, losses_between
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
 _M_MMAP_THRESHOLD, _LARGE = -3, 1 << 17  # of glibc's malloc.h; bytes
-MARKERS = "session/marker"
-"""What is said there marks a moment."""
+MARKERS = "session/marker"  # what is said there marks a moment
 _WITHOUT_METADATA = (
     "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
     "be read and played without"
@@ -72,7 +71,7 @@ class SessionRecorder(GuardedNode):
                 "rosbag2_interfaces is not installed, so there are no services to control this"
             )
         self.create_timer(0.1, self._discover)
-        self.create_timer(1.0, self._look_after)
+        self.create_timer(1.0, self._follow_publishers)
 
     def pause(self) -> None:
         """Record nothing until `resume`, but keep the newest of latched messages for that."""
@@ -131,7 +130,6 @@ class SessionRecorder(GuardedNode):
         super().destroy_node()
 
     def _begin(self, file: str, *, further: bool) -> None:
-        """Open a file and let messages in."""
         settings = self._settings
         beside = Path(file).parent / "metadata.yaml"
         taken = file.endswith(".mcap") and os.path.exists(beside)
@@ -163,7 +161,6 @@ class SessionRecorder(GuardedNode):
         self.get_logger().info(f"recording to {bag.path}")
 
     def _discover(self) -> None:
-        """Subscribe to what has appeared."""
         self._tell_splits()
         for topic, types in self.get_topic_names_and_types():
             if not self._is_wanted(topic):
@@ -222,8 +219,7 @@ class SessionRecorder(GuardedNode):
         if self._bag is not None and not self.paused:
             self._bag.losses.add(topic, in_transport=count)
 
-    def _look_after(self) -> None:
-        """Follow what publishers offer, and say what is wrong."""
+    def _follow_publishers(self) -> None:
         for topic in self._topics.values():
             new = topic.follow(self._offered(topic.name, self._types[topic.name]))
             if new and self._bag is not None:
@@ -235,7 +231,7 @@ class SessionRecorder(GuardedNode):
 
     def _tell_losses(self, bag: WriteBehind) -> None:
         lost = bag.losses.by_topic()
-        new = news(lost, self._told)
+        new = losses_between(lost, self._told)
         self._told = lost
         self.health.dropped = bag.losses.total
         while bag.untold:

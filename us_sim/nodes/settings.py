@@ -83,8 +83,7 @@ def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
         yield f"flow.{name}.", type(flow)
 
 
-BEGUN = Quantity("time", 0.0, 1e10)
-"""When something began, since 1970."""
+BEGUN = Quantity("time", 0.0, 1e10)  # when something began, since 1970
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
@@ -526,7 +525,6 @@ def checked_parameters(
 
 
 def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
-    """A YAML text's value, of a parameter that there is."""
     if name not in known and not name.startswith(_ROS_OWN):
         raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
     try:

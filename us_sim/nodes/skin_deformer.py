@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -55,7 +56,6 @@ class SkinDeformer(SceneNode):
         self.get_logger().info("ready")
 
     def _use(self, values: dict[str, Any]) -> None:
-        """Go on with these settings."""
         if values["skin"] != self._membrane.settings:
             self._membrane = self._membrane.with_settings(values["skin"])
 
@@ -98,9 +98,7 @@ class SkinDeformer(SceneNode):
         return True
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(SkinDeformer, args)
+main = partial(run_node, SkinDeformer)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -128,8 +129,7 @@ _NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contac
 _SEEN = ("contact", "no_colour", "no_spectrum")
 """Diagnostics that are sent at once when they change: they say why an image shows nothing."""
 
-REMEMBERED = 256
-"""Poses kept for the deformed nodes that carry their stamps."""
+REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
 
 
 class SliceInterpolator(SceneNode):
@@ -177,13 +177,11 @@ class SliceInterpolator(SceneNode):
         self.get_logger().info("ready")
 
     def _prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
-        """Load what was set at the console, before it is used."""
         self._scanner.prepare(probe, imaging, acoustics)
         for stream in self._streams:
             stream.prepare(probe)
 
     def _use(self, probe: Probe, imaging: Imaging, acoustics: Acoustics) -> None:
-        """Go on with what was set at the console."""
         changed = probe != self._scanner.probe
         self._scanner.use(probe, imaging, acoustics)
         if changed:
@@ -200,7 +198,6 @@ class SliceInterpolator(SceneNode):
         self._take_mesh()
 
     def _take_mesh(self) -> None:
-        """Once both halves of it are there."""
         if self._rest is None or self._tetrahedra is None:
             return
         nodes = vectors_from(self._rest, "patient")
@@ -208,14 +205,12 @@ class SliceInterpolator(SceneNode):
         self._carried = True
 
     def _remember(self, message: PoseStamped) -> None:
-        """Keep the pose until the nodes deformed by it arrive."""
         self._poses[_nanoseconds(message)] = self._pose(message)
         while len(self._poses) > REMEMBERED:
             del self._poses[next(iter(self._poses))]
         self._image_unpaired()
 
     def _pose(self, message: PoseStamped) -> Pose:
-        """The pose in a message."""
         pose = pose_from(message, "patient")
         self._annotated.pose_came(message.header.stamp)
         return pose
@@ -241,7 +236,6 @@ class SliceInterpolator(SceneNode):
     def _image(
         self, source: PoseStamped | PointCloud2, pose: Pose, tissue: PointCloud2 | None
     ) -> None:
-        """Make and publish what is wanted at ``pose``, under the stamp of what it is made from."""
         self._number += 1
         wanted = [stream for stream in self._streams if stream.is_wanted]
         if not (wanted or self._annotated.is_wanted):
@@ -282,7 +276,6 @@ class SliceInterpolator(SceneNode):
 
 
 def _contact(frame: Frame) -> dict[str, str]:
-    """How the face meets the skin, where that is modelled."""
     if frame.contact is None:
         return {}
     coupling = float(frame.contact[0].mean())
@@ -294,9 +287,7 @@ def _nanoseconds(message: PoseStamped | PointCloud2) -> int:
     return nanoseconds_of(message.header.stamp)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(SliceInterpolator, args)
+main = partial(run_node, SliceInterpolator)
 
 
 if __name__ == "__main__":

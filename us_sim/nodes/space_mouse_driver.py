@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from functools import partial
 from typing import Any
 
 from rclpy.time import Time
@@ -17,8 +18,7 @@ from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse import SpaceMouse
 
-RETRY_S = 1.0
-"""How long a device that is not there is left alone."""
+RETRY_S = 1.0  # how long a device that is not there is left alone
 
 
 class SpaceMouseDriver(GuardedNode):
@@ -53,7 +53,6 @@ class SpaceMouseDriver(GuardedNode):
         super().destroy_node()
 
     def _run(self) -> None:
-        """In the device's thread: read it, each time that it is there."""
         while not self._closing.is_set():
             try:
                 mouse = SpaceMouse()
@@ -71,7 +70,6 @@ class SpaceMouseDriver(GuardedNode):
                 self._closing.wait(RETRY_S)
 
     def _follow(self, mouse: SpaceMouse) -> None:
-        """Until it is gone; raises TrackingError then."""
         while not self._closing.is_set():
             mouse.wait(self._patience)
             now = self.get_clock().now().nanoseconds
@@ -81,7 +79,6 @@ class SpaceMouseDriver(GuardedNode):
             self._guard.trigger()
 
     def _work(self) -> None:
-        """In the node's thread: pass on the newest."""
         with self._lock:
             newest, self._newest = self._newest, None
             problem, self._problem = self._problem, ""
@@ -98,9 +95,7 @@ class SpaceMouseDriver(GuardedNode):
             self.health.problem("device", problem)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(SpaceMouseDriver, args)
+main = partial(run_node, SpaceMouseDriver)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,8 +46,7 @@ from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared,
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
 OWN = "tissue_deformer"
-LOOK_S = 0.1
-"""How often it is looked whether what was set is ready, when no pose comes."""
+PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready, when no pose comes
 
 
 class LiveTissue:
@@ -91,7 +91,7 @@ class LiveTissue:
         self._current = dict(values)  # what the tissue is deformed by
         self._asked = dict(values)  # what is being made ready
         self._preparation = Preparation(self.tissue)
-        node.create_timer(LOOK_S, self._tick)
+        node.create_timer(PREPARED_CHECK_S, self._tick)
 
     @property
     def state(self) -> str:
@@ -105,7 +105,7 @@ class LiveTissue:
         Raises:
             UsSimError: the pose cannot be used.
         """
-        self._look()
+        self._take_prepared()
         try:
             return self.tissue.deform(pose)
         except UsSimError:
@@ -115,7 +115,6 @@ class LiveTissue:
             raise
 
     def _use(self, values: dict[str, Any]) -> None:
-        """Make ready what was set."""
         if values == self._asked:
             return
         self._asked = dict(values)
@@ -129,7 +128,7 @@ class LiveTissue:
             return
         plan = self._plan(values)
         if self._node.lockstep:
-            self._settle(self._made(plan))
+            self._conclude(self._made(plan))
             return
         self._node.get_logger().info(
             f"{plan.reason}: being prepared; {self.tissue.name} goes on until it is ready"
@@ -138,7 +137,6 @@ class LiveTissue:
         self._tell_preparing()
 
     def _plan(self, values: Mapping[str, Any]) -> Plan:
-        """What to make for these settings."""
         own = values[OWN]
         changed = [key for key in values if values[key] != self._current[key]]
         other = any(key.startswith("materials.") for key in changed)
@@ -171,20 +169,18 @@ class LiveTissue:
                 self.state,
                 self._preparation.state,
             )
-        self._look()
+        self._take_prepared()
 
     def _tell_preparing(self) -> None:
-        """Tell diagnostics at once that something is being prepared, or no longer is."""
         self._node.health.state, self._node.health.preparing = self.state, self._preparation.state
         self._node.health.report()
 
-    def _look(self) -> None:
-        """Go on with what is ready, or say why it never will be."""
+    def _take_prepared(self) -> None:
         outcome = self._preparation.take()
         if outcome is not None:
-            self._settle(outcome)
+            self._conclude(outcome)
 
-    def _settle(self, outcome: Prepared | Failed) -> None:
+    def _conclude(self, outcome: Prepared | Failed) -> None:
         self._take(outcome)
         self._node.health.state = self.tissue.name  # also while no pose comes
         self._node.health.preparing = ""
@@ -210,12 +206,10 @@ class LiveTissue:
 
 
 def _settings(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the solvers, by their names."""
     return {name: values[name] for name in SOLVERS.importable}
 
 
 def _materials(values: Mapping[str, Any]) -> dict[str, Material]:
-    """Those of the materials, by their labels."""
     return {
         key.removeprefix("materials."): value
         for key, value in values.items()
@@ -332,8 +326,7 @@ class StructureMarkers:
         )
 
 
-ALWAYS = Time()
-"""The stamp of what does not change: zero, which tf takes as the latest."""
+ALWAYS = Time()  # the stamp of what does not change: zero, which tf takes as the latest
 GO_ON_S = 0.05
 """Time without a pose after which an unfinished frame is gone on with. It is longer than a frame:
 an executor serves timers before messages."""
@@ -436,7 +429,6 @@ class TissueDeformer(SceneNode):
             self._structures.publish(deformation.nodes, stamp)
 
     def _describe(self, deformation: Deformation) -> None:
-        """What diagnostics say of a frame."""
         if deformation.inverted:
             self.health.problem("inside out", _inside_out(deformation, self._live.tissue.name))
         self.health.warning = ""
@@ -459,7 +451,6 @@ class TissueDeformer(SceneNode):
         }
 
     def _comparison(self) -> dict[str, str]:
-        """What diagnostics say of the solver beside the one in use."""
         tissue = self._live.tissue
         apart = tissue.difference
         if apart is None:
@@ -486,9 +477,7 @@ def _inside_out(deformation: Deformation, name: str) -> str:
     )
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    return run_node(TissueDeformer, args)
+main = partial(run_node, TissueDeformer)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 
@@ -165,3 +166,17 @@ diagnostics: diagnostic_msgs/DiagnosticArray
 """
 
 TOPICS = tuple(_topic(entry) for entry in re.split(r"\n(?=\S)", _TABLE.strip()))
+
+
+def published_counts(report: Mapping[str, str]) -> dict[str, int]:
+    """Messages by topic that a node has published or recorded, by the values of its diagnostics.
+
+    >>> published_counts({"state": "imaging", "published ultrasound/image": "7"})
+    {'ultrasound/image': 7}
+    """
+    return {
+        topic: int(value) if value.isdecimal() and len(value) < 20 else 0
+        for key, value in report.items()
+        for kind, _, topic in [key.partition(" ")]
+        if kind == "published"
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,7 @@ from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 SECONDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Images that wait while the volume is saved."""
-REMEMBERED = 256
-"""Poses, and images, kept for what has the same stamp."""
+REMEMBERED = 256  # poses, and images, kept for what has the same stamp
 
 
 class VolumeReconstructor(GuardedNode):
@@ -115,7 +115,6 @@ class VolumeReconstructor(GuardedNode):
 
 
 def _free(file: Path) -> Path:
-    """The file's name, or with a number where it is taken."""
     if not file.exists():
         return file
     stem, dot, ending = file.name.partition(".")
@@ -123,9 +122,7 @@ def _free(file: Path) -> Path:
     return next(name for name in numbered if not name.exists())
 
 
-def main(args: list[str] | None = None) -> int:
-    """Reconstruct until interrupted."""
-    return run_node(VolumeReconstructor, args)
+main = partial(run_node, VolumeReconstructor)
 
 
 if __name__ == "__main__":

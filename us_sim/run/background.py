@@ -1,11 +1,14 @@
-"""A module that works in a process of its own, at low priority, and tells how far it is.
+"""Work beside a running simulation: making a scene, and listing scenes and bags to load.
 
-Bags that a person may want to play: those of the working folder, and installed ones.
+As a program it tells the process that started it how far it is, a JSON mapping a line:
+``python -m us_sim.run.background make SCENE [VOLUME]`` makes the volume and the tissue of a scene,
+which are kept; ``… list [SCENE …]`` lists those scenes and the installed ones, with thumbnails.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import json
 import os
@@ -13,39 +16,41 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Collection, Iterable, Iterator
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from us_sim.errors import BagError
+from us_sim.errors import BagError, UsSimError
 from us_sim.recording.metadata import read_metadata
-from us_sim.run.fork_server import end_with_parent
+from us_sim.run.fork_server import end_with_parent, package_on_path
+from us_sim.scene.building import volume_of
+from us_sim.scene.case_tissue import keep_tissue
+from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
+from us_sim.scene.reading import load_scene
 from us_sim.share import full_path, shared_roots
 
-_NICE = 10
+_MOST_BAGS = 500  # of a folder, the newest
 
 
 class Background:
-    """Runs a module, which says a JSON mapping a line.
+    """This module as a program, at low priority.
 
     Args:
-        module: its name.
-        arguments: that it gets.
+        arguments: of its command line.
         nice: by how much its priority is lower than this process's.
     """
 
-    def __init__(self, module: str, *arguments: str, nice: int = _NICE) -> None:
-        package = str(Path(__file__).resolve().parents[2])
-        search = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
+    def __init__(self, *arguments: str, nice: int) -> None:
         self._said: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments],
+            [sys.executable, "-P", "-m", "us_sim.run.background", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
             errors="replace",
-            env=os.environ | {"PYTHONPATH": search},
+            env=os.environ | {"PYTHONPATH": package_on_path()},
             start_new_session=True,
             preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
@@ -55,7 +60,7 @@ class Background:
         self._reader.start()
 
     def said(self) -> list[dict[str, Any]]:
-        """What it has said since this was asked last."""
+        """Its messages since this was called last."""
         told = []
         with contextlib.suppress(queue.Empty):
             while True:
@@ -64,7 +69,7 @@ class Background:
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is over, and all that it said has come."""
+        """Whether it is over, and all its messages have come."""
         return not self._reader.is_alive() and self._process.poll() is not None
 
     def end(self) -> None:
@@ -83,18 +88,54 @@ class Background:
         self._process.wait()
 
 
-def tell(**said: Any) -> None:
-    """Say something to the process that started this one."""
+def _tell(**said: Any) -> None:
     print(json.dumps(said), flush=True)
 
 
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd")
-_MOST_BAGS = 500
-"""Bags of a folder that are listed, the newest."""
+def make_scene(name: str, volume: str = "") -> None:
+    """Make the volume and the tissue; a phantom and a case's tissue are kept."""
+    try:
+        scene = load_scene(name, volume=volume or None)
+        text = f"making {scene.volume.name}" if scene.volume.phantom else "reading the volume"
+        _tell(fraction=0.0, text=text)
+        read = volume_of(scene, _telling(text))
+        keep_tissue(scene, read, _telling("making the tissue"))
+    except UsSimError as error:
+        _tell(refused=str(error))
+    except MemoryError:
+        _tell(refused=f"{name}: there is not enough memory")
+    else:
+        _tell(ready=True)
+
+
+def _telling(text: str) -> Callable[[float, str], None]:
+    told = 0.0
+
+    def show(fraction: float, _: str) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told > 0.1:
+            told = now
+            _tell(fraction=fraction, text=text)
+
+    return show
+
+
+def list_scenes(*names: str) -> None:
+    """Tell all scenes, then the file of each one's thumbnail as soon as there is one."""
+    scenes: dict[str, ListedScene] = {}
+    for scene in (*map(listed_scene, names), *listed_scenes()):
+        scenes.setdefault(scene.origin, scene)
+    _tell(scenes=[dataclasses.asdict(scene) for scene in scenes.values()])
+    for scene in scenes.values():
+        if not scene.problem:
+            with contextlib.suppress(UsSimError, OSError, MemoryError):  # a list will do without
+                file = thumbnail_file(load_scene(scene.origin))
+                _tell(thumbnail=scene.origin, file=str(file))
 
 
 def bags_in_reach(recordings: str | None = None) -> dict[str, str]:
-    """Files by the names that a person reads; the newest of the working folder come first.
+    """Bags of the working folder and installed ones: files by names, the newest first.
 
     Files in a bag's folder that do not belong to that bag are bags of their own.
 
@@ -123,9 +164,13 @@ def _newest_first(files: Iterable[Path]) -> list[Path]:
     return [file for _, file in sorted(found, reverse=True)[:_MOST_BAGS]]
 
 
+def _is_bag(file: Path) -> bool:
+    return file.name.endswith((".mcap", ".db3", ".mcap.zstd"))
+
+
 def _bags_in(folder: Path) -> Iterator[Path]:
     for path in _entries(folder):
-        yield from [path] if path.name.endswith(_SUFFIXES) else _bags_at(path)
+        yield from [path] if _is_bag(path) else _bags_at(path)
 
 
 def _bags_at(folder: Path) -> Iterator[Path]:
@@ -138,7 +183,7 @@ def _bags_at(folder: Path) -> Iterator[Path]:
     with contextlib.suppress(OSError):
         named = _named_in(metadata, metadata.stat().st_mtime_ns)
     for file in _entries(folder):
-        if file.name.endswith(_SUFFIXES) and file.name not in named:
+        if _is_bag(file) and file.name not in named:
             yield file
 
 
@@ -156,3 +201,8 @@ def _entries(folder: Path) -> list[Path]:
         return list(folder.iterdir())
     except OSError:
         return []
+
+
+if __name__ == "__main__":
+    job, *arguments = sys.argv[1:]
+    (make_scene if job == "make" else list_scenes)(*arguments)

@@ -19,8 +19,7 @@ from us_sim.settings.registry import SLICERS, SOLVERS
 if TYPE_CHECKING:
     from us_sim.tissue.model import TissueModel
 
-Part = tuple[str, Callable[[], object]]
-"""What a person reads, and what compiles it."""
+Part = tuple[str, Callable[[], object]]  # what a person reads, and what compiles it
 
 
 def compile_kernels() -> int:
@@ -98,7 +97,6 @@ def _show_blood() -> None:
 
 
 def _make_image(method: str) -> None:
-    """With everything on that imaging can do."""
     from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
     from us_sim.slicing.b_mode import BMode
     from us_sim.slicing.probe.probe import LinearProbe
@@ -136,7 +134,6 @@ def _track_marker() -> None:
 
 
 def _reconstruct() -> None:
-    """A sweep's images in both ways, and gathered for medians."""
     from us_sim.volume.reconstruction.grid import grid_around
     from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
 

@@ -8,6 +8,11 @@ asked adopts its orphans (PR_SET_CHILD_SUBREAPER).
 
 A process with several threads cannot be forked safely. Where an import starts a thread, the server
 ends, and nodes are started as programs. On other systems than Linux they always are.
+
+The forkserver of `multiprocessing` was tried with the same modules preloaded: memory and the time
+from node to node are the same. But it serves nobody before its last import, so that the page was
+ready after 1.6 s in place of 0.6 s; its nodes get Ctrl-C from the terminal before the recorder may
+end; and when the server is killed, it reports every node as ended (255) while all of them run on.
 """
 
 from __future__ import annotations
@@ -30,24 +35,28 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
-_PR_SET_PDEATHSIG = 1
-_THIS_PROGRAM = ctypes.CDLL(None)
+EVERY_NODE = ("us_sim.nodes", "us_sim.nodes.process", "us_sim.nodes.scene_node")
+"""Modules that every node imports; the first provides rclpy."""
+COMPUTING = ("us_sim.kernels", "scipy.sparse", "scipy.sparse.linalg", "scipy.sparse.csgraph")
+"""Modules that the nodes with kernels import."""
+_ANSWER_S = 60.0  # for a forked process to report: the modules may have to be imported first
+_POLL_S = 0.05
 
 
 def end_with_parent() -> None:
-    """Called in a new process before its program begins."""
-    _THIS_PROGRAM.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    """Have this new process get SIGTERM when its parent ends, before its program begins (Linux)."""
+    set_death_signal = 1  # PR_SET_PDEATHSIG
+    _THIS_PROGRAM.prctl(set_death_signal, signal.SIGTERM)
 
 
-_UTIME, _STIME = 11, 12  # in /proc/PID/stat, counted from the state; see proc_pid_stat(5)
+_THIS_PROGRAM = ctypes.CDLL(None)  # loaded before any fork
 
 
 @dataclass(frozen=True)
 class ProcessState:
-    """A process at one moment."""
+    """A process at one moment, as the system sees it."""
 
     is_stopped: bool  # by SIGSTOP
     is_waiting: bool  # for a processor or a disk
@@ -59,32 +68,20 @@ def process_state(pid: int) -> ProcessState | None:
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
         fields = text.rpartition(")")[2].split()
-        ticks = int(fields[_UTIME]) + int(fields[_STIME])
+        ticks = int(fields[11]) + int(fields[12])  # utime and stime, see proc_pid_stat(5)
     except (OSError, ValueError, IndexError):
         return None
     cpu = ticks / os.sysconf("SC_CLK_TCK")
     return ProcessState(fields[0] == "T", fields[0] in "RD", cpu)
 
 
-_MODULE = "us_sim.run.fork_server"
-_PR_SET_CHILD_SUBREAPER = 36
-_ROOM = 1000
-"""Characters that the server's command line has to spare, for those of its nodes."""
-_PATIENCE_S = 60.0
-"""For a process to be there: what it is forked from may have to be imported first."""
-_END_S = 1.0
-_LONGEST_LOOK_S = 0.05
-_STOPPED_LOOKS = 10
-"""How often in a row it is seen stopped before it is given up."""
-
-
 class ForkedProcess:
-    """A child that was forked: what of `subprocess.Popen` is needed for a node.
+    """A child that was forked, with the part of `subprocess.Popen` that a node needs.
 
     Args:
         pid: of the process, which is a child of this one.
-        stdin: what it reads, if that is written here.
-        stdout: what it says.
+        stdin: its input, if that is written here.
+        stdout: its output.
     """
 
     def __init__(self, pid: int, stdin: IO[str] | None, stdout: IO[str]) -> None:
@@ -115,7 +112,7 @@ class ForkedProcess:
             left = until - time.monotonic()
             if left <= 0:
                 raise subprocess.TimeoutExpired(str(self.pid), timeout)
-            pause = min(2 * pause, left, _LONGEST_LOOK_S)
+            pause = min(2 * pause, left, _POLL_S)
             time.sleep(pause)
         return status
 
@@ -137,7 +134,7 @@ class ForkedProcess:
 class ForkServer:
     """The process that nodes are forked from; it begins to import at once.
 
-    Where there is none, nodes are started as programs: not on Linux, or what nodes import does not
+    Where there is none, nodes are started as programs: not on Linux, or where the imports do not
     let them be forked.
     """
 
@@ -146,9 +143,10 @@ class ForkServer:
         if sys.platform != "linux" or not _adopt_orphans(True):
             return
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        room = " " * 1000  # for the command lines of its nodes
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", _MODULE, " " * _ROOM],
+                [sys.executable, "-P", "-m", "us_sim.run.fork_server", room],
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -165,12 +163,7 @@ class ForkServer:
     def __enter__(self) -> ForkServer:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def fork(
@@ -189,7 +182,12 @@ class ForkServer:
         asked = {"node": node, "command": list(command), "environment": dict(environment)}
         data = json.dumps(asked | {"parent": os.getpid()}).encode()
         with contextlib.ExitStack() as ours, contextlib.ExitStack() as theirs:
-            given, feed = _pipe(theirs, ours) if is_fed else (_nothing(theirs), None)
+            feed = None
+            if is_fed:
+                given, feed = _pipe(theirs, ours)
+            else:
+                given = os.open(os.devnull, os.O_RDONLY)
+                theirs.callback(os.close, given)
             heard, said = _pipe(ours, theirs)
             ready, told = _pipe(ours, theirs)
             try:
@@ -207,11 +205,11 @@ class ForkServer:
         return ForkedProcess(int(pid), stdin, os.fdopen(heard, encoding="utf-8", errors="replace"))
 
     def _answer(self, ready: int) -> bytes:
-        """What it says there; nothing where it has ended, is stopped, or takes too long."""
+        """The node's pid; nothing where the server has ended, is stopped, or takes too long."""
         assert self._process is not None
-        until, stopped = time.monotonic() + _PATIENCE_S, 0
-        while time.monotonic() < until and stopped < _STOPPED_LOOKS:
-            if select.select([ready], [], [], _LONGEST_LOOK_S)[0]:
+        until, stopped = time.monotonic() + _ANSWER_S, 0
+        while time.monotonic() < until and stopped < 10:  # times that it was seen stopped
+            if select.select([ready], [], [], _POLL_S)[0]:
                 return os.read(ready, 32)
             state = process_state(self._process.pid)
             stopped = stopped + 1 if state is None or state.is_stopped else 0
@@ -227,7 +225,7 @@ class ForkServer:
         process.terminate()
         process.send_signal(signal.SIGCONT)  # one that is stopped ends only then
         try:
-            process.wait(_END_S)
+            process.wait(1.0)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -240,45 +238,25 @@ def package_on_path() -> str:
 
 
 def _adopt_orphans(yes: bool) -> bool:
-    """Become the parent of what descends from this process when its own has ended; whether so."""
-    return bool(ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, int(yes), 0, 0, 0) == 0)
+    """Become the parent of descendants whose own parent has ended, or not; whether it worked."""
+    set_child_subreaper = 36  # PR_SET_CHILD_SUBREAPER
+    return bool(_THIS_PROGRAM.prctl(set_child_subreaper, int(yes), 0, 0, 0) == 0)
 
 
 def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:
-    """A pipe, whose ends are closed with those."""
     read, write = os.pipe()
     reader.callback(os.close, read)
     writer.callback(os.close, write)
     return read, write
 
 
-def _nothing(stack: contextlib.ExitStack) -> int:
-    """An input in which there is nothing."""
-    file = os.open(os.devnull, os.O_RDONLY)
-    stack.callback(os.close, file)
-    return file
-
-
-EVERY_NODE = ("us_sim.nodes", "us_sim.nodes.process", "us_sim.nodes.scene_node")
-"""What every node imports; the first provides rclpy."""
-COMPUTING = ("us_sim.kernels", "scipy.sparse", "scipy.sparse.linalg", "scipy.sparse.csgraph")
-"""What the nodes import that compute with kernels."""
-COMPUTING_NODES = ("tissue_deformer", "slice_interpolator", "skin_deformer")
-LONGEST = 1 << 18
-"""Bytes of a request."""
-ADOPTED_S = 5.0
-"""How long a node may take to become a child of the process that asked."""
-
-
 @dataclass(frozen=True)
-class _Request:
-    """A node that is asked for."""
-
+class _Asked:
     node: str
     command: list[str]  # the command line that it would be started with
     environment: dict[str, str]
     parent: int  # pid of the process that asks
-    files: list[int]  # descriptors: its input, its output, and where it says that it is there
+    files: list[int]  # descriptors: its input, its output, and where it reports its pid
 
 
 def main() -> int:
@@ -286,58 +264,47 @@ def main() -> int:
 
     In a node's process it runs that node.
     """
-    request = _serve(socket.socket(fileno=os.dup(0)))
-    if request is None:
-        return 0
-    module = request.command[request.command.index("-m") + 1]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    asked = _serve(socket.socket(fileno=os.dup(0)))
+    if asked is not None:
+        module = asked.command[asked.command.index("-m") + 1]
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
     return 0
 
 
-def _serve(control: socket.socket) -> _Request | None:
-    """In this process None, once nobody asks any more; in a node's process what was asked for."""
+def _serve(control: socket.socket) -> _Asked | None:
+    """In this process None, once nobody asks any more; in a node's process the request for it."""
     waiting = [*EVERY_NODE, *COMPUTING]
     while True:
-        if len(waiting) > len(COMPUTING) or (waiting and not _is_readable(control)):
-            _import(waiting)
+        nobody_asks = not select.select([control], [], [], 0.0)[0]
+        if len(waiting) > len(COMPUTING) or (waiting and nobody_asks):
+            _import_next(waiting)
             continue
-        request = _received(control)
-        if request is None or len(os.listdir("/proc/self/task")) > 1:
+        data, files, _, _ = socket.recv_fds(control, 1 << 18, 3)
+        if not data or len(os.listdir("/proc/self/task")) > 1:
             return None
-        while waiting and request.node in COMPUTING_NODES:
-            _import(waiting)
-        if _forked(request):
+        asked = _Asked(**json.loads(data), files=files)
+        if asked.node in ("tissue_deformer", "slice_interpolator", "skin_deformer"):
+            while waiting:
+                _import_next(waiting)
+        if _forked(asked):
             control.close()
-            return request
-        for file in request.files:
+            return asked
+        for file in asked.files:
             os.close(file)
 
 
-def _import(waiting: list[str]) -> None:
-    """The next module; after the last, all that is imported is made ready to be forked."""
+def _import_next(waiting: list[str]) -> None:
+    """Import the next module; after the last, make all that is imported ready to be forked."""
     importlib.import_module(waiting.pop(0))
     if not waiting:
         from us_sim.kernels import warm_up
 
         warm_up()
         gc.collect()
-        gc.freeze()  # what is collected later is copied for every node that looks at it
+        gc.freeze()  # a later collection would copy it for every node
 
 
-def _is_readable(control: socket.socket) -> bool:
-    return bool(select.select([control], [], [], 0.0)[0])
-
-
-def _received(control: socket.socket) -> _Request | None:
-    """The next request; None when there will be none."""
-    data, files, _, _ = socket.recv_fds(control, LONGEST, 3)
-    if not data:
-        return None
-    asked = json.loads(data)
-    return _Request(**asked, files=files)
-
-
-def _forked(request: _Request) -> bool:
+def _forked(asked: _Asked) -> bool:
     """Fork the node; whether this is its process, and ready to be it."""
     between = os.fork()
     if between:
@@ -347,42 +314,40 @@ def _forked(request: _Request) -> bool:
     if os.fork():
         os._exit(0)
     try:
-        _become(request, own)
+        _become(asked, own)
     except BaseException:
         os._exit(1)
     return True
 
 
-def _become(request: _Request, between: int) -> None:
-    """Make of this process what a program of its own would be."""
+def _become(asked: _Asked, between: int) -> None:
+    """Make of this process the same as a program of its own would be."""
     from us_sim.nodes import end_at_once_when_interrupted
 
-    given, said, ready = request.files
-    until = time.monotonic() + ADOPTED_S
+    given, said, ready = asked.files
+    until = time.monotonic() + 5.0
     while os.getppid() == between and time.monotonic() < until:
         time.sleep(0.0002)
     os.setsid()
     end_with_parent()
-    if os.getppid() != request.parent:
+    if os.getppid() != asked.parent:
         raise ChildProcessError("the process that asked has ended, or does not adopt it")
     os.dup2(given, 0)
     os.dup2(said, 1)
     os.dup2(said, 2)
-    os.environ.update(request.environment)
-    sys.orig_argv = request.command
+    os.environ.update(asked.environment)
+    sys.orig_argv = asked.command
     end_at_once_when_interrupted()
-    program = Path(__file__).parents[1] / "nodes" / f"{request.node}.py"
-    sys.argv = [str(program), *request.command[request.command.index("--ros-args") :]]
-    _show_command(request.command)
+    program = Path(__file__).parents[1] / "nodes" / f"{asked.node}.py"
+    sys.argv = [str(program), *asked.command[asked.command.index("--ros-args") :]]
+    _show_command(asked.command)
     os.write(ready, str(os.getpid()).encode())
-    for file in request.files:
+    for file in asked.files:
         os.close(file)
 
 
 def _show_command(words: list[str]) -> None:
     """Let tools such as ps show the node's command line, as far as there is room for it."""
-    import ctypes
-
     fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     start, end = int(fields[45]), int(fields[46])  # arg_start and arg_end, proc_pid_stat(5)
     line = "\0".join(words).encode(errors="surrogateescape")[: max(end - start - 1, 0)]

@@ -72,14 +72,14 @@ def follow(
                 monitor.refuse_company(set(plan.nodes) - {each.node for each in early})
                 began = time.monotonic()
                 supervisor = Supervisor(plan, group, monitor, settings)
-                look = supervisor.look
+                update = supervisor.update
                 if request is not None:
                     simulation = Simulation(request, supervisor, monitor)
-                    look = simulation.look
-                _await_all(look, supervisor, monitor)
+                    update = simulation.update
+                _await_all(update, supervisor, monitor)
                 monitor.refuse_unknown(plan.processes)
                 startup = time.monotonic() - began
-                _stay(look, supervisor, monitor)
+                _stay(update, supervisor, monitor)
         except KeyboardInterrupt:
             if supervisor is not None:
                 supervisor.end()
@@ -94,12 +94,11 @@ def follow(
         return supervisor.outcome(startup)
 
 
-def _await_all(look: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
-    """Until every node has reported."""
+def _await_all(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
     count = len(supervisor.plan.nodes)
     with Progress("starting (the first run compiles)", count, "nodes") as bar:
         while waiting := supervisor.waiting:
-            look()
+            update()
             monitor.refuse_earlier_run()
             more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
             bar.update(count - len(waiting), ", ".join(waiting[:2]) + more)
@@ -108,8 +107,7 @@ def _await_all(look: Callable[[], None], supervisor: Supervisor, monitor: Monito
                 raise UsSimError(failed)
 
 
-def _stay(look: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
-    """Until the path is at its end, or the time is up."""
+def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
     began = time.monotonic()
     ended: float | None = None
     while True:
@@ -117,7 +115,7 @@ def _stay(look: Callable[[], None], supervisor: Supervisor, monitor: Monitored) 
         total, unit = _shown(plan)
         with Progress("running", total, unit) as bar:
             while _shown(plan) == (total, unit):
-                look()
+                update()
                 plan, now = supervisor.plan, time.monotonic()
                 if now - began < RIVALRY_S:
                     monitor.refuse_earlier_run()
@@ -138,13 +136,11 @@ def _shown(plan: Plan) -> tuple[float | None, str]:
 
 
 def _played(plan: Plan, monitor: Monitored) -> float:
-    """How far what is played has come, in poses or images."""
     text = monitor.node.reports.get(plan.player, {}).get("played", "")
     return float(text) if text.isdecimal() and len(text) < 12 else 0.0
 
 
 def _status(plan: Plan, monitor: Monitored) -> str:
-    """The images so far, their rate and their age, in words."""
     again = ""
     if plan.loops:
         when = "at its end" if plan.poses is None else f"every {plan.poses} {_shown(plan)[1]}"
@@ -382,7 +378,7 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
             group.start([process])
             while group.is_running(process.node):
                 monitor.spin()
-                for how in watch.look(group.pids, monitor.node.heard).values():
+                for how in watch.hung(group.pids, monitor.node.heard).values():
                     raise UsSimError(f"{process.node} {how}, and what it plays is not at its end")
                 report = monitor.node.reports.get(process.node, {})
                 done = sum(int(v) for k, v in report.items() if k.startswith("published "))
@@ -432,7 +428,6 @@ def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = N
 
 
 def _is_kept(scene: Scene) -> bool:
-    """Whether a phantom is in the cache already."""
     from us_sim.volume.phantom.phantom import is_phantom_kept
 
     volume = scene.volume
@@ -442,7 +437,6 @@ def _is_kept(scene: Scene) -> bool:
 
 
 def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
-    """What the scene's camera sees of a path, rendered in view of the person who waits."""
     from us_sim.demo.camera_video import path_video
     from us_sim.recording.path import read_path
 
@@ -459,7 +453,7 @@ def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
 
 def _require_a_cache() -> None:
     """Raise VolumeError when what is made would be lost, and made again by every node."""
-    from us_sim.volume.phantom.phantom import cache_folder
+    from us_sim.cache import cache_folder
 
     folder = cache_folder()
     try:
@@ -474,7 +468,6 @@ def _require_a_cache() -> None:
 
 
 def _require_nothing_lost(outcome: Outcome) -> None:
-    """Raise UsSimError, so that the status says it, when something was."""
     lost = outcome.sentence()
     if lost:
         raise UsSimError(lost)
@@ -483,7 +476,6 @@ def _require_nothing_lost(outcome: Outcome) -> None:
 def _report(
     scene: Scene, out: Path, outcome: Outcome, wall: float, video: PathVideo | None
 ) -> None:
-    """Summary and contact sheet of what was recorded, and one paragraph for the person."""
     from us_sim.demo.contact_sheet import contact_sheet
     from us_sim.demo.session import read_session, write_summary
 
@@ -525,5 +517,4 @@ def _report(
 
 
 def _change(change: float | None, form: str) -> str:
-    """A change for a person."""
     return "not in the image" if change is None else format(change, form)

@@ -53,8 +53,7 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
         raise UsSimError(" ".join(str(error).split())) from error
 
 
-QUIET_S = 0.25
-"""Silence after which everything that was sent has been taken."""
+QUIET_S = 0.25  # silence after which everything that was sent has been taken
 
 
 def render_scene(
@@ -219,7 +218,6 @@ def _nodes(
 def _spin(
     executor: Any, nodes: list[Any], progress: Callable[[int, int], None], truth: list[str]
 ) -> int:
-    """Until the path is at its end and nothing more arrives."""
     recorder, writer, player = nodes[0], nodes[1], nodes[-1]
     clock = player.get_clock()
     total = player.pose_count

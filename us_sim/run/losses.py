@@ -16,8 +16,7 @@ from us_sim.recording.reader import read_bag
 from us_sim.run.plan import NodeProcess
 
 IMAGES = "/ultrasound/image"
-TOLD = 4
-"""Losses that are told one by one in a sentence."""
+TOLD = 4  # losses that are told one by one in a sentence
 
 
 @dataclass

@@ -54,7 +54,6 @@ def _abstract_socket(names: str) -> Iterator[None]:
 
 
 def _holder(name: str) -> int | None:
-    """The process that has the name."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as other:
         other.settimeout(1.0)
         other.connect(name)
@@ -84,10 +83,8 @@ def _taken(by: str) -> UsSimError:
     )
 
 
-LOOK_AROUND_S = 0.4
-"""To discover whether another simulation is on this ROS domain."""
-ANSWER_S = 5.0
-"""For a node to say which parameters it has."""
+DISCOVERY_S = 0.4  # to discover whether another simulation is on this ROS domain
+ANSWER_S = 5.0  # for a node to say which parameters it has
 
 
 class Monitored:
@@ -148,7 +145,7 @@ class Monitored:
 
     def refuse_company(self, names: Collection[str]) -> None:
         """Raise UsSimError when a node of one of these names is on the domain already."""
-        until = time.monotonic() + LOOK_AROUND_S
+        until = time.monotonic() + DISCOVERY_S
         while time.monotonic() < until:
             self.spin()
         taken = sorted(set(names) & set(self.node.get_node_names()))

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 RECORDER, VIEWER = "session_recorder", "viewer"
 PLAYERS = ("path_player", "session_player")
-Parameters = dict[str, dict[str, str]]
-"""Parameters given by a person: YAML texts by node and name."""
+Parameters = dict[str, dict[str, str]]  # parameters given by a person: YAML texts by node and name
 
 
 def module_of(node: str) -> str:

@@ -52,10 +52,8 @@ def deferred_signals() -> Iterator[None]:
             handlers[signal.Signals(each)](each, None)
 
 
-COMPLAINT = "us_sim: "
-"""With which a node begins to say why it cannot work."""
-STOP_S = 0.8
-"""How long nodes may take to end before the recorder is told to."""
+COMPLAINT = "us_sim: "  # with which a node begins to say why it cannot work
+STOP_S = 0.8  # how long nodes may take to end before the recorder is told to
 # Of `us_sim.nodes.process`, which needs rclpy.
 STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
 
@@ -157,10 +155,8 @@ class RunningNode:
 
 # Of `us_sim.nodes.process`, which needs rclpy.
 INTERRUPTED = 130
-RECORDER_STOP_S = 10.0
-"""How long the recorder may take to write what it still holds."""
-HUNG_STOP_S = 2.0
-"""How long a node that hangs may take to end by itself, before it is killed."""
+RECORDER_STOP_S = 10.0  # how long the recorder may take to write what it still holds
+HUNG_STOP_S = 2.0  # how long a node that hangs may take to end by itself, before it is killed
 
 
 def keep_on_this_host(*, network: bool) -> None:
@@ -220,7 +216,6 @@ class ProcessGroup:
             tqdm.write(printable(line.rstrip()), file=sys.stderr)
 
     def _show(self, line: str) -> None:
-        """Put a node's line where it belongs."""
         if self._log is not None:
             with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
                 self._log.write(line)

@@ -30,8 +30,7 @@ _RECORDING_EVERY_S = 1.0
 _OF_SCENE = {"scene", "volume"}
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
 """Parameters that go on to the node that plays."""
-_LOSS_SHOWN_S = 30.0
-"""How long it is said that what was set is lost, or belongs to another scene."""
+_LOSS_SHOWN_S = 30.0  # how long it is said that what was set is lost, or belongs to another scene
 _LISTED = 6
 
 
@@ -65,14 +64,14 @@ class Simulation:
         self._control = monitor.control()
         self._control.obey(self, self._shown())
 
-    def look(self) -> None:
-        """As `Supervisor.look`; and go on with what was asked for.
+    def update(self) -> None:
+        """As `Supervisor.update`; and go on with what was asked for.
 
         Raises:
             UsSimError: a node cannot work, and there is nothing to go back to.
         """
         try:
-            self._supervisor.look()
+            self._supervisor.update()
             failed = self._supervisor.failed()
             if failed and self._request is not self._settled and self._settled is not None:
                 raise UsSimError(failed)
@@ -83,9 +82,9 @@ class Simulation:
         if not self._supervisor.waiting:
             self._settled = self._request
             self._ready_since = self._ready_since or time.monotonic()
-        self._look_at_kept()
-        self._look_at_making()
-        self._look_at_catalogue()
+        self._take_what_was_set()
+        self._follow_making()
+        self._publish_catalogue()
         self._report()
 
     def close(self) -> None:
@@ -151,7 +150,6 @@ class Simulation:
             )
 
     def _steer(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
-        """Hand on to the node that plays what it can do by itself."""
         values: dict[str, object] = {
             name: getattr(wanted, key) for key, name in _OF_PLAYER.items() if key in named
         }
@@ -169,7 +167,7 @@ class Simulation:
         """What was set of the nodes of this scene: they get it back whenever they start again."""
         return self._kept.setdefault(_identity(self._request.scene), {})
 
-    def _look_at_kept(self) -> None:
+    def _take_what_was_set(self) -> None:
         """Keep what was set, whoever set it, but for what could not be run with."""
         kept, dropped = self._supervisor.take_set()
         for node, values in kept.items():
@@ -186,13 +184,12 @@ class Simulation:
         self._lost, self._lost_until = sentence, math.inf
 
     def _make(self, name: str, volume: str | None) -> None:
-        """Have what a scene needs made, while the one before goes on."""
         if self._making is not None:
             self._making.end()
         self._asked, self._made = (name, volume), (0.0, "reading the scene")
-        self._making = Background("us_sim.run.scene_making", name, *filter(None, [volume]), nice=2)
+        self._making = Background("make", name, *filter(None, [volume]), nice=2)
 
-    def _look_at_making(self) -> None:
+    def _follow_making(self) -> None:
         making = self._making
         if making is None:
             return
@@ -209,7 +206,6 @@ class Simulation:
             self._begin(f"{self._asked[0]}: what makes it ended without a word")
 
     def _begin(self, refused: str) -> None:
-        """Load the scene that was made, unless it cannot be."""
         name, volume = self._asked
         if not refused:
             try:
@@ -256,8 +252,7 @@ class Simulation:
         self._supervisor.change(self._plan(before))
         self._control.show(self._shown())
 
-    def _look_at_catalogue(self) -> None:
-        """Say what there is to load and to play, once there is time for it."""
+    def _publish_catalogue(self) -> None:
         now = time.monotonic()
         if self._ready_since is None or now - self._ready_since < CATALOGUE_AFTER_S:
             return
@@ -269,7 +264,7 @@ class Simulation:
                 self._control.tell_bags(bags)
         if self._catalogue is None:
             origin = self._request.scene.origin
-            self._catalogue = Background("us_sim.run.catalogue", origin, nice=19)
+            self._catalogue = Background("list", origin, nice=19)
         for said in self._catalogue.said():
             if "scenes" in said:
                 self._control.tell_scenes([*map(ListedScene.from_json, said["scenes"])])
@@ -278,7 +273,6 @@ class Simulation:
                     self._control.tell_thumbnail(said["thumbnail"], Path(said["file"]).read_bytes())
 
     def _report(self) -> None:
-        """Tell diagnostics how it goes."""
         request, waiting = self._request, self._supervisor.waiting
         count = len(self._supervisor.plan.nodes)
         state, fraction = "running", 1.0
@@ -340,13 +334,11 @@ class Simulation:
 
 
 def _listed(names: list[str]) -> str:
-    """So many names as a person reads."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(names[:_LISTED]) + more
 
 
 def _identity(scene: Scene) -> tuple[str, str | None]:
-    """What tells a scene from others, for who loads it."""
     return scene.origin, scene.volume.file
 
 
@@ -362,5 +354,4 @@ def _volume_of(scene: Scene) -> str | None:
 
 
 def _short(name: str) -> str:
-    """A scene's name from what loads it."""
     return Path(name.rpartition(":")[2]).stem

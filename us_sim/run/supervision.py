@@ -61,7 +61,7 @@ class Supervisor:
     def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
         """Run this plan; processes that the plan before had, too, go on.
 
-        Others are told to end, and new ones are started by `look` once they have.
+        Others are told to end, and new ones are started by `update` once they have.
 
         Args:
             plan: what runs from now on.
@@ -125,7 +125,7 @@ class Supervisor:
                 self.keep(node, values)
                 self._set.setdefault(node, {}).update(values)
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Take what has come, and see to nodes that have ended or hang.
 
         Raises:
@@ -139,13 +139,13 @@ class Supervisor:
         self._keep_what_was_set()
         for node, status in ended.items():
             self._ended(node, status)
-        hung = self._watch.look(self._running(), self._monitor.node.heard)
+        hung = self._watch.hung(self._running(), self._monitor.node.heard)
         for node, how in hung.items():
             said = self._monitor.node.messages.get(node) or self._group.last_words(node)
             self._group.end(node)
             self._lose(node, how, said)
         self._welcome()
-        self._look_at_the_disk()
+        self._note_full_disk()
         if self._settings.standby:
             self._prepare()
 
@@ -207,7 +207,6 @@ class Supervisor:
         self._lose(node, ending(status), self._group.last_words(node))
 
     def _lose(self, node: str, what: str, said: str) -> None:
-        """Note it, and start the node again if that may be."""
         loss = self._loss(node, what, said)
         loss.given_up = self._restarts.refused(node)
         self._note(loss, loss.given_up or "it is started again" + self._without_kept(node))
@@ -234,7 +233,6 @@ class Supervisor:
         return f", without what was set since its start: {', '.join(process.kept)}"
 
     def _welcome(self) -> None:
-        """Note which nodes have reported for the first time, or again."""
         waiting = self.waiting
         self._were_ready |= self._group.pids.keys() - set(waiting)
         for node in [node for node in self._away if node not in waiting]:
@@ -245,7 +243,6 @@ class Supervisor:
             say(f"{node} is back after {loss.back_after:.1f} s")
 
     def _prepare(self) -> None:
-        """Have the next node stand by, one at a time, while all others run."""
         if self.waiting:
             return
         for node in SLOW:
@@ -262,10 +259,9 @@ class Supervisor:
         say(f"{loss.node} {loss.what} after {loss.at:.1f} s{last}; {then}".removesuffix("; "))
 
     def _publish(self) -> None:
-        """Tell diagnostics, which a recorder records."""
         self._monitor.node.tell_lost([str(loss) for loss in self.losses])
 
-    def _look_at_the_disk(self) -> None:
+    def _note_full_disk(self) -> None:
         """Note it when the recorder cannot write any more; it may again when there is room."""
         node = self._monitor.node
         is_full = node.rejected(RECORDER, "disk") > 0

@@ -3,9 +3,9 @@
 >>> from us_sim.run.watch import Watch
 >>> times = iter(range(100))
 >>> watch = Watch(10.0, clock=lambda: 0.5 * next(times), state=lambda pid: None)
->>> watch.look({"slice_interpolator": 7}, {("slice_interpolator", 7): 1})
+>>> watch.hung({"slice_interpolator": 7}, {("slice_interpolator", 7): 1})
 {}
->>> [told for _ in range(21) if (told := watch.look({"slice_interpolator": 7}, {}))]
+>>> [told for _ in range(21) if (told := watch.hung({"slice_interpolator": 7}, {}))]
 [{'slice_interpolator': 'has not reported for 10 s'}]
 """
 
@@ -48,20 +48,15 @@ class SupervisionSettings(Settings):
 STEP_S = 0.5
 """A longer time between two looks counts as this much: the machine slept, or had no time for us,
 and so perhaps none for the nodes."""
-STOPPED_S = 0.5
-"""For which a process may be stopped."""
+STOPPED_S = 0.5  # for which a process may be stopped
 BUSY_SHARE = 0.5
 """Of the silence, in which a node that is busy has worked or waited for a processor."""
-BUSY_PATIENCE = 6.0
-"""How many times as long a busy node may be silent: it may be compiling."""
-START_LIMIT_S = 300.0
-"""For the first report: the first run compiles."""
+BUSY_FACTOR = 6.0  # how many times as long a busy node may be silent: it may be compiling
+START_LIMIT_S = 300.0  # for the first report: the first run compiles
 
 
 @dataclass
 class _Silence:
-    """Of one process, s on the clock of the watch."""
-
     reports: int = 0
     silent: float = 0.0
     busy: float = 0.0  # of it
@@ -89,7 +84,7 @@ class Watch:
         self._last: float | None = None
         self._silences: dict[tuple[str, int], _Silence] = {}
 
-    def look(
+    def hung(
         self, pids: Mapping[str, int], reports: Mapping[tuple[str, int], int]
     ) -> dict[str, str]:
         """The nodes that hang, and how that shows, for a person; each is told once.
@@ -112,7 +107,6 @@ class Watch:
         return hung
 
     def _add(self, silence: _Silence, pid: int, step: float, reports: int) -> None:
-        """One more step of silence, if it is one."""
         state = self._state(pid)
         worked = 0.0
         if state is not None:
@@ -130,7 +124,7 @@ class Watch:
             return "was stopped (SIGSTOP)"
         limit = self._limit
         if silence.busy > BUSY_SHARE * silence.silent:
-            limit *= BUSY_PATIENCE
+            limit *= BUSY_FACTOR
         if not silence.reports:
             limit = max(limit, START_LIMIT_S)
         if silence.silent < limit:

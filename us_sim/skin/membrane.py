@@ -265,7 +265,7 @@ class SkinDeformation:
     vertices: NDArray[np.float64]  # (N, 3), m, frame patient
     normals: NDArray[np.float64]  # (N, 3), unit, out of the body
     residual: float  # unbalanced force over the force that the anchors bear; 0 at rest
-    action: str  # what was done for stability, '' when nothing
+    action: str  # remark on masses or steps changed for stability, else ''
 
 
 class SkinMembrane:
@@ -354,14 +354,8 @@ class SkinMembrane:
         """J, of the springs, the anchors and the motion; 0 at rest."""
         return float(
             spring_energy(
-                self._vertices,
-                self._velocity,
-                self.surface.vertices,
-                self._edges,
-                self._natural_length,
-                self._rest_tension,
-                self._stiffness,
-                self._anchor,
+                *(self._vertices, self._velocity, self.surface.vertices, self._edges),
+                *(self._natural_length, self._rest_tension, self._stiffness, self._anchor),
                 self.mass,
             )
         )
@@ -376,23 +370,10 @@ class SkinMembrane:
         start, steps, note = self._approach(pose)
         vertices, velocity = self._vertices.copy(), self._velocity.copy()
         residual, moved, contacts = _relax(
-            vertices,
-            velocity,
-            self.surface.vertices,
-            self._edges,
-            self._natural_length,
-            self._rest_tension,
-            self._stiffness,
-            self._anchor,
-            self.mass,
-            self._decay,
-            self._time_step,
-            steps,
-            self._parts,
-            self._collider.offset_box,
-            _placement(start),
-            _placement(pose),
-            pose is not None,
+            *(vertices, velocity, self.surface.vertices, self._edges, self._natural_length),
+            *(self._rest_tension, self._stiffness, self._anchor, self.mass, self._decay),
+            *(self._time_step, steps, self._parts, self._collider.offset_box),
+            *(_placement(start), _placement(pose), pose is not None),
         )
         finite = np.isfinite(vertices).all() and np.isfinite(velocity).all()
         if not (finite and math.isfinite(residual)):
@@ -515,7 +496,7 @@ def _relax(
     borne = 0.0
     moved = 0.0
     for i in range(n):
-        # What pushes a particle acts along its way, and can hold what pulls it back.
+        # The contact force acts along the way a particle was pushed, and balances a force back.
         length = way[i, 0] ** 2 + way[i, 1] ** 2 + way[i, 2] ** 2
         along = way[i, 0] * force[i, 0] + way[i, 1] * force[i, 1] + way[i, 2] * force[i, 2]
         held = min(along, 0.0) / length if length > 0.0 else 0.0
@@ -534,7 +515,7 @@ def _relax(
 def _follow(now, last, time_step, velocity):
     """The velocity (3,) of a particle that was pushed: that of its way, but no faster than before.
 
-    So contact never adds to the energy of motion, and what rests against the probe has none.
+    So contact never adds kinetic energy, and a particle at rest against the probe has none.
     """
     before = after = 0.0
     for a in range(3):

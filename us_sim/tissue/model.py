@@ -40,7 +40,7 @@ FACES = {
 # Distance from a bounding box's face, over the box's size, up to which nodes count as on the
 # face; for meshes that are no box.
 _MARGIN = 0.05
-# Nodes, also as a part of all, below which what is held is remarked on as little.
+# Fixed nodes, also as a part of all, below which there is a remark that they are few.
 _FEW, _FEW_PART = 10, 0.01
 # The cosine to -z below which a probe that comes along +z would only graze the surface.
 _GRAZING = 0.1
@@ -127,7 +127,7 @@ class Intervention(Flag):
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """The deformed tissue and what it does to the probe."""
+    """The deformed tissue, and its force on the probe."""
 
     nodes: NDArray[np.float64]  # (N, 3), m, frame patient, in mesh order
     contact_nodes: NDArray[np.int32]  # (K,), nodes that the probe pushes
@@ -142,7 +142,7 @@ class Deformation:
 
 @dataclass(frozen=True, eq=False)
 class TissueState:
-    """What a solver needs to go on from where another one is."""
+    """State of a tissue, which solvers hand to each other."""
 
     displacement: NDArray[np.float64]  # (N, 3), m
     velocity: NDArray[np.float64]  # (N, 3), m/s

@@ -42,12 +42,7 @@ class Shown(Protocol):
     """Logs messages of one type, each at the time that the file has been told."""
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log a message.
-
-        Args:
-            entity: the topic's name without its first slash.
-            message: as a bag gives it.
-            file: that it goes to.
+        """Log a message of the topic ``/entity``.
 
         Raises:
             UsSimError: the message cannot be used.
@@ -58,7 +53,6 @@ class Texts:
     """``std_msgs/String``."""
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log the text."""
         file.log(entity, rerun.TextLog(message.data))
 
 
@@ -66,7 +60,6 @@ class Transforms:
     """``tf2_msgs/TFMessage``."""
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log where each child is in its parent."""
         for each in message.transforms:
             pose, child = transform_from(each), each.child_frame_id
             file.log(
@@ -88,7 +81,6 @@ class Clouds:
     """``sensor_msgs/PointCloud2``, as points that are as large from afar."""
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log where the points are."""
         file.place(entity, message.header.frame_id)
         file.log(entity, rerun.Points3D(vectors_from(message), radii=_RADIUS, colors=_COLOUR))
 
@@ -161,7 +153,6 @@ class Structures:
                 self._made = list(structures_of(scene, volume, mesh, _TRIANGLES))
 
     def take(self, _: str, message: Any, file: RerunFile) -> None:
-        """Log where the tissue's nodes have carried the structures."""
         nodes = vectors_from(message, "patient")
         for structure in self._made:
             entity = f"{STRUCTURES}/{structure.name}"
@@ -180,7 +171,6 @@ class Structures:
 FORCE = "force"  # what a topic's name is followed by in the entity of the curves
 METRES_A_NEWTON = 0.002  # of the arrow's length
 _ARROW_RADIUS = 0.0008  # m, of the arrow's shaft
-_AXES = ("x", "y", "z")
 _COLOURS = ((224, 108, 117), (152, 195, 121), (97, 175, 239))
 
 
@@ -191,7 +181,6 @@ class Wrenches:
         self._named: set[str] = set()
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log the force at the origin of its frame."""
         force = wrench_from(message)[:3]
         file.place(entity, message.header.frame_id)
         arrow = METRES_A_NEWTON * force
@@ -199,7 +188,7 @@ class Wrenches:
         curves = f"{entity}/{FORCE}"
         if curves not in self._named:
             self._named.add(curves)
-            names = [f"{axis}, N" for axis in _AXES]
+            names = ["x, N", "y, N", "z, N"]
             file.log(curves, rerun.SeriesLines(names=names, colors=_COLOURS), static=True)
         file.log(curves, rerun.Scalars(force))
 
@@ -221,7 +210,6 @@ class Diagnostics:
         self._last: dict[str, tuple[int, str]] = {}
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log what each node says of itself."""
         for status in message.status:
             node = status.name.strip("/") or "node"
             for item in status.values:
@@ -329,7 +317,6 @@ class Markers:
         self._entities: dict[str, set[str]] = {}
 
     def take(self, entity: str, message: Any, file: RerunFile) -> None:
-        """Log what is drawn, and what is drawn no more."""
         known = self._entities.setdefault(entity, set())
         for marker in getattr(message, "markers", [message]):
             if marker.action == _DELETE_ALL:

@@ -79,7 +79,7 @@ class Unfiltered(PoseFilter):
 
 
 def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
-    """The filter of that name, with its settings; what is not named is not imported.
+    """Create the filter of that name; no other one is imported.
 
     Raises:
         TrackingError: there is no filter of that name.

@@ -447,7 +447,7 @@ class HapticRendering:
         return np.zeros(6)
 
     def _left(self, now: int) -> NDArray[np.float64]:
-        """(6,) N, N m, what is still felt of earlier models."""
+        """(6,) N, N m, the remainder of earlier models."""
         fraction = 1.0 - 1e-9 * (now - self._since) / self._settings.hand_over
         return self._left_over * min(max(fraction, 0.0), 1.0)
 
@@ -585,7 +585,7 @@ class HapticDevice:
     def on_handle(
         self, probe: Pose, turn: NDArray[np.float64], wrench: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(6,) N, N m: what the handle must feel, about its origin along the axes of the arm.
+        """(6,) N, N m on the handle, about its origin along the axes of the arm.
 
         Its work is that of the wrench on the probe times `work_ratio`: what takes no energy there
         takes none here.

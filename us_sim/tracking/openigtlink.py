@@ -512,7 +512,7 @@ class OpenIGTLinkServer:
                 self._clients[connection] = client
 
     def _serve(self, client: _Client, events: int) -> None:
-        """Read what is not listened to, and send what the connection takes."""
+        """Discard incoming data, and send as much as the connection takes."""
         if client.connection not in self._clients:
             return
         try:

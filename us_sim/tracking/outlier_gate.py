@@ -1,4 +1,4 @@
-"""The gate that refuses poses to which no probe could have come, or not so soon.
+"""A gate that refuses poses which a probe cannot have reached in the time.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tracking.settings import GateSettings
@@ -26,7 +26,7 @@ _DIAGONAL = np.diag_indices(6)
 
 
 class Verdict(Enum):
-    """What the gate says of a measurement."""
+    """Judgement of the gate on a measurement."""
 
     BELIEVED = "believed"
     REFUSED = "refused"

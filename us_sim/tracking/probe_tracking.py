@@ -101,7 +101,7 @@ class ProbeTracking:
         return float(np.median(jumps)) if len(jumps) >= _JUMPS else 0.0
 
     def reset(self) -> None:
-        """Forget all poses: the next one is the first. What was counted stays."""
+        """Forget all poses, and keep the counts."""
         self._newest = self._believed = None
         self._clock.reset()
         self._start_anew()

@@ -95,7 +95,7 @@ class RestSurface:
     def upper_side(
         cls, vertices: NDArray[np.floating], triangles: NDArray[np.integer]
     ) -> RestSurface:
-        """The part of a closed surface on which a probe can be put: what faces -z.
+        """The part of a closed surface that faces -z, on which a probe can stand.
 
         Args:
             vertices: (N, 3) m, frame ``patient``.
@@ -298,7 +298,7 @@ _AT_REST, _ALIGNED = 2e-6, 1e-4
 
 @dataclass(frozen=True)
 class HandSpeed:
-    """What a hand does at most: the quick end of what sonographers do, far below a thrust."""
+    """Speed limits of a hand: as a quick sonographer's, far below a thrust."""
 
     slide: float = 0.25  # m/s, of the line from the one point of the skin to the other
     press: float = 0.15  # m/s

@@ -1,9 +1,4 @@
-"""Where the probe is, whoever moves it, also for who begins to listen when nobody does any more.
-
-What the viewer knows of the surface on which the probe can be put.
-
-Moves the probe as pages ask for it, unless somebody else does.
-"""
+"""The hand of the pages: moves the probe as they ask, unless somebody else moves it."""
 
 from __future__ import annotations
 
@@ -29,7 +24,7 @@ from us_sim.nodes.probe_lead import LEAD_TOPIC
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import Motion, RestSurface, Stance
-from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.feeds import RestMesh, Subscriptions
 from us_sim.viewer.hand_command import HOME_PRESS, AskedPoses, HandCommand, hand_state, is_source
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import Feed, Packet, Simulator
@@ -98,26 +93,25 @@ class ProbeWhereabouts:
         rested: Callable[[Pose | None, int], None],
         goes_on: Callable[[], None],
     ) -> None:
-        self._node = node
-        self._moved, self._rested, self._goes_on = moved, rested, goes_on
-        self._heard = [
-            node.create_subscription(PoseStamped, "probe/pose", self._follow, STREAM),
-            node.create_subscription(DiagnosticStatus, "probe/status", self._find, LATCHED),
-        ]
+        self._node, self._moved, self._rested, self._goes_on = node, moved, rested, goes_on
+        self._subscriptions = Subscriptions(
+            node,
+            (PoseStamped, "probe/pose", self._follow, STREAM, False),
+            (DiagnosticStatus, "probe/status", self._find, LATCHED, False),
+        )
+        self._subscriptions.keep(True)
 
     @property
     def is_told(self) -> bool:
-        """Whether there is somebody who says it."""
+        """Whether anybody publishes it."""
         return self._node.count_publishers(self._node.resolve_topic_name("probe/status")) > 0
 
     def close(self) -> None:
         """Listen no more."""
-        for subscription in self._heard:
-            self._node.destroy_subscription(subscription)
-        self._heard = []
+        self._subscriptions.keep(False)
 
     def _follow(self, message: PoseStamped) -> None:
-        self._moved(pose_from(message, "patient"))
+        self._moved(pose_from(message, PATIENT))
 
     def _find(self, status: DiagnosticStatus) -> None:
         said = {each.key: each.value for each in status.values}
@@ -128,10 +122,6 @@ class ProbeWhereabouts:
             self._rested(None, 0)
         else:
             self._goes_on()
-
-
-_PLANE = 0.1
-"""m around the origin, of the plane where nothing has a surface."""
 
 
 class ViewerSurface:
@@ -147,7 +137,7 @@ class ViewerSurface:
         self._node, self._rest, self._changed = node, rest, changed
         self._skin: RestSurface | None = None
         self._tissue: RestSurface | None = None
-        self._plane = RestSurface.plane(_PLANE)
+        self._plane = RestSurface.plane(0.1)  # m around the origin
         self._heard = node.create_subscription(Mesh, "skin/mesh", self._take_skin, LATCHED)
         rest.watch(self._make_tissue)
         node.guarded(node.resolve_topic_name("tissue/rest"), self._make_tissue)()
@@ -175,7 +165,6 @@ class ViewerSurface:
         self._changed()
 
     def _make_tissue(self) -> None:
-        """The tissue's upper side, of the mesh that is there now."""
         if self._rest.mesh is not None:
             self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
             self._changed()
@@ -186,9 +175,9 @@ MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 images than that."""
 RESTING = 5.0
 """Poses a second; images are called stale after half a second."""
-LOOKS = 2.0
-"""How often within the time from pose to pose it is looked whether one is due."""
-STREAMING, PATIENCE = 3.0, 1.45
+TICKS = 2.0
+"""Timer ticks from pose to pose."""
+STREAMING, LATEST = 3.0, 1.45
 """From pose to pose: how long after a command the next is expected, and then waited for. A timer's
 pose just before it would hold up the command's own."""
 STATE_RATE = 10.0
@@ -232,7 +221,7 @@ class ViewerHand:
         simulator.commands["take"] = self._ask_for_probe
         simulator.leaving.append(lambda page: post(lambda: self.asked.left(page)))
         self._session = simulator.session
-        self._lead = Lead("nobody", "the viewer looks who moves the probe")
+        self._lead = Lead("nobody", "the viewer finds out who moves the probe")
         self._surface: ViewerSurface | None = None
         self._standing: RestSurface | None = None  # the surface that the motion is on
         self._motion: Motion | None = None
@@ -246,8 +235,8 @@ class ViewerHand:
         self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
         self._warning = ""
         self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
-        self._moving_timer = node.create_timer(1.0 / (LOOKS * MOVING), self._tick)
-        self._resting_timer = node.create_timer(1.0 / RESTING, self._look)
+        self._moving_timer = node.create_timer(1.0 / (TICKS * MOVING), self._tick)
+        self._resting_timer = node.create_timer(1.0 / RESTING, self._update)
         self._moving_timer.cancel()
         self._resting_timer.cancel()
 
@@ -255,8 +244,8 @@ class ViewerHand:
         """How deep (m) the probe is pressed, see `Stance`; None while that is not known.
 
         Args:
-            stamp: ns, of its pose: if the hand has published that it is known.
-            position: (3,) m, where it is; if not, it is looked for on the skin.
+            stamp: ns, of its pose.
+            position: (3,) m, where it is, for poses of others.
         """
         known, surface = self._presses.get(stamp), self._standing
         if known is not None or surface is None or position is None:
@@ -264,7 +253,7 @@ class ViewerHand:
         return surface.under(np.asarray(position, dtype=np.float64))[1]
 
     def _command(self, value: Any, page: int) -> str | None:
-        """What a page sent, in its thread; why it is not done, or None."""
+        """Take a page's command, in its thread; why it is not done, or None."""
         try:
             asked = HandCommand.read(value)
         except UsSimError as error:
@@ -275,11 +264,10 @@ class ViewerHand:
         return None
 
     def _watched(self, _: bool) -> None:
-        """A page looks, or none does any more; in that page's thread."""
         self._post(self._watch)
 
     def _watch(self) -> None:
-        """Begin when the first page looks, and leave everything when the last has gone."""
+        """Begin with the first page, and leave everything when the last has gone."""
         if self.feed.is_watched and self._surface is None:
             self._surface = ViewerSurface(self._node, self._rest, self._stand)
             self._session.watch()
@@ -288,7 +276,7 @@ class ViewerHand:
                 self._node, self._follow, self._find, self._be_elsewhere
             )
             self._resting_timer.reset()
-            self._look()
+            self._update()
         elif not self.feed.is_watched and self._surface is not None:
             self._let_go()
             self._surface.close()
@@ -313,8 +301,8 @@ class ViewerHand:
         else:
             self._motion.rest_at(Stance.home(surface, HOME_PRESS))
 
-    def _look(self) -> None:
-        """A few times a second: who leads, is there somewhere to stand, and the pose at rest."""
+    def _update(self) -> None:
+        """Find out who leads and where to stand, and publish the pose at rest."""
         self._stand()
         self._lead = self._lead_now()
         if self._lead.obstacle:
@@ -338,7 +326,7 @@ class ViewerHand:
         if self._standing is None:
             return Lead("nobody", "the patient's surface is awaited")
         if not self._is_found and self._whereabouts is not None and self._whereabouts.is_told:
-            return Lead("nobody", "the viewer looks where the probe is")
+            return Lead("nobody", "the viewer finds out where the probe is")
         return lead
 
     def _take(self) -> None:
@@ -355,7 +343,6 @@ class ViewerHand:
         self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:
-        """Publish no more."""
         self._moving_timer.cancel()
         self._warning = ""
         if self._publisher is not None:
@@ -379,10 +366,9 @@ class ViewerHand:
         self._is_found = True
         if self._publisher is None and pose is not None and stamp != self._last_stamp:
             self._elsewhere = pose
-        self._look()
+        self._update()
 
     def _be_elsewhere(self) -> None:
-        """Poses come, or came a moment ago: of this hand, if it has had the probe."""
         self._is_found |= self._motion is not None
 
     def _follow(self, pose: Pose) -> None:
@@ -405,7 +391,7 @@ class ViewerHand:
                 )
 
     def _obey(self, asked: HandCommand, page: int) -> None:
-        """Aim where a page wants the probe, and set out at once."""
+        """Move to where a page wants the probe, from now on."""
         if self._publisher is None or self._motion is None or self._standing is None:
             return  # somebody else has taken it meanwhile
         self._motion.aim(asked.stance(self._motion.goal, self._standing))
@@ -417,10 +403,9 @@ class ViewerHand:
             self._advance(1.0 / MOVING if rested else LONGEST_STEP)
 
     def _tick(self) -> None:
-        """The next pose of a movement, if it is due."""
         now = time.monotonic()
         is_streaming = now - self.asked.at < STREAMING / MOVING
-        if now - self._sent_at > (PATIENCE if is_streaming else 0.9) / MOVING:
+        if now - self._sent_at > (LATEST if is_streaming else 0.9) / MOVING:
             self._advance(LONGEST_STEP)
 
     def _advance(self, longest: float) -> None:
@@ -438,7 +423,6 @@ class ViewerHand:
             self._tell()
 
     def _publish(self) -> None:
-        """Where the probe is held."""
         assert self._motion is not None
         assert self._standing is not None
         stamp = self._node.get_clock().now()
@@ -462,7 +446,7 @@ class ViewerHand:
         return f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
 
     def _tell(self) -> None:
-        """The pages how the probe is held, and by whom."""
+        """Tell the pages how the probe is held, and by whom."""
         motion, surface = self._motion, self._standing
         stance = motion.stance if motion is not None else None
         goal = motion.goal if motion is not None else None

@@ -1,11 +1,7 @@
-"""Parameters of other nodes: their descriptors and values, read and written.
+"""Parameters of other nodes: found, read, followed and set while pages show them.
 
 The nodes of this package say more in a descriptor than ROS has fields for, as a JSON object in
 ``additional_constraints``, see `us_sim.nodes.parameters`. Others may write there what they like.
-
-The parameters of one other node: read once, followed, and set.
-
-The parameters of the nodes that pages look at: found, read, followed and set.
 """
 
 from __future__ import annotations
@@ -27,7 +23,16 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.settings.quantity import units_of
 from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
 
-_TYPES: dict[Kind, tuple[int, str]] = {
+ANSWER_S = 10.0
+"""How long an answer is waited for: a node that makes images anew may need seconds."""
+_SERVICES_S = 5.0
+"""How long a node may take to offer its services."""
+_EVERY_S = 0.5
+"""How often the graph is searched for nodes that come, go, or are started again."""
+_EVENTS = "/parameter_events"
+_OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
+"""Parameters that rclpy itself declares, or prefixes of them: not what a page is for."""
+_TYPES = {
     Kind.TRUTH: (ParameterType.PARAMETER_BOOL, "bool_value"),
     Kind.WHOLE: (ParameterType.PARAMETER_INTEGER, "integer_value"),
     Kind.NUMBER: (ParameterType.PARAMETER_DOUBLE, "double_value"),
@@ -39,22 +44,15 @@ _TYPES: dict[Kind, tuple[int, str]] = {
 _KINDS = {number: (kind, field) for kind, (number, field) in _TYPES.items()}
 
 
-def parameter_from(
+def _parameter(
     node: str, name: str, descriptor: ParameterDescriptor, value: ParameterValue
 ) -> Parameter:
-    """What a page shows of a parameter.
-
-    Args:
-        node: whose it is.
-        name: of the parameter.
-        descriptor, value: what the node says of it.
-    """
-    kind, raw = raw_from(value)
+    kind, raw = _raw(value)
     told = _extras(descriptor)
     unit, reads = str(told.get("unit", "")), str(told.get("shown_in", ""))
     choices = told.get("choices")
     meanings = {str(k): str(v) for k, v in choices.items()} if isinstance(choices, dict) else {}
-    limits = _limits(descriptor)
+    ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
     if reads not in units_of(unit):
         reads = unit
     return Parameter(
@@ -64,7 +62,7 @@ def parameter_from(
         raw,
         unit=reads,
         size=units_of(unit).get(reads, 1.0),
-        limits=limits,
+        limits=(float(ranges[0].from_value), float(ranges[0].to_value)) if ranges else None,
         choices=tuple(meanings),
         meanings={name: text for name, text in meanings.items() if text},
         may_be_nothing="none" in told,
@@ -74,7 +72,7 @@ def parameter_from(
 
 
 def _extras(descriptor: ParameterDescriptor) -> dict[str, Any]:
-    """The JSON object in the constraints; nothing where another's node has something else there."""
+    """The JSON object in the constraints; empty where another's node has something else there."""
     try:
         told = json.loads(str(descriptor.additional_constraints))
     except (ValueError, RecursionError):
@@ -82,8 +80,7 @@ def _extras(descriptor: ParameterDescriptor) -> dict[str, Any]:
     return told if isinstance(told, dict) else {}
 
 
-def raw_from(value: ParameterValue) -> tuple[Kind, Any]:
-    """The kind and the value in SI units; lists are tuples."""
+def _raw(value: ParameterValue) -> tuple[Kind, Any]:
     if value.type not in _KINDS:
         return Kind.OTHER, None
     kind, field = _KINDS[value.type]
@@ -91,31 +88,101 @@ def raw_from(value: ParameterValue) -> tuple[Kind, Any]:
     return kind, tuple(raw) if kind.is_list else raw
 
 
-def parameter_message(parameter: Parameter, raw: Any) -> ParameterMessage:
-    """What asks the parameter's node to set it to a value in SI units."""
+def _message(parameter: Parameter, raw: Any) -> ParameterMessage:
     number, field = _TYPES[parameter.kind]
-    if parameter.kind is Kind.NUMBERS:
-        raw = array("d", raw)
-    elif parameter.kind.is_list:
-        raw = list(raw)
+    if parameter.kind.is_list:
+        raw = array("d", raw) if parameter.kind is Kind.NUMBERS else list(raw)
     value = ParameterValue(type=number, **{field: raw})
     return ParameterMessage(name=parameter.name, value=value)
 
 
-def _limits(descriptor: ParameterDescriptor) -> tuple[float, float] | None:
-    ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
-    return (float(ranges[0].from_value), float(ranges[0].to_value)) if ranges else None
+class RemoteParameters(ParameterBoard):
+    """A board that is up to date while pages show it, and asks nothing while none does.
+
+    A node is told from one of the same name that was started later by who publishes its
+    parameter events, as the middleware numbers publishers.
+
+    Args:
+        node: that asks.
+        post: has work done in the thread that spins ``node``; returns a future.
+        doors: by the names of nodes, functions that set their parameters in place of them.
+    """
+
+    def __init__(
+        self,
+        node: GuardedNode,
+        post: Callable[[Callable[[], Any]], Any],
+        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
+    ) -> None:
+        super().__init__(lambda: post(self._follow_graph), self._send)
+        self._doors = doors or {}
+        self._node, self._post = node, post
+        self._space = node.get_namespace().rstrip("/")
+        self._nodes: dict[str, _RemoteNode] = {}
+        self._timer: Any = None
+        self._events: Any = None
+
+    def close(self) -> None:
+        """Answer whoever waits."""
+        for remote in self._nodes.values():
+            remote.close()
+
+    def _follow_graph(self) -> None:
+        watched = self.watched
+        if not watched:
+            if self._timer is not None:
+                self._node.destroy_timer(self._timer)
+                self._node.destroy_subscription(self._events)
+                self._timer = None
+            for remote in self._nodes.values():
+                remote.forget()  # it may change unseen
+            return
+        if self._timer is None:
+            every_event = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+            self._events = self._node.create_subscription(
+                ParameterEvent, _EVENTS, self._follow, every_event
+            )
+            self._timer = self._node.create_timer(_EVERY_S, self._follow_graph)
+        there = self._identities()
+        for name in watched:
+            if name not in self._nodes:
+                self._nodes[name] = _RemoteNode(self._node, name, self.tell)
+            self._nodes[name].follow_graph(there.get(f"{self._space}/{name}", frozenset()))
+
+    def _identities(self) -> dict[str, frozenset[Any]]:
+        """The publishers of parameter events of each node of the graph, by its full name."""
+        found: dict[str, set[Any]] = defaultdict(set)
+        for name, space in self._node.get_node_names_and_namespaces():
+            found[f"{space.rstrip('/')}/{name}"].add(name)
+        for each in self._node.get_publishers_info_by_topic(_EVENTS):
+            name = f"{each.node_namespace.rstrip('/')}/{each.node_name}"
+            if name in found:
+                found[name].add(tuple(each.endpoint_gid))
+        return {name: frozenset(identity) for name, identity in found.items()}
+
+    def _follow(self, event: ParameterEvent) -> None:
+        space, _, name = event.node.rpartition("/")
+        if space == self._space and name in self._nodes and name in self.watched:
+            self._nodes[name].follow(event)
+
+    def _send(self, parameter: Parameter, raw: Any) -> Future[str]:
+        if parameter.node in self._doors:
+            return self._doors[parameter.node](**{parameter.name: raw})
+        told: Future[str] = Future()
+
+        def ask() -> None:
+            remote = self._nodes.get(parameter.node)
+            if remote is None:
+                told.set_result(f"{parameter.node} is not shown any more")
+            else:
+                remote.set(parameter, raw, told)
+
+        if self._post(ask).cancelled():
+            told.set_result("the viewer ends")
+        return told
 
 
-ANSWER_S = 10.0
-"""How long an answer is waited for: a node that makes images anew may need seconds."""
-SERVICES_S = 5.0
-"""How long a node that is there may take to offer its services."""
-OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
-"""Parameters that rclpy itself declares, or prefixes of them: not what a page is for."""
-
-
-class RemoteNode:
+class _RemoteNode:
     """Another node's parameters. All of it happens in the thread that spins ``node``.
 
     Args:
@@ -131,19 +198,21 @@ class RemoteNode:
         self._parameters: dict[str, Parameter] = {}
         self._identity: frozenset[Any] = frozenset()
         self._since = 0.0  # s, monotonic: when it was asked, or when it came
-        self._reading = 0  # counts; an answer to an earlier one is of no use
+        self._reading = 0  # counts; answers to earlier readings are ignored
         self._is_read = self._is_asked = False
         self._heard: Counter[str] = Counter()  # events, by parameters' names
         self._setting: dict[Future[str], float] = {}  # until when its answer is waited for
 
-    def look(self, identity: frozenset[Any]) -> None:
+    def follow_graph(self, identity: frozenset[Any]) -> None:
         """Read the parameters if they are not, or are another process's.
 
         Args:
-            identity: what is the same as long as the node is; empty where there is no such node.
+            identity: the same as long as the node is; empty where there is no such node.
         """
         now = time.monotonic()
-        self._give_up(now)
+        for told in [told for told, until in self._setting.items() if now > until]:
+            del self._setting[told]
+            told.set_result(f"{self._name} did not answer within {ANSWER_S:g} s")
         if not identity:
             if self._identity or self._is_asked:
                 self.forget()
@@ -156,52 +225,36 @@ class RemoteNode:
         if self._is_read or (self._is_asked and now - self._since < ANSWER_S):
             return
         if self._client.services_are_ready():
-            self.read()
-        elif now - self._since > SERVICES_S:
+            self._read()
+        elif now - self._since > _SERVICES_S:
             self._say(State.SILENT)
 
     def forget(self) -> None:
-        """What was read holds no longer."""
+        """Drop what was read."""
         self._identity = frozenset()
         self._parameters = {}
         self._is_read = self._is_asked = False
         self._reading += 1
 
-    def read(self) -> None:
-        """Ask for all parameters; what is known of them stays until the answers are there."""
-        if self._is_asked and time.monotonic() - self._since >= ANSWER_S:
-            self._say(State.SILENT)
-        self._reading += 1
-        self._is_asked, self._since = True, time.monotonic()
-        turn = self._reading
-
-        def listed(future: Any) -> None:
-            answer = _answer(future)
-            if turn == self._reading and answer is not None:
-                names = [n for n in answer.result.names if not n.startswith(OF_ROS)]
-                self._describe(turn, names)
-
-        self._client.list_parameters(callback=self._guarded(listed))
-
     def follow(self, event: ParameterEvent) -> None:
-        """Something was declared, set or undeclared."""
+        """Take over parameters that were declared, set or undeclared."""
         if not self._is_read:
             if self._is_asked:
-                self.read()  # what is being answered may be older
+                self._read()  # what is being answered may be older
             return
         changed = [*event.new_parameters, *event.changed_parameters]
         if event.deleted_parameters or any(
-            each.name not in self._parameters and not each.name.startswith(OF_ROS)
+            each.name not in self._parameters and not each.name.startswith(_OF_ROS)
             for each in changed
         ):
-            self.read()
+            self._read()
             return
         for each in changed:
             self._heard[each.name] += 1
             if each.name in self._parameters:
-                kind, raw = raw_from(each.value)
+                kind, raw = _raw(each.value)
                 if kind is not self._parameters[each.name].kind:
-                    self.read()  # it is typed dynamically, and has another type now
+                    self._read()  # it is typed dynamically, and has another type now
                     return
                 self._parameters[each.name] = self._parameters[each.name].with_raw(raw)
         self._say(State.THERE)
@@ -231,15 +284,28 @@ class RemoteNode:
             refused = result.reason or f"{self._name} refuses it"
             told.set_result("" if result.successful else refused)
 
-        self._client.set_parameters(
-            [parameter_message(parameter, raw)], callback=self._guarded(answered)
-        )
+        self._client.set_parameters([_message(parameter, raw)], callback=self._guarded(answered))
 
     def close(self) -> None:
-        """Nobody waits for answers any more."""
+        """Answer whoever waits."""
         for told in self._setting:
             told.set_result("the viewer ends")
         self._setting.clear()
+
+    def _read(self) -> None:
+        """Ask for all parameters; what is known of them stays until the answers are there."""
+        if self._is_asked and time.monotonic() - self._since >= ANSWER_S:
+            self._say(State.SILENT)
+        self._reading += 1
+        self._is_asked, self._since = True, time.monotonic()
+        turn = self._reading
+
+        def listed(future: Any) -> None:
+            answer = _answer(future)
+            if turn == self._reading and answer is not None:
+                self._describe(turn, [n for n in answer.result.names if not n.startswith(_OF_ROS)])
+
+        self._client.list_parameters(callback=self._guarded(listed))
 
     def _describe(self, turn: int, names: list[str]) -> None:
         """Ask for descriptors and values, and tell them once both are there."""
@@ -253,10 +319,9 @@ class RemoteNode:
             if not len(descriptors) == len(values) == len(names):
                 self._leave_out_unset(turn, names)
                 return
-            told = zip(names, descriptors, values, strict=True)
             self._parameters = {
-                name: parameter_from(self._name, name, descriptor, value)
-                for name, descriptor, value in told
+                name: _parameter(self._name, name, descriptor, value)
+                for name, descriptor, value in zip(names, descriptors, values, strict=True)
             }
             self._is_read, self._is_asked = True, False
             self._say(State.THERE)
@@ -266,7 +331,7 @@ class RemoteNode:
         self._client.get_parameters(names, callback=guarded(lambda f: take("get", f)))
 
     def _leave_out_unset(self, turn: int, names: list[str]) -> None:
-        """Ask again without those that have a type and no value: one of them, and none is told."""
+        """Ask again without parameters that have a type and no value: with one, none is told."""
 
         def typed(future: Any) -> None:
             answer = _answer(future)
@@ -281,118 +346,9 @@ class RemoteNode:
 
         self._client.get_parameter_types(names, callback=self._guarded(typed))
 
-    def _give_up(self, now: float) -> None:
-        for told in [told for told, until in self._setting.items() if now > until]:
-            del self._setting[told]
-            told.set_result(f"{self._name} did not answer within {ANSWER_S:g} s")
-
     def _say(self, state: State) -> None:
         self._tell(NodeParameters(self._name, state, dict(self._parameters)))
 
 
 def _answer(future: Any) -> Any:
-    """The response, or None where there is none."""
     return None if future.cancelled() or future.exception() is not None else future.result()
-
-
-EVENTS = "/parameter_events"
-EVERY_EVENT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""As rclpy publishes them."""
-LOOK_S = 0.5
-"""How often the graph is looked at for nodes that come, go, or are started again."""
-
-
-class RemoteParameters:
-    """Keeps the board up to date while pages look, and does nothing while none does.
-
-    A node is told from one of the same name that was started later by who publishes its
-    parameter events, as the middleware numbers publishers.
-
-    Args:
-        node: that asks.
-        post: has work done in the thread that spins ``node``; returns a future.
-        doors: by the names of nodes, what sets their parameters in place of them.
-    """
-
-    def __init__(
-        self,
-        node: GuardedNode,
-        post: Callable[[Callable[[], Any]], Any],
-        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
-    ) -> None:
-        self._doors = doors or {}
-        self._node, self._post = node, post
-        self._space = node.get_namespace().rstrip("/")
-        self._nodes: dict[str, RemoteNode] = {}
-        self._timer: Any = None
-        self._events: Any = None
-        self._told: dict[str, NodeParameters] = {}
-        self.board = ParameterBoard(lambda: post(self._look), self._send)
-
-    def close(self) -> None:
-        """No answer is waited for any more."""
-        for remote in self._nodes.values():
-            remote.close()
-
-    def _look(self) -> None:
-        watched = self.board.watched
-        if not watched:
-            self._rest()
-            return
-        if self._timer is None:
-            self._events = self._node.create_subscription(
-                ParameterEvent, EVENTS, self._follow, EVERY_EVENT
-            )
-            self._timer = self._node.create_timer(LOOK_S, self._look)
-        there = self._identities()
-        for name in watched:
-            if name not in self._nodes:
-                self._nodes[name] = RemoteNode(self._node, name, self._tell)
-            self._nodes[name].look(there.get(f"{self._space}/{name}", frozenset()))
-
-    def _rest(self) -> None:
-        """Nobody looks: what is known may change unseen."""
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._node.destroy_subscription(self._events)
-            self._timer = self._events = None
-        for remote in self._nodes.values():
-            remote.forget()
-
-    def _identities(self) -> dict[str, frozenset[Any]]:
-        """What tells the nodes of the graph from others, by their full names."""
-        found: dict[str, set[Any]] = defaultdict(set)
-        for name, space in self._node.get_node_names_and_namespaces():
-            found[f"{space.rstrip('/')}/{name}"].add(name)
-        for each in self._node.get_publishers_info_by_topic(EVENTS):
-            name = f"{each.node_namespace.rstrip('/')}/{each.node_name}"
-            if name in found:
-                found[name].add(tuple(each.endpoint_gid))
-        return {name: frozenset(identity) for name, identity in found.items()}
-
-    def _follow(self, event: ParameterEvent) -> None:
-        space, _, name = event.node.rpartition("/")
-        if space == self._space and name in self._nodes and name in self.board.watched:
-            self._nodes[name].follow(event)
-
-    def _tell(self, known: NodeParameters) -> None:
-        """Pages are told of what is new only."""
-        if self._told.get(known.node) != known:
-            self._told[known.node] = known
-            self.board.tell(known)
-
-    def _send(self, parameter: Parameter, raw: Any) -> Future[str]:
-        if parameter.node in self._doors:
-            return self._doors[parameter.node](**{parameter.name: raw})
-        told: Future[str] = Future()
-
-        def ask() -> None:
-            remote = self._nodes.get(parameter.node)
-            if remote is None:
-                told.set_result(f"{parameter.node} is not looked at any more")
-            else:
-                remote.set(parameter, raw, told)
-
-        if self._post(ask).cancelled():
-            told.set_result("the viewer ends")
-        return told

@@ -1,11 +1,9 @@
-"""The session as pages see it: what runs, what can be loaded and played, and how to ask for it.
+"""The session as pages see it: the running scene, what can be loaded and played, and requests.
 
 >>> from us_sim.viewer.session import SessionBoard
 >>> board = SessionBoard()
 >>> board.state.is_there, board.ask(record="a.mcap").result()
 (False, 'us-sim does not run this simulation, so nothing can be loaded or recorded from here')
-
-Hears what `session_control` says while pages show it, and hands on what they ask for.
 """
 
 from __future__ import annotations
@@ -29,9 +27,6 @@ from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
 
-Ask = Callable[[Mapping[str, object]], "Future[str]"]
-"""Sets parameters of ``session_control`` together; the future holds why not, or nothing."""
-
 
 @dataclass(frozen=True)
 class LoadableScene:
@@ -49,7 +44,7 @@ class LoadableScene:
 
 @dataclass(frozen=True)
 class SessionState:
-    """What the simulation does."""
+    """State of the simulation: its scene, recording and replay."""
 
     is_there: bool = False  # whether somebody answers for it
     state: str = ""  # for a person
@@ -79,11 +74,11 @@ class SessionState:
 
 
 class SessionBoard:
-    """The newest that is known of the session, and who looks at it; for any thread.
+    """The newest that is known of the session, and who shows it; for any thread.
 
     Args:
-        on_watch: called when pages begin to look, or no longer do.
-        ask: hands on what a page asks for.
+        on_watch: called when pages begin to show it, or no longer do.
+        send: sets parameters of ``session_control`` together; the future holds why not, or nothing.
         folder: to which pages record; "" is the one that us-sim runs in.
         is_own: whether all pages are this computer's own; others may ask for what is listed, and
             for recordings in that folder, and not for files anywhere.
@@ -92,84 +87,46 @@ class SessionBoard:
     def __init__(
         self,
         on_watch: Callable[[], None] = lambda: None,
-        ask: Ask | None = None,
+        send: Callable[[Mapping[str, object]], Future[str]] | None = None,
         folder: str = "",
         *,
         is_own: bool = True,
     ) -> None:
-        self._on_watch, self._ask = on_watch, ask
+        self._on_watch, self._send_to_control = on_watch, send
         self.folder, self._is_own = folder, is_own
         self._lock = threading.Lock()
         self._pages = 0
-        self._state = SessionState()
-        self._scenes: tuple[LoadableScene, ...] = ()
-        self._thumbnails: dict[str, bytes] = {}
-        self._bags: dict[str, str] = {}
+        self.state = SessionState()
+        self.scenes: tuple[LoadableScene, ...] = ()  # another object whenever it changes
+        self.thumbnails: dict[str, bytes] = {}  # JPEG of the image of a scene, by origins
+        self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
     @property
     def is_watched(self) -> bool:
         """Whether a page shows it."""
         return self._pages > 0
 
-    def watch(self) -> None:
-        """One more page looks."""
-        self._count(1)
-
-    def unwatch(self) -> None:
-        """One fewer."""
-        self._count(-1)
-
-    def _count(self, more: int) -> None:
+    def watch(self, pages: int = 1) -> None:
+        """Count so many pages more that show it; fewer where negative."""
         with self._lock:
             before = self.is_watched
-            self._pages += more
+            self._pages += pages
             changed = before != self.is_watched
         if changed:
             self._on_watch()
 
-    @property
-    def state(self) -> SessionState:
-        """What the simulation does."""
-        return self._state
-
-    @property
-    def scenes(self) -> tuple[LoadableScene, ...]:
-        """What can be loaded; another object whenever that changes."""
-        return self._scenes
-
-    @property
-    def bags(self) -> Mapping[str, str]:
-        """Files that can be played, by name; another object whenever that changes."""
-        return self._bags
-
-    def thumbnail(self, origin: str) -> bytes | None:
-        """JPEG of what the probe sees in a scene, once there is one."""
-        return self._thumbnails.get(origin)
-
-    def tell_state(self, state: SessionState) -> None:
-        """The simulation says what it does."""
-        self._state = state
-
-    def tell_scenes(self, scenes: tuple[LoadableScene, ...]) -> None:
-        """This can be loaded."""
-        self._scenes = scenes
-
-    def tell_thumbnail(self, origin: str, jpeg: bytes) -> None:
-        """A scene looks like this."""
-        self._thumbnails[origin] = jpeg
-
-    def tell_bags(self, bags: Mapping[str, str]) -> None:
-        """These can be played."""
-        self._bags = dict(bags)
+    def unwatch(self) -> None:
+        """One page shows it no longer."""
+        self.watch(-1)
 
     def ask(self, **values: object) -> Future[str]:
         """Set parameters of ``session_control``; the future holds why not, or nothing."""
         refusal = "" if self._is_own else self._refusal(values)
-        if self._ask is not None and self._state.is_there and not refusal:
+        if self._send_to_control is not None and self.state.is_there and not refusal:
             file = values.get("record")
             if self.folder and file:
                 values["record"] = str(PurePath(self.folder, str(file)))
-            return self._ask(values)
+            return self._send_to_control(values)
         refused: Future[str] = Future()
         refused.set_result(refusal or NOT_THERE)
         return refused
@@ -180,8 +137,8 @@ class SessionBoard:
         if PurePath(file).name != file or file.startswith(("~", "..")):
             return f"record: {file}: give a name without a folder"
         listed = {
-            "scene": [self._state.origin, *(each.origin for each in self._scenes)],
-            "replay": [self._state.replay, *self._bags.values()],
+            "scene": [self.state.origin, *(each.origin for each in self.scenes)],
+            "replay": [self.state.replay, *self.bags.values()],
             "volume": [],
         }
         for key, files in listed.items():
@@ -191,15 +148,15 @@ class SessionBoard:
 
 
 CONTROL = "session_control"
-LOOK_S = 0.5
+_EVERY_S = 0.5
 SILENT_S = 3.0
 """Without a word, after which nobody answers for the simulation: it says something every second."""
 ANSWER_S = 10.0
 """For it to answer, which it may do late while it reads a scene."""
 
 
-class ViewerSession:
-    """Fills a board from the session's topics, which are subscribed to while a page looks.
+class ViewerSession(SessionBoard):
+    """A board that follows the session's topics while a page shows it, and asks `session_control`.
 
     Args:
         node: that listens.
@@ -215,6 +172,7 @@ class ViewerSession:
         *,
         is_own: bool = True,
     ) -> None:
+        super().__init__(lambda: post(self._listen), self._send, folder, is_own=is_own)
         self._node, self._post = node, post
         self._name = f"{node.get_namespace().rstrip('/')}/{CONTROL}"
         self._subscriptions: list[Any] = []
@@ -222,63 +180,59 @@ class ViewerSession:
         self._client: AsyncParameterClient | None = None
         self._heard = 0.0
         self._asked: list[tuple[Future[str], float]] = []  # and when that was
-        self.board = SessionBoard(lambda: post(self._look), self._ask, folder, is_own=is_own)
 
     def close(self) -> None:
-        """No answer is waited for any more."""
+        """Answer whoever waits."""
         for told, _ in self._asked:
             if not told.done():
                 told.set_result("the viewer ends")
 
-    def _look(self) -> None:
-        """Listen, or not, as pages look now."""
-        wanted = self.board.is_watched
-        if wanted and not self._subscriptions:
+    def _listen(self) -> None:
+        if self.is_watched and not self._subscriptions:
             if self._client is None:
                 self._client = AsyncParameterClient(self._node, CONTROL)
-            for message_type, topic, callback, qos in (
-                (DiagnosticArray, "diagnostics", self._hear, STREAM),
-                (DiagnosticArray, "session/scenes", self._list, LATCHED),
-                (CompressedImage, "session/thumbnails", self._picture, CATALOGUE),
-                (DiagnosticArray, "session/bags", self._offer, LATCHED),
-            ):
-                self._subscriptions.append(
-                    self._node.create_subscription(message_type, topic, callback, qos)
+            self._subscriptions = [
+                self._node.create_subscription(message_type, topic, callback, qos)
+                for message_type, topic, callback, qos in (
+                    (DiagnosticArray, "diagnostics", self._hear, STREAM),
+                    (DiagnosticArray, "session/scenes", self._take_scenes, LATCHED),
+                    (CompressedImage, "session/thumbnails", self._take_thumbnail, CATALOGUE),
+                    (DiagnosticArray, "session/bags", self._take_bags, LATCHED),
                 )
-            self._timer = self._node.create_timer(LOOK_S, self._check)
-        elif not wanted and self._subscriptions:
+            ]
+            self._timer = self._node.create_timer(_EVERY_S, self._check)
+        elif not self.is_watched and self._subscriptions:
             for subscription in self._subscriptions:
                 self._node.destroy_subscription(subscription)
-            self._subscriptions.clear()
+            self._subscriptions = []
             self._node.destroy_timer(self._timer)
-            self._timer = None
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == self._name:
                 self._heard = time.monotonic()
-                self.board.tell_state(_state_of(status))
+                self.state = _state_of(status)
 
-    def _list(self, message: DiagnosticArray) -> None:
-        self.board.tell_scenes(tuple(map(_scene_of, message.status)))
+    def _take_scenes(self, message: DiagnosticArray) -> None:
+        self.scenes = tuple(map(_scene_of, message.status))
 
-    def _picture(self, message: CompressedImage) -> None:
-        self.board.tell_thumbnail(message.header.frame_id, bytes(message.data))
+    def _take_thumbnail(self, message: CompressedImage) -> None:
+        self.thumbnails[message.header.frame_id] = bytes(message.data)
 
-    def _offer(self, message: DiagnosticArray) -> None:
-        self.board.tell_bags({shown(status.name): status.hardware_id for status in message.status})
+    def _take_bags(self, message: DiagnosticArray) -> None:
+        self.bags = {shown(status.name): status.hardware_id for status in message.status}
 
     def _check(self) -> None:
         """Notice when nobody answers for the simulation any more."""
         now = time.monotonic()
-        if self.board.state.is_there and now - self._heard > SILENT_S:
-            self.board.tell_state(SessionState())
+        if self.state.is_there and now - self._heard > SILENT_S:
+            self.state = SessionState()
         for told, asked in self._asked:
             if not told.done() and now - asked > ANSWER_S:
                 told.set_result(f"{CONTROL} has not answered for {ANSWER_S:g} s")
         self._asked = [(told, asked) for told, asked in self._asked if not told.done()]
 
-    def _ask(self, values: Mapping[str, object]) -> Future[str]:
+    def _send(self, values: Mapping[str, object]) -> Future[str]:
         told: Future[str] = Future()
 
         def ask() -> None:

@@ -1,70 +1,17 @@
-"""A surface with its name and colour.
-
-Triangles that come corner by corner, as surfaces that share their vertices.
+"""Surfaces as they go to a page: told once at rest, after which only positions travel.
 
 >>> import numpy as np
->>> from us_sim.viewer.surfaces import welded
+>>> from us_sim.viewer.surfaces import Offsets, RestSurface, clustered, welded
 >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
 >>> vertices, triangles = welded(corners)
 >>> len(vertices), triangles
 (4, array([[0, 2, 3], [0, 3, 1]]))
-
-Fewer triangles by merging vertices that are close together at rest.
-
-Vertices are merged in the cells of a grid (J. Rossignac and P. Borrel, "Multi-resolution 3D
-approximations for rendering complex scenes", 1993), each cell into the vertex nearest to their
-mean. So what is left are vertices of the surface itself, and where they are in a deformed state
-needs no more than to pick them. A closed surface stays closed: as a sum of oriented triangles it
-has no edge left over before, and so none after.
-
->>> import numpy as np
->>> from us_sim.viewer.surfaces import clustered
->>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [1.01, 1.01, 0], [0, 1, 0]])
->>> fan = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [0, 2, 4]])
->>> clustered(square, fan, cell=0.1)
-array([[0, 1, 2],
-       [0, 2, 4]])
-
-Positions as whole steps from where they were at rest: half the bytes of single precision.
-
->>> import numpy as np
->>> from us_sim.viewer.surfaces import Offsets
->>> offsets = Offsets.between(np.array([[0.0, 0.0, 0.012]]), np.zeros((1, 3)))
->>> offsets.resolution, offsets.steps
-(1e-06, array([[    0,     0, 12000]], dtype=int16))
-
-A surface whose triangles are told once, and of which only positions travel after that.
-
->>> import numpy as np
->>> from us_sim.viewer.surfaces import RestSurface
->>> square = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
->>> surface = RestSurface(square, np.array([[0, 1, 2], [0, 2, 3]]))
->>> packet = surface.moved(square + [0, 0, 0.001], kind="skin", sequence=1, stamp=0)
+>>> surface = RestSurface(vertices, triangles)
+>>> packet = surface.moved(vertices + [0, 0, 0.001], kind="skin", sequence=1, stamp=0)
 >>> packet.header["resolution"], len(packet.payload)
 (1e-06, 24)
-
-Surfaces that the tissue carries: told once, after that they move with the tissue's nodes.
-
-Each vertex is the sum of the four nodes of the tetrahedron in which it lies, in barycentric
-weights, which do not change while the tissue deforms. So vessels of forty thousand triangles cost
-nothing beyond the nodes that travel for the tissue anyway, and the page computes where they are.
-
-A transducer as it goes to a page: its parts, and the outline of its image.
-
-How much tissue is strained, as one number a node, for colours.
-
-Of each tetrahedron the equivalent (von Mises) strain of the Green-Lagrange tensor E:
-sqrt(2/3 e : e) with e the part of E without its trace, which is the elongation in uniaxial
-stretch of what keeps its volume, to first order (Holzapfel, *Nonlinear Solid Mechanics*, 2000).
-A node has the mean of the tetrahedra around it, weighted by their volumes at rest.
-
->>> import numpy as np
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> from us_sim.viewer.surfaces import EquivalentStrain
->>> mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1])
->>> strain = EquivalentStrain(mesh)
->>> strain.of(mesh.nodes * [1.0, 1.0, 1.01]).round(4)
-array([0.0067, 0.0067, 0.0067, 0.0067, 0.0067, 0.0067, 0.0067, 0.0067])
+>>> Offsets.between(np.array([[0.0, 0.0, 0.012]]), np.zeros((1, 3))).steps
+array([[    0,     0, 12000]], dtype=int16)
 """
 
 from __future__ import annotations
@@ -119,16 +66,15 @@ def welded(
     return ordered[is_new], triangles[apart]
 
 
-_TRIALS = 12
-"""Each halves the range in which the cell's size lies."""
-_SMALLEST, _LARGEST = 0.2, 20.0
-"""Cells over the mean length of edges."""
-
-
 def clustered(
     vertices: NDArray[np.floating], triangles: NDArray[np.integer], cell: float
 ) -> NDArray[np.integer]:
-    """(F, 3) triangles of the same vertices, those that are left when vertices are merged.
+    """(F, 3) triangles of the same vertices that are left when vertices are merged.
+
+    Vertices are merged in the cells of a grid (J. Rossignac and P. Borrel, "Multi-resolution 3D
+    approximations for rendering complex scenes", 1993), each cell into the vertex nearest to their
+    mean: they are vertices of the surface itself, also in a deformed state. A closed surface stays
+    closed: as a sum of oriented triangles it has no edge left over.
 
     Args:
         vertices: (V, 3) m. triangles: (T, 3).
@@ -137,7 +83,9 @@ def clustered(
     used, corners = np.unique(triangles, return_inverse=True)
     points = vertices[used]
     grid = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, cells = np.unique(grid @ _strides(grid), return_inverse=True)
+    shape = grid.max(axis=0) + 1
+    strides = np.array([shape[1] * shape[2], shape[2], 1])  # which number every cell
+    _, cells = np.unique(grid @ strides, return_inverse=True)
     cells = cells.ravel()
     count = np.bincount(cells)
     mean = np.column_stack([np.bincount(cells, points[:, axis]) / count for axis in range(3)])
@@ -162,9 +110,9 @@ def at_most(
         return triangles
     sides = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
     length = float(np.linalg.norm(sides, axis=2).mean())
-    low, high = np.log(_SMALLEST * length), np.log(_LARGEST * length)
+    low, high = np.log(0.2 * length), np.log(20.0 * length)  # of the cells' size
     best = clustered(vertices, triangles, float(np.exp(high)))
-    for _ in range(_TRIALS):
+    for _ in range(12):  # bisection
         middle = (low + high) / 2
         tried = clustered(vertices, triangles, float(np.exp(middle)))
         if len(tried) > count:
@@ -172,12 +120,6 @@ def at_most(
         else:
             best, high = tried, middle
     return best
-
-
-def _strides(grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(3,) that give every cell of the grid a number of its own."""
-    shape = grid.max(axis=0) + 1
-    return np.array([shape[1] * shape[2], shape[2], 1])
 
 
 def _without_pairs(triangles: NDArray[np.integer]) -> NDArray[np.integer]:
@@ -195,14 +137,9 @@ def _without_pairs(triangles: NDArray[np.integer]) -> NDArray[np.integer]:
     return np.repeat(nodes, np.abs(balance), axis=0)
 
 
-FINEST = 1e-6
-"""m: a step is no shorter. So tissue may move by 33 mm before steps must be longer."""
-_MOST = np.iinfo(np.int16).max
-
-
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """How far points are from their places at rest, in steps."""
+    """Displacements of points in whole steps: half the bytes of single precision."""
 
     steps: NDArray[np.int16]  # (N, 3)
     resolution: float  # m, of a step
@@ -211,8 +148,9 @@ class Offsets:
     def between(cls, positions: NDArray[np.floating], rest: NDArray[np.floating]) -> Offsets:
         """Of positions (N, 3) from rest (N, 3), m, to half a step of the shortest that suffices."""
         moved = np.subtract(positions, rest, dtype=np.float64)
+        finest = 1e-6  # m: tissue may move by 33 mm before steps must be longer
         farthest = float(np.abs(moved).max(initial=0.0))
-        resolution = FINEST * max(1, math.ceil(farthest / (FINEST * _MOST)))
+        resolution = finest * max(1, math.ceil(farthest / (finest * np.iinfo(np.int16).max)))
         return cls(np.rint(moved / resolution).astype(np.int16), resolution)
 
     def positions(self, rest: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -297,16 +235,13 @@ class RestSurface:
         return Packet(kind, sequence, header, offsets.steps.tobytes())
 
 
-_FARTHEST = 5e-3
-"""m: a vertex so far outside the mesh is not of this tissue."""
-WHILE_MOVING = 20_000
-"""Triangles at most while something moves; all of them when it stands still."""
-
-
 class CarriedSurfaces:
-    """Where every vertex is in the tissue, and which triangles are drawn while it moves.
+    """Surfaces that move with the tissue's nodes: in which tetrahedron each vertex lies.
 
-    Vertices are put in an order in which those that are drawn while something moves come first.
+    A vertex is the sum of the tetrahedron's four nodes in barycentric weights, which do not change
+    while the tissue deforms. So vessels of forty thousand triangles cost nothing beyond the nodes
+    that travel for the tissue anyway, and the page computes where they are. Vertices
+    that are drawn while something moves come first.
 
     Args:
         mesh: of the tissue, in the state in which the surfaces are as they are here.
@@ -321,7 +256,7 @@ class CarriedSurfaces:
         self,
         mesh: TetrahedralMesh,
         surfaces: Sequence[ColouredSurface],
-        triangles: int = WHILE_MOVING,
+        triangles: int = 20_000,
     ) -> None:
         from us_sim.tissue.mesh.embedding import locate  # with its kernels
 
@@ -339,7 +274,7 @@ class CarriedSurfaces:
         number[order] = np.arange(len(order), dtype=np.uint32)
         vertices = np.concatenate([surface.vertices for surface in surfaces])[order]
         location = locate(mesh, vertices)
-        if (location.outside > _FARTHEST).any():
+        if (location.outside > 5e-3).any():
             worst = int(np.argmax(location.outside))
             part = int(np.searchsorted(firsts, order[worst], side="right")) - 1
             raise MeshError(
@@ -414,7 +349,12 @@ def transducer_packet(
 
 
 class EquivalentStrain:
-    """Of the states of one mesh, at its nodes."""
+    """Equivalent (von Mises) strain of the states of one mesh, at its nodes.
+
+    sqrt(2/3 e : e) with e the deviator of the Green-Lagrange strain, which is the elongation in
+    uniaxial stretch at constant volume, to first order (Holzapfel, *Nonlinear Solid Mechanics*,
+    2000). A node has the mean of its tetrahedra, weighted by their volumes at rest.
+    """
 
     def __init__(self, mesh: TetrahedralMesh) -> None:
         corners = mesh.nodes[mesh.tetrahedra]

@@ -1,4 +1,4 @@
-"""Shows the simulator in a browser, and lets a person there take the probe."""
+"""The node ``viewer``: shows the simulator in a browser, and lets a person there take the probe."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from us_sim.viewer.session import CONTROL, ViewerSession
 from us_sim.viewer.status import StatusListener
 from us_sim.viewer.stream import Simulator
 
-IMAGED_WITH = ("gain", "dynamic_range", "focus")
+_IMAGED_WITH = ("gain", "dynamic_range", "focus")
 """Parameters of ``slice_interpolator`` that pages are told with each image."""
 
 
 class Viewer(GuardedNode):
-    """A web server beside a node: what a page shows is subscribed to, and nothing else.
+    """A web server beside a node that subscribes only to topics that a page shows.
 
     Its parameters are those of `ViewerSettings`.
     """
@@ -45,28 +45,28 @@ class Viewer(GuardedNode):
         super().__init__("viewer", **kwargs)
         settings = declared(self, ViewerSettings())
         self.health = Health(self, f"{settings.host}:{settings.port}")
-        self.post = Posted(self)
+        self.post = post = Posted(self)
         folder = os.path.abspath(os.path.expanduser(settings.recordings or ""))
         self._session = ViewerSession(
             self,
-            self.post,
+            post,
             folder if settings.recordings else "",
             is_own=is_loopback(settings.host),
         )
-        self._remote = RemoteParameters(self, self.post, {CONTROL: self._session.board.ask})
-        listener = StatusListener(self, self.post)
+        self._remote = RemoteParameters(self, post, {CONTROL: self._session.ask})
         self.simulator = Simulator(
-            nodes=self._remote.board, status=listener.board, session=self._session.board
+            nodes=self._remote, status=StatusListener(self, post), session=self._session
         )
         rest = RestMesh(self)
-        hand = ViewerHand(self, self.post, self.simulator, rest)
-        images = image_feeds(self, self.post, settings.rate, self._known, self._arranged)
-        self.simulator.add(*images)
-        probe = ProbeFeeds(self, self.post, settings.rate)
-        self._hand, self._probe = hand, probe
-        self.simulator.add(*SkinFeeds(self, self.post, settings.rate).feeds, *probe.feeds)
-        self.simulator.add(*TissueFeeds(self, self.post, settings.rate, rest).feeds)
-        self.simulator.add(StructuresFeed(self, self.post, rest).feed)
+        self._hand = ViewerHand(self, post, self.simulator, rest)
+        self._probe = ProbeFeeds(self, post, settings.rate)
+        self.simulator.add(
+            *image_feeds(self, post, settings.rate, self._known, self._arranged),
+            *SkinFeeds(self, post, settings.rate).feeds,
+            *self._probe.feeds,
+            *TissueFeeds(self, post, settings.rate, rest).feeds,
+            StructuresFeed(self, post, rest).feed,
+        )
         self._server = WebServer(
             self.simulator, settings.host, settings.port, os.environ.get(TOKEN, "")
         )
@@ -81,17 +81,18 @@ class Viewer(GuardedNode):
 
     @property
     def _imaging(self) -> Mapping[str, Parameter]:
-        return self.simulator.nodes.of("slice_interpolator").parameters
+        return self._remote.of("slice_interpolator").parameters
 
     def _arranged(self) -> tuple[bool, bool]:
         flip, beside = map(self._imaging.get, ("flip", "beside"))
         return flip is not None and bool(flip.raw), beside is not None and bool(beside.raw)
 
     def _known(self, stamp: int) -> dict[str, Any]:
-        """For pages, beside the image of a stamp (ns): the scene, and how the probe was then.
+        """The scene, and how the probe was at the stamp (ns) of an image, for its header.
 
         m and N; settings in the unit that a person reads. ``command`` is the page, and its number
-        for it, of the last wish that is seen in the image; so the page can tell how long that took.
+        for it, of the last command that is seen in the image, so that the page can tell how long
+        that took.
         """
         probe = self._probe.at(str(stamp))
         parameters = self._imaging
@@ -99,10 +100,10 @@ class Viewer(GuardedNode):
             "command": self._hand.asked.by(stamp),
             "press": self._hand.press(stamp, probe.get("position")),
             "force": float(np.linalg.norm(probe["force"])) if "force" in probe else None,
-            "scene": self.simulator.session.state.scene or None,
+            "scene": self._session.state.scene or None,
             "settings": {
                 in_words(name): f"{parameter.value:g} {parameter.unit}"
-                for name in IMAGED_WITH
+                for name in _IMAGED_WITH
                 if (parameter := parameters.get(name)) is not None and parameter.value is not None
             },
         }

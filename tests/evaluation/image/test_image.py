@@ -16,7 +16,6 @@ ASKED += ["error_percent", "ms_median"]
 class Broken(Artefact):
     name = "broken"
     title = "Broken"
-    simplified = "everything."
 
     def points(self, quick):
         raise ArithmeticError(f"no closed form, quick {quick}")
@@ -31,7 +30,6 @@ class Broken(Artefact):
 class Even(Artefact):
     name = "even"
     title = "Even"
-    simplified = "odd ones."
 
     def points(self, quick):
         return [Point.of("even", "linear", 10.0, 0.02, 2.0, 2.1, "mm")] if quick else []
@@ -40,15 +38,14 @@ class Even(Artefact):
         return [Target.at_most("an even error", 6, points[0].error_percent, "%")]
 
     def report(self, points, folder):
-        return [f"There are {len(points)} of {folder.subject}."]
+        return f"There are {len(points)} of {folder.subject}."
 
 
 def test_the_report_has_every_artefact_and_says_which_broke(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(measure, "ARTEFACTS", (Broken(), Even()))
     assert main(["evaluate", "image", "--quick", "--out", str(tmp_path)]) == 1
     report = (tmp_path / "image.md").read_text(encoding="utf-8")
-    assert "There are 1 of image." in report
-    assert "- Even: odd ones." in report
+    assert "## Broken\n\n## Even\n\nThere are 1" in report
     assert "ArithmeticError: no closed form, quick True" in report
     assert "broken" in capsys.readouterr().out
     with (tmp_path / "image.csv").open(encoding="utf-8") as stream:

@@ -9,7 +9,6 @@ import pytest
 
 import us_sim
 from us_sim.command.main import main
-from us_sim.errors import SettingsError
 from us_sim.evaluation.block import LARGEST_MESH, MESHES
 from us_sim.evaluation.report import exponent
 from us_sim.evaluation.tissue import reference as kept_reference
@@ -43,10 +42,10 @@ def test_errors_of_a_known_field_are_what_they_are_by_hand():
     wrong[7] += [0.003, 0.0, 0.004]
     found = Outcome(wrong, -5.0, signed_volumes(nodes * [1, 1, 1.2], model.mesh.tetrahedra).sum())
     errors = compare(found, exact, 0.002)
-    assert errors.rel_l2_error == pytest.approx(0.005 / np.linalg.norm(0.1 * nodes[:, 2]))
-    assert errors.max_error_mm == pytest.approx(5.0)
-    assert errors.force_error == pytest.approx(0.25)
-    assert errors.volume_error == pytest.approx((0.0024 - 0.0018) / 0.002)
+    assert errors["rel_l2_error"] == pytest.approx(0.005 / np.linalg.norm(0.1 * nodes[:, 2]))
+    assert errors["max_error_mm"] == pytest.approx(5.0)
+    assert errors["force_error"] == pytest.approx(0.25)
+    assert errors["volume_error"] == pytest.approx((0.0024 - 0.0018) / 0.002)
 
 
 def test_the_front_leaves_out_what_is_slower_and_worse():
@@ -80,8 +79,6 @@ def test_the_evaluated_methods_are_those_of_the_package():
             assert set(setting) <= set(settings)
         assert method.has_springs == issubclass(SOLVERS.settings(name), SpringSettings)
         assert method.is_explicit == ("stabilisation" in settings)
-    with pytest.raises(SettingsError, match="did you mean 'fem_nonlinear'"):
-        TISSUE_METHODS["fem_nonlinaer"]
 
 
 def test_the_full_plan_has_every_method_on_every_mesh_and_scene():

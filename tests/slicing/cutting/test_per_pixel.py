@@ -1,6 +1,5 @@
-"""The naive method, against numbers worked out by hand, linear algebra and scipy.
-
-Fast slicing methods against the location of every pixel on its own, on random cases.
+"""Locating every pixel, against numbers by hand, linear algebra and SciPy; and fast methods
+against it.
 """
 
 import numpy as np

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import map_coordinates
 
-from us_sim.errors import MeshError, SettingsError, VolumeError
+from us_sim.errors import MeshError, SettingsError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting import resampling, row_subdivision, section, trilinear
-from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.row_subdivision import RowSubdivision, RowSubdivisionSettings
 from us_sim.slicing.cutting.slicer import warm_up
 from us_sim.slicing.probe.plane import SlicePlane
@@ -73,40 +71,6 @@ def pressed(mesh, depth=0.008, width=0.012):
     x, y, z = mesh.nodes.T
     dent = np.exp(-(x**2 + y**2) / width**2) * depth * (1 - z / SIZE[2])
     return mesh.nodes + np.column_stack([0 * dent, 0 * dent, dent])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_an_undeformed_mesh_is_the_volume_itself(seed):
-    rng = np.random.default_rng(seed)
-    volume, mesh = volume_around_the_box(seed=seed), box()
-    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
-    pose = Pose([0.0, 0.0, 0.005], np.array([0.0, 0, 0, 1]) + rng.normal(scale=0.2, size=4))
-    plane = LinearProbe(0.05, 0.04, 83, 67).plane(pose)
-    np.testing.assert_allclose(
-        slicer.rest_coordinates(mesh.nodes, plane), plane.pixels(), rtol=0, atol=1e-9
-    )
-    index = plane.pixels() @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
-    expected = map_coordinates(
-        volume.intensities.astype(float), np.moveaxis(index, -1, 0), order=1, mode="nearest"
-    )
-    among = ((index >= 0) & (index <= np.array(volume.shape) - 1)).all(axis=-1)
-    image = slicer.image(mesh.nodes, plane)
-    assert np.abs(image - np.floor(expected + 0.5))[among].max() <= 1
-    assert np.abs(image.astype(int) - sample_plane(volume, plane)).max() <= 1
-    np.testing.assert_array_equal(slicer.labels(mesh.nodes, plane), sample_labels(volume, plane))
-
-
-def test_a_sheared_mesh_gives_the_analytic_map():
-    volume, mesh = volume_around_the_box(), box()
-    shear = np.array([[1.0, 0.1, 0.2], [0.0, 1.1, -0.1], [0.05, 0.0, 0.9]])
-    plane = LinearProbe(0.03, 0.03, 64, 48).plane(Pose([0, 0, 0.01], [0.05, 0.1, 0.2, 1.0]))
-    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
-    expected = plane.pixels() @ np.linalg.inv(shear).T
-    found = slicer.rest_coordinates(mesh.nodes @ shear.T, plane)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
-    index = expected @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
-    grey = map_coordinates(volume.intensities.astype(float), np.moveaxis(index, -1, 0), order=1)
-    assert np.abs(slicer.image(mesh.nodes @ shear.T, plane) - np.floor(grey + 0.5)).max() <= 1
 
 
 @settings(max_examples=25, deadline=None)
@@ -220,40 +184,6 @@ def test_tissue_that_was_pushed_away_leaves_black_and_no_ghost():
     )
 
 
-def test_a_pressed_image_starts_in_tissue():
-    """With the face at the bottom of the dent no pixel below it is black."""
-    mesh = box((13, 9, 11))
-    volume = volume_around_the_box()
-    volume = Volume(np.full(volume.shape, 200, np.uint8), volume.index_to_patient)
-    plane = LinearProbe(0.02, 0.03, 128, 100).plane(Pose([0, 0, 0.008]))
-    image = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra).image(pressed(mesh), plane)
-    assert (image == 200).all()
-
-
-def test_a_plane_away_from_the_mesh_is_rigid_or_black():
-    volume, mesh = volume_around_the_box(), box((3, 3, 3))
-    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
-    probe = LinearProbe(0.04, 0.04, 32, 32)
-    beside = probe.plane(Pose([0, SIZE[1] / 2 + 0.004, 0.005]))
-    np.testing.assert_array_equal(slicer.image(pressed(mesh), beside), sample_plane(volume, beside))
-    assert slicer.image(pressed(mesh), beside).any()
-    assert not slicer.image(pressed(mesh), probe.plane(Pose([0, 0, -0.5]))).any()
-
-
-def test_inverted_and_flat_tetrahedra_are_left_out_and_counted():
-    volume, mesh = volume_around_the_box(), box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.04])
-    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
-    plane = LinearProbe(0.03, 0.03, 40, 40).plane(Pose([0, 1e-3, 5e-3]))
-    mirrored = mesh.nodes * [1.0, 1.0, -1.0] + [0, 0, 0.04]
-    met = slicer.labels(mesh.nodes, plane)
-    assert slicer.skipped == 0
-    assert met.all()
-    assert not slicer.image(mirrored, plane).any()
-    assert slicer.skipped >= 3
-    assert not slicer.image(mesh.nodes * [1.0, 0.0, 1.0] + [0, 1e-3, 0], plane).any()
-    assert slicer.skipped == 5
-
-
 def test_threads_and_regions_do_not_change_a_byte():
     volume, mesh = volume_around_the_box(), box()
     plane = LinearProbe(0.07, 0.05, 200, 150).plane(Pose([0, 1e-3, -0.002], [0.1, 0, 0.2, 1]))
@@ -272,44 +202,28 @@ def test_threads_and_regions_do_not_change_a_byte():
         np.testing.assert_array_equal(image, images[0])
 
 
-def test_nodes_that_cannot_be_cut_are_refused():
-    volume, mesh = volume_around_the_box(), box((3, 3, 3))
-    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
-    plane = LinearProbe(0.04, 0.04, 8, 8).plane(Pose())
-    broken = mesh.nodes.copy()
-    broken[5, 1] = np.nan
-    with pytest.raises(MeshError, match="node 5 is not finite"):
-        slicer.image(broken, plane)
-    with pytest.raises(MeshError, match="4 deformed nodes but 27 at rest"):
-        slicer.image(mesh.nodes[:4], plane)
-    with pytest.raises(MeshError, match=r"shape \(27, 2\)"):
-        slicer.image(mesh.nodes[:, :2], plane)
+def test_bad_regions_and_nodes_of_two_coordinates_are_refused():
+    with pytest.raises(SettingsError, match=r"slice\.regions"):
+        RowSubdivisionSettings(regions=0)
+    mesh = box((3, 3, 3))
+    slicer = RowSubdivision(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
+    with pytest.raises(MeshError, match=r"\(27, 2\)"):
+        slicer.image(mesh.nodes[:, :2], LinearProbe(0.04, 0.04, 8, 8).plane(Pose()))
 
 
 @pytest.mark.parametrize(
     ("nodes", "tetrahedra", "words"),
     [
-        (np.full((4, 3), np.inf), [[0, 1, 2, 3]], "node 0 is not finite"),
-        (np.eye(4)[:, :3], [[0, 1, 2, 4]], "only 4 nodes"),
-        (np.eye(4)[:, :3], [[0, 1, 2, -1]], "name nodes -1"),
-        (np.eye(4)[:, :3], [[0, 1, 2]], r"give \(M, 4\) integers"),
-        (np.eye(4)[:, :3], [[0.0, 1, 2, 3]], r"give \(M, 4\) integers"),
+        (np.full((4, 3), np.inf), [[0, 1, 2, 3]], "node 0"),
+        (np.eye(4)[:, :3], [[0, 1, 2, 4]], "4 nodes"),
+        (np.eye(4)[:, :3], [[0, 1, 2, -1]], "-1"),
+        (np.eye(4)[:, :3], [[0, 1, 2]], r"\(M, 4\)"),
+        (np.eye(4)[:, :3], [[0.0, 1, 2, 3]], r"\(M, 4\)"),
     ],
 )
 def test_a_rest_mesh_that_cannot_be_is_refused(nodes, tetrahedra, words):
     with pytest.raises(MeshError, match=words):
         RowSubdivision(volume_around_the_box(), nodes, np.array(tetrahedra))
-
-
-def test_other_bad_input_is_refused():
-    mesh, volume = box((2, 2, 2)), volume_around_the_box()
-    with pytest.raises(SettingsError, match=r"slice\.regions: 0 is outside 1 to 4096"):
-        RowSubdivisionSettings(regions=0)
-    plain = Volume(volume.intensities, volume.index_to_patient)
-    with pytest.raises(VolumeError, match="has no labels"):
-        RowSubdivision(plain, mesh.nodes, mesh.tetrahedra).labels(
-            mesh.nodes, LinearProbe(0.04, 0.04, 8, 8).plane(Pose())
-        )
 
 
 def test_nothing_is_left_to_compile_after_warming_up():

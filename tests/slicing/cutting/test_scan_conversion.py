@@ -135,20 +135,6 @@ def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
     np.testing.assert_array_equal(places[shown], slicer.rest_coordinates(nodes, full)[shown])
 
 
-@pytest.mark.parametrize("threads", [2, 3, 7])
-def test_threads_and_repetition_do_not_change_a_byte(threads):
-    volume, mesh = volume_around_the_box(), box()
-    rng = np.random.default_rng(0)
-    nodes = mesh.nodes + rng.uniform(-0.006, 0.006, mesh.nodes.shape)
-    plane = LinearProbe(0.08, 0.07, 301, 203).plane(Pose([0, 1e-3, -0.01], [0.1, 0, 0.2, 1]))
-    one = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
-    many = ScanConversion(volume, mesh.nodes, mesh.tetrahedra, threads=threads)
-    for _ in range(2):
-        np.testing.assert_array_equal(one.image(nodes, plane), many.image(nodes, plane))
-    assert one.skipped == many.skipped > 0
-    np.testing.assert_array_equal(one.labels(nodes, plane), many.labels(nodes, plane))
-
-
 def test_more_spans_than_pixels_find_room():
     """A hundred copies of a mesh in one place: where spans overlap, each is a span of its own."""
     mesh, copies = box((2, 2, 2)), 100

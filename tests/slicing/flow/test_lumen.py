@@ -1,9 +1,4 @@
-"""Cross-sections of tubes that are known, and where points lie in them.
-
-The middle of tubes that are known, and why other shapes have none.
-
-Areas of a carried lumen against Nanson's formula.
-"""
+"""Centre lines and sections of known tubes, at rest and carried."""
 
 import hypothesis.extra.numpy as arrays
 import numpy as np

@@ -1,7 +1,4 @@
-"""Flow against the closed forms of its circuit: Poiseuille, and a reservoir that fills.
-
-A pulse has the peak and the mean that are set, whatever they are.
-"""
+"""A vessel's flow against the closed forms of its circuit, and its pulse."""
 
 import numpy as np
 import pytest

@@ -1,9 +1,4 @@
-"""Where the transducer's face touches the skin, against what geometry says.
-
-What is shown between the face and a mesh that stands off it.
-
-Lines without contact: decibels lost, bands a lens apart, nothing of the tissue.
-"""
+"""Contact of face and skin against geometry, the layer of gel, and lines without contact."""
 
 import functools
 

@@ -1,7 +1,4 @@
-"""The parts together: what is off costs nothing, what is on happens in order.
-
-Gain, time gain, dynamic range and grey map, in numbers that decibels give.
-"""
+"""The stages of image formation together, and grey levels in decibels."""
 
 import dataclasses
 import importlib.util

@@ -1,7 +1,4 @@
-"""Point targets become as wide and as long as was asked, at every depth and in every geometry.
-
-The beam's thickness: moments of its weights, and what they make of simple volumes.
-"""
+"""Points as wide and long as was asked, and the thickness of the beam."""
 
 import dataclasses
 

@@ -1,7 +1,4 @@
-"""Where the pixels and beams of each kind of transducer lie, in millimetres.
-
-Probe geometry: where the pixels are.
-"""
+"""Pixels, beams, outlines and places of each kind of transducer, in millimetres."""
 
 import dataclasses
 import math
@@ -14,8 +11,9 @@ from hypothesis import strategies as st
 from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.slicer import create_slicer
+from us_sim.slicing.probe.beams import beam_angles, fractions_and_depths, pixels_of, require_depth
 from us_sim.slicing.probe.plane import SlicePlane
-from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
+from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe, image_outline
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
@@ -451,3 +449,71 @@ def test_spans_beyond_the_image_are_refused(spans):
     runs[:, 0] = [1, 4]
     shown = SlicePlane(**steps, columns=5, rows=4, spans=runs).is_shown()
     np.testing.assert_array_equal(shown, np.tile([False, True, True, True, False], (4, 1)))
+
+
+OUTLINED = [
+    LinearProbe(aperture=0.04, depth=0.05),
+    ConvexProbe(radius=0.06, opening_angle=math.radians(60), depth=0.14),
+    SectorProbe(aperture=0.02, opening_angle=math.radians(90), depth=0.16),
+]
+
+
+@pytest.mark.parametrize("probe", OUTLINED, ids=lambda p: type(p).__name__)
+def test_the_outlines_box_is_the_image(probe):
+    outline = image_outline(probe)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    assert high[0] - low[0] == pytest.approx(probe.width, rel=1e-6)
+    assert high[2] - low[2] == pytest.approx(probe.height, rel=2e-3)
+    assert not outline[:, 1].any()
+
+
+@pytest.mark.parametrize("probe", OUTLINED, ids=lambda p: type(p).__name__)
+def test_every_beam_is_as_long_as_the_image_is_deep(probe):
+    outline = image_outline(probe)
+    lengths = np.linalg.norm(
+        outline[: len(outline) // 2] - outline[len(outline) // 2 :][::-1], axis=1
+    )
+    assert lengths == pytest.approx(probe.depth)
+
+
+STEERED = [
+    LinearProbe(aperture=0.04, depth=0.05, columns=70, rows=80),
+    LinearProbe(aperture=0.04, depth=0.05, columns=70, rows=80, lines=1),
+    ConvexProbe(radius=0.05, opening_angle=1.1, depth=0.1, columns=90, rows=80),
+    SectorProbe(aperture=0.02, opening_angle=1.4, depth=0.1, columns=90, rows=80),
+    SectorProbe(aperture=0.03, opening_angle=1.0, depth=0.1, columns=90, rows=80, radius=0.02),
+]
+
+
+@pytest.mark.parametrize("probe", STEERED)
+def test_every_pixel_lies_where_its_own_beam_and_depth_lead(probe):
+    if probe.lines == 1:
+        return  # between the lines of one line there is nothing
+    fraction, depth = fractions_and_depths(probe)
+    row, column = np.nonzero(~np.isnan(depth))
+    places = pixels_of(probe, fraction[row, column], depth[row, column])
+    # Where beams leave one point, the start between two lines is between their starts.
+    assert np.abs(places - np.column_stack([column, row])).max() < 0.02
+
+
+@given(fraction=st.floats(-0.5, 0.5), depth=st.floats(1e-3, 0.04), angle=st.floats(-0.5, 0.5))
+def test_a_steered_beam_leaves_its_upright_one_by_the_angle(fraction, depth, angle):
+    probe = STEERED[0]
+    upright, steered = (
+        pixels_of(probe, np.array([fraction]), np.array([depth]), turn)[0] for turn in (0.0, angle)
+    )
+    moved = (steered - upright) * probe.pixel_spacing
+    assert moved == pytest.approx([depth * np.sin(angle), depth * (np.cos(angle) - 1)], abs=1e-9)
+    assert beam_angles(probe, np.array([fraction]), angle)[0] == pytest.approx(angle)
+
+
+def test_one_line_is_everywhere_the_same():
+    assert (
+        pixels_of(STEERED[1], np.array([-0.4, 0.4]), np.array([0.02, 0.02])).std(axis=0).max() == 0
+    )
+
+
+def test_a_depth_outside_the_image_is_refused_and_none_is_its_middle():
+    assert require_depth(STEERED[0], "gate.depth", None, "the gate") == 0.025
+    with pytest.raises(ProbeError, match=r"gate.depth: the gate at 50 mm lies outside the image"):
+        require_depth(STEERED[0], "gate.depth", 0.05, "the gate")

@@ -23,7 +23,7 @@ from us_sim.tissue.elasticity.materials import (
     volumetric_split,
 )
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.elasticity.neo_hookean_material import emptying, lumen_table, require_solid
+from us_sim.tissue.elasticity.neo_hookean_material import lumen_energy, lumen_table, require_solid
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
@@ -76,17 +76,17 @@ def test_a_block_of_lumen_under_a_pressure_has_the_area_of_the_law(outside):
 def test_beyond_the_venous_pressure_nothing_holds_a_lumen_until_its_walls_touch():
     law = constants(1.0, 1000.0, 1e4, 5e3)
     changes = np.linspace(-0.79, -0.21, 50)
-    assert [emptying(change, law)[1] for change in changes] == pytest.approx([-1000.0] * 50)
-    assert max(emptying(change, law)[2] for change in changes) == 0.0
-    assert emptying(-0.9, law)[1] < -1500.0  # of the wall
-    assert emptying(0.1, law)[1] == pytest.approx(1250.0)  # distended: 1.5^2 - 1
+    assert [lumen_energy(change, law)[1] for change in changes] == pytest.approx([-1000.0] * 50)
+    assert max(lumen_energy(change, law)[2] for change in changes) == 0.0
+    assert lumen_energy(-0.9, law)[1] < -1500.0  # of the wall
+    assert lumen_energy(0.1, law)[1] == pytest.approx(1250.0)  # distended: 1.5^2 - 1
 
 
 @given(fractions, blood, bulks, st.floats(0.1, 1.5))
 @settings(deadline=None)
 def test_lumen_and_solid_bear_one_pressure_and_their_volumes_add_up(f, p, k, ratio):
     law = constants(f, p, k)
-    pressure = emptying(ratio - 1, law)[1]
+    pressure = lumen_energy(ratio - 1, law)[1]
     lowest = 1 - (1 - f) * p / k - 0.2 * f  # where the lumen's wall is slack
     if ratio > max(lowest, law[5]):
         lumen = 1 - 0.2 * (1 - np.sqrt(max(1 + pressure / p, 0.0)))
@@ -102,12 +102,12 @@ def test_the_energy_is_the_integral_of_a_pressure_that_never_falls_with_the_volu
     law = constants(f, p, k, 2 * k)
     low, high = min(i, j), max(i, j)
     kinks = [1 - law[1] - law[2], law[5]]
-    work = quad(lambda x: emptying(x - 1, law)[1], low, high, points=kinks, limit=200)[0]
-    rise = emptying(high - 1, law)[0] - emptying(low - 1, law)[0]
-    largest = max(abs(emptying(x - 1, law)[1]) for x in (low, high))
+    work = quad(lambda x: lumen_energy(x - 1, law)[1], low, high, points=kinks, limit=200)[0]
+    rise = lumen_energy(high - 1, law)[0] - lumen_energy(low - 1, law)[0]
+    largest = max(abs(lumen_energy(x - 1, law)[1]) for x in (low, high))
     assert work == pytest.approx(rise, abs=1e-6 * (largest + p))
-    assert emptying(low - 1, law)[1] <= emptying(high - 1, law)[1] + 1e-9 * largest
-    assert emptying(low - 1, law)[2] >= 0.0
+    assert lumen_energy(low - 1, law)[1] <= lumen_energy(high - 1, law)[1] + 1e-9 * largest
+    assert lumen_energy(low - 1, law)[2] >= 0.0
 
 
 @given(bulks)
@@ -115,7 +115,7 @@ def test_the_energy_is_the_integral_of_a_pressure_that_never_falls_with_the_volu
 def test_hardly_any_lumen_is_the_solid_as_long_as_it_is_pressed_by_less_than_blood(k):
     law = constants(1e-7, 0.01 * k, k)
     for change in (-0.008, 1e-4, 0.02):
-        assert emptying(change, law)[1] == pytest.approx(k * change, rel=1e-3)
+        assert lumen_energy(change, law)[1] == pytest.approx(k * change, rel=1e-3)
 
 
 @BOTH

@@ -10,7 +10,7 @@ from tissue_block import block_mesh
 
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
-from us_sim.tissue.elasticity.neo_hookean_material import wall_modulus, withstood_force
+from us_sim.tissue.elasticity.neo_hookean_material import barrier_modulus, barrier_strength
 
 MESH = block_mesh((4, 3, 3))
 COUNT = len(MESH.tetrahedra)
@@ -19,7 +19,7 @@ shears = st.lists(st.floats(1.0, 1e9), min_size=COUNT, max_size=COUNT).map(np.ar
 
 
 def wall(shear):
-    return wall_modulus(MESH.tetrahedra, shear, len(MESH.nodes))
+    return barrier_modulus(MESH.tetrahedra, shear, len(MESH.nodes))
 
 
 @pytest.mark.parametrize("shear", [1.0, 3e3, 1e12])
@@ -51,13 +51,13 @@ def test_it_scales_with_the_moduli_and_does_not_know_the_tetrahedras_order(shear
     np.testing.assert_allclose(wall(factor * shear), factor * wall(shear), rtol=1e-12)
     order = list(range(COUNT))
     random.shuffle(order)
-    shuffled = wall_modulus(MESH.tetrahedra[order], shear[order], len(MESH.nodes))
+    shuffled = barrier_modulus(MESH.tetrahedra[order], shear[order], len(MESH.nodes))
     np.testing.assert_array_equal(shuffled, wall(shear)[order])
 
 
 def withstood(shear):
     soft = uniform_material(MESH, Material(3.0, 0.25, 1000.0))
-    return withstood_force(MESH, replace(soft, young_modulus=2.5 * shear))
+    return barrier_strength(MESH, replace(soft, young_modulus=2.5 * shear))
 
 
 def third_of_faces():

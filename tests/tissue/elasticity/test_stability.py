@@ -14,9 +14,10 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of, volume_term
 from us_sim.tissue.elasticity.stability import (
+    ElasticResidual,
     highest_frequency,
     node_stiffness,
-    stabilised,
+    stabilise,
     step_limit,
 )
 from us_sim.tissue.model import TissueState
@@ -156,7 +157,7 @@ def test_beyond_the_limit_the_last_good_state_is_kept_and_it_is_said():
 def test_a_stable_step_leaves_the_masses_alone():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilised(model, factors, 1e-6, 0.1, "mass_scaling", 100)
+    mass, substeps, action = stabilise(model, factors, 1e-6, 0.1, "mass_scaling", 100)
     np.testing.assert_array_equal(mass, model.lumped_mass)
     assert (substeps, action) == (1, "")
 
@@ -164,7 +165,7 @@ def test_a_stable_step_leaves_the_masses_alone():
 def test_masses_are_scaled_where_needed_and_it_is_said():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilised(model, factors, 0.01, 0.1, "mass_scaling", 100)
+    mass, substeps, action = stabilise(model, factors, 0.01, 0.1, "mass_scaling", 100)
     assert substeps == 1
     assert (mass >= model.lumped_mass).all()
     frequency = highest_frequency(factors, mass, model.fixed)
@@ -176,14 +177,14 @@ def test_masses_are_scaled_where_needed_and_it_is_said():
 def test_substeps_are_counted_or_refused():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilised(model, factors, 0.01, 0.1, "substeps", 100)
+    mass, substeps, action = stabilise(model, factors, 0.01, 0.1, "substeps", 100)
     np.testing.assert_array_equal(mass, model.lumped_mass)
     assert substeps > 1
     frequency = highest_frequency(factors, mass, model.fixed)
     assert 0.01 / substeps < step_limit(frequency, 0.1) < 4 * 0.01 / substeps
     assert action.startswith(f"{substeps} sub-steps a step")
     with pytest.raises(SolverError, match=f"needs {substeps} sub-steps"):
-        stabilised(model, factors, 0.01, 0.1, "substeps", substeps - 1)
+        stabilise(model, factors, 0.01, 0.1, "substeps", substeps - 1)
 
 
 def test_where_nothing_is_free_any_step_is_stable():
@@ -192,3 +193,14 @@ def test_where_nothing_is_free_any_step_is_stable():
     solver = Msds(model)
     assert solver.step_limit == math.inf
     np.testing.assert_array_equal(solver.deform(None).nodes, model.mesh.nodes)
+
+
+def test_the_residual_is_unbalanced_over_contact_force_or_the_largest_since_rest():
+    residual, down = ElasticResidual(rounding=1e-12), np.array([[0.0, 0.0, 1.0]])
+    elastic = np.array([[0.0, 0.1, 4.0], [0.1, 0.0, 0.0]])  # N; the probe bears 4 N on node 0
+    found = residual.residual(elastic, np.array([0]), down)
+    assert found == pytest.approx(math.hypot(0.1, 0.1) / 4.0)
+    released = residual.residual(elastic / 40, np.array([], int), down[:0])
+    assert released == pytest.approx(np.linalg.norm(elastic) / 40 / 4.0)
+    residual.reset()
+    assert residual.residual(elastic / 40, np.array([], int), down[:0]) == 1.0

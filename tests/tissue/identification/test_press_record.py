@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from us_sim.errors import StiffnessError
 from us_sim.tissue.identification.press_record import (
     choose_poses,
+    evenly_spaced,
     find_delay,
     paired,
-    spread,
     stamped_alike,
     without_wrench,
 )
@@ -117,7 +117,7 @@ def clearance_of(record, numbers):
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=80), st.integers(2, 30))
 def test_places_ascend_once_each_and_hold_both_ends(steps, count):
     way = np.cumsum(steps)
-    places = spread(way, count)
+    places = evenly_spaced(way, count)
     assert (np.diff(places) > 0).all()
     assert len(places) <= count
     assert way[places[0]] == way[0]

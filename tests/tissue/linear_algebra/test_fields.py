@@ -15,7 +15,7 @@ def test_a_sum_is_the_product_with_the_forces(seed, surface, precision):
     random = np.random.default_rng(seed)
     exact = random.normal(size=(40, 3, 3 * surface))
     nodes = random.permutation(40)[:33]
-    made = DenseFields.made(
+    made = DenseFields.compute(
         nodes,
         surface,
         lambda chosen: exact.reshape(40, 3, -1, 3)[:, :, chosen].reshape(40, 3, -1),
@@ -53,7 +53,7 @@ def points():
 @pytest.fixture(scope="module")
 def made(points):
     nodes = np.arange(20, len(points))  # those before are held
-    return LowRankFields.made(
+    return LowRankFields.compress(
         points, nodes, points[:SURFACE], lambda chosen: kelvin(points, chosen), TOLERANCE
     )
 
@@ -101,7 +101,7 @@ def test_what_is_far_takes_little_place(points):
     """Forces on one side, nodes ten times as far away as both are wide: a few vectors do."""
     far = points + np.where(np.arange(len(points))[:, None] < SURFACE, 0.0, 10.0)
     nodes = np.arange(SURFACE, len(far))
-    made = LowRankFields.made(
+    made = LowRankFields.compress(
         far, nodes, far[:SURFACE], lambda chosen: kelvin(far, chosen), TOLERANCE
     )
     assert made.minor.size + made.major.size + made.right.size < 0.1 * 9 * SURFACE * len(nodes)

@@ -7,15 +7,15 @@ from hypothesis import strategies as st
 
 from us_sim.errors import MeshError
 from us_sim.tissue.mesh.box_planes import (
-    Wanted,
+    DesiredSpacing,
     fitted_planes,
-    wanted_by_labels,
-    wanted_under_probe,
+    spacing_by_labels,
+    spacing_under_probe,
 )
 
 
 def wish(spacing, length):
-    return Wanted(np.linspace(0.0, length, len(spacing) + 1), np.array(spacing))
+    return DesiredSpacing(np.linspace(0.0, length, len(spacing) + 1), np.array(spacing))
 
 
 AXIS = st.builds(
@@ -45,7 +45,7 @@ def test_an_even_wish_gives_an_even_box_of_cubes():
 
 def test_cells_are_as_long_as_wished_where_they_are_near_to_what_is_thin():
     edges = np.linspace(0.0, 0.1, 1001)
-    thin = Wanted(edges, np.where((edges[1:] > 0.05) & (edges[1:] <= 0.06), 1e-3, 1.0))
+    thin = DesiredSpacing(edges, np.where((edges[1:] > 0.05) & (edges[1:] <= 0.06), 1e-3, 1.0))
     flat = wish([1.0], 0.1)
     planes, *_ = fitted_planes([thin, flat, flat], 3 * 3 * 60)
     steps, middles = np.diff(planes), (planes[1:] + planes[:-1]) / 2
@@ -70,31 +70,31 @@ def test_a_round_vessel_asks_for_a_third_of_its_thickness_at_its_middle(radius):
     labels = np.repeat(section[:, None, :], 40, axis=1).astype(np.uint8)
     box = np.array([[0.0, 0.0, 0.0], [0.0395, 0.0195, 0.0395]])
     index = np.diag([1 / step] * 3 + [1.0])
-    wanted = wanted_by_labels(labels, index, box, step)
+    wanted = spacing_by_labels(labels, index, box, step)
     for axis in (wanted[0], wanted[2]):
         middle = axis.spacing[len(axis.spacing) // 2]
         # The median, over a diameter, of chords at right angles to it: it is the chord itself.
         assert middle == pytest.approx(2 * radius / 3, abs=step)
         assert axis.spacing[0] == pytest.approx(0.0395 / 3)
     assert (wanted[1].spacing >= 0.0195 / 3 - 1e-9).all()  # along the vessel nothing is thin
-    assert (wanted_by_labels(labels, index, box, step, counted=[])[0].spacing > 0.01).all()
+    assert (spacing_by_labels(labels, index, box, step, counted=[])[0].spacing > 0.01).all()
 
 
 def test_a_turned_volume_asks_for_the_same():
     labels = np.zeros((40, 30, 20), np.uint8)
     labels[10:16, :, 5:12] = 1
     box = np.array([[-5e-4, -5e-4, -5e-4], [0.0395, 0.0295, 0.0195]])
-    plain = wanted_by_labels(labels, np.diag([1e3, 1e3, 1e3, 1.0]), box, 1e-3)
+    plain = spacing_by_labels(labels, np.diag([1e3, 1e3, 1e3, 1.0]), box, 1e-3)
     turned = np.array([[0, 1e3, 0, 0], [0, 0, -1e3, 19], [1e3, 0, 0, 0], [0, 0, 0, 1]])
-    again = wanted_by_labels(labels.transpose(1, 2, 0)[:, ::-1], turned, box, 1e-3)
+    again = spacing_by_labels(labels.transpose(1, 2, 0)[:, ::-1], turned, box, 1e-3)
     for one, other in zip(plain, again, strict=True):
         np.testing.assert_allclose(one.spacing, other.spacing)
 
 
 def test_under_the_probe_cells_are_no_longer_than_half_its_half_width():
     flat = wish([1.0] * 100, 0.1)
-    x = Wanted(flat.edges - 0.05, flat.spacing)
-    found = wanted_under_probe([x, x, flat], 0.02, 0.008)
+    x = DesiredSpacing(flat.edges - 0.05, flat.spacing)
+    found = spacing_under_probe([x, x, flat], 0.02, 0.008)
     centre = (x.edges[1:] + x.edges[:-1]) / 2
     np.testing.assert_allclose(found[0].spacing[np.abs(centre) < 0.02], 4e-3)
     np.testing.assert_allclose(found[1].spacing[np.abs(centre) < 0.008], 4e-3)

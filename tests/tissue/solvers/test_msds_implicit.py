@@ -54,7 +54,7 @@ def test_at_rest_there_is_no_force_at_all():
     mesh = block_mesh((4, 3, 3))
     materials = uniform_material(mesh, SOFT)
     springs = fitted_springs(mesh, materials)
-    for volume in (VolumeTerm.nothing(len(mesh.nodes)), volume_term(mesh, materials, springs)):
+    for volume in (VolumeTerm.empty(len(mesh.nodes)), volume_term(mesh, materials, springs)):
         potential = IncrementalPotential(springs, volume, np.ones(len(mesh.nodes)), 0.2, 0.1)
         potential.begin(mesh.nodes, np.zeros_like(mesh.nodes))
         value, force = potential.evaluate(mesh.nodes)

@@ -1,23 +1,12 @@
-"""Tissues that a hand presses, and its motions on each.
+"""How tissue follows a random motion of a hand: every pose fed, then live, then the probe held.
 
->>> from us_sim.evaluation.hand.measure import TISSUES, motions
+Nodes are compared with the converged answer: a ``fem_nonlinear`` with the settings with which it
+converges follows the poses in order, and is called again at each until it has converged, or goes no
+further.
+
+>>> from us_sim.evaluation.hand.measure import TISSUES, Held, motions
 >>> [str(motion) for motion in motions(quick=True, seed=1)][0]
 'arm, free, brisk'
->>> len(TISSUES["block"].model.mesh.nodes)
-2000
-
-What every method is compared with: large deformation, converged at each pose of a motion.
-
-A ``fem_nonlinear`` with all the patience that its settings allow follows the poses in order, and is
-called again at each until it has converged, or goes no further.
-
->>> from us_sim.evaluation.hand.measure import Converged
->>> Converged.of_no_frame(3).trusted.tolist()
-[False, False, False]
-
-What came of a motion with one method: every pose fed, then as live, then the probe held still.
-
->>> from us_sim.evaluation.hand.measure import Held
 >>> held = Held(np.array([0.3, 0.02, 5e-4, 1e-6]))
 >>> held.frames_to(1e-2), held.frames_to(1e-8)
 (2.0, nan)
@@ -35,11 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.block import EXTENT, MESHES
-from us_sim.evaluation.named import Named
-from us_sim.evaluation.report import (
-    Row,
-    words_of,
-)
+from us_sim.evaluation.report import Row, percentile, words_of
 from us_sim.evaluation.timing import frames_until
 from us_sim.evaluation.tissue.cases import SCENES
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
@@ -53,15 +38,24 @@ from us_sim.tissue.solvers.frame_budget import frame_limit, usable_cores
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
-__all__ = ["MAIN_TISSUE", "RATE", "TISSUES", "Motion", "Tissue", "motions"]
-
-
 MAIN_TISSUE = "arm"
+METHOD = "fem_nonlinear"
+"""The method whose converged frames are the answer."""
 APPROACH = 0.5
 """s, in which the probe comes to where a motion begins: these frames do not count."""
+CONVERGED = 1e-5
+"""Residual at which a pose is left for the next."""
+TRUSTED = 1e-3
+"""Residual of the answer above which nothing is compared with it."""
+HELD = 1e-6
+"""m that a fixed node may move before nothing is compared with it either."""
+ENOUGH = 0.9
+"""Fraction of the frames that must be compared before their errors are reported."""
+HOLD = 60
+"""Frames in which the probe stays at its last pose."""
+OWN_EVERY = 5
+"""Frames, of which one is converged by itself."""
 
-_MAIN, _ELSEWHERE = 10.0, 4.0  # s, of a motion on the main tissue and on others
-_SIDE_KINDS = 4.0  # s, of a motion that is not free
 _QUICK_MOTIONS = (
     (MAIN_TISSUE, "free", "brisk", 2.0),
     (MAIN_TISSUE, "free", "violent", 0.7),
@@ -71,10 +65,12 @@ _QUICK_MOTIONS = (
     ("block", "stabbing", "violent", 0.7),
 )
 
+_Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True, eq=False)
 class Tissue:
-    """What is pressed, how a report calls it, and how far the hand may go on it."""
+    """A tissue, its name in a report, and how far the hand may go on it."""
 
     name: str
     words: str
@@ -84,7 +80,7 @@ class Tissue:
 
     @cached_property
     def model(self) -> TissueModel:
-        """Made once.
+        """The model, made once.
 
         Raises:
             UsSimError: it cannot be made.
@@ -103,8 +99,6 @@ def _liver() -> TissueModel:
     scene = load_scene("liver_sweep", volume=find_scene("liver_sweep"))
     return tissue_model_of(scene, Volume(np.zeros((1, 1, 1), np.uint8), np.eye(4)))
 
-
-_BLOCK = SCENES["tilt"]
 
 _ALL = (
     Tissue(
@@ -126,11 +120,11 @@ _ALL = (
         "block",
         "the uniform block of `us-sim evaluate tissue`, 10 kPa, under a capsule of 25 mm radius",
         "#D55E00",
-        lambda: _BLOCK.model(MESHES[0]),
+        lambda: SCENES["tilt"].model(MESHES[0]),
         Room(edge=EXTENT[0][1]),
     ),
 )
-TISSUES = Named("tissue of the hand evaluation", {tissue.name: tissue for tissue in _ALL})
+TISSUES = {tissue.name: tissue for tissue in _ALL}
 
 
 @dataclass(frozen=True)
@@ -149,13 +143,9 @@ class Motion:
     @cached_property
     def poses(self) -> list[Pose]:
         """One a frame, those of the approach first."""
+        room = TISSUES[self.tissue].room
         return hand_motion(
-            self.kind,
-            self.haste,
-            self.seed,
-            self.duration,
-            TISSUES[self.tissue].room,
-            approach=APPROACH,
+            self.kind, self.haste, self.seed, self.duration, room, approach=APPROACH
         ).poses
 
     @property
@@ -165,7 +155,7 @@ class Motion:
 
 
 def motions(quick: bool, seed: int) -> list[Motion]:
-    """All that is measured, in order: a tissue's motions stand together.
+    """All motions that are measured, in order: a tissue's motions stand together.
 
     The free hand in every haste on every tissue, the longest on the main one; there every kind in
     every haste, elsewhere every kind in the middle one.
@@ -174,7 +164,7 @@ def motions(quick: bool, seed: int) -> list[Motion]:
         rows = list(_QUICK_MOTIONS)
     else:
         rows = [
-            (tissue, kind, haste, _seconds(tissue, kind))
+            (tissue, kind, haste, 10.0 if kind == "free" and tissue == MAIN_TISSUE else 4.0)
             for tissue in TISSUES
             for kind in KINDS
             for haste in HASTES
@@ -185,44 +175,25 @@ def motions(quick: bool, seed: int) -> list[Motion]:
     return sorted(found, key=lambda motion: order.index(motion.tissue))
 
 
-def _seconds(tissue: str, kind: str) -> float:
-    if kind != "free":
-        return _SIDE_KINDS
-    return _MAIN if tissue == MAIN_TISSUE else _ELSEWHERE
-
-
-METHOD = "fem_nonlinear"
-CONVERGED = 1e-5
-"""Residual at which a pose is left for the next."""
-TRUSTED = 1e-3
-"""Residual above which nothing is compared with what was reached."""
-HELD = 1e-6
-"""m that a fixed node may move before nothing is compared with it either."""
-
-_MOST_CALLS = 20  # at one pose
-_PATIENCE, _PROGRESS = 4, 0.7  # calls, in which the least residual must fall by that factor
-
-
 @dataclass(frozen=True, eq=False)
 class Converged:
-    """The answer at each of K poses."""
+    """The converged answer at each of K poses."""
 
-    nodes: NDArray[np.float64]  # (K, N, 3) m
-    residual: NDArray[np.float64]  # (K,) as the solver said in the end
+    nodes: _Array  # (K, N, 3) m
+    residual: _Array  # (K,) as the solver said in the end
     pressed: NDArray[np.bool_]  # (K,) whether the probe touches the tissue
-    smallest: NDArray[np.float64]  # (K,) volume ratio of the tetrahedron most crushed
-    slipped: NDArray[np.float64]  # (K,) m, of the fixed node that moved most
+    smallest: _Array  # (K,) volume ratio of the tetrahedron most crushed
+    slipped: _Array  # (K,) m, of the fixed node that moved most
 
     @classmethod
     def of_no_frame(cls, count: int) -> Converged:
-        """In place of what failed: there is nothing to compare with."""
-        never = np.zeros(count, dtype=np.bool_)
-        unknown = np.full(count, np.nan)
+        """In place of an answer that failed: nothing is compared with it."""
+        never, unknown = np.zeros(count, dtype=np.bool_), np.full(count, np.nan)
         return cls(np.empty((count, 0, 3)), np.full(count, np.inf), never, unknown, unknown)
 
     @property
     def trusted(self) -> NDArray[np.bool_]:
-        """(K,) whether something may be compared with it."""
+        """(K,) whether frames may be compared with it."""
         return (self.residual <= TRUSTED) & (self.slipped <= HELD)
 
     @property
@@ -233,59 +204,47 @@ class Converged:
 
 
 def converged(
-    model: TissueModel, poses: Sequence[Pose], progress: Callable[[int], None] | None = None
+    model: TissueModel, poses: Sequence[Pose], progress: Callable[[int], None] = lambda _: None
 ) -> Converged:
-    """Follow the poses, each to convergence.
-
-    Args:
-        model: of the tissue.
-        poses: of the probe, in order.
-        progress: told how many of the poses are done.
+    """Follow the poses, each to convergence; ``progress`` is told how many are done.
 
     Raises:
         UsSimError: the method does not take the tissue.
     """
-    solver = patient_solver(model)
-    nodes = np.empty((len(poses), *model.mesh.nodes.shape))
-    residual, pressed = np.empty(len(poses)), np.zeros(len(poses), dtype=np.bool_)
-    smallest, slipped = np.empty(len(poses)), np.empty(len(poses))
+    solver = _patient_solver(model)
+    count = len(poses)
+    nodes, pressed = np.empty((count, *model.mesh.nodes.shape)), np.zeros(count, dtype=np.bool_)
+    residual, smallest, slipped = np.empty((3, count))
     for k, pose in enumerate(poses):
-        found = settled(solver, pose)
+        found = _settled(solver, pose)
         nodes[k], residual[k] = found.nodes, found.residual
         pressed[k] = len(found.contact_nodes) > 0
         volumes = signed_volumes(found.nodes, model.mesh.tetrahedra)
         smallest[k] = (volumes / model.mesh.volumes).min()
-        slipped[k] = moved_fixed(model, found)
-        if progress is not None:
-            progress(k + 1)
+        slipped[k] = _moved_fixed(model, found)
+        progress(k + 1)
     return Converged(nodes, residual, pressed, smallest, slipped)
 
 
-def moved_fixed(model: TissueModel, found: Deformation) -> float:
+def _moved_fixed(model: TissueModel, found: Deformation) -> float:
     """m, of the fixed node that moved most: none should."""
     return float(np.abs(found.nodes - model.mesh.nodes)[model.fixed].max(initial=0.0))
 
 
-def patient_solver(model: TissueModel) -> TissueSolver:
-    """The method with the settings with which it converges.
-
-    Raises:
-        UsSimError: it does not take the tissue.
-    """
+def _patient_solver(model: TissueModel) -> TissueSolver:
     return create_solver(METHOD, model, **(TISSUE_METHODS[METHOD].patient or {}))
 
 
-def settled(solver: TissueSolver, pose: Pose) -> Deformation:
-    """The last of many frames at one pose, or the best: until it settles, or goes no further.
+def _settled(solver: TissueSolver, pose: Pose) -> Deformation:
+    """The best of up to 20 frames at one pose: until it settles, or goes no further.
 
-    Of frames in balance the last is the best: in the earlier ones the probe is still sunk in.
+    Of frames in balance the last is the best: in the earlier ones the probe is still sunk in. It
+    goes no further where in four calls the least residual has not fallen by a factor of 0.7.
     """
     found = solver.deform(pose)
     best = [found]
-    for _ in range(_MOST_CALLS - 1):
-        stalled = len(best) > _PATIENCE and (
-            best[-1].residual > max(CONVERGED, _PROGRESS * best[-1 - _PATIENCE].residual)
-        )
+    for _ in range(19):
+        stalled = len(best) > 4 and best[-1].residual > max(CONVERGED, 0.7 * best[-5].residual)
         if solver.is_settled or stalled:
             break
         found = solver.deform(pose)
@@ -294,21 +253,7 @@ def settled(solver: TissueSolver, pose: Pose) -> Deformation:
     return best[-1]
 
 
-ENOUGH = 0.9
-"""Fraction of the frames that must be compared before their errors are told of."""
-HOLD = 60
-"""Frames in which the probe stays where it is."""
-OWN_EVERY = 5
-"""Frames, of which one is converged by itself."""
-SENDING_S = 0.0005
-"""What it takes a node to send its result."""
-_SMALL = 1e-3
-"""Residual that a held probe must come to."""
-
-_Array = NDArray[np.float64]
-
-
-def _nothing() -> _Array:
+def _unknown() -> _Array:
     return np.empty(0)
 
 
@@ -317,18 +262,26 @@ class Frames:
     """Frames of a motion, each array (K,); an error is NaN where there is no converged answer."""
 
     number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))  # of the pose
-    error: _Array = field(default_factory=_nothing)  # mm, of the node that is farthest off
-    rms: _Array = field(default_factory=_nothing)  # mm, root mean square over all nodes
-    own: _Array = field(default_factory=_nothing)  # mm, to its own balance; NaN in most frames
-    residual: _Array = field(default_factory=_nothing)  # as reported
-    inverted: _Array = field(default_factory=_nothing)  # tetrahedra
-    slipped: _Array = field(default_factory=_nothing)  # mm, of the fixed node that moved most
-    cpu: _Array = field(default_factory=_nothing)  # ms, processor time of all threads
-    wall: _Array = field(default_factory=_nothing)  # ms
+    error: _Array = field(default_factory=_unknown)  # mm, of the node that is farthest off
+    rms: _Array = field(default_factory=_unknown)  # mm, root mean square over all nodes
+    own: _Array = field(default_factory=_unknown)  # mm, to its own balance; NaN in most frames
+    residual: _Array = field(default_factory=_unknown)  # as reported
+    inverted: _Array = field(default_factory=_unknown)  # tetrahedra
+    slipped: _Array = field(default_factory=_unknown)  # mm, of the fixed node that moved most
+    cpu: _Array = field(default_factory=_unknown)  # ms, processor time of all threads
+    wall: _Array = field(default_factory=_unknown)  # ms
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[float, ...]]) -> Frames:
+        """From rows in the order of the fields."""
+        if not rows:
+            return cls()
+        number, *others = np.array(rows).T
+        return cls(number.astype(np.intp), *others)
 
     @property
     def compared(self) -> float:
-        """Fraction of the frames that have an error; what there is of few says nothing of all."""
+        """Fraction of the frames that have an error."""
         return float(np.isfinite(self.error).mean()) if len(self.error) else 0.0
 
 
@@ -338,7 +291,7 @@ class Live:
 
     poses: int = 0  # that came
     frames: Frames = field(default_factory=Frames)  # that were made
-    latency: _Array = field(default_factory=_nothing)  # (K,) ms, from a pose to its frame
+    latency: _Array = field(default_factory=_unknown)  # (K,) ms, from a pose to its frame
 
     @property
     def skipped(self) -> float:
@@ -350,18 +303,13 @@ class Live:
 class Held:
     """Frames after the probe has stopped."""
 
-    residual: _Array = field(default_factory=_nothing)  # (K,), of the last frame before them first
+    residual: _Array = field(default_factory=_unknown)  # (K,), of the last frame before them first
     inverted: int = 0  # tetrahedra in the last of them
 
     def frames_to(self, residual: float) -> float:
         """Frames until it is as small, and stays so; NaN where it never is."""
         found = frames_until(self.residual, residual)
         return math.nan if found is None else float(found)
-
-    @property
-    def last(self) -> float:
-        """The residual in the end."""
-        return float(self.residual[-1]) if len(self.residual) else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,10 +327,13 @@ class Point(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """What sums up the frames, by column."""
+        """Summary of the frames, by column."""
         frames, live, held, motion = self.frames, self.live, self.held, self.motion
         over = {
-            f"residual_over_{limit:g}": _mean(frames.residual > limit) for limit in (1e-2, 0.1, 1.0)
+            f"residual_over_{limit:g}": (
+                float((frames.residual > limit).mean()) if len(frames.residual) else math.nan
+            )
+            for limit in (1e-2, 0.1, 1.0)
         }
         return {
             "tissue": motion.tissue,
@@ -408,38 +359,34 @@ class Point(Row):
             **_percentiles("live_latency_ms", live.latency, (50, 99, 100)),
             "live_frames_inverted": int((live.frames.inverted > 0).sum()),
             "hold_frames_to_1e-2": held.frames_to(1e-2),
-            "hold_frames_to_1e-3": held.frames_to(_SMALL),
-            "hold_residual": held.last,
+            "hold_frames_to_1e-3": held.frames_to(1e-3),
+            "hold_residual": float(held.residual[-1]) if len(held.residual) else math.nan,
             "hold_inverted": bool(held.inverted),
             "failure": self.failure,
         }
 
     @property
     def title(self) -> str:
-        """What was tried."""
+        """The method and the motion."""
         return f"{self.method}, {self.motion}"
 
 
+def _percentiles(name: str, values: _Array, percents: Sequence[int]) -> dict[str, object]:
+    """By column: ``name_p50``, and ``name_worst`` for 100."""
+    known = values[~np.isnan(values)]
+    return {f"{name}_{'worst' if p == 100 else f'p{p}'}": percentile(known, p) for p in percents}
+
+
 def those(
-    points: Iterable[Point],
-    *,
-    method: str | None = None,
-    tissue: str | None = None,
-    kind: str | None = None,
-    haste: str | None = None,
+    points: Iterable[Point], *, method: str | None = None, **motion: str | None
 ) -> list[Point]:
     """Points that did not fail, of this method, tissue, kind and haste; None is any."""
-    wanted = (method, tissue, kind, haste)
     return [
         p
         for p in points
         if not p.failure
-        and all(
-            value is None or value == own
-            for value, own in zip(
-                wanted, (p.method, p.motion.tissue, p.motion.kind, p.motion.haste), strict=True
-            )
-        )
+        and method in (None, p.method)
+        and all(value in (None, getattr(p.motion, name)) for name, value in motion.items())
     ]
 
 
@@ -448,7 +395,7 @@ def measure(
     motion: Motion,
     answer: Converged,
     balance: TissueSolver | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> Point:
     """Follow a motion twice from rest, once with every pose and once live, and hold the probe.
 
@@ -462,12 +409,16 @@ def measure(
     Raises:
         FloatingPointError: a number that the solver returned is not finite.
     """
-    bench = _Following(solver, motion, answer, balance)
-    frames = bench.every_pose(progress)
-    held = bench.held()
-    live = bench.live()
+    following = _Following(solver, motion, answer, balance)
+    frames = following.every_pose(progress)
+    held = following.held()
+    live = following.live()
     poses = motion.poses[motion.begins :]
-    speed, turning = _speeds(poses)
+    places = np.array([pose.position for pose in poses])
+    turns = np.array([pose.orientation for pose in poses])
+    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
+    speed = RATE * float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    turning = RATE * float(np.median(2 * np.arccos(cosine)))
     return Point(motion, solver.name, speed, turning, frames, live, held)
 
 
@@ -475,17 +426,13 @@ class _Following:
     """One solver and one motion."""
 
     def __init__(
-        self,
-        solver: TissueSolver,
-        motion: Motion,
-        answer: Converged,
-        balance: TissueSolver | None,
+        self, solver: TissueSolver, motion: Motion, answer: Converged, balance: TissueSolver | None
     ) -> None:
         self._solver, self._motion, self._answer = solver, motion, answer
         self._balance, self._mesh = balance, solver.model.mesh
         self._last = solver.deform(None)
 
-    def every_pose(self, progress: Callable[[int], None] | None) -> Frames:
+    def every_pose(self, progress: Callable[[int], None]) -> Frames:
         """No pose is left out, however long a frame takes; up to the last one that presses."""
         self._solver.reset()
         rows = []
@@ -493,9 +440,8 @@ class _Following:
             row = self._frame(k, own_balance=k % OWN_EVERY == 0 and k >= self._motion.begins)
             if k >= self._motion.begins:
                 rows.append(row)
-            if progress is not None:
-                progress(k + 1)
-        return _frames(rows)
+            progress(k + 1)
+        return Frames.of(rows)
 
     def held(self) -> Held:
         """The probe stays where the motion above ended."""
@@ -512,10 +458,10 @@ class _Following:
         """Poses come at their times, and a frame begins with the newest of them.
 
         The clock is the wall's while a frame is made; waiting for a pose takes no time. A frame may
-        take as long as `frame_limit` says, as in the node.
+        take as long as `frame_limit` says, as in the node, which needs 0.5 ms to send its result.
         """
         self._solver.reset()
-        self._solver.frame_limit = frame_limit(SENDING_S, usable_cores())
+        self._solver.frame_limit = frame_limit(0.0005, usable_cores())
         poses = self._motion.poses
         rows, latency = [], []
         now, done = 0.0, -1
@@ -532,7 +478,7 @@ class _Following:
                 rows.append(row)
                 latency.append(1e3 * (now - newest / RATE))
         self._solver.frame_limit = None
-        return Live(len(poses) - self._motion.begins, _frames(rows), np.array(latency))
+        return Live(len(poses) - self._motion.begins, Frames.of(rows), np.array(latency))
 
     def _frame(self, k: int, *, own_balance: bool = False) -> tuple[float, ...]:
         pose = self._motion.poses[k]
@@ -545,23 +491,22 @@ class _Following:
             raise FloatingPointError(f"frame {k} is not finite")
         error = rms = own = math.nan
         if own_balance and self._balance is not None:
-            own = self._to_own_balance(pose, found)
+            own = self._to_own_balance(self._balance, pose, found)
         if self._answer.trusted[k]:
             off = np.linalg.norm(found.nodes - self._answer.nodes[k], axis=1)
             error, rms = float(off.max()), float(np.sqrt((off**2).mean()))
         times = (1e3 * processor, 1e3 * wall)
         errors = (1e3 * error, 1e3 * rms, 1e3 * own)
-        slipped = moved_fixed(self._solver.model, found)
+        slipped = _moved_fixed(self._solver.model, found)
         return (k, *errors, found.residual, self._inverted(found), 1e3 * slipped, *times)
 
-    def _to_own_balance(self, pose: Pose, found: Deformation) -> float:
-        """m, from the frame to what it converges to where the probe is; NaN where to nothing."""
-        assert self._balance is not None
+    def _to_own_balance(self, balance: TissueSolver, pose: Pose, found: Deformation) -> float:
+        """m, from the frame to what it converges to at the pose; NaN where it does not."""
         state = self._solver.state
-        state.displacement[self._solver.model.fixed] = 0.0  # what moved is in its own column
-        self._balance.take_over(state)
-        there = settled(self._balance, pose)
-        if there.residual > TRUSTED or moved_fixed(self._solver.model, there) > HELD:
+        state.displacement[self._solver.model.fixed] = 0.0  # its motion has a column of its own
+        balance.take_over(state)
+        there = _settled(balance, pose)
+        if there.residual > TRUSTED or _moved_fixed(self._solver.model, there) > HELD:
             return math.nan
         return float(np.linalg.norm(found.nodes - there.nodes, axis=1).max())
 
@@ -570,43 +515,12 @@ class _Following:
         return int((signed_volumes(found.nodes, self._mesh.tetrahedra) <= 0).sum())
 
 
-def _frames(rows: Sequence[tuple[float, ...]]) -> Frames:
-    if not rows:
-        return Frames()
-    number, *others = np.array(rows).T
-    return Frames(number.astype(np.intp), *others)
-
-
-def _speeds(poses: Sequence[Pose]) -> tuple[float, float]:
-    """m/s and rad/s, medians from pose to pose."""
-    places = np.array([pose.position for pose in poses])
-    turns = np.array([pose.orientation for pose in poses])
-    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
-    moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    return RATE * float(np.median(moved)), RATE * float(np.median(2 * np.arccos(cosine)))
-
-
-def _percentiles(name: str, values: _Array, percents: Sequence[int]) -> dict[str, object]:
-    """By column: ``name_p50``, and ``name_worst`` for 100."""
-    known = values[~np.isnan(values)]
-    return {
-        f"{name}_{'worst' if p == 100 else f'p{p}'}": (
-            float(np.percentile(known, p)) if len(known) else math.nan
-        )
-        for p in percents
-    }
-
-
-def _mean(values: NDArray[np.bool_]) -> float:
-    return float(values.mean()) if len(values) else math.nan
-
-
-def _points(
+def measured_points(
     planned: Sequence[Motion],
     answers: dict[Motion, Converged],
     progress: Callable[[float, str], None],
 ) -> Iterator[Point]:
-    """Every motion with every method; what has converged at its poses is put into ``answers``."""
+    """Every motion with every method; the converged answers are put into ``answers``."""
     done = 0
     bench = _Bench()
     for motion in planned:
@@ -625,7 +539,7 @@ def _points(
 
 
 class _Bench:
-    """Keeps the last tissue's solvers."""
+    """Measures motions; keeps the last tissue's solvers."""
 
     def __init__(self) -> None:
         self._tissue = ""
@@ -634,7 +548,7 @@ class _Bench:
         self._broken: dict[Motion, str] = {}
 
     def answer(self, motion: Motion, progress: Callable[[int], None]) -> Converged:
-        """The converged answer; where there is none, that of no frame."""
+        """The converged answer; where it breaks, one of no frame."""
         try:
             return converged(TISSUES[motion.tissue].model, motion.poses, progress)
         # Whatever breaks on one tissue must not take the others' results along.
@@ -650,7 +564,12 @@ class _Bench:
             return Point(motion, method, failure=self._broken[motion])
         try:
             solver = self._solver(motion.tissue, method)
-            return measure(solver, motion, answer, self._balance(method), progress)
+            balance = None
+            if method == METHOD:  # the others solve other equations
+                if self._patient is None:
+                    self._patient = _patient_solver(TISSUES[motion.tissue].model)
+                balance = self._patient
+            return measure(solver, motion, answer, balance, progress)
         except Exception as error:
             self._solvers.pop(method, None)
             return Point(motion, method, failure=words_of(error))
@@ -663,11 +582,3 @@ class _Bench:
             solver.warm_up()
             self._solvers[method] = solver
         return self._solvers[method]
-
-    def _balance(self, method: str) -> TissueSolver | None:
-        """What converges a method's frames; None where it solves other equations."""
-        if method != METHOD:
-            return None
-        if self._patient is None:
-            self._patient = patient_solver(TISSUES[self._tissue].model)
-        return self._patient

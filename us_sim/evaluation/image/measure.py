@@ -1,17 +1,10 @@
-"""What each artefact that is measured says of itself: its numbers, what is asked, its pictures.
+"""Rows of image.csv, the interface of artefacts, and layers of tissue with their known loss.
 
-What was measured of one artefact: a row of image.csv.
-
->>> from us_sim.evaluation.image.measure import Point
+>>> from us_sim.evaluation.image.measure import Point, lost
 >>> Point.of("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB").error_percent.__round__(2)
 -1.14
 >>> Point.of("strain", "linear", 0.0, 0.02, 0.04, 0.0404, "").error_percent.__round__(2)
 1.0
-
-Layers of tissue, and what each of a probe's beams loses in them, in closed form.
-
->>> import numpy as np
->>> from us_sim.evaluation.image.measure import LAYERS, lost
 >>> down = np.array([0.0, 0.0, 1.0])
 >>> float(lost(np.zeros(3), down, np.array([0.01]), 5e6)[0].round(3))  # 1 cm of liver
 -4.5
@@ -34,32 +27,9 @@ from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorPr
 from us_sim.volume.volume import Volume
 
 
-class Artefact(ABC):
-    """One file each; `us_sim.evaluation.image.report` has the list of them."""
-
-    name: ClassVar[str]
-    """The first column of its rows: a word, or several with underscores."""
-    title: ClassVar[str]
-    """The heading of its part of the report."""
-    simplified: ClassVar[str]
-    """What it leaves out or takes as simpler than it is, a sentence or more."""
-
-    @abstractmethod
-    def points(self, quick: bool) -> list[Point]:
-        """The rows of image.csv."""
-
-    @abstractmethod
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        """What is asked, against its own rows."""
-
-    @abstractmethod
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> list[str]:
-        """The paragraphs of its part of the report, whose pictures it draws into the folder."""
-
-
 @dataclass(frozen=True)
 class Point(Row):
-    """One number that an image should show, and what it does show."""
+    """One expected number, and the one that the image shows."""
 
     artefact: str
     probe: str
@@ -90,7 +60,7 @@ class Point(Row):
 
         Args:
             tilt: degrees. depth: m.
-            of: what the error is a fraction of; None is the expected value, and of pixels one.
+            of: whole of which the error is a fraction; None is the expected value, of pixels one.
         """
         if unit == "dB":
             error = 100.0 * (10.0 ** ((measured - expected) / 20.0) - 1.0)
@@ -101,8 +71,34 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """What it is about."""
+        """Artefact, probe and tilt."""
         return f"{self.artefact}, {self.probe}, {self.tilt_deg:g}°"
+
+
+class Artefact(ABC):
+    """An effect in images that is measured; `us_sim.evaluation.image.report` lists them."""
+
+    name: ClassVar[str]
+    """The first column of its rows: a word, or several with underscores."""
+    title: ClassVar[str]
+    """The heading of its part of the report."""
+
+    @abstractmethod
+    def points(self, quick: bool) -> list[Point]:
+        """The rows of image.csv."""
+
+    @abstractmethod
+    def targets(self, points: Sequence[Point]) -> list[Target]:
+        """Limits against its own rows."""
+
+    @abstractmethod
+    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
+        """Its part of the report, from its template; draws its pictures into the folder."""
+
+
+def worst_percent(points: Sequence[Point]) -> float:
+    """The greatest error."""
+    return max(abs(p.error_percent) for p in points)
 
 
 @dataclass(frozen=True)
@@ -133,23 +129,29 @@ PROBES: dict[str, Probe] = {
     "sector": SectorProbe(aperture=0.02, opening_angle=np.radians(80), depth=0.07),
 }
 
-LAYER_GREY = 170
+GREY = 170
 """Of all voxels."""
 
-_VOXEL = (4e-3, 4e-3, 0.1e-3)  # m; nothing changes along x and y
-_EXTENT = ((-0.16, 0.16), (-0.16, 0.16), (-0.06, 0.11))  # m
+
+def voxel_grid(
+    extent: Sequence[tuple[float, float]], voxel: Sequence[float]
+) -> tuple[list[int], NDArray[np.float64]]:
+    """Counts of voxels (m) that fill an extent (m), and the matrix from indices to ``patient``."""
+    counts = [round((high - low) / step) for (low, high), step in zip(extent, voxel, strict=True)]
+    to_patient = np.diag([*voxel, 1.0])
+    to_patient[:3, 3] = [low + 0.5 * step for (low, _), step in zip(extent, voxel, strict=True)]
+    return counts, to_patient
 
 
 def layered_volume() -> Volume:
-    """The layers, with a border of theirs on a border of voxels."""
-    counts = [round((high - low) / step) for (low, high), step in zip(_EXTENT, _VOXEL, strict=True)]
-    to_patient = np.diag([*_VOXEL, 1.0])
-    to_patient[:3, 3] = [low + 0.5 * step for (low, _), step in zip(_EXTENT, _VOXEL, strict=True)]
-    z = to_patient[2, 3] + _VOXEL[2] * np.arange(counts[2])
+    """The layers, with a border of theirs on a border of voxels; nothing changes along x and y."""
+    voxel = (4e-3, 4e-3, 0.1e-3)
+    counts, to_patient = voxel_grid(((-0.16, 0.16), (-0.16, 0.16), (-0.06, 0.11)), voxel)
+    z = to_patient[2, 3] + voxel[2] * np.arange(counts[2])
     labels = np.empty(counts, dtype=np.uint8)
     labels[:] = np.searchsorted([layer.begin for layer in LAYERS], z)
     names = {number: layer.name for number, layer in enumerate(LAYERS, 1)}
-    return Volume(np.full(counts, LAYER_GREY, dtype=np.uint8), to_patient, labels, names)
+    return Volume(np.full(counts, GREY, dtype=np.uint8), to_patient, labels, names)
 
 
 def lost(

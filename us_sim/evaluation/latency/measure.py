@@ -1,14 +1,8 @@
-"""The ways to run the arm that are measured: one thing is changed at a time.
+"""Run the arm in many ways, one thing changed at a time, and listen to its graph.
 
 >>> from us_sim.evaluation.latency.measure import cases
 >>> [str(case) for case in cases(quick=True)][:2]
 ['fem, 2,000 nodes, 512 x 512, recorder', 'fem, 8,192 nodes, 512 x 512, recorder']
-
-What one way to run the arm shows: one row of the file.
-
-The scene file of a case: the arm, with another mesh, method or image.
-
-Runs the arm in one way, and listens to it.
 """
 
 from __future__ import annotations
@@ -31,7 +25,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.processes import UsageOverTime, listening, start_program, usage_of
-from us_sim.evaluation.report import Row
+from us_sim.evaluation.report import Row, percentile
 from us_sim.evaluation.timing import Tell
 from us_sim.recording.reader import read_bag
 from us_sim.run.lockstep import render
@@ -85,10 +79,10 @@ class Case:
 
 
 LIVE = Case(mesh=FINE, seconds=300.0)
-"""What the limits for a live simulation are for."""
+"""The case of the limits for a live simulation."""
 
 DEMO = Case("fem_nonlinear")
-"""What the demo runs."""
+"""The method and mesh of the demo."""
 
 
 def cases(quick: bool) -> list[Case]:
@@ -131,7 +125,7 @@ Heard = Sequence[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Point(Row):
-    """A case, and what was measured."""
+    """A row of latency.csv."""
 
     case: Case
     heard: Mapping[str, Heard] = field(default_factory=dict)  # by topic, in their order
@@ -161,7 +155,7 @@ class Point(Row):
             "cores_busy": case.busy,
             "scheduling": self.scheduling,
             "seconds": case.seconds,
-            "poses": len(self._heard("tracker/pose")),
+            "poses": len(self.heard.get("tracker/pose", ())),
             "images": len(self.images),
             "images_a_second": self.rate,
             "dropped": self.dropped,
@@ -184,7 +178,7 @@ class Point(Row):
     @property
     def images(self) -> Heard:
         """Those that came."""
-        return self._heard("ultrasound/image")
+        return self.heard.get("ultrasound/image", ())
 
     @property
     def rate(self) -> float:
@@ -199,7 +193,7 @@ class Point(Row):
         stamps = {stamp for stamp, _ in self.images}
         if not stamps:
             return 0
-        poses = {stamp for stamp, _ in self._heard("tracker/pose")}
+        poses = {stamp for stamp, _ in self.heard.get("tracker/pose", ())}
         return sum(min(stamps) <= stamp <= max(stamps) for stamp in poses - stamps)
 
     @property
@@ -215,18 +209,11 @@ class Point(Row):
 
     def ages(self, topic: str) -> NDArray[np.float64]:
         """ms from the tracker's pose to the arrival of each message."""
-        return np.array([1e-6 * (came - stamp) for stamp, came in self._heard(topic)])
+        return np.array([1e-6 * (came - stamp) for stamp, came in self.heard.get(topic, ())])
 
     def latency(self, topic: str, percent: float) -> float:
         """Percentile of these, ms; NaN where none came."""
-        ages = self.ages(topic)
-        return float(np.percentile(ages, percent)) if len(ages) else np.nan
-
-    def _heard(self, topic: str) -> Heard:
-        return self.heard.get(topic, ())
-
-
-_ARM = "upper_arm"
+        return percentile(self.ages(topic), percent)
 
 
 def write_scene(case: Case, folder: Path) -> Path:
@@ -236,7 +223,7 @@ def write_scene(case: Case, folder: Path) -> Path:
         tissue["mesh"] = {"nodes": list(case.mesh), "planes": _planes(case.mesh)}
     document = {
         "name": "latency",
-        "based_on": _ARM,
+        "based_on": "upper_arm",
         "probe": {"image": list(case.image)},
         "tissue": tissue,
     }
@@ -247,7 +234,7 @@ def write_scene(case: Case, folder: Path) -> Path:
 
 def _planes(counts: tuple[int, int, int]) -> dict[str, list[float]]:
     """m, more planes of nodes than the arm has, as close together as there."""
-    arm = load_scene(_ARM)
+    arm = load_scene("upper_arm")
     assert arm.tissue is not None
     planes = {}
     for axis, count in zip("xyz", counts, strict=True):
@@ -258,18 +245,8 @@ def _planes(counts: tuple[int, int, int]) -> dict[str, list[float]]:
     return planes
 
 
-_START_S = 300.0  # the first run compiles
-_WARMING_S = 2.0  # of images that do not count
-_SETTLE_S = 1.5  # for what is under way to arrive, and to be recorded
-_SAMPLE_S = 0.5
-
-
 def run_case(case: Case, tell: Tell) -> Point:
-    """What the case shows.
-
-    Args:
-        case: how to run the arm.
-        tell: is told how many of the case's seconds are over.
+    """Run the arm as the case says; ``tell`` is told how many of its seconds are over.
 
     Raises:
         UsSimError: a node ends, or no image comes.
@@ -284,7 +261,7 @@ def run_case(case: Case, tell: Tell) -> Point:
 
 
 def _in_lockstep(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
-    """How many images a second there are where each pose waits for the one before."""
+    """Images a second where each pose waits for the one before."""
     began: list[float] = []
 
     def count(done: int, total: int) -> None:
@@ -319,9 +296,9 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
             for node, pid in running.pids.items():
                 usage[node].add(passed, usage_of(pid))
             tell(passed, f"{len(arrivals.heard('ultrasound/image'))} images")
-            time.sleep(_SAMPLE_S)
+            time.sleep(0.5)
         ended_ns = time.time_ns()
-        time.sleep(_SETTLE_S)
+        time.sleep(1.5)  # for messages under way to arrive, and to be recorded
         heard = {
             topic: [each for each in arrivals.heard(topic) if began_ns <= each[0] < ended_ns]
             for topic in arrivals.topics
@@ -386,16 +363,16 @@ def _started(case: Case, processes: list[NodeProcess], folder: Path) -> Iterator
 
 
 def _await_images(arrivals: Arrivals, running: _Running, tell: Tell) -> None:
-    """Until images have come for a while."""
+    """Wait until images have come for two seconds, which do not count."""
     began, first = time.monotonic(), 0.0
-    while not first or time.monotonic() - first < _WARMING_S:
+    while not first or time.monotonic() - first < 2.0:
         tell(0.0, "imaging" if first else "starting")
         time.sleep(0.1)
         running.check()
         if not first and arrivals.heard("ultrasound/image"):
             first = time.monotonic()
-        if time.monotonic() - began > _START_S:
-            raise UsSimError(f"no image came in {_START_S:g} s")
+        if time.monotonic() - began > 300.0:  # the first run compiles
+            raise UsSimError("no image came in 300 s")
 
 
 def _recorded(file: Path, stamps: set[int]) -> int:

@@ -1,32 +1,18 @@
-"""What `us-sim evaluate slice` cuts: a block of speckle, its meshes, dents and planes.
+"""Images that `us-sim evaluate slice` cuts of a block of speckle, and their true grey values.
 
->>> import numpy as np
->>> from us_sim.evaluation.slice.cases import MAIN, dented
->>> MAIN.name
-'512 px, 32x16x16 nodes, pressed_12mm, straight'
->>> mesh = MAIN.mesh()
->>> len(mesh.nodes), len(mesh.tetrahedra)
-(8192, 34875)
->>> float(dented(np.zeros((1, 3)), 0.012)[0, 2])
-0.012
+The truth is brute force in float64 by NumPy and SciPy, which shares no arithmetic with the slicers:
+every pixel is tried in every tetrahedron whose bounding box it lies in.
 
-What an image must show, by brute force in float64 with NumPy and SciPy alone.
-
-It shares no arithmetic with the slicers: every pixel is tried in every tetrahedron whose bounding
-box it lies in, and SciPy samples the volume.
-
->>> import numpy as np
->>> from us_sim.evaluation.slice.cases import exact_slice
+>>> from us_sim.evaluation.slice.cases import MAIN, dented, exact_slice
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.slicing.probe.probe import LinearProbe
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
->>> from us_sim.volume.volume import Volume
->>> ramp = np.tile(np.arange(50, dtype=np.uint8), (41, 41, 1))
+>>> MAIN.name, len(MAIN.mesh().nodes), float(dented(np.zeros((1, 3)), 0.012)[0, 2])
+('512 px, 32x16x16 nodes, pressed_12mm, straight', 8192, 0.012)
 >>> to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
 >>> to_patient[:2, 3] = -0.02
+>>> volume = Volume(np.tile(np.arange(50, dtype=np.uint8), (41, 41, 1)), to_patient)
 >>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
 >>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
->>> volume = Volume(ramp, to_patient)
 >>> exact_slice(volume, mesh.nodes, mesh.tetrahedra, mesh.nodes * [1, 1, 0.5], plane).grey[:, 0]
 array([ 4., 12., 20., 28., 36.])
 """
@@ -41,7 +27,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.evaluation.block import EXTENT, LARGEST_MESH, MESHES, block
-from us_sim.evaluation.named import Named
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
@@ -49,16 +34,12 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
 SIZES = (256, 512, 1024)  # columns, and rows, of an image
-DEPTHS = Named("deformation", {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03})
+DEPTHS = {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03}
 """m, by which the block is pressed."""
 
 _BEYOND = 5e-3  # m of volume around the block, which does not deform
 _VOXEL = 0.4e-3  # m
 _WIDTH = 0.022  # m, standard deviation of the dent
-_BULGE = 0.25  # of the dent's depth, by which tissue under it is pushed aside
-_APERTURE, _DEPTH = 0.06, 0.08  # m, of the image
-_LAYERS = (0.008, 0.02, 0.035, 0.05, 0.07, 0.09)  # m below the skin
-_TREMOR = 0.2e-3  # m, of the probe from one image to the next
 
 
 @dataclass(frozen=True)
@@ -72,19 +53,12 @@ class _View:
     on_faces: bool = False  # moved onto a layer of the mesh's faces
 
 
-PLANES = Named(
-    "plane",
-    {
-        "straight": _View("in the probe's plane"),
-        "oblique": _View(
-            "turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)
-        ),
-        "corner": _View(
-            "turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)
-        ),
-        "faces": _View("along a layer of faces", on_faces=True),
-    },
-)
+PLANES = {
+    "straight": _View("in the probe's plane"),
+    "oblique": _View("turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)),
+    "corner": _View("turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)),
+    "faces": _View("along a layer of faces", on_faces=True),
+}
 
 
 @dataclass(frozen=True)
@@ -127,9 +101,9 @@ class Case:
                 layers = rest[:, 1]
                 position[1] = layers[np.abs(layers).argmin()]
             else:
-                position += _TREMOR * number
+                position += 0.2e-3 * number  # m
             pose = Pose(position, _turn(math.radians(view.turned), math.radians(view.tilted)))
-            probe = LinearProbe(_APERTURE, _DEPTH, self.size, self.size)
+            probe = LinearProbe(0.06, 0.08, self.size, self.size)
             found.append(Frame(nodes, probe.plane(pose)))
         return found
 
@@ -173,7 +147,7 @@ def dented(nodes: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
     height = EXTENT[2][1]
     below = nodes[:, 2:] / height
     dent = np.exp(-(nodes[:, :2] ** 2).sum(axis=1, keepdims=True) / (2.0 * _WIDTH**2))
-    aside = _BULGE * depth / _WIDTH * nodes[:, :2] * 4.0 * below * (1.0 - below) ** 2
+    aside = 0.25 * depth / _WIDTH * nodes[:, :2] * 4.0 * below * (1.0 - below) ** 2
     return np.asarray(nodes + np.hstack([aside, depth * (1.0 - below) ** 2]) * dent)
 
 
@@ -196,7 +170,7 @@ def speckle(seed: int = 1) -> Volume:
         inside = [(axis[p] - c) ** 2 for axis, p, c in zip(axes, part, centre, strict=True)]
         x, y, z = np.ix_(*inside)
         grey[part][x + y + z < radius**2] *= np.float32(generator.choice([0.2, 2.0]))
-    for depth in _LAYERS:
+    for depth in (0.008, 0.02, 0.035, 0.05, 0.07, 0.09):  # m below the skin
         grey[:, :, np.abs(axes[2] - depth) < 0.6e-3] *= np.float32(2.5)
     return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
 
@@ -230,8 +204,6 @@ def _turn(about_z: float, about_x: float) -> NDArray[np.float64]:
     return np.array([cz * sx, sz * sx, sz * cx, cz * cx])
 
 
-_CLOSED = -1e-9  # least barycentric coordinate of a point inside
-_FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron has no interior
 _PAIRS = 1_000_000  # pairs of a pixel and a tetrahedron that are tried at once
 
 
@@ -296,7 +268,7 @@ def _located(
     end = np.minimum(np.floor(high[:, :2] + 1e-6), last[:2]).astype(int) + 1
     near = ((low <= last + 1e-6) & (high >= -1e-6)).all(axis=1) & (end > first).all(axis=1)
     before = _determinants(rest_nodes, tetrahedra)
-    upright = _determinants(nodes, tetrahedra) * np.sign(before) > _FLAT * np.abs(before)
+    upright = _determinants(nodes, tetrahedra) * np.sign(before) > 1e-6 * np.abs(before)
     chosen = np.flatnonzero(near & upright)
 
     found = np.full((plane.rows, plane.columns, 3), np.nan)
@@ -315,7 +287,7 @@ def _located(
         inverse = np.linalg.inv(edges)
         away = np.stack([column, row, np.zeros(len(row))], axis=1) - corners[members, 0][number]
         weights = np.einsum("pij,pj->pi", inverse[number], away)
-        inside = (weights.min(axis=1) >= _CLOSED) & (weights.sum(axis=1) <= 1.0 - _CLOSED)
+        inside = (weights.min(axis=1) >= -1e-9) & (weights.sum(axis=1) <= 1.0 + 1e-9)
         number, weights = number[inside], weights[inside]
         origin = rest_nodes[tetrahedra[members]][number]
         found[row[inside], column[inside]] = origin[:, 0] + np.einsum(

@@ -1,31 +1,36 @@
-"""."""
+"""Every slicing method cuts the same images, in turns; each is compared with brute force.
+
+>>> from us_sim.evaluation.slice.measure import SLICING_METHODS
+>>> [name for name, method in SLICING_METHODS.items() if method.tissue_only]
+['vtk']
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.named import Named
-from us_sim.evaluation.report import (
-    Row,
-    not_a_column,
-)
+from us_sim.evaluation.report import Row, not_a_column, words_of
 from us_sim.evaluation.slice.cases import (
     DEPTHS,
     MAIN,
     Case,
     ExactSlice,
     Frame,
+    black_and_white,
+    exact_slice,
+    sampled,
+    speckle,
     voxel_distance,
 )
-from us_sim.evaluation.timing import RunTimes
+from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.formation.coupling import ContactSurface
@@ -37,6 +42,8 @@ from us_sim.volume.volume import Volume
 
 OURS = "scan_conversion"
 """The method that the others are compared with, and that the targets are about."""
+
+HOW_TO_GET = "VTK was left out, since it is not installed: pip install 'us_sim[evaluate]' adds it"
 
 
 @dataclass(frozen=True)
@@ -56,10 +63,37 @@ _ALL = (
     SlicingMethod("per_pixel", "#009E73", "s", (1,)),
     SlicingMethod("vtk", "#CC79A7", "^", (1, 2), tissue_only=True),
 )
-
-
-SLICING_METHODS = Named("evaluated slicing method", {method.name: method for method in _ALL})
+SLICING_METHODS = {method.name: method for method in _ALL}
 """By name, in the reports' order; colours are told apart in every common colour blindness."""
+
+
+@dataclass(frozen=True)
+class Point(Row):
+    """A row of slice.csv, and its failure."""
+
+    method: str
+    size: int  # columns, and rows
+    nodes: int
+    tets: int
+    threads: int
+    ms_median: float = float("nan")
+    ms_p99: float = float("nan")
+    coverage_mismatch_px: int = 0  # pixels that show tissue, the rigid volume or black wrongly
+    max_grey_difference: float = float("nan")
+    mean_grey_difference: float = float("nan")
+    max_voxel_error: float = float("nan")  # of places at rest, of pixels without a mismatch
+    deformation: str = ""
+    plane: str = ""
+    cpu_ms_median: float = float("nan")  # processor time, of all threads
+    filter_ms: float = float("nan")  # of VTK: finding pixels, processor time
+    sampling_ms: float = float("nan")  # of VTK: sampling, processor time
+    images: int = 0  # that were timed
+    failure: str = not_a_column("")
+
+    @property
+    def title(self) -> str:
+        """The method and its case."""
+        return f"{self.method} on {self.size} px, {self.nodes} nodes"
 
 
 @dataclass(frozen=True)
@@ -73,6 +107,11 @@ class Contender:
     parts: Callable[[], tuple[float, float]] | None = None  # ms of the latest image, where known
 
 
+def is_installed() -> bool:
+    """Whether VTK can be imported."""
+    return importlib.util.find_spec("vtkmodules") is not None
+
+
 def methods() -> list[SlicingMethod]:
     """Those that can be evaluated here."""
     return [method for name, method in SLICING_METHODS.items() if name != "vtk" or is_installed()]
@@ -82,37 +121,238 @@ def contender(volume: Volume, case: Case, method: str, threads: int) -> Contende
     """A method that is about to cut a case's images of a volume.
 
     Raises:
-        ImportError: the method's module, or what it needs, cannot be imported.
+        ImportError: the method's module, or a library of it, cannot be imported.
     """
     mesh = case.mesh()
+    slicer: Any
     if method == "vtk":
-        vtk = VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
-        return Contender(
-            method,
-            threads,
-            lambda frame: vtk.image(frame.nodes, frame.plane),
-            lambda frame: vtk.rest_coordinates(frame.nodes, frame.plane),
-            lambda: (vtk.filter_ms, vtk.sampling_ms),
-        )
-    slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=threads)
+        slicer = VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
+    else:
+        slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=threads)
     return Contender(
         method,
         threads,
         lambda frame: slicer.image(frame.nodes, frame.plane),
         lambda frame: slicer.rest_coordinates(frame.nodes, frame.plane),
+        (lambda: (slicer.filter_ms, slicer.sampling_ms)) if method == "vtk" else None,
     )
 
 
-HOW_TO_GET = "VTK was left out, since it is not installed: pip install 'us_sim[evaluate]' adds it"
+class Bench:
+    """Cuts cases with every method; keeps the volumes that they cut.
+
+    Args:
+        seconds: s, of timing the main case, and another.
+    """
+
+    def __init__(self, seconds: tuple[float, float]) -> None:
+        self.volume, self._contrast = speckle(), black_and_white()
+        self._seconds = seconds
+
+    def points(self, case: Case) -> list[Point]:
+        """A row for every method."""
+        mesh, frames = case.mesh(), case.frames(4)
+        first = frames[0]
+        exact = exact_slice(self.volume, mesh.nodes, mesh.tetrahedra, first.nodes, first.plane)
+        shown = sampled(self._contrast, exact.rest)
+        seen: dict[str, NDArray[np.uint8]] = {}
+        contenders: list[Contender] = []
+        points: dict[tuple[str, int], Point] = {}
+        for method, threads in ((m, n) for m in methods() for n in m.threads):
+            point = Point(
+                *(method.name, case.size, len(mesh.nodes), len(mesh.tetrahedra), threads),
+                deformation=case.deformation,
+                plane=case.plane,
+            )
+            try:
+                ready = contender(self.volume, case, method.name, threads)
+                if method.name not in seen:
+                    other = contender(self._contrast, case, method.name, threads)
+                    seen[method.name] = other.image(first)
+                errors: Any = compare(
+                    *(self.volume, first, exact, ready.image(first)),
+                    ready.rest_coordinates(first),
+                    (shown, seen[method.name]),
+                    tissue_only=method.tissue_only,
+                )
+            # Whatever breaks in one method must not take the others' results along.
+            except Exception as error:
+                points[method.name, threads] = replace(point, failure=words_of(error))
+                continue
+            points[method.name, threads] = replace(point, **errors)
+            contenders.append(ready)
+        times: Any = timed_together(contenders, frames, self._seconds[case != MAIN])
+        for ready, columns in zip(contenders, times, strict=True):
+            key = (ready.method, ready.threads)
+            points[key] = replace(points[key], **columns)
+        return list(points.values())
 
 
-def is_installed() -> bool:
-    """Whether VTK can be imported."""
-    return importlib.util.find_spec("vtkmodules") is not None
+def timed_together(
+    contenders: Sequence[Contender], frames: Sequence[Frame], seconds: float
+) -> list[dict[str, float]]:
+    """Times of all contenders, by columns of `Point`, in turns on a noisy machine.
+
+    The probe moves on from image to image. A turn has five images of a method that takes less than
+    8 ms, one of another.
+
+    Args:
+        contenders: to be timed; each has cut an image before, so that nothing is compiled now.
+        frames: that they cut, over and over.
+        seconds: after which no further turn begins, if each has had three; methods slower than 150
+            ms sit those out.
+    """
+    found: list[list[float]] = [[] for _ in contenders]
+    processor: list[list[float]] = [[] for _ in contenders]
+    parts: list[list[tuple[float, float]]] = [[] for _ in contenders]
+    begin = time.perf_counter()
+    turn = 0
+    while turn < 3 or time.perf_counter() - begin < seconds:
+        for number, contender in enumerate(contenders):
+            if turn and min(found[number]) > 150.0 and time.perf_counter() - begin > seconds:
+                continue
+            for image in range(5):
+                frame = frames[(turn + image) % len(frames)]
+                before, worked = time.perf_counter(), time.process_time()
+                contender.image(frame)
+                found[number].append((time.perf_counter() - before) * 1e3)
+                processor[number].append((time.process_time() - worked) * 1e3)
+                if contender.parts is not None:
+                    parts[number].append(contender.parts())
+                if min(found[number]) > 8.0:
+                    break
+        turn += 1
+    timings = []
+    for wall, own, known in zip(found, processor, parts, strict=True):
+        finding, sampling = np.median(known, axis=0).tolist() if known else (math.nan, math.nan)
+        timings.append(
+            {
+                "ms_median": float(np.median(wall)),
+                "ms_p99": float(np.percentile(wall, 99)),
+                "cpu_ms_median": float(np.median(own)),
+                "filter_ms": finding,
+                "sampling_ms": sampling,
+                "images": len(wall),
+            }
+        )
+    return timings
+
+
+def compare(
+    volume: Volume,
+    frame: Frame,
+    exact: ExactSlice,
+    image: NDArray[np.uint8],
+    rest: NDArray[np.float64],
+    contrast: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
+    tissue_only: bool = False,
+) -> dict[str, float]:
+    """Errors, by columns of `Point`, of an image (rows, columns) and of its places at rest.
+
+    Args:
+        volume: that was cut.
+        frame: nodes and plane.
+        exact: the reference.
+        image: grey values.
+        rest: (rows, columns, 3) m, places at rest; NaN where the method found nothing.
+        contrast: reference and image of a volume of black and white voxels: whatever the method
+            says in ``rest``, there a pixel shows its place to half a grey level or 0.002 voxels.
+        tissue_only: the method knows nothing of the rigid volume outside the mesh: grey values
+            and places are compared where both find tissue.
+    """
+    right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
+    greys = right if tissue_only else np.ones(right.shape, dtype=np.bool_)
+    grey = np.abs(image - np.rint(exact.grey))[greys]
+    distance = voxel_distance(volume, rest, expected)[right].max(initial=0.0)
+    if contrast is not None:
+        shown, seen = contrast
+        off = np.abs(seen - shown)[right].max(initial=0.0)
+        # A value is rounded to a whole one, and from black to white is a voxel.
+        distance = max(distance, (off - 0.5 - 1e-6) / 255.0)
+    return {
+        "coverage_mismatch_px": int(wrong.sum()),
+        "max_grey_difference": float(grey.max(initial=0.0)),
+        "mean_grey_difference": float(grey.mean()) if grey.size else 0.0,
+        "max_voxel_error": float(distance),
+    }
+
+
+def wrong_pixels(
+    volume: Volume, frame: Frame, exact: ExactSlice, rest: NDArray[np.float64], tissue_only: bool
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
+    """Which pixels' coverage is right and which wrong; arguments as for `compare`.
+
+    Returns:
+        (rows, columns): where both show the same kind of thing and something; where they do not
+        show the same; and (rows, columns, 3) m, where each pixel is from.
+    """
+    expected = np.where(exact.tissue[..., None], exact.rest, np.nan) if tissue_only else exact.rest
+    known, seen = np.isfinite(expected[..., 0]), np.isfinite(rest[..., 0])
+    pixels = frame.plane.pixels()
+    moved = voxel_distance(volume, expected, pixels) > 0.01
+    seen_moved = voxel_distance(volume, rest, pixels) > 0.005
+    # Tissue that hardly moved is where the rigid volume is, and shows the same.
+    right = known & seen & ~(moved & ~seen_moved) & (exact.tissue | ~seen_moved)
+    return right, (known | seen) & ~right, expected
+
+
+def costs(
+    volume: Volume, quick: bool
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """ms of processor time of whole images in the main case, by probe and by imaging setting.
+
+    The third are the parts of each probe's pixels that show something.
+    """
+    mesh, frames = MAIN.mesh(), MAIN.frames(4)
+    linear = LinearProbe(aperture=0.06, depth=0.08, columns=MAIN.size, rows=MAIN.size)
+    size: Any = {"depth": 0.08, "columns": MAIN.size, "rows": MAIN.size}
+    probes: dict[str, Probe] = {
+        "linear, 60 × 80 mm": linear,
+        "convex, 40 mm radius, 60°": ConvexProbe(
+            radius=0.04, opening_angle=math.radians(60), **size
+        ),
+        "sector, 90°": SectorProbe(aperture=0.02, opening_angle=math.radians(90), **size),
+    }
+    settings = {
+        "all at their defaults": Imaging(),
+        "gain": Imaging(gain=6.0),
+        "time gain, dynamic range, grey map": Imaging(
+            time_gain=(0.0, 3.0, 6.0), dynamic_range=50.0, grey_map="soft"
+        ),
+        "lateral and axial resolution": Imaging(lateral_resolution=1.5e-3, axial_resolution=0.5e-3),
+        "contact": Imaging(contact=True),
+        "5 elevation planes": Imaging(elevation_planes=5),
+    }
+    slicer = create_slicer(OURS, volume, mesh.nodes, mesh.tetrahedra)
+    surface = ContactSurface(mesh.nodes, mesh.boundary)
+    pose = Pose(np.array([0.0, 0.0, DEPTHS[MAIN.deformation]]))
+
+    def imaged(probe: Probe, imaging: Imaging) -> Callable[[int], object]:
+        formation = ImageFormation(probe, imaging)
+
+        def image(number: int) -> object:
+            nodes = frames[number % len(frames)].nodes
+            images = [slicer.image(nodes, plane) for plane in formation.planes(pose)]
+            if not formation.needs_contact:
+                return formation.form(images)
+            return formation.form(images, *surface.contact(nodes, probe, pose))
+
+        return image
+
+    work = {name: imaged(probe, Imaging()) for name, probe in probes.items()}
+    work |= {name: imaged(linear, imaging) for name, imaging in settings.items()}
+    median = medians_in_turn(work, 16 if quick else 61, 1, all_threads=True)
+    shown = {name: float(probe.plane(pose).is_shown().mean()) for name, probe in probes.items()}
+    return {n: median[n] for n in probes}, {n: median[n] for n in settings}, shown
 
 
 class VtkSlicer:
-    """Cuts images with VTK.
+    """Cuts images with VTK, as a user of VTK would, to compare with.
+
+    `vtkProbeFilter` finds the pixels in the deformed mesh, whose nodes carry their coordinates at
+    rest, and interpolates those; a second one samples the volume there. The mesh is passed to it in
+    columns, rows and heights over the image, since it ignores an image's direction matrix; that is
+    also its fast method, which goes through the cells instead of searching one for each pixel.
 
     Args:
         volume: in frame ``patient``.
@@ -124,10 +364,8 @@ class VtkSlicer:
         ImportError: VTK is not installed.
     """
 
-    filter_ms: float = float("nan")
-    """Processor time of finding the pixels of the latest image."""
-    sampling_ms: float = float("nan")
-    """Processor time of sampling the volume for the latest image."""
+    filter_ms = sampling_ms = float("nan")
+    """Processor time of finding the latest image's pixels, and of sampling the volume there."""
 
     def __init__(
         self,
@@ -226,243 +464,3 @@ class VtkSlicer:
         """(rows, columns): which pixels of the latest image lie in the mesh."""
         mask = self._finder.GetOutput().GetPointData().GetArray("vtkValidPointMask")
         return np.asarray(self._to_numpy(mask).reshape(plane.rows, plane.columns) > 0)
-
-
-_AGAIN = 5  # images in a turn of a method that takes less than _SHORT
-
-
-_SHORT = 8.0  # ms
-
-
-_FEWEST = 3  # turns of each method that takes less than _SLOW
-
-
-_SLOW = 150.0  # ms
-
-
-_MOVED = 0.01
-"""Voxels by which tissue must have moved before taking it for the rigid volume can be told."""
-
-
-_ROUNDED = 0.5 + 1e-6  # grey levels
-
-
-class Errors(NamedTuple):
-    """How much an image differs from what it must show."""
-
-    coverage_mismatch_px: int  # pixels that show tissue, the rigid volume or black wrongly
-    max_grey_difference: float
-    mean_grey_difference: float
-    max_voxel_error: float  # of the place at rest, over the pixels without a mismatch
-
-
-@dataclass(frozen=True)
-class Point(Row):
-    """A row of slice.csv, and what the report says beyond it."""
-
-    method: str
-    size: int  # columns, and rows
-    nodes: int
-    tets: int
-    threads: int
-    ms_median: float = float("nan")
-    ms_p99: float = float("nan")
-    coverage_mismatch_px: int = 0
-    max_grey_difference: float = float("nan")
-    mean_grey_difference: float = float("nan")
-    max_voxel_error: float = float("nan")
-    deformation: str = ""
-    plane: str = ""
-    cpu_ms_median: float = float("nan")  # processor time, of all threads
-    filter_ms: float = float("nan")  # of VTK: finding pixels, processor time
-    sampling_ms: float = float("nan")  # of VTK: sampling, processor time
-    images: int = 0  # that were timed
-    failure: str = not_a_column("")
-
-    @property
-    def title(self) -> str:
-        """The method and what it cut."""
-        return f"{self.method} on {self.size} px, {self.nodes} nodes"
-
-
-@dataclass(frozen=True, eq=False)
-class Timing(RunTimes):
-    """How long one method's images took."""
-
-    processor: NDArray[np.float64]  # ms, of all threads
-    parts: tuple[float, float] = (float("nan"), float("nan"))  # ms, medians, where they are known
-
-
-def timed_together(
-    contenders: Sequence[Contender], frames: Sequence[Frame], seconds: float
-) -> list[Timing]:
-    """Times of all contenders, taken in turns, so that a noisy machine is as noisy for all.
-
-    The probe moves on from image to image. Where a method says what parts its images took, their
-    medians come too.
-
-    Args:
-        contenders: to be timed; each has cut an image before, so that nothing is compiled now.
-        frames: what they cut, over and over.
-        seconds: after which no further turn begins, if each has had a few; slow methods sit those
-            few out.
-    """
-    found: list[list[float]] = [[] for _ in contenders]
-    processor: list[list[float]] = [[] for _ in contenders]
-    parts: list[list[tuple[float, float]]] = [[] for _ in contenders]
-    begin = time.perf_counter()
-    turn = 0
-    while turn < _FEWEST or time.perf_counter() - begin < seconds:
-        for number, contender in enumerate(contenders):
-            if turn and min(found[number]) > _SLOW and time.perf_counter() - begin > seconds:
-                continue
-            for image in range(_AGAIN):
-                frame = frames[(turn + image) % len(frames)]
-                before, worked = time.perf_counter(), time.process_time()
-                contender.image(frame)
-                found[number].append((time.perf_counter() - before) * 1e3)
-                processor[number].append((time.process_time() - worked) * 1e3)
-                if contender.parts is not None:
-                    parts[number].append(contender.parts())
-                if min(found[number]) > _SHORT:
-                    break
-        turn += 1
-    timings = []
-    for wall, own, known in zip(found, processor, parts, strict=True):
-        timing = Timing(np.array(wall), np.array(own))
-        medians = tuple(np.median(known, axis=0).tolist()) if known else timing.parts
-        timings.append(replace(timing, parts=medians))
-    return timings
-
-
-def compare(
-    volume: Volume,
-    frame: Frame,
-    exact: ExactSlice,
-    image: NDArray[np.uint8],
-    rest: NDArray[np.float64],
-    contrast: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
-    tissue_only: bool = False,
-) -> Errors:
-    """How wrong an image (rows, columns), and where it took it from (rows, columns, 3) m, are.
-
-    Args:
-        volume: that was cut.
-        frame: what was cut.
-        exact: what it must show.
-        image: grey values.
-        rest: NaN where the method found nothing.
-        contrast: what the image of a volume of black and white voxels must show, and the method's
-            image of it: whatever the method says in ``rest``, there a pixel shows where it comes
-            from, to half a grey level or 0.002 voxels.
-        tissue_only: the method knows nothing of the rigid volume outside the mesh: grey values
-            and places are compared where both find tissue.
-    """
-    right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
-    greys = right if tissue_only else np.ones(right.shape, dtype=np.bool_)
-    grey = np.abs(image - np.rint(exact.grey))[greys]
-    distance = voxel_distance(volume, rest, expected)[right].max(initial=0.0)
-    if contrast is not None:
-        shown, seen = contrast
-        off = np.abs(seen - shown)[right].max(initial=0.0)
-        # A value is rounded to a whole one, and from black to white is a voxel.
-        distance = max(distance, (off - _ROUNDED) / 255.0)
-    return Errors(
-        int(wrong.sum()),
-        float(grey.max(initial=0.0)),
-        float(grey.mean()) if grey.size else 0.0,
-        float(distance),
-    )
-
-
-def wrong_pixels(
-    volume: Volume, frame: Frame, exact: ExactSlice, rest: NDArray[np.float64], tissue_only: bool
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-    """Which pixels' coverage is right and which wrong; arguments as for `compare`.
-
-    Returns:
-        (rows, columns): where both show the same kind of thing and something; where they do not
-        show the same; and (rows, columns, 3) m, where each pixel is from.
-    """
-    expected = np.where(exact.tissue[..., None], exact.rest, np.nan) if tissue_only else exact.rest
-    known, seen = np.isfinite(expected[..., 0]), np.isfinite(rest[..., 0])
-    pixels = frame.plane.pixels()
-    moved = voxel_distance(volume, expected, pixels) > _MOVED
-    seen_moved = voxel_distance(volume, rest, pixels) > _MOVED / 2
-    # Tissue that hardly moved is where the rigid volume is, and shows the same.
-    right = known & seen & ~(moved & ~seen_moved) & (exact.tissue | ~seen_moved)
-    return right, (known | seen) & ~right, expected
-
-
-_LINEAR = LinearProbe(aperture=0.06, depth=0.08, columns=MAIN.size, rows=MAIN.size)
-
-
-_PROBES: Mapping[str, Probe] = {
-    "linear, 60 × 80 mm": _LINEAR,
-    "convex, 40 mm radius, 60°": ConvexProbe(
-        radius=0.04, opening_angle=math.radians(60), depth=0.08, columns=MAIN.size, rows=MAIN.size
-    ),
-    "sector, 90°": SectorProbe(
-        aperture=0.02, opening_angle=math.radians(90), depth=0.08, columns=MAIN.size, rows=MAIN.size
-    ),
-}
-
-
-_SETTINGS = {
-    "all at their defaults": Imaging(),
-    "gain": Imaging(gain=6.0),
-    "time gain, dynamic range, grey map": Imaging(
-        time_gain=(0.0, 3.0, 6.0), dynamic_range=50.0, grey_map="soft"
-    ),
-    "lateral and axial resolution": Imaging(lateral_resolution=1.5e-3, axial_resolution=0.5e-3),
-    "contact": Imaging(contact=True),
-    "5 elevation planes": Imaging(elevation_planes=5),
-}
-
-
-@dataclass(frozen=True)
-class Cost:
-    """One line of the table."""
-
-    what: str
-    ms: float  # of a whole image, processor time, median
-    shown: float = 1.0  # part of the image's pixels that show something
-
-
-def costs(volume: Volume, quick: bool) -> tuple[list[Cost], list[Cost]]:
-    """Whole images in the main case on one thread: by probe, and by setting."""
-    mesh = MAIN.mesh()
-    frames = MAIN.frames(4)
-    slicer = create_slicer("scan_conversion", volume, mesh.nodes, mesh.tetrahedra)
-    surface = ContactSurface(mesh.nodes, mesh.boundary)
-    pose = Pose(np.array([0.0, 0.0, DEPTHS[MAIN.deformation]]))
-
-    def imaged(probe: Probe, imaging: Imaging) -> Callable[[int], object]:
-        formation = ImageFormation(probe, imaging)
-
-        def image(number: int) -> object:
-            nodes = frames[number % len(frames)].nodes
-            images = [slicer.image(nodes, plane) for plane in formation.planes(pose)]
-            if not formation.needs_contact:
-                return formation.form(images)
-            return formation.form(images, *surface.contact(nodes, probe, pose))
-
-        return image
-
-    work = {name: imaged(probe, Imaging()) for name, probe in _PROBES.items()}
-    work |= {name: imaged(_LINEAR, imaging) for name, imaging in _SETTINGS.items()}
-    median = _medians(work, 15 if quick else 60)
-    shown = {name: float(probe.plane(pose).is_shown().mean()) for name, probe in _PROBES.items()}
-    probes = [Cost(name, median[name], shown[name]) for name in _PROBES]
-    return probes, [Cost(name, median[name]) for name in _SETTINGS]
-
-
-def _medians(work: Mapping[str, Callable[[int], object]], images: int) -> dict[str, float]:
-    """ms of processor time each takes, all in turns; the first image of each is not counted."""
-    found: dict[str, list[float]] = {name: [] for name in work}
-    for number in range(images + 1):
-        for name, image in work.items():
-            before = time.process_time()
-            image(number)
-            found[name].append((time.process_time() - before) * 1e3)
-    return {name: float(np.median(ms[1:])) for name, ms in found.items()}

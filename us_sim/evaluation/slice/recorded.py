@@ -1,30 +1,17 @@
-"""Where a probe's fan lies in the images that a scanner recorded.
+"""Simulated images beside those that a real probe recorded at the same poses.
+
+A freehand sweep was compounded to a volume; cutting that volume along the sweep's own poses must
+give back its images, but for the blur of compounding. This tests the whole path from a pose to an
+image on real data: the probe's geometry, the frames and their units, the slicer.
 
 >>> import numpy as np
->>> from us_sim.evaluation.slice.recorded import LIVER_SWEEP
+>>> from us_sim.evaluation.slice.recorded import LIVER_SWEEP, normalised_cross_correlation
 >>> probe = LIVER_SWEEP.probe(0.314818e-3)
 >>> round(probe.radius * 1e3, 2), round(probe.depth * 1e3, 2), probe.rows
 (50.79, 177.25, 585)
->>> frame = np.diag([0.314818e-3, 0.314818e-3, 0.314818e-3, 1.0])
->>> (LIVER_SWEEP.pose(frame).position * 1e3).round(2)
-array([116.17,   6.93,   0.  ])
-
-A recorded frame and the image simulated at its pose, on the same pixels, and how alike they are.
-
->>> import numpy as np
->>> from us_sim.evaluation.slice.recorded import normalised_cross_correlation
 >>> image = np.array([[1.0, 2.0], [3.0, 9.0]])
->>> everywhere = np.ones((2, 2), dtype=bool)
->>> round(normalised_cross_correlation(image, 5.0 - 2.0 * image, everywhere), 12)
+>>> round(normalised_cross_correlation(image, 5.0 - 2.0 * image, np.ones((2, 2), bool)), 12)
 -1.0
-
-Recorded frames and simulated images side by side, and how alike they are along the sweep.
-
-Simulated images beside those that a real probe recorded at the same poses.
-
-A freehand sweep was compounded to a volume; cutting that volume along the sweep's own poses must
-give back its images, but for what compounding blurred. This puts to the test, on real data, the
-whole path from a pose to an image: the probe's geometry, the frames and their units, the slicer.
 """
 
 from __future__ import annotations
@@ -41,7 +28,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.evaluation.report import Row, markdown_table, write_rows
+from us_sim.evaluation.report import Row, filled, markdown_table, write_rows
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer
@@ -51,6 +38,8 @@ from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
 from us_sim.volume.volume import Volume
+
+_ATTRIBUTION = "Data: ImFusion GmbH, CC BY 4.0"
 
 
 @dataclass(frozen=True)
@@ -117,8 +106,6 @@ are not compared."""
 
 SHIFT_STEP = 0.63e-3
 """m, between the shifts that are tried; about two pixels of the liver sweep."""
-
-LARGEST_SHIFT = 3 * SHIFT_STEP
 
 _SHIFTS = SHIFT_STEP * np.arange(-3, 4)
 _COARSE = 5e-3  # m, standard deviation of the Gaussian that leaves no structures
@@ -291,22 +278,14 @@ def normalised_cross_correlation(
     return float(first @ second) / scale if scale else math.nan
 
 
-_BRIGHTEST = 99.2  # percentile that is shown white, since few pixels of a recording are bright
-_DIFFERENCE = 40.0  # grey levels, at the ends of the colour scale
-
-
-def draw_recorded(
-    rows: Sequence[RecordedFrame],
-    pairs: Sequence[RecordedPair],
-    probe: Probe,
-    attribution: str,
-    file: Path,
+def _draw_recorded(
+    rows: Sequence[RecordedFrame], pairs: Sequence[RecordedPair], probe: Probe, file: Path
 ) -> None:
     """A column a pair: recorded, simulated, their difference; below, all frames' correlation."""
     figure = Figure(figsize=(2.9 * len(pairs) + 0.8, 9.6), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(4, len(pairs), height_ratios=(1, 1, 1, 0.7))
-    white = float(np.percentile([pair.recorded for pair in pairs], _BRIGHTEST))
+    white = float(np.percentile([pair.recorded for pair in pairs], 99.2))  # few pixels are bright
     corner = 1e3 * (probe.image_to_probe @ [-0.5, -0.5, 0, 1])
     end = 1e3 * (probe.image_to_probe @ [probe.columns - 0.5, probe.rows - 0.5, 0, 1])
     extent = (corner[0], end[0], end[2], corner[2])
@@ -319,7 +298,7 @@ def draw_recorded(
             (
                 ("recorded", pair.recorded, "gray", (0.0, white)),
                 ("simulated", pair.simulated, "gray", (0.0, white)),
-                ("simulated − recorded", difference, "RdBu_r", (-_DIFFERENCE, _DIFFERENCE)),
+                ("simulated − recorded", difference, "RdBu_r", (-40.0, 40.0)),
             )
         ):
             axes = figure.add_subplot(grid[line, column])
@@ -336,7 +315,7 @@ def draw_recorded(
     _plot_correlation(figure.add_subplot(grid[3, :]), rows)
     figure.suptitle(
         f"Real frames of a freehand sweep, and the volume made from it cut at their poses.  "
-        f"{attribution}",
+        f"{_ATTRIBUTION}",
         fontsize=13,
     )
     figure.savefig(file, dpi=80)
@@ -359,22 +338,14 @@ def _plot_correlation(axes, rows: Sequence[RecordedFrame]) -> None:  # type: ign
     axes.legend(loc="lower left", fontsize=9, ncols=4)
 
 
-_ATTRIBUTION = "Data: ImFusion GmbH, CC BY 4.0"
-_ASKED = 0.8  # normalised cross-correlation
-_HEAD = ("normalised cross-correlation with", "lowest", "median", "highest", "at least 0.8")
-_SHOWN = 6  # frames in the picture
-_QUICK = 10  # every so many frames are compared in a quick run
-
-
 @dataclass(frozen=True, eq=False)
 class RecordedComparison:
-    """What `compare_with_recorded` found."""
+    """Result of `compare_with_recorded`."""
 
     rows: Sequence[RecordedFrame]
     shifts: NDArray[np.float64]  # (P, 3) m, along x, y, z of the probe, that would fit best
     left_out: int  # frames of the sweep without a usable pose or time
     probe: ConvexProbe
-    files: Sequence[Path]
 
     @property
     def lowest(self) -> float:
@@ -382,9 +353,8 @@ class RecordedComparison:
         return min(row.ncc_raw for row in self.rows)
 
     def markdown(self) -> str:
-        """A paragraph, a table and what follows from it, for a report."""
+        """Section of the report."""
         probe = self.probe
-        coverage = np.mean([row.coverage for row in self.rows])
         rows = []
         for name, words in (
             ("ncc_raw", "the frame as recorded"),
@@ -393,28 +363,32 @@ class RecordedComparison:
         ):
             ncc = np.array([getattr(row, name) for row in self.rows])
             numbers = (f"{x:.3f}" for x in (ncc.min(), np.median(ncc), ncc.max()))
-            rows.append((words, *numbers, f"{(ncc >= _ASKED).sum()} of {len(ncc)}"))
+            rows.append((words, *numbers, f"{(ncc >= 0.8).sum()} of {len(ncc)}"))
+        head = ("normalised cross-correlation with", "lowest", "median", "highest", "at least 0.8")
         lateral, elevation, axial = 1e3 * np.abs(self.shifts).max(axis=0)
-        parts = [
-            f"{len(self.rows)} recorded frames beside the volume cut at their poses: a curved "
-            f"array of {1e3 * probe.radius:.1f} mm radius, "
-            f"{math.degrees(probe.opening_angle):.1f}° and {1e3 * probe.depth:.0f} mm depth, "
-            f"{probe.columns} × {probe.rows} pixels of {1e3 * probe.pixel_spacing[1]:.3f} mm. "
-            f"They are compared in the fan, {1e3 * MARGIN:g} mm or more inside what the sweep "
-            f"covers ({100 * coverage:.0f} % of the fan). {self.left_out} frames had no "
-            f"usable pose.",
-            markdown_table(_HEAD, rows),
-            "The volume is the mean of these very frames: this shows that poses, geometry and "
-            "sampling are right, not how well an unseen image would be foretold. Tissue at rest "
-            "and the volume without tissue differ by "
-            f"{max(row.grey_difference_rigid for row in self.rows)} grey levels at most. Of all "
-            f"shifts by up to {1e3 * LARGEST_SHIFT:.1f} mm (in steps of {1e3 * SHIFT_STEP:.1f} "
-            f"mm, judged by structures of 1 to 5 mm in {len(self.shifts)} frames), those that fit "
-            f"best are at most {lateral:.1f} mm along the array, {axial:.1f} mm along the depth "
-            f"and {elevation:.1f} mm across the image. "
-            f"{_ATTRIBUTION}.",
-        ]
-        return "\n\n".join(parts)
+        return filled(
+            "slice",
+            "recorded",
+            count=f"{len(self.rows)}",
+            radius=f"{1e3 * probe.radius:.1f}",
+            angle=f"{math.degrees(probe.opening_angle):.1f}",
+            depth=f"{1e3 * probe.depth:.0f}",
+            columns=f"{probe.columns}",
+            rows=f"{probe.rows}",
+            spacing=f"{1e3 * probe.pixel_spacing[1]:.3f}",
+            margin=f"{1e3 * MARGIN:g}",
+            coverage=f"{100 * np.mean([row.coverage for row in self.rows]):.0f}",
+            left_out=f"{self.left_out}",
+            table=markdown_table(head, rows),
+            rigid=f"{max(row.grey_difference_rigid for row in self.rows)}",
+            largest=f"{3e3 * SHIFT_STEP:.1f}",
+            step=f"{1e3 * SHIFT_STEP:.1f}",
+            shifted=f"{len(self.shifts)}",
+            lateral=f"{lateral:.1f}",
+            axial=f"{axial:.1f}",
+            elevation=f"{elevation:.1f}",
+            attribution=_ATTRIBUTION,
+        )
 
 
 def compare_with_recorded(
@@ -440,8 +414,8 @@ def compare_with_recorded(
     """
     volume, sweep = read_volume(volume_file), read_sweep(sweep_file)
     frames = RecordedPairs.of(volume, sweep, fan, method)
-    chosen = list(range(0, len(sweep.numbers), _QUICK if quick else 1))
-    shown = {chosen[i] for i in np.linspace(0, len(chosen) - 1, _SHOWN).round().astype(int)}
+    chosen = list(range(0, len(sweep.numbers), 10 if quick else 1))
+    shown = {chosen[i] for i in np.linspace(0, len(chosen) - 1, 6).round().astype(int)}
     rows, pairs, shifts = [], [], []
     for index, image in zip(chosen, sweep.images(chosen), strict=True):
         pair = frames.pair(sweep, index, image)
@@ -450,8 +424,7 @@ def compare_with_recorded(
             pairs.append(pair)
             shifts.append(frames.best_shift(pair))
     out.mkdir(parents=True, exist_ok=True)
-    table, picture = out / "recorded_frames.csv", out / "recorded_frames.png"
-    write_rows(table, rows)
-    draw_recorded(rows, pairs, frames.probe, _ATTRIBUTION, picture)
+    write_rows(out / "recorded_frames.csv", rows)
+    _draw_recorded(rows, pairs, frames.probe, out / "recorded_frames.png")
     left_out = sum(sweep.left_out.values())
-    return RecordedComparison(rows, np.array(shifts), left_out, frames.probe, (table, picture))
+    return RecordedComparison(rows, np.array(shifts), left_out, frames.probe)

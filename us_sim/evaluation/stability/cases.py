@@ -1,27 +1,11 @@
-"""The stiff and extreme cases on which every tissue solver is tried.
+"""Stiff and extreme cases for tissue solvers: small meshes, materials, supports and motions.
 
->>> from us_sim.evaluation.stability.cases import sampled_cases
+>>> from us_sim.evaluation.stability.cases import held_cases, mesh_named, poses_of, sampled_cases
 >>> cases = sampled_cases(64)
->>> len(cases), cases == sampled_cases(64)
-(64, True)
-
-Small tissues on which solvers are tried: well shaped, badly shaped, in pieces, badly held.
-
->>> from us_sim.evaluation.stability.cases import MESHES, mesh_named
->>> sorted(MESHES)[:3], len(mesh_named("box").nodes)
-(['box', 'delaunay', 'fine'], 64)
-
-Cases within what anatomy is, in which a probe that is held must come to balance.
-
->>> from us_sim.evaluation.stability.cases import held_cases
->>> cases = held_cases(3, seed=1)
->>> [case.case for case in cases], cases == held_cases(3, seed=1)
-(['held 1.0', 'held 1.1', 'held 1.2'], True)
-
-What a probe does to a tissue to break its solver: pressing, jumping, trembling, and worse.
-
->>> from us_sim.evaluation.stability.cases import poses_of
->>> from us_sim.evaluation.stability.cases import mesh_named
+>>> len(cases), cases == sampled_cases(64), len(mesh_named("box").nodes)
+(64, True, 64)
+>>> [case.case for case in held_cases(3, seed=1)]
+['held 1.0', 'held 1.1', 'held 1.2']
 >>> [round(float(pose.position[2]), 3) for pose in poses_of("press", mesh_named("box"), 0.5)]
 [0.008, 0.016, 0.024, 0.032, 0.04, 0.04, 0.04]
 """
@@ -73,11 +57,7 @@ MOTIONS = (
     *("press", "jump", "through", "tremor", "slide", "tilt", "sideways", "upside down"),
     *("scribble", "flicker"),
 )
-"""What the probe does, see `us_sim.evaluation.stability.cases`."""
-
-_STIFFEST = 12.0  # decimal logarithm of Pa
-_GREATEST_CONTRAST = 9.0  # decimal logarithm
-_REACHED_FROM_ALL_SIDES = ("through", "sideways", "upside down", "scribble")
+"""Motions of the probe, see `poses_of`."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +97,11 @@ def _sampled(number: int, point: NDArray[np.float64]) -> StabilityCase:
     def one_of(values: tuple[str, ...], fraction: float) -> str:
         return values[int(fraction * len(values))]
 
-    contrast = _GREATEST_CONTRAST * point[1]
+    contrast = 9.0 * point[1]  # decimal logarithm, as the stiffest modulus, 12
     damping = 8 * point[5] / 7 - 1 / 7
     return StabilityCase(
         case=f"sample {number}",
-        young_modulus=float(10 ** ((_STIFFEST - contrast) * point[0])),
+        young_modulus=float(10 ** ((12.0 - contrast) * point[0])),
         contrast=float(10**contrast),
         poisson_ratio=float(0.5 - 0.5 * 10 ** (math.log10(2e-4) * point[2])),
         density=float(10 ** (6 * point[3])),
@@ -216,7 +196,7 @@ def model_of(case: StabilityCase) -> TissueModel:
         modulus, np.full(count, case.poisson_ratio), np.full(count, case.density)
     )
     fixed = fixed_nodes(mesh, case.support)
-    everywhere = case.motion in _REACHED_FROM_ALL_SIDES
+    everywhere = case.motion in ("through", "sideways", "upside down", "scribble")
     reached = np.unique(mesh.boundary) if everywhere else face_nodes(mesh, "top")
     collider = _scaled(COLLIDERS[case.collider], float(np.ptp(mesh.nodes[:, 0])) / 0.1)
     return TissueModel(mesh, materials, fixed, collider, reached.astype(np.int32))
@@ -246,9 +226,6 @@ def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
 
 SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
 """What of a tissue is held."""
-
-_FLATTEST = 1e-7
-"""Volume over the longest edge cubed, below which a tetrahedron of Delaunay's is left out."""
 
 
 @lru_cache
@@ -311,7 +288,7 @@ def _delaunay() -> TetrahedralMesh:
     volume = signed_volumes(points, corners)
     corners[volume < 0] = corners[volume < 0][:, [0, 1, 3, 2]]
     longest = np.max([np.linalg.norm(p - q, axis=1) for p in (a, b, c, d) for q in (a, b, c)], 0)
-    corners = corners[np.abs(volume) > _FLATTEST * longest**3]
+    corners = corners[np.abs(volume) > 1e-7 * longest**3]
     used, renumbered = np.unique(corners, return_inverse=True)
     return TetrahedralMesh(points[used], renumbered.reshape(corners.shape))
 
@@ -374,53 +351,40 @@ HOLD = 30
 SMALL = 1e-3
 """Residual that must be reached by then."""
 
-_MESHES = ("box", "fine", "layered", "perturbed", "delaunay", "slab")
-_MOTIONS = ("press", "jump", "slide", "tilt", "tremor")
-_COLLIDERS = ("sphere", "capsule", "plate", "pebble")
-_SUPPORTS = ("bottom", "walls")
-_MODULUS = (3.0, 5.0)  # decimal logarithms of Pa, of the softest tetrahedron
-_CONTRAST = (0.0, 3.0)  # decimal logarithms
-_COMPRESSIBLE = (0.005, 0.2)  # 0.5 - Poisson's ratio, from 0.495 to 0.3
-_DEPTH = (0.05, 0.5)  # of the thickness
-
 
 def held_cases(count: int, seed: int) -> list[StabilityCase]:
-    """So many cases at random; another seed gives others.
+    """So many random cases within anatomy, in which a held probe must come to balance.
 
     Moduli are 1 to 100 kPa (the softest), contrasts up to 1000, Poisson's ratios 0.3 to 0.495,
-    depths 5 to 50 % of the thickness; modulus, contrast and what is left to incompressibility are
-    even in their logarithms.
+    depths 5 to 50 % of the thickness; modulus, contrast and 0.5 minus Poisson's ratio are even in
+    their logarithms.
     """
     random = np.random.default_rng(seed)
 
-    def between(ends: tuple[float, float]) -> float:
-        return float(random.uniform(*ends))
+    def between(low: float, high: float) -> float:
+        return float(random.uniform(low, high))
 
-    def one_of(names: tuple[str, ...]) -> str:
+    def one_of(*names: str) -> str:
         return names[int(random.integers(len(names)))]
 
-    low, high = (float(np.log10(part)) for part in _COMPRESSIBLE)
     return [
         StabilityCase(
             case=f"held {seed}.{number}",
-            young_modulus=10 ** between(_MODULUS),
-            contrast=10 ** between(_CONTRAST),
-            layout=one_of(LAYOUTS),
-            poisson_ratio=0.5 - 10 ** between((low, high)),
-            depth=between(_DEPTH),
-            motion=one_of(_MOTIONS),
-            mesh=one_of(_MESHES),
-            support=one_of(_SUPPORTS),
-            collider=one_of(_COLLIDERS),
-            release=one_of(("removed", "lifted")),
+            young_modulus=10 ** between(3.0, 5.0),
+            contrast=10 ** between(0.0, 3.0),
+            layout=one_of(*LAYOUTS),
+            poisson_ratio=0.5 - 10 ** between(float(np.log10(0.005)), float(np.log10(0.2))),
+            depth=between(0.05, 0.5),
+            motion=one_of("press", "jump", "slide", "tilt", "tremor"),
+            mesh=one_of("box", "fine", "layered", "perturbed", "delaunay", "slab"),
+            support=one_of("bottom", "walls"),
+            collider=one_of("sphere", "capsule", "plate", "pebble"),
+            release=one_of("removed", "lifted"),
             held=HOLD,
         )
         for number in range(count)
     ]
 
-
-_TREMOR = 1000.0  # Hz
-_FRAME_RATE = 2718.0  # Hz; no small multiple of the tremor's, so that no phase repeats
 
 LIFTED = Pose(position=np.array([0.0, 0.0, -100.0]))  # far from any tissue
 
@@ -457,7 +421,8 @@ def _centred(motion: str, mesh: TetrahedralMesh, depth: float) -> list[Pose | No
         stops = (-0.2 * thick, deep, 2.5 * thick, deep, -0.2 * thick, deep)
         return [_at(z=z) for z in stops]
     if motion == "tremor":
-        phase = 2 * np.pi * _TREMOR / _FRAME_RATE * np.arange(14)
+        # 1 kHz at 2718 frames a second: no small multiple, so that no phase repeats.
+        phase = 2 * np.pi * 1000.0 / 2718.0 * np.arange(14)
         return [_at(z=deep + 0.02 * thick * shake) for shake in np.sin(phase)]
     if motion == "slide":
         aside = (0.0, 0.0, 0.1, 0.25, 0.45, 0.7, 0.2)

@@ -1,24 +1,11 @@
-"""One solver on one extreme case: did it stay finite and bounded, come back, and say the truth.
+"""One solver on one extreme case: finite, bounded, back at rest after release, and truthful?
 
 >>> from us_sim.evaluation.stability.cases import StabilityCase
->>> from us_sim.evaluation.stability.measure import try_case
+>>> from us_sim.evaluation.stability.measure import refusal_of, try_case
 >>> trial = try_case("fem_cg", StabilityCase("soft", young_modulus=1.0))
 >>> trial.finite, trial.bounded, trial.truthful, trial.recovered_mm
 (True, True, True, 0.0)
-
-Inputs that no solver may start on: each must be refused in one sentence.
-
->>> from us_sim.evaluation.stability.measure import REFUSALS, refusal_of
->>> trial = refusal_of("fem_cg", "a node is not a number")
->>> trial.refused, trial.passed
-(True, True)
-
-The longest stable step of an explicit method, found by trying, beside the one it predicts.
-
->>> from us_sim.evaluation.stability.measure import observed_step_limit
->>> from us_sim.evaluation.stability.cases import StabilityCase
->>> predicted, observed = observed_step_limit("msds", StabilityCase("paper's", damping=0.1))
->>> bool(abs(observed / predicted - 1) < 0.02)
+>>> refusal_of("fem_cg", "a node is not a number").refused
 True
 """
 
@@ -58,24 +45,13 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
-_NEGLIGIBLE, _FACTOR = 1e-5, 2.0
-"""Residuals below the first are the same; above it they agree within the second."""
-
-_QUASI_STATIC_FRAMES, _DYNAMIC_FRAMES = 40, 150
-"""Frames after the release, of methods without masses and of those with them."""
-
-_HELD = ("frames_to_1e-3", "held_residual", "held_inverted")
-"""What only a case has in which the probe was held."""
-
 _RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_checked", "truthful")
-"""What only a case that was not refused has."""
-
-_RECOVERED = 1e-4  # of the thickness; a tissue that is so near its rest has come back
+"""Columns of cases that were not refused."""
 
 
 @dataclass(eq=False)
 class Trial:
-    """What came of a case."""
+    """Result of a case."""
 
     finite: bool = True
     bounded: bool = True
@@ -92,7 +68,7 @@ class Trial:
     step_limit_observed: float = math.nan  # s
     slowest_ms: float = 0.0
     kept: int = 0  # frames that failed, so that the solver kept its last good state or rest
-    actions: list[str] = field(default_factory=list)  # what it said, each once
+    actions: list[str] = field(default_factory=list)  # that it reported, each once
 
     @property
     def passed(self) -> bool:
@@ -101,18 +77,18 @@ class Trial:
 
     @property
     def frames_to_balance(self) -> int | None:
-        """Of the hold, until the residual is small and stays so; None where it never is."""
+        """Frames of the hold until the residual stays small; None where it never does."""
         return frames_until(self.held, SMALL)
 
     def say(self, action: str) -> None:
-        """Add what a solver said."""
+        """Add an action that a solver reported."""
         if action and action not in self.actions:
             self.actions.append(action)
 
 
 @dataclass(frozen=True, eq=False)
 class Tried(Row):
-    """A method, the case it was tried on, and what came of that."""
+    """A method, the case it was tried on, and the result: a row of stability.csv."""
 
     digits = 6
 
@@ -123,7 +99,7 @@ class Tried(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """By column; what a method does not have, or a refused case lacks, is None."""
+        """By column; None where the method or a refused case has no such value."""
         trial, method = self.trial, TISSUE_METHODS[self.method]
         varied = {entry.name: None for entry in fields(StabilityCase)}
         if self.case is not None:
@@ -141,7 +117,9 @@ class Tried(Row):
             "method": self.method,
             **(varied | {"case": self.name}),
             "recovery_frames": ran("recovery_frames"),
-            **dict(zip(_HELD, self._held, strict=True)),
+            "frames_to_1e-3": trial.frames_to_balance if trial.held else None,
+            "held_residual": trial.held[-1] if trial.held else None,
+            "held_inverted": bool(trial.held_inverted) if trial.held else None,
             "dt_limit_predicted": trial.step_limit_predicted,
             "dt_limit_observed": trial.step_limit_observed,
             **{name: ran(name) for name in _RAN},
@@ -149,15 +127,8 @@ class Tried(Row):
         }
 
     @property
-    def _held(self) -> tuple[object, ...]:
-        trial = self.trial
-        if not trial.held:
-            return (None, None, None)
-        return trial.frames_to_balance, trial.held[-1], bool(trial.held_inverted)
-
-    @property
     def failure(self) -> str:
-        """What went wrong, and nothing where nothing did."""
+        """The first thing that went wrong; empty where nothing did."""
         trial = self.trial
         if trial.failure or trial.passed:
             return trial.failure
@@ -205,7 +176,7 @@ def run_trial(
     thickness = float(np.ptp(model.mesh.nodes[:, 2]))
     released = None if case.release == "removed" else LIFTED
     quasi_static = TISSUE_METHODS[solver.name].is_quasi_static
-    frames = _QUASI_STATIC_FRAMES if quasi_static else _DYNAMIC_FRAMES
+    frames = 40 if quasi_static else 150  # after the release
     last: Deformation | None = None
     stuck = 0
     for number, pose in enumerate([*poses, *[released] * frames]):
@@ -226,14 +197,13 @@ def run_trial(
             volumes = signed_volumes(deformation.nodes, model.mesh.tetrahedra)
             trial.held_inverted = int((volumes <= 0).sum())
         failed = Intervention.FRAME_FAILED in deformation.interventions
-        kept = Intervention.KEPT_STATE in deformation.interventions
         if failed:
             trial.kept += 1
             residual.forget()
-        if kept:
-            same = last is None or np.array_equal(deformation.nodes, last.nodes)
-            if not same or (last is not None and deformation.residual != last.residual):
-                trial.failure = "said that it kept the last good state, and returned another one"
+            if Intervention.KEPT_STATE in deformation.interventions and last is not None:
+                same = np.array_equal(deformation.nodes, last.nodes)
+                if not same or deformation.residual != last.residual:
+                    trial.failure = "said that it kept the last good state, and returned another"
         free = number - len(poses)
         moved = np.abs(deformation.nodes - model.mesh.nodes).max()
         trial.bounded = trial.bounded and bool(moved <= bound)
@@ -245,7 +215,7 @@ def run_trial(
         if free >= 0:
             away = _from_rest(model, deformation.nodes)
             trial.recovered_mm = 1e3 * away
-            if away > _RECOVERED * thickness:
+            if away > 1e-4 * thickness:
                 trial.recovery_frames = None
             elif trial.recovery_frames is None:
                 trial.recovery_frames = free + 1
@@ -260,7 +230,7 @@ def run_trial(
 
 
 def _unbalanced(trial: Trial, case: StabilityCase) -> str:
-    """What is wrong under the held probe; nothing where the tissue is in balance and upright."""
+    """Fault under the held probe; empty where the tissue is in balance and not inverted."""
     if trial.frames_to_balance is None:
         return f"held for {case.held} frames it was left with a residual of {trial.held[-1]:.3g}"
     if trial.held_inverted:
@@ -271,14 +241,14 @@ def _unbalanced(trial: Trial, case: StabilityCase) -> str:
 def agrees(reported: float, checked: float, rounding: float, least: bool = False) -> bool:
     """Whether a reported residual is true: within a factor of two, or both negligible.
 
-    Negligible is below 1e-5, or below what rounding the nodes to doubles makes. Where what was
-    checked is only the ``least`` that it can be, it may be greater.
+    Negligible is below 1e-5, or below the ``rounding`` of nodes to doubles. Where the checked one
+    is only the ``least`` that it can be, the reported one may be greater.
     """
-    floor = max(_NEGLIGIBLE, rounding)
+    floor = max(1e-5, rounding)
     if not (math.isfinite(reported) and math.isfinite(checked)):
         return False
     low, high = sorted((reported, checked))
-    return high <= floor or high <= _FACTOR * low or (least and checked <= reported)
+    return high <= floor or high <= 2.0 * low or (least and checked <= reported)
 
 
 def damping_factor(case: StabilityCase, model: TissueModel) -> float:
@@ -297,7 +267,7 @@ def damping_factor(case: StabilityCase, model: TissueModel) -> float:
 
 
 def equations_of(method: str, case: StabilityCase, model: TissueModel) -> IndependentResidual:
-    """What checks the residuals of a method on a case."""
+    """Independent residuals of a method on a case."""
     return TISSUE_METHODS[method].residual(model, spring_settings(case))
 
 
@@ -372,7 +342,7 @@ def _from_rest(model: TissueModel, nodes: NDArray[np.float64]) -> float:
 
 
 def refusal_of(method: str, name: str) -> Trial:
-    """What a method does with one of the inputs of `REFUSALS`."""
+    """Result of a method on one of the inputs of `REFUSALS`."""
     trial = Trial()
     try:
         REFUSALS[name](method)
@@ -473,21 +443,12 @@ REFUSALS: dict[str, Callable[[str], None]] = {
 """Each gives a method one broken input, by what is wrong with it."""
 
 
-_AMPLITUDE = 1e-8
-"""First displacements over the shortest edge: so small that springs do not turn."""
-_SWELLING = 1e3
-"""Growth that shows instability. Just below the limit amplitudes swell by 20 times and stay so."""
-_STEPS = 3000
-_PRECISION = 2e-3  # relative, of the bisection
-
-
 def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]:
-    """s, the step limit that a solver predicts for a case without a probe, and the observed one.
+    """Step limit, s, that a solver predicts for a case without a probe, and the observed one.
 
-    Both are infinite where every node is fixed, or the limit is none that can be set.
-
-    Small random displacements are let go with unscaled masses, for some thousand steps of a length
-    that is bisected until it is known whether they grow.
+    Small random displacements are released with unscaled masses, for some thousand steps, whose
+    length is bisected by whether they grow. Both limits are infinite where every node is fixed, or
+    the limit is none that can be set.
 
     Raises:
         UsSimError: the case is refused.
@@ -499,18 +460,20 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
     shape = np.random.default_rng(1).uniform(-1.0, 1.0, nodes.shape)
     shape[model.fixed] = 0.0
     edges = nodes[model.mesh.edges]
-    shape *= _AMPLITUDE * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).min()
+    # So small that springs do not turn.
+    shape *= 1e-8 * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).min()
     start = TissueState(shape, np.zeros_like(nodes))
 
     def grows(step: float) -> bool:
-        going_on = {"steps": _STEPS, "rest_tolerance": 0.0, **settings}
+        going_on = {"steps": 3000, "rest_tolerance": 0.0, **settings}
         solver = create_solver(method, model, time_step=step, **going_on)
         solver.take_over(start)
-        with np.errstate(over="ignore", invalid="ignore"):  # which is what it is to be unstable
+        with np.errstate(over="ignore", invalid="ignore"):
             ended = solver.deform(None)
         moved = np.abs(ended.nodes - nodes).max()
+        # Just below the limit amplitudes swell by 20 times and stay so.
         failed = Intervention.FRAME_FAILED in ended.interventions
-        return bool(failed or moved > _SWELLING * np.abs(shape).max())
+        return bool(failed or moved > 1e3 * np.abs(shape).max())
 
     if model.fixed.all():
         return math.inf, math.inf
@@ -524,7 +487,7 @@ def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]
         low /= 2
     while high < can_be_set.maximum / 2 and not grows(high):
         high *= 2
-    while high > (1 + _PRECISION) * low:
+    while high > (1 + 2e-3) * low:
         middle = (low * high) ** 0.5
         low, high = (low, middle) if grows(middle) else (middle, high)
     return predicted, (low * high) ** 0.5

@@ -1,4 +1,4 @@
-"""How `us-sim evaluate tissue` presses its block, and with what.
+"""The presses of `us-sim evaluate tissue`, all of the block of tissue, held at its bottom.
 
 >>> from us_sim.evaluation.block import MESHES
 >>> from us_sim.evaluation.tissue.cases import SCENES
@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.block import EXTENT, block, graded_planes
-from us_sim.evaluation.named import Named
 from us_sim.geometry.collider import Capsule, Collider, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -29,17 +28,13 @@ MAIN_SCENE = "press_25mm"
 """The scene that is pressed on every mesh."""
 
 _STEP = 0.0025  # m, of the probe in a frame
-_TURN = math.radians(2.5)  # of the probe in a frame
 _SPHERE = Sphere(0.03)
-
-_GROWTH, _FAST_GROWTH = 1.2, 1.5  # of the reference's elements, away from the probe
-_HARDLY_COMPRESSIBLE = 0.49
-"""Poisson's ratio beyond which the reference's linear equations take too long on small elements."""
+_AROUND = (-0.03, 0.03, 0.03)  # m, touched by a sphere that is pressed straight down
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A probe's path into the block, held at its bottom; results are compared at its end."""
+    """A probe's path into the block; results are compared at its end."""
 
     name: str
     words: str
@@ -64,7 +59,8 @@ class Scene:
     def reference_planes(self, size: float) -> tuple[NDArray[np.float64], ...]:
         """Planes (m) of the reference's half block, ``size`` apart where the probe touches."""
         low, high, beside = self.touched
-        growth = _GROWTH if self.poisson_ratio <= _HARDLY_COMPRESSIBLE else _FAST_GROWTH
+        # Beyond 0.49 the reference's linear equations take too long on small elements.
+        growth = 1.2 if self.poisson_ratio <= 0.49 else 1.5
         return (
             graded_planes(*EXTENT[0], low, high, size, growth),
             graded_planes(0.0, EXTENT[1][1], 0.0, beside, size, growth),
@@ -83,14 +79,13 @@ def _slide(depth: float, distance: float) -> tuple[Pose, ...]:
 
 
 def _tilt(depth: float, angle: float) -> tuple[Pose, ...]:
-    halves = np.arange(1, round(angle / _TURN) + 1) * _TURN / 2
+    turn = math.radians(2.5)  # in a frame
+    halves = np.arange(1, round(angle / turn) + 1) * turn / 2
     return tuple(
         Pose(np.array([0.0, 0.0, depth]), np.array([0.0, math.sin(half), 0.0, math.cos(half)]))
         for half in halves
     )
 
-
-_AROUND = (-0.03, 0.03, 0.03)  # m, what a sphere touches that is pressed straight down
 
 _ALL = (
     Scene("press_12mm", "pressed by 12 mm", _SPHERE, _press(0.012), _AROUND),
@@ -119,7 +114,7 @@ _ALL = (
     ),
 )
 
-SCENES = Named("scene of the tissue evaluation", {scene.name: scene for scene in _ALL})
+SCENES = {scene.name: scene for scene in _ALL}
 
 LOCKING = ("press_12mm", *(name for name in SCENES if name.startswith("press_12mm_nu")))
 """Scenes in which linear tetrahedra lock: the same press of ever less compressible tissue."""

@@ -1,41 +1,18 @@
-"""Large symmetric systems of quadratic elements by conjugate gradients over two levels.
+"""Finite elements of scikit-fem as a second opinion on `us_sim.tissue`, with no kernel in common.
 
-The coarse level is the same mesh with linear elements, solved directly by SciPy; the fine one is
-smoothed by Chebyshev polynomials of the block-Jacobi iteration (M. Adams, M. Brezina, J. Hu and
-R. Tuminaro, Parallel multigrid smoothing, J. Comput. Phys. 188, 2003).
-
->>> import numpy as np
->>> from scipy.sparse import bsr_array, csr_array
->>> from us_sim.evaluation.tissue.finite_elements import TwoLevel
->>> matrix = bsr_array(np.diag(np.arange(1.0, 7.0)), blocksize=(3, 3))
->>> solve = TwoLevel(matrix, csr_array(np.eye(6, 3)))
->>> solve(np.ones(6), 1e-12).round(3).tolist()
-[1.0, 0.5, 0.333, 0.25, 0.2, 0.167]
-
-Large deformation of a block by 27-node hexahedra of scikit-fem: energy, forces, stiffness.
-
-A second opinion on `us_sim.tissue`: other elements (triquadratic), another library's interpolation
-and quadrature, and no kernel in common. The energy density is the stable neo-Hookean one (B. Smith,
-F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37, 2018, without its
-logarithm):
-
-    mu/2 (|F|^2 - 3) - mu (J - 1) + own/2 (J - 1)^2 + linear/2 p^2,   own + linear = lambda + mu,
-
-where p is the linear function in an element that is nearest to J - 1 in the mean square (the 27/4
-element of T. Sussman and K.-J. Bathe, A finite element formulation for nonlinear incompressible
-elastic and inelastic analysis, Comput. Struct. 26, 1987). With J - 1 alone large elements are too
-stiff however far from the probe they lie: at Poisson's ratio 0.49 displacements came out 3 % wrong.
-
->>> import numpy as np
->>> from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra
->>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.evaluation.tissue.cases import SCENES
 >>> planes = [0.0, 0.05, 0.1]
 >>> block = NeoHookeanHexahedra((planes, planes, planes), Material(10e3, 0.45, 1000.0))
->>> block.nodes.shape
-(125, 3)
 >>> turned = block.nodes @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T - block.nodes
->>> bool(abs(block.forces(turned)).max() < 1e-12)
+>>> block.nodes.shape, bool(abs(block.forces(turned)).max() < 1e-12)
+((125, 3), True)
+>>> model = SCENES["press_12mm"].model((5, 3, 3))
+>>> turned = np.cross([0.0, 0.0, 1.0], model.mesh.nodes)
+>>> bool(abs(LinearEquations(model).forces(turned)).max() < 1e-12)  # a small turn strains nothing
 True
+>>> matrix = bsr_array(np.diag(np.arange(1.0, 7.0)), blocksize=(3, 3))
+>>> TwoLevel(matrix, csr_array(np.eye(6, 3)))(np.ones(6), 1e-12).round(3).tolist()
+[1.0, 0.5, 0.333, 0.25, 0.2, 0.167]
 """
 
 from __future__ import annotations
@@ -48,7 +25,7 @@ from scipy.sparse import bsr_array, csr_array, dia_array
 from scipy.sparse.linalg import LinearOperator, splu
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.block import solved
+from us_sim.evaluation.block import conjugate_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import volumetric_split
 from us_sim.tissue.model import TissueModel
@@ -77,7 +54,12 @@ _SMOOTHED = 20.0  # the smoother acts on eigenvalues down to the largest over th
 
 
 class TwoLevel:
-    """A factorised system, called with a right-hand side.
+    """Large symmetric systems of quadratic elements by conjugate gradients over two levels.
+
+    The coarse level is the same mesh with linear elements, solved directly by SciPy; the fine one
+    is smoothed by Chebyshev polynomials of the block-Jacobi iteration (M. Adams, M. Brezina, J. Hu
+    and R. Tuminaro, Parallel multigrid smoothing, J. Comput. Phys. 188, 2003). The factorised
+    system is called with a right-hand side.
 
     Args:
         matrix: (3N, 3N) symmetric and positive definite, in 3x3 blocks.
@@ -175,7 +157,18 @@ _SIGN[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 
 
 class NeoHookeanHexahedra:
-    """A box of triquadratic elements between planes of each axis.
+    """Large deformation of a box of 27-node hexahedra between planes of each axis.
+
+    The energy density is the stable neo-Hookean one (B. Smith, F. de Goes and T. Kim, Stable
+    Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37, 2018, without its logarithm):
+
+        mu/2 (|F|^2 - 3) - mu (J - 1) + own/2 (J - 1)^2 + linear/2 p^2,  own + linear = lambda + mu,
+
+    where p is the linear function in an element that is nearest to J - 1 in the mean square (the
+    27/4 element of T. Sussman and K.-J. Bathe, A finite element formulation for nonlinear
+    incompressible elastic and inelastic analysis, Comput. Struct. 26, 1987). With J - 1 alone large
+    elements are too stiff however far from the probe they lie: at Poisson's ratio 0.49
+    displacements came out 3 % wrong.
 
     Args:
         planes: m, ascending, of x, y and z.
@@ -424,7 +417,7 @@ class LinearEquations:
         right = project(-self._product(prescribed.ravel()))
         diagonal = self._matrix.diagonal() + self._spread.power(2) @ self._nodal
         shape = self._matrix.shape
-        found = solved(
+        found = conjugate_gradients(
             LinearOperator(shape, lambda v: project(self._product(project(v)))),
             right,
             1e-11,

@@ -1,35 +1,18 @@
-"""Where a block of tissue really is under the probe: large deformation on fine quadratic elements.
+"""The true shape of a block under the probe: large deformation on fine quadratic elements.
 
 Frictionless contact of the whole surface, not of nodes only, by augmented Lagrangian terms at the
 surface's quadrature points (P. Wriggers, Computational Contact Mechanics, 2nd ed., 2006, 9.3.3),
 and Newton's method with a line search. Elastic equilibrium without friction does not depend on the
-path, so a pose is approached in a few steps from rest.
+path, so a pose is approached in a few steps from rest. The block lies between its mirror plane
+y = 0 and its side; the probe must be as symmetric. Solutions are kept in the user's cache folder.
 
-The block lies between its mirror plane y = 0 and its side; the probe must be as symmetric.
-
->>> import numpy as np
 >>> from us_sim.geometry.collider import Sphere
 >>> from us_sim.evaluation.tissue.reference import solve_contact
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.elasticity.material import Material
 >>> planes = [-0.05, -0.02, 0.02, 0.05], [0.0, 0.02, 0.05], [0.0, 0.02, 0.05]
 >>> soft = Material(10e3, 0.45, 1000.0)
 >>> solution = solve_contact(planes, soft, Sphere(0.03), [Pose(position=[0.0, 0.0, 0.002])])
 >>> bool(solution.force[2] < 0), bool(solution.penetration < 2e-5)
 (True, True)
-
-The linear equations that the solver `fem` solves, assembled by scikit-fem, solved by SciPy.
-
->>> import numpy as np
->>> from us_sim.evaluation.tissue.reference import LinearEquations
->>> from us_sim.evaluation.tissue.cases import SCENES
->>> model = SCENES["press_12mm"].model((5, 3, 3))
->>> equations = LinearEquations(model)
->>> turned = np.cross([0.0, 0.0, 1.0], model.mesh.nodes)
->>> bool(abs(equations.forces(turned)).max() < 1e-12)  # a small turn strains nothing
-True
-
-Reference solutions on two meshes, kept in the user's cache folder by what decides them.
 """
 
 from __future__ import annotations
@@ -47,12 +30,9 @@ from scipy.spatial import cKDTree
 
 from us_sim.cache import Form, kept
 from us_sim.errors import SolverError
-from us_sim.evaluation.tissue import finite_elements as hexahedra
+from us_sim.evaluation.tissue import finite_elements
 from us_sim.evaluation.tissue.cases import Scene
-from us_sim.evaluation.tissue.finite_elements import (
-    NeoHookeanHexahedra,
-    TwoLevel,
-)
+from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra, TwoLevel
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -265,11 +245,7 @@ class _Search:
         normal = np.sign(local) * outside / distance[:, None]
         curved = (beyond > 0).astype(float)[:, :, None] * np.eye(3)
         curvature = (curved - normal[:, :, None] * normal[:, None, :]) / distance[:, None, None]
-        return (
-            distance - rounding,
-            normal @ rotation.T,
-            rotation @ curvature @ rotation.T,
-        )
+        return (distance - rounding, normal @ rotation.T, rotation @ curvature @ rotation.T)
 
 
 def _diagonal(entries: NDArray[np.floating]) -> dia_array:
@@ -398,7 +374,7 @@ def _approach(scene: Scene) -> list[Pose]:
 def _hash(scene: Scene, planes: tuple[NDArray[np.float64], ...]) -> str:
     """Of everything that decides the solution, the code included."""
     digest = hashlib.sha256()
-    for file in (str(hexahedra.__file__), __file__):
+    for file in (str(finite_elements.__file__), __file__):
         digest.update(Path(file).read_bytes())
     for array in (*planes, *(p.matrix for p in _approach(scene)), scene.collider.offset_box):
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -18,7 +18,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.named import Named
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import exp, rotation_exp
 from us_sim.share import shared_path
@@ -35,24 +34,18 @@ _SPEED, _TURNING = 0.05, 0.2  # m/s and rad/s, of the hand
 _EXPOSURE = 0.015  # s, in the condition with motion blur
 _HASTE = 3.0  # times the hand's speed in that condition
 
-CONDITIONS = Named(
-    "condition",
-    {
-        "plain": (Conditions(), "a webcam's noise (2 grey levels in the white) in even light"),
-        "noise": (
-            Conditions(read_noise=4.0, shot_noise=0.05),
-            "5 grey levels of noise, as at dusk",
-        ),
-        "blur": (
-            Conditions(defocus=1.6),
-            f"out of focus by 1.6 pixels, and moving by {_HASTE * _SPEED * _EXPOSURE * 1e3:.1f} mm "
-            f"during the exposure",
-        ),
-        "occlusion": (Conditions(occlusion=0.35), "a hand over a third of the body"),
-        "gradient": (Conditions(gradient=0.7), "light that falls by 70 % across the image"),
-    },
-)
-"""What makes views worse, and that in words."""
+CONDITIONS = {
+    "plain": (Conditions(), "a webcam's noise (2 grey levels in the white) in even light"),
+    "noise": (Conditions(read_noise=4.0, shot_noise=0.05), "5 grey levels of noise, as at dusk"),
+    "blur": (
+        Conditions(defocus=1.6),
+        f"out of focus by 1.6 pixels, and moving by {_HASTE * _SPEED * _EXPOSURE * 1e3:.1f} mm "
+        f"during the exposure",
+    ),
+    "occlusion": (Conditions(occlusion=0.35), "a hand over a third of the body"),
+    "gradient": (Conditions(gradient=0.7), "light that falls by 70 % across the image"),
+}
+"""Conditions of views, each in settings and in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +94,7 @@ _ALL = (
         facing=(0.5, 0.0, math.sqrt(0.75)),
     ),
 )
-MARKERS = Named("body of markers", {marker.name: marker for marker in _ALL})
+MARKERS = {marker.name: marker for marker in _ALL}
 """By name, in the reports' order; colours are told apart in every common colour blindness."""
 
 

@@ -1,4 +1,4 @@
-"""What filters bring and cost: how far they are behind a moving hand, and how much still trembles.
+"""Filters' lag behind a moving hand, and the jitter that they leave.
 
 >>> import numpy as np
 >>> from us_sim.evaluation.tracking.filters import delay
@@ -18,7 +18,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.named import Named
 from us_sim.evaluation.report import Row
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp, rotation_log
@@ -28,17 +27,12 @@ from us_sim.tracking.filters import create_filter
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import KalmanSettings, OneEuroSettings
 
-FILTER_METHODS = Named(
-    "evaluated filter",
-    {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")},
-)
+FILTER_METHODS = {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")}
 """By name, the colour and the mark of its points in a plot."""
 
 _RATE = 60.0  # Hz
 _NOISE, _TURN_NOISE = 3e-4, 3.5e-3  # m and rad, standard deviation of a coordinate
 _MOVING, _REST = 8.0, 8.0  # s
-_BEGINNING, _SETTLING = 1.0, 4.0  # s of the motion, and of the rest, that do not count
-_LONGEST = 0.8  # s, of lags that are looked for
 _SWAY = ((0.25, 0.035, 0.25), (0.9, 0.009, 0.12), (2.3, 0.0012, 0.015))
 """Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor."""
 
@@ -116,7 +110,7 @@ def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) 
     def misfit(lag: float) -> float:
         return float(((values - path(times - lag)) ** 2).sum())
 
-    grid = np.linspace(-0.05, _LONGEST, 171)
+    grid = np.linspace(-0.05, 0.8, 171)
     step = float(grid[1] - grid[0])
     best = float(grid[np.argmin([misfit(lag) for lag in grid])])
     for _ in range(4):
@@ -128,7 +122,7 @@ def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) 
 
 
 def filter_point(method: str, settings: Settings | None, words: str) -> FilterPoint:
-    """What a filter with some settings, named in words, makes of the noisy path."""
+    """Row of a filter with some settings, named in words, on the noisy path."""
     times = np.arange(round((_MOVING + _REST) * _RATE)) / _RATE
     random = np.random.default_rng(7)
     noise = random.normal(0.0, _NOISE, (len(times), 3))
@@ -150,8 +144,8 @@ def filter_point(method: str, settings: Settings | None, words: str) -> FilterPo
     seconds = (time.thread_time() - began) / len(measured)
     found = np.array([pose.position for pose in filtered])
     found_turns = np.array([rotation_log(pose.orientation) for pose in filtered])
-    moving = (times >= _BEGINNING) & (times < _MOVING)
-    rest = times >= _MOVING + _SETTLING
+    moving = (times >= 1.0) & (times < _MOVING)
+    rest = times >= _MOVING + 4.0
     lag = delay(times[moving], found[moving], _position)
     return FilterPoint(
         method,

@@ -1,14 +1,9 @@
-"""What one case shows: how far poses are off, how often they fail, and how long they take.
+"""A tracker's errors, failures and run time in one case, and small markers' corners.
 
->>> import numpy as np
->>> from us_sim.evaluation.tracking.measure import mirrored
+>>> from us_sim.evaluation.tracking.measure import mirrored, small_marker_point
 >>> tilted = Pose([0.0, 0.0, 0.4], [np.sin(0.1), 0.0, 0.0, np.cos(0.1)])
 >>> mirrored(tilted, np.zeros(3), np.array([0.0, 0.0, 1.0])).orientation.round(4) + 0.0
 array([-0.0998,  0.    ,  0.    ,  0.995 ])
-
-How many small markers are kept of those that OpenCV finds, and how exact their corners are.
-
->>> from us_sim.evaluation.tracking.measure import small_marker_point
 >>> point = small_marker_point("APRILTAG_36h11", 32.0, 4)
 >>> point.views, point.kept == point.found_by_opencv > 0, point.median_px < 0.2
 (4, True, True)
@@ -25,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import Row
+from us_sim.evaluation.report import Row, percentile
 from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, Marker
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import product, rotation_between, rotation_exp
@@ -39,13 +34,10 @@ from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import CameraSettings
 
-_FLIP = 5.0  # degrees; a body that is turned by less is not its mirror image
-_CHI_SQUARE_95 = 12.5916  # of six degrees of freedom
-
 
 @dataclass(frozen=True)
 class View:
-    """What the tracker made of one image."""
+    """The tracker's result of one image."""
 
     first: bool  # of a sequence: nothing was known before
     ms: float  # wall clock
@@ -62,7 +54,7 @@ class View:
     @property
     def inside(self) -> bool:
         """Whether the error is in the ellipsoid that should hold 95 % of them."""
-        return self.square < _CHI_SQUARE_95
+        return self.square < 12.5916  # chi-square of six degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ class Point(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """What sums up the case's views, by column."""
+        """Summary of the case's views, by column."""
         found = self.found
         return {
             "marker": self.case.marker,
@@ -94,20 +86,20 @@ class Point(Row):
             "p95_mm": self.error(95),
             "median_deg": self.turned(50),
             "p95_deg": self.turned(95),
-            "ms_median": _percentile([view.ms for view in self.views], 50),
-            "ms_first": _percentile([view.ms for view in self.views if view.first], 50),
+            "ms_median": percentile([view.ms for view in self.views], 50),
+            "ms_first": percentile([view.ms for view in self.views if view.first], 50),
             "cpu_ms_median": self.cpu_ms,
             "detector_cpu_ms": self.detector_cpu_ms,
             "pose_cpu_ms": self.pose_cpu_ms,
             "markers_used": _mean([view.used for view in found]),
-            "expected_mm": _percentile([view.expected_mm for view in found], 50),
+            "expected_mm": percentile([view.expected_mm for view in found], 50),
             "within_95": _mean([view.inside for view in found]),
             "failure": self.failure,
         }
 
     @property
     def title(self) -> str:
-        """What was looked at."""
+        """The case."""
         return str(self.case)
 
     @property
@@ -123,15 +115,15 @@ class Point(Row):
     @property
     def cpu_ms(self) -> float:
         """Processor time of an image, median."""
-        return _percentile([view.cpu_ms for view in self.views], 50)
+        return percentile([view.cpu_ms for view in self.views], 50)
 
     def error(self, percent: float) -> float:
         """mm, percentile of the position's error."""
-        return _percentile([view.mm for view in self.found], percent)
+        return percentile([view.mm for view in self.found], percent)
 
     def turned(self, percent: float) -> float:
         """Degrees, percentile of the rotation's error."""
-        return _percentile([view.degrees for view in self.found], percent)
+        return percentile([view.degrees for view in self.found], percent)
 
 
 def those(points: Sequence[Point], **case: object) -> list[Point]:
@@ -146,18 +138,18 @@ def views_of(points: Sequence[Point], **case: object) -> list[View]:
 
 
 class Bench:
-    """Renders cases and has them tracked; keeps the room of the last body."""
+    """Renders cases and tracks them; keeps the room of the last body."""
 
     def __init__(self) -> None:
         self._rooms: dict[tuple[str, str], RenderedView] = {}
 
     def warm_up(self) -> None:
-        """Let everything be compiled that is timed later."""
+        """Compile everything that is timed later."""
         for name in MARKERS:
             self.point(Case(name, SMALL, 0.4, 30.0), 1)
 
     def point(self, case: Case, sequences: int) -> Point:
-        """What so many sequences of images show."""
+        """Row of a case, from so many sequences of images."""
         seen, camera = MARKERS[case.marker], WEBCAMS[case.image_size]
         key = (case.marker, case.image_size)
         if key not in self._rooms:
@@ -180,8 +172,8 @@ class Bench:
                         parts.append(_parts(camera, seen, image))
         finally:
             cv2.setNumThreads(threads)
-        detector = _percentile([part[0] for part in parts], 50)
-        solver = _percentile([part[1] for part in parts if np.isfinite(part[1])], 50)
+        detector = percentile([part[0] for part in parts], 50)
+        solver = percentile([part[1] for part in parts if np.isfinite(part[1])], 50)
         return Point(case, tuple(views), detector, solver)
 
 
@@ -219,7 +211,7 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
     return replace(
         view,
         detected=True,
-        flipped=bool(other < angle and angle > np.radians(_FLIP)),
+        flipped=bool(other < angle and angle > np.radians(5.0)),
         mm=1e3 * float(np.linalg.norm(off)),
         degrees=float(np.degrees(angle)),
         expected_mm=1e3 * (measured.position_deviation or np.nan),
@@ -255,10 +247,6 @@ def _parts(camera: CameraModel, seen: Marker, image: NDArray[np.uint8]) -> tuple
     return 1e3 * (between - begin), 1e3 * (time.thread_time() - between)
 
 
-def _percentile(values: Sequence[float], percent: float) -> float:
-    return float(np.percentile(values, percent)) if len(values) else float("nan")
-
-
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
@@ -270,10 +258,6 @@ _CAMERA = CameraModel(
     np.array([-0.2, 0.06, 0.0, 0.0, 0.0]),
 )
 _SIZE = 0.04  # m, of the marker
-_STEEPEST = 60.0  # degrees, to which a marker is tilted
-_BLURS = (0.5, 1.2)  # pixels, of the lens
-_NOISE = (1.0, 4.0)  # grey
-_PLACES = 5.0  # pixels from the middle
 
 
 @dataclass(frozen=True)
@@ -292,19 +276,16 @@ class SmallMarkerPoint(Row):
 
 
 def small_marker_trials(quick: bool) -> Iterator[tuple[str, float, int]]:
-    """What `small_marker_point` is asked for: dictionaries, edges in pixels, and views of each."""
+    """Arguments of `small_marker_point`: dictionaries, edges in pixels, and views of each."""
     for name in ("APRILTAG_36h11", "APRILTAG_25h9", "4X4_50"):
         for edge in (14.0, 18.0, 24.0, 32.0, 44.0):
             yield name, edge, 40 if quick else 200
 
 
 def small_marker_point(name: str, edge: float, views: int) -> SmallMarkerPoint:
-    """Markers of a dictionary in views of a size, tilted by up to 60° and turned anyhow.
+    """Markers of the dictionary ``name`` in so many views, tilted by up to 60° towards any side.
 
-    Args:
-        name: of the dictionary.
-        edge: pixels, of a marker that faces the camera.
-        views: how many.
+    The ``edge`` of a marker that faces the camera is in pixels.
     """
     random = np.random.default_rng([zlib.crc32(name.encode()), round(10 * edge)])
     plain = cv2.aruco.ArucoDetector(dictionary(name), cv2.aruco.DetectorParameters())
@@ -312,7 +293,9 @@ def small_marker_point(name: str, edge: float, views: int) -> SmallMarkerPoint:
     for number in range(views):
         body = RigidBody.single(name, int(random.integers(0, 30)), _SIZE)
         pose = _pose(random, edge)
-        conditions = Conditions(defocus=random.uniform(*_BLURS), read_noise=random.uniform(*_NOISE))
+        conditions = Conditions(
+            defocus=random.uniform(0.5, 1.2), read_noise=random.uniform(1.0, 4.0)
+        )
         image = RenderedView(_CAMERA, body, number).render(pose, conditions, number)
         corners, ids, _ = plain.detectMarkers(image)
         seen = [] if ids is None else np.asarray(ids).ravel().tolist()
@@ -334,12 +317,12 @@ def small_marker_point(name: str, edge: float, views: int) -> SmallMarkerPoint:
 def _pose(random: np.random.Generator, edge: float) -> Pose:
     """Somewhere near the middle of the image, at the distance of that size."""
     about = random.uniform(0, 2 * np.pi)
-    angle = np.radians(random.uniform(0, _STEEPEST))
+    angle = np.radians(random.uniform(0, 60.0))
     tilt = rotation_exp(angle * np.array([np.cos(about), np.sin(about), 0.0]))
     spin = rotation_exp(np.array([0.0, 0.0, random.uniform(0, 2 * np.pi)]))
     facing = rotation_exp(np.array([np.pi, 0.0, 0.0]))
     distance = float(_CAMERA.matrix[0, 0]) * _SIZE / edge
-    pixel = np.array([100.0, 80.0]) + random.uniform(-_PLACES, _PLACES, 2)
+    pixel = np.array([100.0, 80.0]) + random.uniform(-5.0, 5.0, 2)
     place = distance * np.append(_CAMERA.rays(pixel[None])[0], 1.0)
     return Pose(place, product(tilt, product(facing, spin)))
 

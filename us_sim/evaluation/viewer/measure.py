@@ -1,16 +1,8 @@
-"""The ways to look at the arm that are measured.
+"""Run the arm with a viewer, and look at it with pages that only take, and with real browsers.
 
 >>> from us_sim.evaluation.viewer.measure import cases
 >>> [str(case) for case in cases(quick=True)][:2]
 ['no viewer, path', 'viewer without a page, path']
-
-What one way to look at the arm shows: one row of the file.
-
-Pages in a real Chromium without a window, whose probe a mouse drags.
-
-A page that takes what streams, as a browser would, and draws nothing; it may move the probe.
-
-Runs the arm in one way, and looks at it.
 """
 
 from __future__ import annotations
@@ -36,7 +28,7 @@ import numpy as np
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, started_by
-from us_sim.evaluation.report import Row
+from us_sim.evaluation.report import Row, percentile
 from us_sim.evaluation.timing import Tell
 from us_sim.share import find_bag
 from us_sim.viewer.stream import Packet
@@ -80,7 +72,7 @@ def cases(quick: bool) -> list[Case]:
 
 @dataclass(frozen=True)
 class Point(Row):
-    """A case, and what was measured."""
+    """A row of viewer.csv."""
 
     case: Case
     made: float = np.nan  # images a second of the simulator
@@ -128,7 +120,7 @@ class Point(Row):
 
     def age(self, percent: float) -> float:
         """Percentile of the images' ages, ms."""
-        return float(np.percentile(self.ages, percent)) if len(self.ages) else np.nan
+        return percentile(self.ages, percent)
 
     def cores(self, name: str) -> float:
         """Processor time over time of the processes of a name."""
@@ -229,15 +221,7 @@ class Browser:
         self._tool.stop()
 
 
-STREAMED = (
-    "image",
-    "skin_mesh",
-    "skin",
-    "structures_mesh",
-    "structures",
-    "probe",
-    "hand",
-)
+STREAMED = ("image", "skin_mesh", "skin", "structures_mesh", "structures", "probe", "hand")
 """What the page shows when it is opened."""
 COMMAND_RATE = 60.0
 """Commands a second of a hand that moves."""
@@ -340,11 +324,7 @@ _ADDRESS = re.compile(r"http://\S+")
 
 
 def run_case(case: Case, tell: Tell) -> Point:
-    """What the case shows.
-
-    Args:
-        case: how to look at the arm.
-        tell: is told how many of the case's seconds are over.
+    """Look at the arm as the case says; ``tell`` is told how many of its seconds are over.
 
     Raises:
         UsSimError: the simulation ends, or no image comes.
@@ -433,9 +413,7 @@ class _Pages:
             found = self._browser.delays()
             return found["median"], found["p99"], found["count"]
         delays = [delay for taker in self._takers for delay in taker.delays]
-        if not delays:
-            return np.nan, np.nan, np.nan
-        return float(np.median(delays)), float(np.percentile(delays, 99)), float(len(delays))
+        return percentile(delays, 50), percentile(delays, 99), len(delays) or np.nan
 
     def close(self) -> None:
         """Close them."""

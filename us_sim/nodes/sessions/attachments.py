@@ -84,7 +84,6 @@ def _attach_scene(
 
 
 def _parts(path: Path) -> list[Path]:
-    """The file itself, or those of the bag in a folder."""
     if not path.is_dir():
         return [path]
     try:
@@ -108,7 +107,6 @@ def _attach(attached: dict[str, tuple[str, bytes]], path: Path, name: str = "") 
 
 
 def _files(settings: Any) -> Iterator[Path]:
-    """The files that settings, and settings within them, name."""
     if isinstance(settings, dict):
         for value in settings.values():
             yield from _files(value)
@@ -140,7 +138,6 @@ def _placed(document: Any, places: dict[Path, str]) -> Any:
 
 
 def _checksum(path: Path) -> str:
-    """SHA-256 of a file; of a folder, nothing that could be compared."""
     if not path.is_file():
         return "-" * 64
     try:

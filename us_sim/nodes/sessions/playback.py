@@ -18,8 +18,7 @@ CHECK_S, CHECKS = 0.05, 6
 
 A best-effort subscriber may find a publisher a little later than it is found itself.
 """
-PATIENCE_S = 5.0
-"""After so long it is said what is waited for."""
+TELL_AFTER_S = 5.0  # after so long it is said what is waited for
 RECORDER = "session_recorder"
 
 
@@ -49,7 +48,7 @@ class Awaited:
             return True
         now = time.monotonic()
         self._since = self._since or now
-        if missing and missing != self._told and now - self._since > PATIENCE_S:
+        if missing and missing != self._told and now - self._since > TELL_AFTER_S:
             self._told = self._node.health.values["awaited"] = missing
             self._node.get_logger().warning(f"nothing is played yet: waiting for {missing}")
         return False

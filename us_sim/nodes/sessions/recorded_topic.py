@@ -17,10 +17,8 @@ from us_sim.errors import BagError
 from us_sim.recording.schemas import schema_text
 from us_sim.recording.topic import QosProfile
 
-QUEUE = 1000
-"""Messages that may wait for the executor."""
-OVERLAP_S = 2.0
-"""In which publishers find a new subscription, before the old one is given up."""
+QUEUE = 1000  # messages that may wait for the executor
+OVERLAP_S = 2.0  # in which publishers find a new subscription, before the old one is given up
 
 
 class RecordedTopic:

@@ -27,8 +27,7 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import OVERLAYS
 
-REMEMBERED = 256
-"""Poses whose arrival is kept for the images at them."""
+REMEMBERED = 256  # poses whose arrival is kept for the images at them
 
 
 class PoseAge:
@@ -82,7 +81,6 @@ class PoseAge:
         return "stale" if age > limits.stale_after else "live"
 
     def _since(self, stamp: int) -> float:
-        """s since the pose with that stamp came."""
         now, real = self._now()
         came, really = self._arrivals[stamp]
         if came > now:  # time was set back, as when a bag starts again
@@ -94,12 +92,10 @@ class PoseAge:
         return int(self._node.get_clock().now().nanoseconds), time.monotonic_ns()
 
 
-CHECKS = 5.0
-"""Times a second that the age of the newest pose is looked at."""
+CHECKS = 5.0  # times a second that the age of the newest pose is looked at
 
 _AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
-_NEVER = TimeMessage()
-"""The stamp of a picture of no pose: zero."""
+_NEVER = TimeMessage()  # the stamp of a picture of no pose: zero
 
 Pixels = NDArray[np.uint8]
 
@@ -202,7 +198,6 @@ class AnnotatedImage:
             self._send(badge)
 
     def _report(self) -> None:
-        """Say that poses stay away, and that they have come back, once."""
         node, state = self._node, self.state
         node.health.values["probe_pose"] = state
         missing = state in ("stale", "lost")
@@ -223,7 +218,6 @@ class AnnotatedImage:
         node.health.warning = warning
 
     def _badge(self) -> Badge | None:
-        """What marks an image that is not live."""
         if self._age is None:
             return None
         word = self.state
@@ -261,7 +255,6 @@ class AnnotatedImage:
         self._node.health.published("ultrasound/image_annotated")
 
     def _outline(self, frame: Frame) -> None:
-        """Look up the labels to be outlined, once."""
         if self._is_outlined:
             return
         self._is_outlined = True
@@ -271,7 +264,6 @@ class AnnotatedImage:
             self._node.health.problem("labels", f"{error}; nothing is outlined")
 
     def _overlay(self, frame: Frame) -> Overlay | None:
-        """The colours that are chosen, if there are some."""
         stream = self._overlays.get(self._settings.values["shown"].overlay)
         try:
             return stream.overlay(frame) if stream else None

@@ -24,8 +24,7 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ColourSettings, DopplerSettings, SpectrumSettings
 from us_sim.volume.volume import Volume
 
-EVERY_S = 0.2
-"""Between two looks at where the vessel is; of the frames' time."""
+EVERY_S = 0.2  # between two looks at where the vessel is; of the frames' time
 
 
 class Following:
@@ -39,13 +38,13 @@ class Following:
 
     def __init__(self, node: SceneNode, prefix: str, blood: Blood) -> None:
         self._node, self._prefix, self._blood = node, prefix, blood
-        self._looked = 0.0  # s, of the frame's time
+        self._updated = 0.0  # s, of the frame's time
 
-    def look(self, frame: Frame, settings: DopplerSettings, steering: float) -> None:
+    def update(self, frame: Frame, settings: DopplerSettings, steering: float) -> None:
         """Move it, for the frames to come; ``steering`` (rad) is that of beams from the face on."""
-        if not settings.follow or 0.0 <= frame.time - self._looked < EVERY_S:
+        if not settings.follow or 0.0 <= frame.time - self._updated < EVERY_S:
             return
-        self._looked = frame.time
+        self._updated = frame.time
         depth = 0.5 * frame.probe.depth if settings.depth is None else settings.depth
         place = nearest_vessel(self._blood, frame, settings.lateral, depth, steering)
         if place is None:
@@ -87,7 +86,7 @@ class ColourStream(SettableStream[ColourDoppler]):
         """Made once, since frames before it count, too."""
         if frame is not self._frame:
             doppler = self.for_frame(frame)
-            self._following.look(frame, doppler.settings, 0.0)
+            self._following.update(frame, doppler.settings, 0.0)
             self._shown = doppler.estimate(self._blood, frame)
             self._frame = frame
             why = doppler.absence(self._blood, frame, self._shown)
@@ -131,7 +130,7 @@ class SpectrumStream(SettableStream[Spectrum]):
 
     def _message(self, frame: Frame, stamp: Time) -> Image:
         spectrum = self.for_frame(frame)
-        self._following.look(frame, spectrum.settings, spectrum.settings.steering)
+        self._following.update(frame, spectrum.settings, spectrum.settings.steering)
         picture = spectrum.show(self._blood, frame)
         self._node.health.values["no_spectrum"] = spectrum.absence(self._blood, frame).value
         return colour_image_message(picture, stamp, "probe")

@@ -33,8 +33,7 @@ class FrameStream(ABC):
         node: that publishes it.
     """
 
-    topic: ClassVar[str]
-    """Its name."""
+    topic: ClassVar[str]  # its name
 
     def __init__(self, node: SceneNode) -> None:
         self._node = node

@@ -44,11 +44,9 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _MOST_SEGMENTS = 1000  # of a JPEG before its picture
-_MOST_PIXELS = 1 << 26
-"""Of a compressed image: as many as 8192 × 8192."""
+_MOST_PIXELS = 1 << 26  # of a compressed image: as many as 8192 × 8192
 
-_LARGEST = 1e9
-"""Pixels, or a coefficient of the distortion."""
+_LARGEST = 1e9  # pixels, or a coefficient of the distortion
 
 
 def camera_from(message: CameraInfo) -> CameraModel:
@@ -166,7 +164,7 @@ class CameraInput(TrackerInput):
             (Image, "camera/image_raw", grey_from),
             (CompressedImage, "camera/image_raw/compressed", grey_from_compressed),
         ):
-            device.listen_to_newest(message_type, topic, self._looking(topic, decode))
+            device.listen_to_newest(message_type, topic, self._measuring(topic, decode))
 
     def reset(self) -> None:
         """Forget where the probe was; the camera stays."""
@@ -174,7 +172,6 @@ class CameraInput(TrackerInput):
             self._source.reset()
 
     def _describe(self, message: CameraInfo) -> None:
-        """Look through this camera from now on; drivers repeat it with every image."""
         if self._described is not None and _is_same(message, self._described):
             return
         self._described = message
@@ -184,10 +181,10 @@ class CameraInput(TrackerInput):
             self._source = None
             self._device.refuse("camera", f"camera/camera_info: {error}")
 
-    def _looking(
+    def _measuring(
         self, topic: str, decode: Callable[[Any], NDArray[Any]]
     ) -> Callable[[Image | CompressedImage], None]:
-        def look(message: Image | CompressedImage) -> None:
+        def measure(message: Image | CompressedImage) -> None:
             if self._source is None:
                 if self._described is None:
                     self._device.refuse(
@@ -209,11 +206,10 @@ class CameraInput(TrackerInput):
                 self._device.health.values["markers"] = left_out or "all that are seen are used"
                 self._device.take(measurement)
 
-        return look
+        return measure
 
 
 def _is_same(a: CameraInfo, b: CameraInfo) -> bool:
-    """Whether two descriptions are of the same camera."""
     return (a.width, a.height, a.distortion_model) == (b.width, b.height, b.distortion_model) and (
         list(a.k) == list(b.k) and list(a.d) == list(b.d)
     )

@@ -48,7 +48,6 @@ class PathInput(TrackerInput):
         self._timer = device.every(CHECK_S, self._begin)
 
     def _begin(self) -> None:
-        """Start once everything has been there for a while, so that all have found each other."""
         device = self._device
         self._checks = self._checks + 1 if device.is_awaited() else 0
         if self._checks < CHECKS:

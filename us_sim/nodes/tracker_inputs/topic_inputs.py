@@ -185,7 +185,7 @@ class TfInput(TrackerInput):
             except PoseError as error:
                 self._device.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
                 continue
-            if self._tree.place(child, parent.lstrip("/"), pose):
+            if self._tree.set_pose(child, parent.lstrip("/"), pose):
                 moved.add(child)
         return moved
 

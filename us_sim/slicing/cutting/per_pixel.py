@@ -7,7 +7,6 @@ first that holds it says where it lay at rest.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,9 +23,6 @@ from us_sim.slicing.cutting.section import INSIDE, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
 from us_sim.slicing.cutting.trilinear import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
-
-if TYPE_CHECKING:
-    pass
 
 _ON_PLANE = 1e-9  # pixels off the plane that count as on it, as for a section
 _FLAT = 1e-6  # fraction of its rest volume below which a tetrahedron is flat

@@ -23,8 +23,6 @@ array([ 4, 12, 20, 28, 36], dtype=uint8)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -55,9 +53,6 @@ from us_sim.slicing.cutting.span_sampling import (
     sample_spans,
 )
 from us_sim.slicing.probe.plane import SlicePlane
-
-if TYPE_CHECKING:
-    pass
 
 
 class ScanConversion(Slicer):

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import turned, turned_back
+from us_sim.geometry.collider_distance import rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
@@ -272,10 +272,10 @@ def _gaps_of(box, forward, rotation, origin, rest, index, displacement, skirt, g
         a = rest[i, 0] + displacement[m, 0] - origin[0]
         b = rest[i, 1] + displacement[m, 1] - origin[1]
         c = rest[i, 2] + displacement[m, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[m], x, y, z)
         gap[m] = g
-        normal[m, 0], normal[m, 1], normal[m, 2] = turned(r, nx, ny, nz)
+        normal[m, 0], normal[m, 1], normal[m, 2] = rotate(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})

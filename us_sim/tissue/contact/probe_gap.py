@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import curved_box_distance, turned, turned_back
+from us_sim.geometry.collider_distance import curved_box_distance, rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 
@@ -200,10 +200,10 @@ def _pushing_gaps(box, forward, rotation, origin, points, skirt, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         g, nx, ny, nz = pushing_gap(box, forward, skirt[i], x, y, z)
         gap[i] = g
-        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
 
 
 class FlaredProbe:
@@ -362,9 +362,9 @@ def _distances(shape, r, origin, points, near, gap, normal):
         a = points[i, 0] - origin[0]
         b = points[i, 1] - origin[1]
         c = points[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         gap[i], nx, ny, nz = _distance(shape, x, y, z)
-        normal[i, 0], normal[i, 1], normal[i, 2] = turned(r, nx, ny, nz)
+        normal[i, 0], normal[i, 1], normal[i, 2] = rotate(r, nx, ny, nz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -26,7 +26,7 @@ from us_sim.kernels import njit
 from us_sim.tissue.contact.penalty_contact import PenaltyContact, PenaltyFriction
 from us_sim.tissue.contact.probe_gap import FlaredProbe
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
-from us_sim.tissue.elasticity.neo_hookean_material import withstood_force
+from us_sim.tissue.elasticity.neo_hookean_material import barrier_strength
 from us_sim.tissue.model import TissueModel
 
 _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}
@@ -53,7 +53,7 @@ _STIFFENING = 0.2
 """Depth at which a spring pushes twice as much as if it were linear, over the nodes' spacing."""
 
 _GREATEST_FORCE = 25.0
-"""Greatest force of a node's springs, over `withstood_force` there: less than what a crushed
+"""Greatest force of a node's springs, over `barrier_strength` there: less than what a crushed
 tetrahedron resists, so that no probe turns one inside out."""
 
 
@@ -70,7 +70,7 @@ def surface_contact(
     spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
     points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
     stiffness = _FIRMNESS * points.spread(nodal_shear_stiffness(model.mesh, model.materials))
-    greatest = _GREATEST_FORCE * points.spread(withstood_force(model.mesh, model.materials))
+    greatest = _GREATEST_FORCE * points.spread(barrier_strength(model.mesh, model.materials))
     law = (FlaredProbe(model.collider, spacing), stiffness, greatest, _STIFFENING * spacing)
     return points, PenaltyFriction(*law, friction) if friction else PenaltyContact(*law)
 

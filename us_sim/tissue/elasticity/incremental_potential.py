@@ -49,7 +49,7 @@ class IncrementalPotential:
         self._inertia = mass / time_step**2
         self._lengths = np.empty_like(self._rest_length)
         self._volumes = np.empty_like(self._rest_volume)
-        self._aim = np.zeros((len(mass), 3))
+        self._target = np.zeros((len(mass), 3))
 
     @property
     def viscous_part(self) -> float:
@@ -58,11 +58,11 @@ class IncrementalPotential:
 
     def begin(self, positions: NDArray[np.float64], velocity: NDArray[np.float64]) -> None:
         """Start a step from positions (N, 3) m and velocity (N, 3) m/s."""
-        _aim(
+        _set_targets(
             *(self._springs[0], self._rest_length, self._volume.tetrahedra, self._rest_volume),
             *(positions, self._stiffening, self._lengths, self._volumes),
         )
-        self._aim = positions + self._time_step * velocity
+        self._target = positions + self._time_step * velocity
 
     def evaluate(self, positions: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """J, up to a constant of the step, and minus its gradient (N, 3) N, at positions (N, 3)."""
@@ -85,7 +85,9 @@ class IncrementalPotential:
         force = np.zeros_like(positions)
         value = _add_spring_forces(*self._springs, lengths, positions, force)
         value += _add_volume_forces(self._volume, volumes, positions, force)
-        value = stiffening * value + _add_inertia(inertia, self._aim, positions, stiffening, force)
+        value = stiffening * value + _add_inertia(
+            inertia, self._target, positions, stiffening, force
+        )
         return value, force
 
     def curvature(self, positions: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
@@ -97,7 +99,7 @@ class IncrementalPotential:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _aim(edges, rest_length, tetrahedra, rest_volume, x, stiffening, length, volume):
+def _set_targets(edges, rest_length, tetrahedra, rest_volume, x, stiffening, length, volume):
     """Fills length (E,) and volume (M,) to which a step from x (N, 3) draws springs and volumes."""
     viscous = 1.0 - 1.0 / stiffening  # exactly zero without viscosity
     for e in range(len(edges)):
@@ -112,12 +114,12 @@ def _aim(edges, rest_length, tetrahedra, rest_volume, x, stiffening, length, vol
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_inertia(inertia, aim, positions, stiffening, force):
-    """Turns force (N, 3) into that of a step, and returns what inertia (N,) N/m adds, J."""
+def _add_inertia(inertia, target, positions, stiffening, force):
+    """Turns force (N, 3) into that of a step; returns the energy of inertia (N,) N/m, J."""
     value = 0.0
     for i in range(len(positions)):
         for axis in range(3):
-            lag = aim[i, axis] - positions[i, axis]
+            lag = target[i, axis] - positions[i, axis]
             value += 0.5 * inertia[i] * lag * lag
             force[i, axis] = stiffening * force[i, axis] + inertia[i] * lag
     return value
@@ -144,7 +146,7 @@ def _add_spring_forces(edges, stiffness, rest_length, x, force):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_volume_forces(volumes, aimed_volume, x, force):
+def _add_volume_forces(volumes, target_volume, x, force):
     """Adds the forces of volumes to force (N, 3), and returns their energy, J."""
     tetrahedra, rest_volume, element, nodal = volumes[:4]
     inverse_weight, mean = volumes.inverse_weight, volumes.mean
@@ -152,7 +154,7 @@ def _add_volume_forces(volumes, aimed_volume, x, force):
     mean[:] = 0.0
     for t in range(len(tetrahedra) if len(mean) > 0 else 0):
         volume = area_vectors(x, tetrahedra, t)[0]
-        quarter = 0.25 * nodal[t] * (volume - aimed_volume[t])
+        quarter = 0.25 * nodal[t] * (volume - target_volume[t])
         for corner in range(4):
             mean[tetrahedra[t, corner]] += quarter
     for i in range(len(mean)):
@@ -161,7 +163,7 @@ def _add_volume_forces(volumes, aimed_volume, x, force):
     for t in range(len(tetrahedra)):
         a, b, c, d = tetrahedra[t, 0], tetrahedra[t, 1], tetrahedra[t, 2], tetrahedra[t, 3]
         volume, px, py, pz, qx, qy, qz, rx, ry, rz = area_vectors(x, tetrahedra, t)
-        change = volume - aimed_volume[t]
+        change = volume - target_volume[t]
         push = -element[t] * change / rest_volume[t]
         energy -= 0.5 * push * change
         if len(mean) > 0:

@@ -135,7 +135,7 @@ class AveragedPressure:
         return (self.element + self.coupling.T @ (scaled @ self.coupling)).tocsr()
 
     def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) N, what holds the nodes at a displacement (N, 3) m."""
+        """(N, 3) N, external forces that hold the nodes at a displacement (N, 3) m."""
         moved = displacement.ravel()
         swelling = self.coupling @ moved
         held = self.element @ moved + self.coupling.T @ (swelling / self.capacity)

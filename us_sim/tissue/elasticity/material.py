@@ -90,7 +90,7 @@ KINDS: Mapping[str, Material] = {
     "bone": Material(10e6, 0.3, 1900.0),
 }
 
-# Kinds that lie in layers and fill what is between organs: they move with what is beside them.
+# Kinds that lie in layers and fill the space between organs, with which they move.
 LAYERS = ("tissue", "skin", "fat", "muscle")
 _WORDS = {
     **{kind: kind for kind in KINDS},

@@ -36,9 +36,9 @@ from numpy.typing import DTypeLike, NDArray
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
-from us_sim.tissue.elasticity.neo_hookean_cells import CellSums
+from us_sim.tissue.elasticity.neo_hookean_cells import cell_sums
 from us_sim.tissue.elasticity.neo_hookean_material import neo_hookean_constants
-from us_sim.tissue.elasticity.neo_hookean_tetrahedra import TetrahedraSums
+from us_sim.tissue.elasticity.neo_hookean_tetrahedra import tetrahedra_sums
 from us_sim.tissue.elasticity.nodal_sums import NodalSums
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
@@ -65,10 +65,9 @@ class NeoHookean:
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.float32, np.float64):
             raise SolverError(f"the neo-Hookean tissue is in {dtype}: give float32 or float64")
-        #: Number of nodes, N.
-        self.count = len(mesh.nodes)
-        kind = TetrahedraSums if mesh.planes is None else CellSums
-        self._sums: NodalSums = kind(mesh, materials, self.dtype)
+        self.count = len(mesh.nodes)  # N
+        sums = tetrahedra_sums if mesh.planes is None else cell_sums
+        self._sums: NodalSums = sums(mesh, materials, self.dtype)
         weight = neo_hookean_constants(mesh, materials).nodal * mesh.volumes / 4
         total = np.zeros(self.count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])
@@ -84,7 +83,7 @@ class NeoHookean:
         return self.energy_and_forces(displacement, np.empty(displacement.shape, self.dtype))
 
     def forces(self, displacement: NDArray, out: NDArray | None = None) -> NDArray:
-        """(3, N) N, the slope of the energy: what must act on each node to hold it there."""
+        """(3, N) N, the slope of the energy: external forces that hold the nodes there."""
         out = np.empty(displacement.shape, self.dtype) if out is None else out
         self.energy_and_forces(displacement, out)
         return out
@@ -93,29 +92,38 @@ class NeoHookean:
         """The energy, J, and its slope (3, N) N, which overwrites ``out``."""
         self._require(displacement)
         self._require(out)
-        energy = 0.0
+        sums, energy = self._sums, 0.0
         if self._averaged:
-            self._sums.volume_changes(displacement, self._nodal)
+            sums.volume_changes(displacement, sums.nodes, sums.constants, sums.lanes, self._nodal)
             energy = float(
                 np.einsum("i,i,i->", self._nodal, self._nodal, self._inverse, dtype=np.float64) / 2
             )
             self._nodal *= self._inverse
-        return energy + self._sums.energy_and_forces(displacement, self._nodal, out)
+        return energy + sums.energy_and_forces(
+            displacement, self._nodal, sums.nodes, sums.constants, sums.lumens, sums.lanes, out
+        )
 
     def linearise(self, displacement: NDArray) -> None:
         """Let `tangent_product` and `diagonal_blocks` be those at this displacement."""
         self._require(displacement)
-        self._sums.linearise(displacement, self._mean_change(displacement))
+        sums = self._sums
+        if self._averaged:
+            sums.volume_changes(displacement, sums.nodes, sums.constants, sums.lanes, self._nodal)
+            self._nodal *= self._inverse
+        arrays = sums.nodes, sums.constants, sums.lumens, sums.lanes, sums.tangent
+        sums.linearise(displacement, self._nodal, *arrays)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""
         self._require(change)
         out = np.empty_like(change) if out is None else out
         self._require(out)
+        sums = self._sums
+        arrays = sums.nodes, sums.constants, sums.tangent, sums.lanes
         if self._averaged:
-            self._sums.volume_slopes(change, self._nodal)
+            sums.volume_slopes(change, *arrays, self._nodal)
             self._nodal *= self._inverse
-        self._sums.tangent_product(change, self._nodal, out)
+        sums.tangent_product(change, self._nodal, *arrays, out)
         return out
 
     def diagonal_blocks(self) -> NDArray:
@@ -124,19 +132,23 @@ class NeoHookean:
         The nodal part of the bulk stiffness is counted as it is at rest.
         """
         blocks = np.empty((6, self.count), dtype=self.dtype)
-        self._sums.diagonal_blocks(blocks)
+        sums = self._sums
+        sums.diagonal_blocks(sums.nodes, sums.constants, sums.tangent, sums.lanes, blocks)
         blocks += self._nodal_blocks
         return blocks
 
     def smallest_volume_ratio(self, displacement: NDArray) -> float:
         """The smallest J, a tetrahedron's volume over its volume at rest; NaN if any J is NaN."""
-        self._require(displacement)
-        return self._sums.volume_ratios(displacement)[0]
+        return self._volume_ratios(displacement)[0]
 
     def inverted(self, displacement: NDArray) -> int:
         """How many tetrahedra have a J that is not above zero."""
+        return self._volume_ratios(displacement)[1]
+
+    def _volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
         self._require(displacement)
-        return self._sums.volume_ratios(displacement)[1]
+        sums = self._sums
+        return sums.volume_ratios(displacement, sums.nodes, sums.constants, sums.lanes)
 
     def _require(self, field: NDArray) -> None:
         if (
@@ -148,12 +160,6 @@ class NeoHookean:
                 f"a field of the neo-Hookean tissue is {field.dtype} of shape {field.shape}: give "
                 f"C-contiguous {self.dtype} of shape {(3, self.count)}"
             )
-
-    def _mean_change(self, displacement: NDArray) -> NDArray:
-        if self._averaged:
-            self._sums.volume_changes(displacement, self._nodal)
-            self._nodal *= self._inverse
-        return self._nodal
 
 
 def _nodal_blocks(mesh: TetrahedralMesh, weight: NDArray, total: NDArray) -> NDArray:
@@ -192,7 +198,7 @@ class PronyBranch:
 
 
 class Overstress:
-    """The energy of a tissue's branch, and what it remembers.
+    """The viscous overstress of a tissue: one Prony branch and its internal variable.
 
     Args:
         branch: its constants.
@@ -207,7 +213,7 @@ class Overstress:
         self.stiffness = branch.modulus * -math.expm1(-frames) / frames
         self._tissue = tissue
         self._single = single
-        self.relaxed = np.zeros((3, tissue.count))  # (3, N) m, v above
+        self.relaxed = np.zeros((3, tissue.count))  # (3, N) m, the internal variable v
         self.load = 0.0  # N, norm of the forces when last added
         self._image = np.empty((3, tissue.count), single.dtype)
 
@@ -228,15 +234,15 @@ class Overstress:
         force += own
 
     def add_product(self, change: NDArray[np.floating], image: NDArray[np.floating]) -> None:
-        """Add how that changes with the displacement, by ``change``, to ``image``, both (3, N)."""
+        """Add the tangent of `add_forces` times ``change`` to ``image``, both (3, N)."""
         self._single.tangent_product(change, self._image)
         self._image *= self._image.dtype.type(self.stiffness)
         image += self._image
 
     def relax(self, displacement: NDArray[np.float64]) -> None:
-        """Let the time from one frame to the next pass, the first of which ended as given."""
+        """Advance the internal variable by a frame that ended at a displacement (3, N) m."""
         self.relaxed = displacement + self._kept * (self.relaxed - displacement)
 
-    def forget(self, displacement: NDArray[np.float64]) -> None:
-        """Be relaxed at a displacement (3, N) m."""
+    def reset(self, displacement: NDArray[np.float64]) -> None:
+        """Relax fully at a displacement (3, N) m."""
         self.relaxed = displacement.copy()

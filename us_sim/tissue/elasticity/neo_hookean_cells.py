@@ -17,7 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike
 
-from us_sim.errors import MeshError
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean_material import (
@@ -26,10 +25,10 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
     INLINED,
     LOOP,
     ONE,
+    barrier_term,
     block,
     bulk_slope,
     cofactor_change,
-    crowding,
     energy_density,
     neo_hookean_constants,
     stress,
@@ -39,19 +38,18 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
 )
 from us_sim.tissue.elasticity.nodal_sums import (
     LANES,
-    Kernels,
     NodalSums,
-    emptied,
     five,
     in_groups,
     in_lanes,
+    lumen_energy_at,
     put_six,
     three,
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 # Row of the constants: one over the width along x (negative where mirrored), then y and z.
-PER_WIDTH = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
+PER_WIDTH = np.int64(0)  # numba compiles callers again for each literal
 FIELD = np.int64(0)  # First row of a buffer's field, row 3 corner + axis of it
 SUMS = FIELD + 24  # First row of a buffer's nodal sums, one a corner
 # First row of a buffer's pressures in the five tetrahedra, which the nodal sums make.
@@ -265,50 +263,17 @@ _K, _BULK, _TANGENT = FIELD + 24, FIELD + 29, FIELD + 34
 _ENERGY = OUT + 24
 
 
-class CellSums(NodalSums):
-    """Energies, forces and their slopes of every tetrahedron of a box mesh, summed at the nodes.
-
-    Raises:
-        MeshError: not a box mesh.
-    """
-
-    def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
-        if mesh.planes is None:
-            raise MeshError("the mesh has no planes, and so no cells: make it with box_mesh")
-        shape = tuple(len(planes) for planes in mesh.planes)
-        widths = [np.diff(planes) for planes in mesh.planes]
-        cells = np.indices([n - 1 for n in shape]).reshape(3, -1)
-        number = (cells[0] * shape[1] + cells[1]) * shape[2] + cells[2]
-        rows = np.zeros((number[-1] + 1, _CONSTANTS))
-        for axis in range(3):
-            rows[number, PER_WIDTH + axis] = 1 / widths[axis][cells[axis]]
-        rows[number, PER_WIDTH] *= 1 - 2 * (cells.sum(axis=0) % 2)
-        made = neo_hookean_constants(mesh, materials)
-        rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * made.shear).reshape(-1, 5)
-        rows[number, _ELEMENT:_NODAL] = (mesh.volumes * made.element).reshape(-1, 5)
-        rows[number, _NODAL:_WALL] = (mesh.volumes * made.nodal / 4).reshape(-1, 5)
-        rows[number, _WALL:] = (mesh.volumes * made.wall).reshape(-1, 5)
-        lumens = np.zeros((len(rows), 5, CONSTANTS))
-        lumens[number] = made.lumen_energies(mesh).reshape(-1, 5, CONSTANTS)
-        self._lumens = in_groups(lumens, dtype)
-        self._constants = in_lanes(rows).astype(dtype)
-        # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
-        self._nodes = np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1])
-        self._tangent = np.zeros((len(self._constants), _TANGENT * LANES), dtype=dtype)
-        self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
-
-
 @njit(**INLINED)
 def add_lumens(field, rows, lumen, entry, row, lanes):
-    """Add to the five rows from ``row`` on an entry of `emptied` of each tetrahedron of cells."""
+    """Add an entry of `lumen_energy_at` of each tetrahedron to the five rows from ``row`` on."""
     for w in range(LANES):
         p, q, r, s, t = gradients(field, rows, w)
         v = row * LANES + w
-        lanes[v] += emptied(p, lumen, w, 5 * LANES)[entry]
-        lanes[v + LANES] += emptied(q, lumen, w + LANES, 5 * LANES)[entry]
-        lanes[v + 2 * LANES] += emptied(r, lumen, w + 2 * LANES, 5 * LANES)[entry]
-        lanes[v + 3 * LANES] += emptied(s, lumen, w + 3 * LANES, 5 * LANES)[entry]
-        lanes[v + 4 * LANES] += emptied(t, lumen, w + 4 * LANES, 5 * LANES)[entry]
+        lanes[v] += lumen_energy_at(p, lumen, w, 5 * LANES)[entry]
+        lanes[v + LANES] += lumen_energy_at(q, lumen, w + LANES, 5 * LANES)[entry]
+        lanes[v + 2 * LANES] += lumen_energy_at(r, lumen, w + 2 * LANES, 5 * LANES)[entry]
+        lanes[v + 3 * LANES] += lumen_energy_at(s, lumen, w + 3 * LANES, 5 * LANES)[entry]
+        lanes[v + 4 * LANES] += lumen_energy_at(t, lumen, w + 4 * LANES, 5 * LANES)[entry]
 
 
 @njit(**LOOP)
@@ -332,9 +297,9 @@ def _nodal_pressures(nodal, grid, first, rows, lanes):
 
 @njit(**INLINED)
 def _pressure(h, element, wall, nodal):
-    """V times the slope by J of all energy but the shear's; nodal is what the nodes add to it."""
+    """V times the slope by J of all energy but the shear's; nodal is the nodes' part of it."""
     change = volume_change(h)
-    return element * change + nodal + wall * crowding(change)[1]
+    return element * change + nodal + wall * barrier_term(change)[1]
 
 
 @njit(**INLINED)
@@ -578,12 +543,37 @@ def _diagonal_blocks(grid, constants, tangent, lanes, blocks):
             add_out(lanes, OUT + entry, SYMMETRIC, grid, chunk * LANES, rows, blocks[entry])
 
 
-CellSums._kernels = Kernels(
-    _volume_ratios,
-    _volume_changes,
-    _energy_and_forces,
-    _linearise,
-    _volume_slopes,
-    _tangent_product,
-    _diagonal_blocks,
-)
+def cell_sums(mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> NodalSums:
+    """Energies, forces and their slopes of every tetrahedron of a box mesh, summed at the nodes."""
+    assert mesh.planes is not None
+    shape = tuple(len(planes) for planes in mesh.planes)
+    widths = [np.diff(planes) for planes in mesh.planes]
+    cells = np.indices([n - 1 for n in shape]).reshape(3, -1)
+    number = (cells[0] * shape[1] + cells[1]) * shape[2] + cells[2]
+    rows = np.zeros((number[-1] + 1, _CONSTANTS))
+    for axis in range(3):
+        rows[number, PER_WIDTH + axis] = 1 / widths[axis][cells[axis]]
+    rows[number, PER_WIDTH] *= 1 - 2 * (cells.sum(axis=0) % 2)
+    made = neo_hookean_constants(mesh, materials)
+    rows[number, _SHEAR:_ELEMENT] = (mesh.volumes * made.shear).reshape(-1, 5)
+    rows[number, _ELEMENT:_NODAL] = (mesh.volumes * made.element).reshape(-1, 5)
+    rows[number, _NODAL:_WALL] = (mesh.volumes * made.nodal / 4).reshape(-1, 5)
+    rows[number, _WALL:] = (mesh.volumes * made.wall).reshape(-1, 5)
+    lumens = np.zeros((len(rows), 5, CONSTANTS))
+    lumens[number] = made.lumen_energies(mesh).reshape(-1, 5, CONSTANTS)
+    constants = in_lanes(rows).astype(dtype)
+    return NodalSums(
+        _volume_ratios,
+        _volume_changes,
+        _energy_and_forces,
+        _linearise,
+        _volume_slopes,
+        _tangent_product,
+        _diagonal_blocks,
+        # Steps in node number from a cell's corner to the next along x, y, z; the end of the cells.
+        nodes=np.array([shape[1] * shape[2], shape[2], 1, number[-1] + 1]),
+        constants=constants,
+        lumens=in_groups(lumens, dtype),
+        tangent=np.zeros((len(constants), _TANGENT * LANES), dtype=dtype),
+        lanes=np.zeros(ROWS * LANES, dtype=dtype),
+    )

@@ -13,7 +13,7 @@ derivatives and grows without bound,
 
     wall (J0 - J)^3 / (3 J0 J),
 
-with the modulus of `wall_modulus`, and that goes on below a fiftieth as its Taylor polynomial of
+with the modulus of `barrier_modulus`, and that goes on below a fiftieth as its Taylor polynomial of
 second order, so that it is defined everywhere. Everything is written in h, not F, so that small
 strains keep all their digits in single precision. A 3x3 matrix is a tuple of nine numbers, row by
 row. The functions are compiled into the loops that call them, which LLVM vectorises.
@@ -41,9 +41,9 @@ lumen is empty, its walls touch and the solid is pressed: there the wall term ab
 stiff as the solid.
 
 >>> import numpy as np
->>> from us_sim.tissue.elasticity.neo_hookean_material import emptying, lumen_table
+>>> from us_sim.tissue.elasticity.neo_hookean_material import lumen_energy, lumen_table
 >>> whole = lumen_table(np.ones(1), np.array([1000.0]), np.ones(1), np.ones(1))[0]
->>> pressures = [float(emptying(ratio - 1.0, whole)[1]) for ratio in (1.0, 0.9, 0.8, 0.5, 0.2)]
+>>> pressures = [float(lumen_energy(ratio - 1.0, whole)[1]) for ratio in (1.0, 0.9, 0.8, 0.5, 0.2)]
 >>> np.round(pressures).tolist()
 [0.0, -750.0, -1000.0, -1000.0, -1000.0]
 """
@@ -77,7 +77,7 @@ ONE, HALF = np.float32(1.0), np.float32(0.5)
 # Numbers that are exact in any precision. Literals would turn single precision into double.
 _THREE = np.float32(3.0)
 # Volume ratios J at which a tetrahedron begins to resist being crushed, and is crushed.
-_CROWDED, _CRUSHED = np.float32(0.25), np.float32(0.02)
+_BARRIER_ONSET, _CRUSHED = np.float32(0.25), np.float32(0.02)
 
 
 @njit(**INLINED)
@@ -145,7 +145,7 @@ def volume_change(h):
 
 
 @njit(**INLINED)
-def crowding_below(change, onset):
+def barrier_from(change, onset):
     """The term against being crushed that begins at J = onset, over its modulus, and its two slopes
     by J = change + 1.
     """
@@ -168,9 +168,9 @@ def crowding_below(change, onset):
 
 
 @njit(**INLINED)
-def crowding(change):
+def barrier_term(change):
     """That of a solid."""
-    return crowding_below(change, _CROWDED)
+    return barrier_from(change, _BARRIER_ONSET)
 
 
 @njit(**INLINED)
@@ -179,7 +179,7 @@ def energy_density(h, shear, bulk, wall):
     beyond = _volume_change_beyond_trace(h)
     change = (h[0] + h[4] + h[8]) + beyond
     plain = shear * (HALF * inner(h, h) - beyond) + HALF * (bulk * change * change)
-    return plain + wall * crowding(change)[0]
+    return plain + wall * barrier_term(change)[0]
 
 
 @njit(**INLINED)
@@ -229,7 +229,7 @@ def volume_slope(h, d):
 @njit(**INLINED)
 def bulk_slope(change, element, wall):
     """How fast the pressure rises with J = change + 1: by element, and against being crushed."""
-    return element + wall * crowding(change)[2]
+    return element + wall * barrier_term(change)[2]
 
 
 @njit(**INLINED)
@@ -267,7 +267,7 @@ def block(g, c, shear, bulk):
 _FIRMNESS = 5.0
 
 
-def wall_modulus(
+def barrier_modulus(
     tetrahedra: NDArray[np.integer], shear: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
     """(M,) Pa, of the wall of each tetrahedron.
@@ -280,7 +280,7 @@ def wall_modulus(
     return _FIRMNESS * _mean_with_stiffest(tetrahedra, shear, count)
 
 
-def withstood_force(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
+def barrier_strength(mesh: TetrahedralMesh, materials: TissueMaterials) -> NDArray[np.float64]:
     """(N,) N, a measure of the force that the walls around each node withstand.
 
     It is the sum, over the tetrahedra at the node, of shear modulus times a third of a face, where
@@ -309,7 +309,7 @@ CONSTANTS = 6  # Numbers that the law of a lumen needs, see `lumen_table`
 _SLACK = 0.2  # Fraction of its volume, e above, that a vein has lost when its wall is slack
 # Shear modulus of a lumen over that of the solid that stands in for it. Blood has none; this one
 # keeps the mesh inside in shape. In the arm it is a tenth of the pressure, so that flattening the
-# mesh takes a tenth of what emptying takes.
+# mesh takes a tenth of the work of emptying it.
 _SOFTNESS = 0.05
 # Volume ratio at which the walls of an empty lumen begin to touch: they have a thickness.
 _TOUCHING = 0.2
@@ -323,10 +323,10 @@ _LEAST = np.float32(1e-12)
 
 @dataclass(frozen=True, eq=False)
 class NeoHookeanConstants:
-    """What the neo-Hookean sums need of each tetrahedron.
+    """Constants of each tetrahedron for the neo-Hookean sums.
 
-    The first four are those of `volumetric_split` and `wall_modulus`; where there is a lumen, all
-    but the shear modulus are zero, and a row of ``lumen`` says how it resists.
+    The first four are of `volumetric_split` and `barrier_modulus`; where there is a lumen, all but
+    the shear modulus are zero, and a row of ``lumen`` says how it resists.
     """
 
     shear: NDArray[np.float64]  # (M,), Pa
@@ -349,9 +349,9 @@ def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
     lose its volume whatever its neighbours do.
     """
     split = volumetric_split(materials)
-    emptied = _emptied(materials)
+    emptied = _drained_fraction(materials)
     shear = split.shear * (1.0 - (1.0 - _SOFTNESS) * emptied)
-    wall = wall_modulus(mesh.tetrahedra, shear, len(mesh.nodes))
+    wall = barrier_modulus(mesh.tetrahedra, shear, len(mesh.nodes))
     lumen = lumen_table(emptied, materials.lumen_pressure, split.element, wall)
     solid = materials.lumen_fraction == 0.0
     return NeoHookeanConstants(
@@ -359,10 +359,10 @@ def neo_hookean_constants(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
     )
 
 
-def _emptied(materials: TissueMaterials) -> NDArray[np.float64]:
+def _drained_fraction(materials: TissueMaterials) -> NDArray[np.float64]:
     """(M,), fraction of each tetrahedron that may leave it, somewhat more than that of its lumen.
 
-    What a tetrahedron contains moves as one. So of the lumen f in one that loses f of its volume,
+    A tetrahedron's contents move as one. So of the lumen f in one that loses f of its volume,
     f (1 - f) would stay to be seen: of the arm's vein, whose tetrahedra are almost as large as it
     is, a fifth. With 1 - (1 - f)^2 it is half of that.
     """
@@ -410,7 +410,7 @@ def require_solid(mesh: TetrahedralMesh, materials: TissueMaterials) -> None:
 
 
 @njit(**INLINED)
-def emptying(change, constants):
+def lumen_energy(change, constants):
     """Energy density of a tetrahedron with lumen, its slope by J = change + 1 and that one's.
 
     With s = m - 1, the quadratic equation is a s^2 + (2 a + b) s = J - 1.
@@ -426,9 +426,9 @@ def emptying(change, constants):
     value *= pressure
     curvature = _TWO * pressure * (ONE + s) * per / root
     curvature = curvature if change > lowest else ONE - ONE
-    crowded = crowding_below(change, onset)
+    barrier = barrier_from(change, onset)
     return (
-        value + wall * crowded[0],
-        pressure * s * two + wall * crowded[1],
-        curvature + wall * crowded[2],
+        value + wall * barrier[0],
+        pressure * s * two + wall * barrier[1],
+        curvature + wall * barrier[2],
     )

@@ -16,10 +16,10 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
     INLINED,
     LOOP,
     ONE,
+    barrier_term,
     block,
     bulk_slope,
     cofactor_change,
-    crowding,
     energy_density,
     neo_hookean_constants,
     stress,
@@ -29,11 +29,10 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
 )
 from us_sim.tissue.elasticity.nodal_sums import (
     LANES,
-    Kernels,
     NodalSums,
-    emptied,
     in_groups,
     in_lanes,
+    lumen_energy_at,
     nine,
     put_nine,
     put_six,
@@ -42,7 +41,7 @@ from us_sim.tissue.elasticity.nodal_sums import (
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 # First row of the constants' gradients of the shape functions of nodes 1, 2 and 3.
-SHAPE = np.int64(0)  # and no literal, for each of which numba would compile what takes a row
+SHAPE = np.int64(0)  # numba compiles callers again for each literal
 FIELD = np.int64(0)  # First row of a buffer's field, row 3 b + axis of it at the b-th node
 SUMS = FIELD + 12  # First row of a buffer's nodal sums, one a node
 OUT = SUMS + 4  # First row of a buffer's result: a field of 3 b + axis, 6 rows a node, or fewer
@@ -135,7 +134,7 @@ def put_forces(p, constants, w, lanes):
     _put_row(p[6], p[7], p[8], constants, w, lanes, OUT + 2)
 
 
-_ROW = np.int64(LANES)  # no literal, for which numba would compile `emptied` again
+_ROW = np.int64(LANES)  # no literal, for which numba would compile `lumen_energy_at` again
 # Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
 # number.
 _SHEAR, _ELEMENT, _NODAL, _WALL, _CONSTANTS = (
@@ -152,26 +151,6 @@ _GRADIENT, _K, _BULK, _TANGENT = np.int64(0), 9, 10, 11
 _ENERGY = OUT + 12  # Row of energies, behind those of forces
 
 
-class TetrahedraSums(NodalSums):
-    """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
-
-    def __init__(self, mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike) -> None:
-        count = len(mesh.tetrahedra)
-        made = neo_hookean_constants(mesh, materials)
-        rows = np.empty((count, _CONSTANTS))
-        rows[:, SHAPE:_SHEAR] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
-        rows[:, _SHEAR] = mesh.volumes * made.shear
-        rows[:, _ELEMENT] = mesh.volumes * made.element
-        rows[:, _NODAL] = mesh.volumes * made.nodal / 4
-        rows[:, _WALL] = mesh.volumes * made.wall
-        self._lumens = in_groups(made.lumen_energies(mesh)[:, None], dtype)
-        self._constants = in_lanes(rows).astype(dtype)
-        # Lanes beyond the last tetrahedron name node 0 and have no stiffness.
-        self._nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
-        self._tangent = np.zeros((len(self._nodes), _TANGENT * LANES), dtype=dtype)
-        self._lanes = np.zeros(ROWS * LANES, dtype=dtype)
-
-
 @njit(**INLINED)
 def _nodal_pressure(lanes, constants, w):
     """The nodal weight times the sum of the nodes' values that `gather_scalar` has made."""
@@ -184,7 +163,7 @@ def _nodal_pressure(lanes, constants, w):
 def _pressure(h, lanes, rows, w):
     """V times the slope by J of all energy but the shear's and lumens'."""
     change = volume_change(h)
-    own = rows[_ELEMENT * LANES + w] * change + rows[_WALL * LANES + w] * crowding(change)[1]
+    own = rows[_ELEMENT * LANES + w] * change + rows[_WALL * LANES + w] * barrier_term(change)[1]
     return own + _nodal_pressure(lanes, rows, w)
 
 
@@ -240,7 +219,7 @@ def _energy_and_forces(displacement, nodal, nodes, constants, lumens, lanes, for
             lumen = lumens[1][lumens[0][chunk]]
             for w in range(LANES):
                 h = gradient(lanes, rows, w)
-                energy, slope, _ = emptied(h, lumen, w, _ROW)
+                energy, slope, _ = lumen_energy_at(h, lumen, w, _ROW)
                 lanes[_ENERGY * LANES + w] += energy
                 pressure = _pressure(h, lanes, rows, w) + slope
                 put_forces(stress(h, rows[_SHEAR * LANES + w], pressure), rows, w, lanes)
@@ -268,7 +247,7 @@ def _linearise(displacement, nodal, nodes, constants, lumens, lanes, tangent):
         if lumens[0][chunk] >= 0:
             lumen = lumens[1][lumens[0][chunk]]
             for w in range(LANES):
-                _, pressure, slope = emptied(gradient(lanes, rows, w), lumen, w, _ROW)
+                _, pressure, slope = lumen_energy_at(gradient(lanes, rows, w), lumen, w, _ROW)
                 kept[_K * LANES + w] += pressure
                 kept[_BULK * LANES + w] += slope
 
@@ -331,12 +310,30 @@ def _diagonal_blocks(nodes, constants, tangent, lanes, blocks):
                     values[at[w]] += added[w]
 
 
-TetrahedraSums._kernels = Kernels(
-    _volume_ratios,
-    _volume_changes,
-    _energy_and_forces,
-    _linearise,
-    _volume_slopes,
-    _tangent_product,
-    _diagonal_blocks,
-)
+def tetrahedra_sums(
+    mesh: TetrahedralMesh, materials: TissueMaterials, dtype: DTypeLike
+) -> NodalSums:
+    """Energies, forces and their slopes of the tetrahedra of any mesh, summed at the nodes."""
+    made = neo_hookean_constants(mesh, materials)
+    rows = np.empty((len(mesh.tetrahedra), _CONSTANTS))
+    rows[:, SHAPE:_SHEAR] = shape_gradients(mesh)[:, 1:].reshape(-1, 9)
+    rows[:, _SHEAR] = mesh.volumes * made.shear
+    rows[:, _ELEMENT] = mesh.volumes * made.element
+    rows[:, _NODAL] = mesh.volumes * made.nodal / 4
+    rows[:, _WALL] = mesh.volumes * made.wall
+    # Lanes beyond the last tetrahedron name node 0 and have no stiffness.
+    nodes = in_lanes(mesh.tetrahedra.astype(np.uint32))
+    return NodalSums(
+        _volume_ratios,
+        _volume_changes,
+        _energy_and_forces,
+        _linearise,
+        _volume_slopes,
+        _tangent_product,
+        _diagonal_blocks,
+        nodes=nodes,
+        constants=in_lanes(rows).astype(dtype),
+        lumens=in_groups(made.lumen_energies(mesh)[:, None], dtype),
+        tangent=np.zeros((len(nodes), _TANGENT * LANES), dtype=dtype),
+        lanes=np.zeros(ROWS * LANES, dtype=dtype),
+    )

@@ -1,8 +1,8 @@
 """Sums of a neo-Hookean material over tetrahedra at their nodes, sixty-four tetrahedra at a time.
 
 Row r of a buffer begins at r * `LANES` and holds one number a cell or tetrahedron. The functions
-are inlined into the loops that call them, so that the row is a constant there. One class does the
-sums for the cells of a box mesh, another for any tetrahedra; `NeoHookean` adds the nodal averages.
+are inlined into the loops that call them, so that the row is a constant there. `cell_sums` are for
+the cells of a box mesh, `tetrahedra_sums` for any mesh; `NeoHookean` adds the nodal averages.
 Lumens, which most groups have none of, are added in loops of their own, so that a tissue without
 vessels takes no longer.
 """
@@ -10,13 +10,13 @@ vessels takes no longer.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from us_sim.kernels import njit
-from us_sim.tissue.elasticity.neo_hookean_material import INLINED, emptying, volume_change
+from us_sim.tissue.elasticity.neo_hookean_material import INLINED, lumen_energy, volume_change
 
 # Numbers in a row: a few vectors of the widest kind, so that all rows stay in the L1 cache.
 LANES = 64
@@ -89,77 +89,33 @@ def put_nine(values, rows, row, w):
     rows[v + 8 * LANES] = values[8]
 
 
-_Kernel = Callable[..., Any]
-
-
-class Kernels(NamedTuple):
-    """The compiled functions behind the methods of `NodalSums`, by the methods' names."""
-
-    volume_ratios: _Kernel
-    volume_changes: _Kernel
-    energy_and_forces: _Kernel
-    linearise: _Kernel
-    volume_slopes: _Kernel
-    tangent_product: _Kernel
-    diagonal_blocks: _Kernel
-
-
-class NodalSums:
-    """Energies, forces and their slopes of every tetrahedron, summed at the nodes.
+class NodalSums(NamedTuple):
+    """Compiled sums over all tetrahedra at their nodes, and the arrays that they take.
 
     Displacements and their changes are (3, N) m. ``nodal`` is (N,) and belongs to the nodal part
     of the bulk stiffness; it is empty where there is none.
     """
 
-    _kernels: ClassVar[Kernels]
-    _nodes: NDArray[Any]  # how kernels find the nodes of a tetrahedron
-    _constants: NDArray[Any]  # of each block of tetrahedra
-    _lumens: tuple[NDArray[Any], NDArray[Any]]  # of those blocks that have one, see `in_groups`
-    _tangent: NDArray[Any]  # what `linearise` stores of each block
-    _lanes: NDArray[Any]  # what kernels work in
-
-    def volume_ratios(self, displacement: NDArray) -> tuple[float, int]:
-        """The smallest volume over rest volume, and how many are not above zero."""
-        ratios: tuple[float, int] = self._kernels.volume_ratios(
-            displacement, self._nodes, self._constants, self._lanes
-        )
-        return ratios
-
-    def volume_changes(self, displacement: NDArray, nodal: NDArray) -> None:
-        """Fill nodal, J: at each node the sum over its tetrahedra of their weight times J - 1."""
-        self._kernels.volume_changes(displacement, self._nodes, self._constants, self._lanes, nodal)
-
-    def energy_and_forces(self, displacement: NDArray, nodal: NDArray, out: NDArray) -> float:
-        """J, of each tetrahedron by itself, without the nodal part; and (3, N) N into ``out``, the
-        whole energy's slope, where nodal is the nodes' mean volume change.
-        """
-        energy: float = self._kernels.energy_and_forces(
-            displacement, nodal, self._nodes, self._constants, self._lumens, self._lanes, out
-        )
-        return energy
-
-    def linearise(self, displacement: NDArray, nodal: NDArray) -> None:
-        """Store what the slopes at this displacement need; nodal is the nodes' mean change."""
-        self._kernels.linearise(
-            *(displacement, nodal, self._nodes, self._constants),
-            *(self._lumens, self._lanes, self._tangent),
-        )
-
-    def volume_slopes(self, change: NDArray, nodal: NDArray) -> None:
-        """Fill nodal, J: how much `volume_changes` changes with the displacement."""
-        self._kernels.volume_slopes(
-            change, self._nodes, self._constants, self._tangent, self._lanes, nodal
-        )
-
-    def tangent_product(self, change: NDArray, nodal: NDArray, out: NDArray) -> None:
-        """(3, N) N, how much the forces change, where nodal is the change of the nodes' mean."""
-        self._kernels.tangent_product(
-            change, nodal, self._nodes, self._constants, self._tangent, self._lanes, out
-        )
-
-    def diagonal_blocks(self, out: NDArray) -> None:
-        """(6, N) N/m xx, xy, xz, yy, yz, zz of each node's block, without the nodes' averages."""
-        self._kernels.diagonal_blocks(self._nodes, self._constants, self._tangent, self._lanes, out)
+    # (displacement, nodes, constants, lanes): smallest J, and how many are not above zero
+    volume_ratios: Callable[..., tuple[float, int]]
+    # (displacement, nodes, constants, lanes, nodal): fills the nodes' weighted sums of J - 1, J
+    volume_changes: Callable[..., None]
+    # (displacement, nodal, nodes, constants, lumens, lanes, out): J without the nodal part, and the
+    # whole energy's slope (3, N) N into out, where nodal is the nodes' mean volume change
+    energy_and_forces: Callable[..., float]
+    # (displacement, nodal, nodes, constants, lumens, lanes, tangent): fills the tangent
+    linearise: Callable[..., None]
+    # (change, nodes, constants, tangent, lanes, nodal): fills the slopes of `volume_changes`
+    volume_slopes: Callable[..., None]
+    # (change, nodal, nodes, constants, tangent, lanes, out): fills the change of the forces
+    tangent_product: Callable[..., None]
+    # (nodes, constants, tangent, lanes, out): fills (6, N) N/m, without the nodes' averages
+    diagonal_blocks: Callable[..., None]
+    nodes: NDArray[Any]  # how kernels find the nodes of a tetrahedron
+    constants: NDArray[Any]  # of each group of tetrahedra
+    lumens: tuple[NDArray[Any], NDArray[Any]]  # of those groups that have one, see `in_groups`
+    tangent: NDArray[Any]  # of each group, which `linearise` fills
+    lanes: NDArray[Any]  # work space
 
 
 def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDArray]:
@@ -181,9 +137,9 @@ def in_groups(table: NDArray, dtype: DTypeLike) -> tuple[NDArray[np.int32], NDAr
 
 
 @njit(**INLINED)
-def emptied(h, lumen, v, step):
-    """`emptying` of a tetrahedron, times its volume; its constants are at v and so many apart."""
-    return emptying(
+def lumen_energy_at(h, lumen, v, step):
+    """`lumen_energy` times volume; the tetrahedron's constants are at v and ``step`` apart."""
+    return lumen_energy(
         volume_change(h),
         (
             lumen[v],

@@ -93,7 +93,6 @@ def springs_of(
     """The paper's Algorithm 1: all edges of all tetrahedra become springs, duplicates merge.
 
     Args:
-        mesh, materials: of the tissue.
         stiffness_factor: m, spring constant over Young's modulus, for one tetrahedron's edge. The
             paper gives it as a bare number, but it is a length: the right one grows with the mesh's
             spacing, as `fitted_springs` shows.
@@ -120,10 +119,9 @@ def fitted_springs(
     that Algorithm 1 hides in its constant is 15 V / (2 (1 + nu) sum(L**2)).
 
     Args:
-        mesh, materials: of the tissue.
         damping_factor: s, damping constant over spring constant.
-        with_volume: match mu, since a volume term will add what lambda lacks. Otherwise, and below
-            Poisson's ratio 1/4, match Young's modulus, at the springs' own ratio of 1/4.
+        with_volume: match mu, since a volume term will add the missing part of lambda. Otherwise,
+            and below Poisson's ratio 1/4, match Young's modulus, at the springs' own ratio of 1/4.
     """
     ratio = np.maximum(materials.poisson_ratio, 0.25) if with_volume else 0.25
     shear = materials.young_modulus / (2 * (1 + ratio))
@@ -246,7 +244,7 @@ class VolumeTerm:
     yield_area: NDArray[np.float64]
 
     @classmethod
-    def nothing(cls, count: int) -> VolumeTerm:
+    def empty(cls, count: int) -> VolumeTerm:
         """The term without a tetrahedron, for ``count`` nodes."""
         none = np.zeros(0)
         return cls(np.zeros((0, 4), np.int32), none, none, none, np.zeros(count), 0.0, none)
@@ -312,8 +310,6 @@ def volume_term(
     make the tissue collapse.
 
     Args:
-        mesh, materials: of the tissue.
-        springs: on the mesh's edges.
         damping_time: s, viscosity over stiffness.
         yielding: whether a tetrahedron whose faces have grown beyond `_YIELD` resists no more than
             it does there. Its stiffness grows with the square of its faces, and so, without this,
@@ -400,7 +396,7 @@ def _measure(tetrahedra, nodes, volume):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_volume_forces(volumes, positions, velocity, force):
-    """Adds to force (N, 3) what the volume term does at positions and velocity (N, 3).
+    """Adds to force (N, 3) that of the volume term at positions and velocity (N, 3).
 
     Its `change` is left with volumes above those at rest, as if moved on for the damping time.
     """

@@ -69,7 +69,8 @@ def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
     """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
 
     For springs alone it is the sum of a node's spring constants, which holds however they turn and
-    stretch. With or without a volume term it is about 2.7 times what the undeformed tissue needs.
+    stretch. With or without a volume term it is about 2.7 times the
+    bound that the undeformed tissue needs.
 
     Args:
         factors: as in `highest_frequency`.
@@ -84,7 +85,7 @@ def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
     return total
 
 
-def stabilised(
+def stabilise(
     model: TissueModel,
     factors: Sequence[csr_array],
     time_step: float,
@@ -92,18 +93,17 @@ def stabilised(
     stabilisation: str,
     maximum_substeps: int,
 ) -> tuple[NDArray[np.float64], int, str]:
-    """Masses (N,) kg and number of sub-steps that make a step stable, and what was done, in words.
+    """Masses (N,) kg and number of sub-steps that make a step stable, and a remark on them.
 
     They follow from the bound of `node_stiffness`, so that the step stays stable as the tissue
-    deforms. The limit in the words is the one of small oscillations.
+    deforms. The limit in the remark is that of small oscillations.
 
     Args:
         model: whose lumped masses are simulated where possible.
         factors: as in `highest_frequency`.
         time_step: s, as set.
         damping_factor: s, damping constant over stiffness.
-        stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only says what it is.
-        maximum_substeps: of one step.
+        stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only adds the remark.
 
     Raises:
         SolverError: more sub-steps than allowed.
@@ -139,37 +139,33 @@ def stabilised(
 # Tetrahedra up to which all are watched, which takes less than a millisecond; and how many layers
 # under the surface are watched otherwise.
 _WATCHED, _LAYERS = 50_000, 2
-_PATIENCE = 10  # Frames in which a released tissue may untangle by itself
+_FRAMES_TO_UNTANGLE = 10  # Frames in which a released tissue may untangle by itself
 
 
-class Tangling:
-    """Watches a tissue for tetrahedra inside out, frame by frame.
-
-    Args:
-        model: of the tissue.
-    """
+class InversionWatch:
+    """Count of tetrahedra inside out, frame by frame."""
 
     def __init__(self, model: TissueModel) -> None:
         self._tetrahedra = model.mesh.tetrahedra
         self._held = bool(model.fixed.any())
         self._frames_free = 0
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew, since the tissue was put elsewhere."""
         self._frames_free = 0
 
-    def judge(self, positions: NDArray[np.float64], touched: bool) -> tuple[str, bool]:
-        """What to say at the end of a frame, and whether the tissue is to be put back to rest.
+    def check(self, positions: NDArray[np.float64], touched: bool) -> tuple[str, bool]:
+        """Remark at the end of a frame, and whether the tissue is to be put back to rest.
 
         Args:
             positions: (N, 3) m.
-            touched: whether the probe pushes the tissue.
+            touched: whether the probe touches the tissue.
         """
         self._frames_free = 0 if touched else self._frames_free + 1
         inverted = count_inverted(positions, self._tetrahedra)
         if inverted == 0:
             return "", False
-        if self._frames_free < _PATIENCE or not self._held:
+        if self._frames_free < _FRAMES_TO_UNTANGLE or not self._held:
             return f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out", False
         return (
             f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
@@ -201,7 +197,7 @@ def count_inverted(nodes, tetrahedra):
     return count
 
 
-class ElasticBalance:
+class ElasticResidual:
     """Residual of each frame of a run.
 
     It is the norm of the unbalanced elastic forces over the norm of the contact forces, or, without
@@ -214,13 +210,13 @@ class ElasticBalance:
 
     def __init__(self, rounding: float) -> None:
         self._rounding = rounding
-        self._heaviest = 0.0
+        self.largest_load = 0.0  # N, largest norm of contact forces since the tissue was at rest
 
     @classmethod
     def of(
         cls, springs: SpringNetwork, volume: VolumeTerm, nodes: NDArray[np.float64]
-    ) -> ElasticBalance:
-        """The balance of springs and volumes that are undeformed at nodes (N, 3) m."""
+    ) -> ElasticResidual:
+        """The residual of springs and volumes that are undeformed at nodes (N, 3) m."""
         stiffness = float(np.linalg.norm(springs.stiffness))
         if len(volume.tetrahedra):
             # A tetrahedron resists as a spring of its modulus and size.
@@ -228,34 +224,30 @@ class ElasticBalance:
             stiffness += float(np.linalg.norm((volume.element + volume.nodal) * size))
         return cls(4 * float(np.finfo(np.float64).eps * np.abs(nodes).max()) * stiffness)
 
-    @property
-    def heaviest(self) -> float:
-        """N, largest norm of contact forces since the tissue was at rest."""
-        return self._heaviest
-
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew, since the tissue was put elsewhere: earlier loads no longer count."""
-        self._heaviest = 0.0
+        self.largest_load = 0.0
 
     def residual(
         self,
-        holding: NDArray[np.float64],
+        elastic: NDArray[np.float64],
         touched: NDArray[np.integer],
         normal: NDArray[np.float64],
     ) -> float:
         """The residual of one frame.
 
         Args:
-            holding: (N, 3) N that would hold the nodes where they are, nothing at fixed ones.
-            touched: (K,) nodes that the probe pushes.
-            normal: (K, 3) unit directions in which it pushes them where they are.
+            elastic: (N, 3) N that would hold the nodes where they are, nothing at fixed ones.
+            touched: (K,) nodes in contact.
+            normal: (K, 3) unit directions of the contact forces.
         """
-        push = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
-        unbalanced = holding.copy()
-        unbalanced[touched] -= push[:, None] * normal
-        imbalance, load = float(np.linalg.norm(unbalanced)), float(np.linalg.norm(push))
-        if load == 0.0 and imbalance <= self._rounding:
-            self._heaviest = 0.0
+        contact_force = np.maximum(np.einsum("ij,ij->i", elastic[touched], normal), 0.0)
+        unbalanced = elastic.copy()
+        unbalanced[touched] -= contact_force[:, None] * normal
+        unbalanced_norm = float(np.linalg.norm(unbalanced))
+        load = float(np.linalg.norm(contact_force))
+        if load == 0.0 and unbalanced_norm <= self._rounding:
+            self.largest_load = 0.0
             return 0.0
-        self._heaviest = max(self._heaviest, load) or imbalance
-        return imbalance / (load or self._heaviest)
+        self.largest_load = max(self.largest_load, load) or unbalanced_norm
+        return unbalanced_norm / (load or self.largest_load)

@@ -46,8 +46,8 @@ Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """Where the sum of squares is least."""
+class FitResult:
+    """The least-squares solution."""
 
     log_moduli: NDArray[np.float64]  # (P,) of Pa
     nuisance: NDArray[np.float64]  # (Q,)
@@ -72,7 +72,7 @@ def fit(
     nuisance: NDArray[np.float64],
     start: NDArray[np.float64],
     progress: Progress | None = None,
-) -> Fitted:
+) -> FitResult:
     """The logarithms of moduli that fit best.
 
     Args:
@@ -121,11 +121,13 @@ def fit(
                 continue
         damping = 10 * max(damping, _DAMPING)
         if damping > _MOST_DAMPING:
-            break  # rounding of the model hides what is left to gain
+            break  # the model's rounding hides any further gain
     residual = measured - here.values
-    others = _others(residual, nuisance, noise)
+    others = _nuisance_values(residual, nuisance, noise)
     bounded = (here.at <= bounds[0] + 1e-6) | (here.at >= bounds[1] - 1e-6)
-    return Fitted(here.at, others, residual - nuisance @ others, here.slopes, noise, bounded, steps)
+    return FitResult(
+        here.at, others, residual - nuisance @ others, here.slopes, noise, bounded, steps
+    )
 
 
 def without_nuisance(
@@ -134,7 +136,7 @@ def without_nuisance(
     nuisance: NDArray[np.float64],
     noise: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n,) residuals and (n, P) slopes over the noise, less what the other unknowns explain."""
+    """(n,) residuals and (n, P) slopes over the noise, orthogonal to the other unknowns'."""
     left = np.column_stack([residual, slopes]) / noise[:, None]
     explained = basis(nuisance / noise[:, None])
     left -= explained @ (explained.T @ left)
@@ -148,7 +150,7 @@ def basis(columns: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(vectors[:, values > 1e-10 * values.max(initial=0.0)])
 
 
-def _others(residual: NDArray, nuisance: NDArray, noise: NDArray) -> NDArray:
+def _nuisance_values(residual: NDArray, nuisance: NDArray, noise: NDArray) -> NDArray:
     weighted = nuisance / noise[:, None]
     return np.asarray(np.linalg.lstsq(weighted, residual / noise, rcond=None)[0])
 
@@ -156,7 +158,7 @@ def _others(residual: NDArray, nuisance: NDArray, noise: NDArray) -> NDArray:
 def _noise(
     residual: NDArray, groups: NDArray, nuisance: NDArray, measured: NDArray, moduli: int
 ) -> NDArray:
-    """(n,) scatter of each kind of measurements, of what the other unknowns leave."""
+    """(n,) scatter of each kind of measurements, after fitting the other unknowns."""
     noise = np.empty(len(residual))
     free = (len(residual) - nuisance.shape[1] - moduli) / len(residual)
     for group in np.unique(groups):
@@ -172,7 +174,7 @@ def _noise(
 def _step(
     misfit: NDArray, slopes: NDArray, damping: float, at: NDArray, bounds: tuple[NDArray, NDArray]
 ) -> tuple[NDArray, float]:
-    """(P,) the next step, and how much the sum of squares would fall by it if all were linear."""
+    """(P,) the next step, and the predicted decrease of the sum of squares."""
     curvature, slope = slopes.T @ slopes, slopes.T @ misfit
     damped = curvature + np.diag(damping * np.diag(curvature) + np.finfo(np.float64).tiny)
     change = np.linalg.lstsq(damped, slope, rcond=None)[0]
@@ -243,12 +245,12 @@ def quantile(confidence: float) -> float:
 
 
 _SINGULAR = 1e-9  # Eigenvalue of the slopes' products over the largest, below which moduli are one
-_LIKE = 0.3  # Part of what a modulus does to the measurements that another one must do to be named
+_LIKE = 0.3  # Share of a modulus' slope that another one must explain to be named
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """What is known of P moduli."""
+class Identifiability:
+    """Which of P moduli are determined, and how well."""
 
     half_widths: NDArray[np.float64]  # (P,) of the intervals of their logarithms, the rest given
     determined: NDArray[np.bool_]  # (P,)
@@ -256,29 +258,23 @@ class Verdict:
     like: list[list[int]]  # of each that is not determined, those that do the same
 
 
-def judge(
-    slopes: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    noise: NDArray[np.float64],
+def assess_identifiability(
+    fitted: FitResult,
     nuisance: NDArray[np.float64],
     times: NDArray[np.float64],
     depths: NDArray[np.float64],
-    *,
-    widest: float = 3.0,
-    confidence: float = 0.95,
-) -> Verdict:
-    """Tell moduli that are determined from others.
+    widest: float,
+    confidence: float,
+) -> Identifiability:
+    """Tell moduli that are determined from those that are not.
 
     Args:
-        slopes: (n, P) of the measurements by the logarithms of moduli.
-        residual: (n,) that the fit left.
-        noise: (n,) deviation of each measurement.
         nuisance: (n, Q) slopes by other unknowns.
         times: (n,) s.
         depths: (n,) m, of the probe, zero without contact.
         widest: factor by which a modulus may be off either way and still counts as determined.
-        confidence: of the intervals.
     """
+    slopes, residual, noise = fitted.jacobian, fitted.residual, fitted.noise
     _, clear = without_nuisance(residual, slopes, nuisance, noise)
     limit, times_deviation = np.log(widest), quantile(confidence)
     count = slopes.shape[1]
@@ -301,7 +297,7 @@ def judge(
     like: list[list[int]] = [[] for _ in range(count)]
     for p in np.flatnonzero(felt & ~determined):
         like[p] = _alike(clear, int(p), kept)
-    return Verdict(widths, determined, felt, like)
+    return Identifiability(widths, determined, felt, like)
 
 
 def _deviations(clear: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -316,7 +312,7 @@ def _deviations(clear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _alike(clear: NDArray[np.float64], which: int, kept: NDArray[np.intp]) -> list[int]:
-    """Those of the kept that together do what one does, the largest parts first."""
+    """Those of the kept whose slopes together make up that of one, the largest parts first."""
     if len(kept) == 0:
         return []
     column = clear[:, which]

@@ -46,14 +46,14 @@ _MOST_ITERATIONS, _UNSOLVED = 3000, 1e-3
 
 
 class Slopes(NamedTuple):
-    """How a press changes with the logarithms of P moduli."""
+    """Slopes of a press by the logarithms of P moduli."""
 
     wrench: NDArray[np.float64]  # (6, P) N and N m, frame probe
     displacement: NDArray[np.float64]  # (P, 3, N) m
 
 
 class PressedTissue:
-    """Forces, wrench and tangent of a model at a displacement that is put.
+    """Forces, wrench and tangent of a model at a given displacement.
 
     Args:
         model: of the tissue and the probe; contact is without friction.
@@ -72,16 +72,16 @@ class PressedTissue:
         gap, _ = self._probe.distance(pose, self._points.rest)
         return float(gap.min(initial=np.inf))
 
-    def put(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
-        """Put the probe at a pose and the nodes at a displacement (3, N) m."""
+    def set_state(self, pose: Pose, displacement: NDArray[np.float64]) -> None:
+        """Set the probe's pose and the nodes' displacement (3, N) m."""
         self._pose, self._displacement = pose, displacement
         at = self._points.rest + self._points.moved(displacement)
         self._contact.set_pose(pose, at)
         self._contact.drop_planes(at)
 
     @property
-    def _pushes(self) -> NDArray[np.float64]:
-        """(3, N) N, with which the probe pushes the nodes."""
+    def _contact_forces(self) -> NDArray[np.float64]:
+        """(3, N) N, of the probe on the nodes."""
         pushes = np.zeros_like(self._displacement)
         self._points.add(self._contact.force, pushes, self._contact.near)
         return pushes
@@ -89,7 +89,7 @@ class PressedTissue:
     @property
     def unbalanced(self) -> NDArray[np.float64]:
         """(3, N) N, forces of the tissue less those of the probe; zero at fixed nodes."""
-        forces = self._tissue.forces(self._displacement) - self._pushes
+        forces = self._tissue.forces(self._displacement) - self._contact_forces
         forces[:, self._fixed] = 0.0
         return forces
 
@@ -98,10 +98,12 @@ class PressedTissue:
         """(6,) N and N m, of the tissue on the probe about its origin, frame ``probe``."""
         touched = self.model.contact_nodes
         places = self.model.mesh.nodes[touched] + self._displacement.T[touched]
-        return np.concatenate(wrench_on_probe(self._pose, places, self._pushes[:, touched].T))
+        return np.concatenate(
+            wrench_on_probe(self._pose, places, self._contact_forces[:, touched].T)
+        )
 
     def solve(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(3, N) m, by which a small force (3, N) N would move the nodes, probe and all else alike.
+        """(3, N) m, the displacement by a small force (3, N) N under the unmoved probe.
 
         Raises:
             SolverError: the tissue is about to buckle, so that no force can say how it moves.
@@ -160,22 +162,21 @@ def slopes(
     pose: Pose,
     displacement: NDArray[np.float64],
 ) -> Slopes:
-    """How wrench and displacement of a balanced tissue change with each of P moduli.
+    """Slopes of wrench and displacement of a balanced tissue by each of P moduli.
 
     Args:
         tissue: whose forces balance.
         varied: the same with the logarithm of one modulus larger by ``step``, for each modulus.
         step: small, since these slopes of the forces are differences.
-        pose: of the probe.
         displacement: (3, N) m, at which the forces balance.
     """
-    tissue.put(pose, displacement)
+    tissue.set_state(pose, displacement)
     forces, wrench = tissue.unbalanced, tissue.wrench
     found, moved = np.empty((6, len(varied))), np.empty((len(varied), *displacement.shape))
     for p, other in enumerate(varied):
-        other.put(pose, displacement)
+        other.set_state(pose, displacement)
         moved[p] = tissue.solve((forces - other.unbalanced) / step)
-        other.put(pose, displacement + step * moved[p])
+        other.set_state(pose, displacement + step * moved[p])
         found[:, p] = (other.wrench - wrench) / step
     return Slopes(found, moved)
 
@@ -188,8 +189,8 @@ Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
-    """What is felt and seen at K poses, and its slopes by the logarithms of P moduli."""
+class PredictedPress:
+    """Wrenches at K poses, places of S points, and their slopes by the logarithms of P moduli."""
 
     wrenches: NDArray[np.float64]  # (K, 6) N and N m, on the probe about its origin, frame probe
     slopes: NDArray[np.float64]  # (K, 6, P)
@@ -198,8 +199,8 @@ class Felt:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPoints:
-    """Points of the tissue that are seen at some of the poses."""
+class CarriedPoints:
+    """Points of the tissue that were observed at some of the poses."""
 
     poses: NDArray[np.intp]  # (S,) number of the pose
     rest: NDArray[np.float64]  # (S, 3) m, where they are in the undeformed tissue
@@ -207,7 +208,7 @@ class SeenPoints:
     weights: NDArray[np.float64]  # (S, 4)
 
     @classmethod
-    def none(cls) -> SeenPoints:
+    def none(cls) -> CarriedPoints:
         """No point."""
         return cls(
             np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 4), np.int32), np.zeros((0, 4))
@@ -231,15 +232,17 @@ class PressModel:
         materials_for: MaterialsFor,
         names: Sequence[str],
         poses: Sequence[Pose],
-        seen: SeenPoints | None = None,
+        seen: CarriedPoints | None = None,
     ) -> None:
         self.names = tuple(names)
         self._model, self._materials_for, self._poses = model, materials_for, list(poses)
-        self._seen = seen or SeenPoints.none()
+        self._seen = seen or CarriedPoints.none()
         self._settings = FemNonlinearSettings()
 
-    def predict(self, moduli: Mapping[str, float], progress: Progress | None = None) -> Felt:
-        """What is felt with these moduli (Pa), of all structures.
+    def predict(
+        self, moduli: Mapping[str, float], progress: Progress | None = None
+    ) -> PredictedPress:
+        """The press with these moduli (Pa), of all structures.
 
         Raises:
             SolverError: the tissue cannot be solved.
@@ -259,13 +262,13 @@ class PressModel:
             moved = self.balanced(solver, pose, k)
             field = np.ascontiguousarray(moved.T)
             found = slopes(tissue, others, _STEP, pose, field)
-            tissue.put(pose, field)
+            tissue.set_state(pose, field)
             wrenches[k], changes[k] = tissue.wrench, found.wrench
             for s in np.flatnonzero(self._seen.poses == k):
                 nodes, weights = self._seen.nodes[s], self._seen.weights[s]
                 places[s] += weights @ moved[nodes]
                 place_slopes[s] = (found.displacement[:, :, nodes] @ weights).T
-        return Felt(wrenches, changes, places, place_slopes)
+        return PredictedPress(wrenches, changes, places, place_slopes)
 
     def solver(self, moduli: Mapping[str, float]) -> FemNonlinear:
         """The tissue of these moduli (Pa), at rest."""

@@ -276,7 +276,6 @@ def choose_poses(
     """Poses that press the tissue, and as many that do not touch it, where there are some.
 
     Args:
-        record: the press.
         clearance: m, of a pose from the undeformed tissue.
         count: of poses that press, at most.
 
@@ -298,7 +297,7 @@ def choose_poses(
             f"its registration right?"
         )
     way = _way(record, pressed)
-    chosen = pressed[spread(way, count)]
+    chosen = pressed[evenly_spaced(way, count)]
     if len(chosen) < _FEWEST:
         raise StiffnessError(
             f"{len(chosen)} different poses press the tissue, and at least {_FEWEST} are needed: "
@@ -306,11 +305,11 @@ def choose_poses(
         )
     _require_unsaturated(record, pressed)
     _require_agreement(record, pressed, free, apart)
-    free = free[spread(np.arange(len(free), dtype=np.float64), count)]
+    free = free[evenly_spaced(np.arange(len(free), dtype=np.float64), count)]
     return ChosenPoses(chosen, free, apart)
 
 
-def spread(way: NDArray[np.float64], count: int) -> NDArray[np.intp]:
+def evenly_spaced(way: NDArray[np.float64], count: int) -> NDArray[np.intp]:
     """At most ``count`` places in an ascending way (K,) that are as evenly spaced as can be."""
     if len(way) == 0:
         return np.zeros(0, np.intp)

@@ -57,7 +57,7 @@ class StiffnessSettings(Settings):
     )
 
     def check(self) -> None:
-        """Refuse what would be written over, before the work."""
+        """Refuse files that exist, before the work."""
         if self.out.suffix.lower() not in (".yaml", ".yml"):
             raise self.refused("out", f"{self.out}: must be a file that ends in .yaml")
         for file in (self.out, self.picture):

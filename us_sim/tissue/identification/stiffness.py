@@ -23,13 +23,19 @@ from numpy.typing import NDArray
 from us_sim.errors import StiffnessError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.text_files import read_text
-from us_sim.tissue.identification.fit import FARTHEST, Fitted, Verdict, fit, judge
+from us_sim.tissue.identification.fit import (
+    FARTHEST,
+    FitResult,
+    Identifiability,
+    assess_identifiability,
+    fit,
+)
 from us_sim.tissue.identification.press_model import (
-    Felt,
+    CarriedPoints,
     MaterialsFor,
+    PredictedPress,
     PressedTissue,
     PressModel,
-    SeenPoints,
 )
 from us_sim.tissue.identification.press_record import (
     CHANNELS,
@@ -47,7 +53,7 @@ GROUPS = ("force", "torque", "landmark")
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class LandmarkSightings:
     """Places of landmarks that were seen."""
 
     places: NDArray[np.float64]  # (S, 3) m, frame patient
@@ -57,7 +63,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """n numbers that were measured; those with a model come first."""
+    """n measured numbers; those with a model come first."""
 
     values: NDArray[np.float64]  # (n,) N, N m or m
     groups: NDArray[np.intp]  # (n,) into GROUPS
@@ -67,8 +73,8 @@ class Observations:
     nuisance_names: tuple[str, ...]  # Q
     channels: NDArray[np.intp]  # of the wrench, those used
 
-    def modelled(self, felt: Felt) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(n,) what a model says of these, and (n, P) its slopes by the logarithms of moduli."""
+    def modelled(self, felt: PredictedPress) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(n,) modelled values of these, and (n, P) their slopes by the logarithms of moduli."""
         count = felt.slopes.shape[2]
         values = [felt.wrenches[:, self.channels].ravel(), felt.places.ravel()]
         slopes = [
@@ -82,14 +88,15 @@ class Observations:
 
 
 def observations_of(
-    record: PressRecord, chosen: ChosenPoses, seen: Seen | None = None, *, late: bool = False
+    record: PressRecord,
+    chosen: ChosenPoses,
+    seen: LandmarkSightings | None = None,
+    *,
+    late: bool = False,
 ) -> Observations:
     """The measurements at chosen poses.
 
     Args:
-        record: the press.
-        chosen: its poses.
-        seen: landmarks.
         late: whether the wrenches' stamps may be late by a little more.
     """
     channels = np.flatnonzero(record.channels)
@@ -132,7 +139,7 @@ _OUTSIDE = 1e-3  # m, that a point may lie outside the mesh
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """L points at rest, and S sights of them."""
+    """L points at rest, and S sightings of them."""
 
     names: tuple[str, ...]  # L
     rest: NDArray[np.float64]  # (L, 3) m, frame patient
@@ -142,8 +149,8 @@ class Landmarks:
 
     def at(
         self, record: PressRecord, chosen: ChosenPoses, mesh: TetrahedralMesh, tolerance: float
-    ) -> tuple[ChosenPoses, Seen, SeenPoints]:
-        """The sights with the poses that they were had at, which are looked at as well.
+    ) -> tuple[ChosenPoses, LandmarkSightings, CarriedPoints]:
+        """The sightings, with their poses added to the chosen ones.
 
         Raises:
             StiffnessError: there is no pose at the time of one, or a point is outside the mesh.
@@ -168,8 +175,8 @@ class Landmarks:
             raise StiffnessError("no landmark was seen while the probe pressed the tissue")
         pressed = np.union1d(chosen.pressed, nearest)
         poses, which = np.searchsorted(pressed, nearest), self.which[pressing]
-        seen = Seen(self.places[pressing], poses, self.times[pressing])
-        points = SeenPoints(
+        seen = LandmarkSightings(self.places[pressing], poses, self.times[pressing])
+        points = CarriedPoints(
             poses,
             self.rest[which],
             mesh.tetrahedra[located.tetrahedra[which]],
@@ -234,35 +241,27 @@ def read_landmarks(file: str | Path) -> Landmarks:
 _UNITS = (("force", 1.0, "N"), ("torque", 1.0, "N m"), ("landmarks", 1e3, "mm"))
 
 
-def refusal(
+def undetermined(
     names: Sequence[str],
-    verdict: Verdict,
+    known: Identifiability,
     observed: Observations,
-    fitted: Fitted,
+    fitted: FitResult,
     settings: StiffnessSettings,
 ) -> str:
-    """The sentence.
-
-    Args:
-        names: of P structures.
-        verdict: on these.
-        observed: the measurements.
-        fitted: what they led to.
-        settings: with which they are judged.
-    """
-    reasons, unknown = [], [p for p in range(len(names)) if not verdict.determined[p]]
+    """Reasons why a press does not determine moduli, and remedies, in a sentence."""
+    reasons, unknown = [], [p for p in range(len(names)) if not known.determined[p]]
     for p in unknown:
-        if not verdict.felt[p]:
+        if not known.felt[p]:
             reasons.append(f"{names[p]} hardly matters: {_effect(p, observed, fitted, settings)}")
-        elif verdict.like[p]:
-            others = " and ".join(names[other] for other in verdict.like[p][:3])
+        elif known.like[p]:
+            others = " and ".join(names[other] for other in known.like[p][:3])
             reasons.append(f"{names[p]} cannot be told from {others}, which act alike")
         else:
-            factor = np.exp(min(verdict.half_widths[p], 50.0))
+            factor = np.exp(min(known.half_widths[p], 50.0))
             reasons.append(f"{names[p]} is known to a factor of {factor:.3g} only")
     those = " ".join(names[p] for p in unknown)
-    known = [name for name, fine in zip(names, verdict.determined, strict=True) if fine]
-    rest = f"; it does determine {', '.join(known)}" if known else ""
+    fine = [name for name, fine in zip(names, known.determined, strict=True) if fine]
+    rest = f"; it does determine {', '.join(fine)}" if fine else ""
     return (
         f"this press does not determine {', '.join(names[p] for p in unknown)}: "
         f"{'; '.join(reasons)}{rest}; fix what it does not with --keep {those}, or press deeper, "
@@ -270,8 +269,8 @@ def refusal(
     )
 
 
-def _effect(p: int, observed: Observations, fitted: Fitted, settings: StiffnessSettings) -> str:
-    """What a stiffer structure would do, over the noise."""
+def _effect(p: int, observed: Observations, fitted: FitResult, settings: StiffnessSettings) -> str:
+    """Largest change by a stiffer structure beside the noise, in a sentence."""
     best, text = -1.0, ""
     for group, (name, scale, unit) in enumerate(_UNITS):
         its = observed.groups == group
@@ -294,7 +293,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Tissue:
-    """What is pressed: its mesh and probe, and how its materials follow from moduli."""
+    """The pressed tissue and probe, and how its materials follow from moduli."""
 
     model: TissueModel
     materials_for: MaterialsFor
@@ -319,13 +318,13 @@ class StiffnessFit:
     intervals: Mapping[str, Interval]  # of those that were fitted
     confidence: float
     observations: Observations
-    fitted: Fitted
+    fitted: FitResult
     depths: NDArray[np.float64]  # (K,) m, of the poses that press
     remarks: tuple[str, ...]
 
     @property
     def modelled(self) -> NDArray[np.float64]:
-        """(n,) what the model says of the measurements, offsets included."""
+        """(n,) modelled values of the measurements, offsets included."""
         return self.observations.values - self.fitted.residual
 
     def scatter(self, kind: str) -> float | None:
@@ -346,9 +345,6 @@ def fit_stiffness(
     """The moduli that explain a press best.
 
     Args:
-        tissue: what is pressed.
-        record: the press.
-        settings: see `StiffnessSettings`.
         landmarks: points that were seen meanwhile.
         chosen: poses; by default `choose_poses` does.
         progress: told how far a step of the fit is, and which it is.
@@ -388,7 +384,7 @@ def fit_stiffness(
     fitted = fit(model, observed.values, observed.groups, observed.nuisance, start, told)
     if progress is not None:
         progress(1.0, step)
-    return _judged(tissue, names, observed, fitted, chosen, settings)
+    return _result(tissue, names, observed, fitted, chosen, settings)
 
 
 def _fitted_names(tissue: Tissue, record: PressRecord, settings: StiffnessSettings) -> list[str]:
@@ -409,7 +405,7 @@ def _fitted_names(tissue: Tissue, record: PressRecord, settings: StiffnessSettin
 
 
 def _require_same_sign(observed: Observations, values: NDArray[np.float64]) -> None:
-    """Refuse forces on the tissue where those on the probe are meant."""
+    """Refuse forces on the tissue in place of those on the probe."""
     for place, channel in enumerate(observed.channels):
         if channel == 2:
             its = observed.nuisance[:, place] > 0
@@ -421,26 +417,24 @@ def _require_same_sign(observed: Observations, values: NDArray[np.float64]) -> N
                 )
 
 
-def _judged(
+def _result(
     tissue: Tissue,
     names: list[str],
     observed: Observations,
-    fitted: Fitted,
+    fitted: FitResult,
     chosen: ChosenPoses,
     settings: StiffnessSettings,
 ) -> StiffnessFit:
-    verdict = judge(
-        fitted.jacobian,
-        fitted.residual,
-        fitted.noise,
+    known = assess_identifiability(
+        fitted,
         observed.nuisance,
         observed.times,
         observed.depths,
-        widest=settings.widest,
-        confidence=settings.confidence,
+        settings.widest,
+        settings.confidence,
     )
-    if not verdict.determined.all():
-        raise StiffnessError(refusal(names, verdict, observed, fitted, settings))
+    if not known.determined.all():
+        raise StiffnessError(undetermined(names, known, observed, fitted, settings))
     if fitted.bounded.any():
         first = names[int(np.argmax(fitted.bounded))]
         raise StiffnessError(
@@ -449,7 +443,7 @@ def _judged(
             f"units and what else is soft, or keep it with --keep {first}"
         )
     moduli = np.exp(fitted.log_moduli)
-    factors = np.exp(verdict.half_widths)
+    factors = np.exp(known.half_widths)
     weights = _weights(observed, fitted)
     intervals = {
         name: Interval(
@@ -468,15 +462,15 @@ def _judged(
     )
 
 
-def _weights(observed: Observations, fitted: Fitted) -> NDArray[np.float64]:
-    """(P,) part of the forces (without any, of all that is measured) that each modulus makes."""
+def _weights(observed: Observations, fitted: FitResult) -> NDArray[np.float64]:
+    """(P,) share of each modulus in the forces, or, without any, in all measurements."""
     model = observed.values - fitted.residual - observed.nuisance @ fitted.nuisance
     its = observed.groups == (0 if (observed.groups == 0).any() else observed.groups.min())
     size = float(model[its] @ model[its]) or 1.0
     return np.asarray(fitted.jacobian[its].T @ model[its] / size)
 
 
-def _remarks(chosen: ChosenPoses, observed: Observations, fitted: Fitted) -> tuple[str, ...]:
+def _remarks(chosen: ChosenPoses, observed: Observations, fitted: FitResult) -> tuple[str, ...]:
     remarks = []
     if len(observed.channels) and len(chosen.free) == 0:
         remarks.append(

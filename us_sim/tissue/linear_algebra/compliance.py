@@ -31,7 +31,7 @@ Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 @dataclass(frozen=True, eq=False)
 class DenseFields:
-    """What each of 3S forces does to F nodes."""
+    """Displacements of F nodes by each of 3S unit forces."""
 
     nodes: NDArray[np.integer]  # (F,)
     fields: NDArray[np.floating]  # (3S, 3, F), m/N
@@ -44,14 +44,12 @@ class DenseFields:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def made(
+    def compute(
         cls, nodes: NDArray[np.integer], forces: int, solve: Solve, precision: type
     ) -> DenseFields:
         """The fields at ``nodes`` (F,) of forces on S nodes.
 
         Args:
-            nodes: of the fields.
-            forces: S.
             solve: the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
             precision: of the numbers to keep.
         """
@@ -62,7 +60,7 @@ class DenseFields:
         return cls(nodes, fields)
 
     def add(self, forces: NDArray[np.float64], displacement: NDArray[np.floating]) -> None:
-        """Add what forces (3S,) N do to displacement (N, 3) m; zeros are not read."""
+        """Add the displacement by forces (3S,) N to displacement (N, 3) m; zeros are not read."""
         rows = np.flatnonzero(forces)
         _add_rows(self.fields, rows, forces[rows], self.nodes, displacement)
 
@@ -129,11 +127,11 @@ class SurfaceCompliance:
         self.field(np.zeros((len(self.nodes), 3)))
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
-        """Add what forces (S, 3) N do to displacement (3, N) m; those without are not read."""
+        """Add the displacement by forces (S, 3) N to displacement (3, N) m; zeros are not read."""
         self.fields.add(forces.ravel(), displacement.T)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) m, what forces (S, 3) N do to every node."""
+        """(N, 3) m, the displacement of every node by forces (S, 3) N."""
         displacement = np.zeros((self.count, 3))
         self.fields.add(forces.ravel(), displacement)
         return displacement
@@ -148,8 +146,7 @@ def surface_compliance(
     fixed and contact nodes.
 
     Args:
-        model: the tissue.
-        progress: told the fraction done and what is being done, if it takes a second or more.
+        progress: called with the fraction done and a label, if it takes a second or more.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.
@@ -157,16 +154,18 @@ def surface_compliance(
     require_held(model.mesh, model.fixed)
     touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
     if 9 * touched * free < _KEPT:
-        return _made(model, None)
+        return _compute(model, None)
 
     def waiting() -> None:
         if progress is not None:
             progress(0.0, "waiting for another process that computes it")
 
-    return kept(_key(model), _FORM, lambda: _made(model, progress), waiting)
+    return kept(_key(model), _FORM, lambda: _compute(model, progress), waiting)
 
 
-def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> SurfaceCompliance:
+def _compute(
+    model: TissueModel, progress: Callable[[float, str], None] | None
+) -> SurfaceCompliance:
     def show(fraction: float) -> None:
         if progress is not None:
             progress(fraction, "compliance of the surface")
@@ -201,10 +200,10 @@ def _made(model: TissueModel, progress: Callable[[float, str], None] | None) -> 
 
         found: DenseFields | LowRankFields
         if compressed:
-            found = LowRankFields.made(points, free, points[nodes], solve, _TOLERANCE)
+            found = LowRankFields.compress(points, free, points[nodes], solve, _TOLERANCE)
         else:
             precision = np.float64 if size < _DOUBLE else np.float32
-            found = DenseFields.made(free, len(nodes), solve, precision)
+            found = DenseFields.compute(free, len(nodes), solve, precision)
     matrix += matrix.T  # symmetric to the last digit
     matrix /= 2
     made = SurfaceCompliance(nodes, matrix, found, len(points), 0.0)

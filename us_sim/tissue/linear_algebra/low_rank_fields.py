@@ -38,7 +38,7 @@ Solve = Callable[[NDArray[np.int64]], NDArray[np.floating]]
 
 @dataclass(frozen=True, eq=False)
 class LowRankFields:
-    """What each of 3S forces does to F nodes, as P products of matrices, left and right.
+    """Displacements of F nodes by each of 3S unit forces, as P products of two matrices.
 
     A right matrix turns the forces on a patch into weights of the vectors in the left one. Those of
     all blocks for which a patch is the same are beside each other, so that they are read in long
@@ -65,7 +65,7 @@ class LowRankFields:
             array.flags.writeable = False
 
     @classmethod
-    def made(
+    def compress(
         cls,
         points: NDArray[np.float64],
         nodes: NDArray[np.integer],
@@ -77,7 +77,6 @@ class LowRankFields:
 
         Args:
             points: (N, 3) m, by which nodes are put into blocks.
-            nodes: of the fields.
             surface: (S, 3) m, where the forces are.
             solve: the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
             tolerance: singular values that are left out, over the largest displacement that a force
@@ -90,21 +89,12 @@ class LowRankFields:
         return compression.packed()
 
     def add(self, forces: NDArray[np.float64], displacement: NDArray[np.floating]) -> None:
-        """Add what forces (3S,) N do to displacement (N, 3) m; patches without are not read."""
+        """Add the displacement by forces (3S,) N to displacement (N, 3) m."""
         ordered = forces.reshape(-1, 3)[self.order].astype(np.float32)
         weights, loaded = _weights(self.patches, self.columns, self.rows, self.right, ordered)
         _add_products(
-            self.nodes,
-            self.blocks,
-            self.products,
-            self.patch,
-            self.weights,
-            self.place,
-            self.minor,
-            self.major,
-            weights,
-            loaded,
-            displacement,
+            *(self.nodes, self.blocks, self.products, self.patch, self.weights, self.place),
+            *(self.minor, self.major, weights, loaded, displacement),
         )
 
 

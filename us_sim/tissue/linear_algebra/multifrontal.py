@@ -95,7 +95,8 @@ def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
 
 
 _LARGE = 100_000  # Numbers in a matrix from which on it may be kept in a file
-_Update = tuple[NDArray[np.int64], NDArray[np.float64]]  # unknowns, and what is added to them
+# Unknowns, and the Schur complement on them.
+_Update = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +147,7 @@ class Eliminated:
     _precision: type
 
     def fields(self, nodes: NDArray[np.integer]) -> NDArray[np.floating]:
-        """(N, 3, 3K) m/N, what a unit force along each axis at each of nodes (K,) does to all.
+        """(N, 3, 3K) m/N, displacements by a unit force along each axis at each of nodes (K,).
 
         The nodes are among those that `eliminate` was told; column 3 k + axis is of node k.
         """
@@ -179,8 +180,6 @@ def eliminate(
     """Eliminate all nodes.
 
     Args:
-        mesh: of the system.
-        system: its equations.
         fixed: (N,), nodes that stay; enough to make the stiffness positive definite.
         loaded: (K,) nodes that are not fixed, on which there will be forces.
         precision: of the numbers that say how parts follow.
@@ -253,7 +252,7 @@ class _Elimination:
         return size * float(size + around) ** 2 + sum(self._work(below) for below in part.parts)
 
     def _eliminate(self, part: Part) -> _Update:
-        """Eliminate a part and those below it; what that adds to the unknowns around it."""
+        """Eliminate a part and those below it; returns the Schur complement around it."""
         updates = [self._eliminate(below) for below in part.parts]
         moves, presses = self._unknowns(part.own)
         own = np.concatenate([moves, presses])

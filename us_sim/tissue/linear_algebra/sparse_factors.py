@@ -25,7 +25,11 @@ from scipy.sparse.linalg import splu
 
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
-from us_sim.tissue.elasticity.neo_hookean_material import crowding, emptying, neo_hookean_constants
+from us_sim.tissue.elasticity.neo_hookean_material import (
+    barrier_term,
+    lumen_energy,
+    neo_hookean_constants,
+)
 from us_sim.tissue.model import TissueModel
 
 _BLOCK = 64  # right-hand sides at a time
@@ -40,7 +44,7 @@ class ScalarPreconditioner:
         diagonal: (N,) N/m.
         free: (N,), the others do not move.
         surface: (C,) free nodes that can be confined.
-        progress: told the fraction done of the solutions for the surface, and what they are.
+        progress: called with the fraction done of the surface's solutions, and a label.
     """
 
     def __init__(
@@ -195,7 +199,7 @@ def _wall_slopes(change, modulus):
     """(M,) how fast the walls' pressures rise with the volume ratio 1 + change."""
     slopes = np.empty_like(change)
     for e in range(len(change)):
-        slopes[e] = modulus[e] * crowding(change[e])[2]
+        slopes[e] = modulus[e] * barrier_term(change[e])[2]
     return slopes
 
 
@@ -205,5 +209,5 @@ def _lumen_slopes(change, table):
     slopes = np.empty_like(change)
     for e in range(len(change)):
         p, a, b, per, wall, onset = table[e]
-        slopes[e] = emptying(change[e], (p, a, b, per, wall, onset))[2]
+        slopes[e] = lumen_energy(change[e], (p, a, b, per, wall, onset))[2]
     return slopes

@@ -3,7 +3,7 @@
 The matrix is a stiffness and springs that are both only known by their products. Conjugate
 gradients with a local preconditioner carry a force one layer of nodes an iteration. So the
 preconditioner adds up the answers of each node by itself, its springs included, and of a coarse
-grid, on which what varies slowly is solved for directly: some hundred nodes of a regular grid
+grid, on which the smooth part is solved for directly: some hundred nodes of a regular grid
 around the mesh, between which displacements are trilinear (B. Smith, P. Bjorstad and W. Gropp,
 Domain Decomposition, 1996, section 2.1). The grid need not follow the mesh, which may be of any
 kind. Fields are (3, N).
@@ -39,7 +39,6 @@ class CoarseGrid:
     Woodbury, Inverting modified matrices, 1950).
 
     Args:
-        mesh: of any shape.
         fixed: (N,), nodes that do not move.
         product: K times a field (3, N), with the fixed nodes' rows left in.
         dtype: in which it is applied.
@@ -70,9 +69,9 @@ class CoarseGrid:
         self._room = np.empty((3, len(self._node)), dtype)
         self._coarse = np.zeros((2, self.size), dtype)
         self._dtype = dtype
-        self.touch(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+        self.set_contacts(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
 
-    def touch(
+    def set_contacts(
         self,
         nodes: NDArray[np.integer],
         normals: NDArray[np.float64],
@@ -91,34 +90,16 @@ class CoarseGrid:
         self._response = np.empty((len(nodes), self.size), self._dtype)
         self._factor = np.zeros((len(nodes), len(nodes)))
         _respond(
-            self._inverse,
-            self._touched_corner,
-            self._touched_weight,
-            self._normal,
-            1.0 / (_YIELD * stiffness),
-            self._response,
-            self._factor,
+            *(self._inverse, self._touched_corner, self._touched_weight, self._normal),
+            *(1.0 / (_YIELD * stiffness), self._response, self._factor),
         )
 
     def add_correction(self, force: NDArray[np.floating], correction: NDArray[np.floating]) -> None:
         """Add the smooth displacement that balances ``force`` to ``correction``, both (3, N)."""
         _correct(
-            self._inverse,
-            self._node,
-            self._start,
-            self._corner,
-            self._weight,
-            self._across,
-            self._room,
-            self._touched_corner,
-            self._touched_weight,
-            self._normal,
-            self._response,
-            self._factor,
-            self._coarse[0],
-            self._coarse[1],
-            force,
-            correction,
+            *(self._inverse, self._node, self._start, self._corner, self._weight, self._across),
+            *(self._room, self._touched_corner, self._touched_weight, self._normal),
+            *(self._response, self._factor, *self._coarse, force, correction),
         )
 
     def _invert(self, count: int, product: Callable[[NDArray], NDArray]) -> NDArray:
@@ -265,23 +246,9 @@ def _respond(inverse, corner, weight, normal, softness, response, factor):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _correct(
-    inverse,
-    node,
-    start,
-    corner,
-    weight,
-    across,
-    room,
-    touched_corner,
-    touched_weight,
-    normal,
-    response,
-    factor,
-    right,
-    solution,
-    force,
-    correction,
-):
+    inverse, node, start, corner, weight, across, room, touched_corner, touched_weight, normal,
+    response, factor, right, solution, force, correction,
+):  # fmt: skip
     """correction (3, N) += the constrained grid's answer to force (3, N)."""
     _restrict(force, node, start, corner, weight, right)
     solution[:] = 0
@@ -333,14 +300,14 @@ _LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """What conjugate gradients found."""
+class CgSolution:
+    """Result of `conjugate_gradients`."""
 
     solution: NDArray[np.floating]  # (3, N)
     image: NDArray[np.floating]  # (3, N), the product without springs of the solution
     direction: NDArray[np.floating]  # (3, N), the last search direction
     iterations: int
-    curved: bool  # whether that was one of negative curvature; the solution is what came before
+    curved: bool  # whether the last direction had no positive curvature, and was not followed
 
 
 class Preconditioner(Protocol):
@@ -399,7 +366,7 @@ class TwoLevel:
         )
         if self._grid is not None:
             # A spring softer than the tissue does not keep it from moving.
-            self._grid.touch(nodes, normals, np.minimum(own, stiffness))
+            self._grid.set_contacts(nodes, normals, np.minimum(own, stiffness))
 
     def apply(self, residual: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         """Overwrite ``out`` with the preconditioner times ``residual``."""
@@ -415,13 +382,12 @@ def conjugate_gradients(
     iterations: int,
     tolerance: float,
     add_springs: Product | None = None,
-) -> Solved:
+) -> CgSolution:
     """Solve for a displacement that balances ``residual``, starting from none.
 
     Args:
         product: writes the stiffness, without springs, times its first argument into the second.
-        preconditioner: prepared.
-        residual: (3, N), zero at fixed nodes; overwritten with what is left.
+        residual: (3, N), zero at fixed nodes; overwritten with the remaining one.
         iterations: the most products.
         tolerance: norm of the residual at which to end.
         add_springs: adds the springs' forces for its first argument to the second.
@@ -440,11 +406,11 @@ def conjugate_gradients(
             add_springs(search, whole)
         curvature = _curvature(search, whole, fixed)
         if not curvature > 0.0:
-            return Solved(solution, image, search, iteration + 1, True)
+            return CgSolution(solution, image, search, iteration + 1, True)
         left = _advance(slope / curvature, search, elastic, whole, solution, image, residual)
         if left <= tolerance * tolerance:
-            return Solved(solution, image, search, iteration + 1, False)
-    return Solved(solution, image, search, iterations, False)
+            return CgSolution(solution, image, search, iteration + 1, False)
+    return CgSolution(solution, image, search, iterations, False)
 
 
 def largest_local_eigenvalue(
@@ -570,9 +536,9 @@ def _dot(a, b):
 
 @njit(**_LOOP)
 def _turn(residual, conditioned, before, search):
-    """Turn the search to what is left, conditioned; returns the slope along that.
+    """Update the search direction from the preconditioned residual; returns r . z.
 
-    It was ``before`` along the search before; without one, that is zero.
+    ``before`` is the last step's r . z, or zero in the first.
     """
     slope = _dot(residual, conditioned)
     s = search.dtype.type(slope / before if before != 0.0 else 0.0)
@@ -593,7 +559,7 @@ def _curvature(search, whole, fixed):
 
 @njit(**_LOOP)
 def _advance(length, search, elastic, whole, solution, image, residual):
-    """One step along the search direction; returns the square of the residual that is left."""
+    """One step along the search direction; returns the squared residual norm."""
     s = search.dtype.type(length)
     total = 0.0
     for d in range(3):

@@ -24,7 +24,7 @@ _BISECTIONS = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
+class DesiredSpacing:
     """The spacing that is wanted along one axis."""
 
     edges: NDArray[np.float64]  # (S + 1,) m, ascending, between parts of the axis
@@ -32,12 +32,11 @@ class Wanted:
 
 
 def fitted_planes(
-    wanted: Sequence[Wanted], nodes: int
+    wanted: Sequence[DesiredSpacing], nodes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Mesh planes (m, ascending) of x, y and z, from the first edge to the last of each.
 
     Args:
-        wanted: of the three axes.
         nodes: that the box has at most.
 
     Raises:
@@ -45,7 +44,7 @@ def fitted_planes(
     """
     if nodes < _FEWEST**3:
         raise MeshError(f"a box of {nodes} nodes is none: give at least {_FEWEST**3}")
-    smooth = [Wanted(axis.edges, _smoothed(axis)) for axis in wanted]
+    smooth = [DesiredSpacing(axis.edges, _smoothed(axis)) for axis in wanted]
     cells = [float((np.diff(axis.edges) / axis.spacing).sum()) for axis in smooth]
 
     def counts(scale: float) -> list[int]:
@@ -59,29 +58,28 @@ def fitted_planes(
     return x, y, z
 
 
-def wanted_under_probe(
-    wanted: Sequence[Wanted], half_length: float, half_width: float
-) -> tuple[Wanted, Wanted, Wanted]:
-    """The spacing that is wanted, where it is less than what the probe's edges need.
+def spacing_under_probe(
+    wanted: Sequence[DesiredSpacing], half_length: float, half_width: float
+) -> tuple[DesiredSpacing, DesiredSpacing, DesiredSpacing]:
+    """The desired spacing, lowered to the one that the probe's edges need.
 
     Under the probe, at the surface, that is half of the probe's half width; it grows with depth
     and beside the probe.
 
     Args:
-        wanted: of x, y and z.
-        half_length, half_width: m, of what presses, along x and y.
+        half_length, half_width: m, of the probe's footprint, along x and y.
     """
     least = _UNDER_PROBE * half_width
     found = []
     for axis, reach in zip(wanted, (half_length, half_width, 0.0), strict=True):
         centre = (axis.edges[1:] + axis.edges[:-1]) / 2
         beyond = np.maximum(np.abs(centre) - reach, 0.0)
-        found.append(Wanted(axis.edges, np.minimum(axis.spacing, least + _GROWTH * beyond)))
+        found.append(DesiredSpacing(axis.edges, np.minimum(axis.spacing, least + _GROWTH * beyond)))
     x, y, z = found
     return x, y, z
 
 
-def _smoothed(axis: Wanted) -> NDArray[np.float64]:
+def _smoothed(axis: DesiredSpacing) -> NDArray[np.float64]:
     """The wanted spacing, lowered where it would grow faster than `_GROWTH` from a neighbour's."""
     spacing = axis.spacing.astype(np.float64)
     steps = _GROWTH * np.diff((axis.edges[1:] + axis.edges[:-1]) / 2)
@@ -92,7 +90,7 @@ def _smoothed(axis: Wanted) -> NDArray[np.float64]:
     return spacing
 
 
-def _spread(axis: Wanted, count: int) -> NDArray[np.float64]:
+def _spread(axis: DesiredSpacing, count: int) -> NDArray[np.float64]:
     """``count`` planes with as much of the wanted number of cells between each two."""
     passed = np.concatenate([[0.0], np.cumsum(np.diff(axis.edges) / axis.spacing)])
     planes = np.interp(np.linspace(0.0, passed[-1], count), passed, axis.edges)
@@ -104,7 +102,7 @@ def _spread(axis: Wanted, count: int) -> NDArray[np.float64]:
 _ACROSS = 3.0
 
 
-def wanted_by_labels(
+def spacing_by_labels(
     labels: NDArray[np.uint8],
     index_from_patient: NDArray[np.float64],
     box: NDArray[np.float64],
@@ -112,7 +110,7 @@ def wanted_by_labels(
     *,
     counted: Collection[int] | None = None,
     aside: float = math.inf,
-) -> tuple[Wanted, Wanted, Wanted]:
+) -> tuple[DesiredSpacing, DesiredSpacing, DesiredSpacing]:
     """The spacing along x, y and z that the structures in a box need.
 
     At each place along an axis it is a third of the thickness of the thinnest structure there,
@@ -125,7 +123,7 @@ def wanted_by_labels(
         box: (2, 3) m, lower and upper corner.
         step: m, at which labels are looked up.
         counted: labels of the structures that count; all but 0 without it. A layer, such as skin,
-            is better left out: it moves with what is under it.
+            is better left out: it moves with the tissue under it.
         aside: m, how far from y = 0 structures count for x and z.
     """
     counts = np.maximum(2, np.ceil((box[1] - box[0]) / step - 1e-9).astype(int))
@@ -137,7 +135,7 @@ def wanted_by_labels(
     near = grid.copy()
     near[:, np.abs(centres[1]) > aside, :] = 0
     x, y, z = (
-        Wanted(edges[a], _thickness(grid if a == 1 else near, a, edges[a]) / _ACROSS)
+        DesiredSpacing(edges[a], _thickness(grid if a == 1 else near, a, edges[a]) / _ACROSS)
         for a in range(3)
     )
     return x, y, z

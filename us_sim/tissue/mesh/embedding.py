@@ -302,7 +302,7 @@ class EmbeddedSurface:
                 f"nodes have shape {nodes.shape}: the surface is embedded in a mesh of shape "
                 f"{self._rest.shape}"
             )
-        # Displacements, not positions, so that float32 rounds what moved and nothing else.
+        # Displacements, not positions, so that float32 rounds only the movement.
         moved = np.zeros((len(nodes), 4), dtype=np.float32)
         moved[:, :3] = nodes - self._rest
         vertices = np.empty_like(self.vertices)

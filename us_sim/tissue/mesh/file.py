@@ -72,7 +72,7 @@ def parse_gmsh(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64], 
 
 
 def _part(content: bytes, name: bytes) -> bytes:
-    """What lies between ``$Name`` and ``$EndName``."""
+    """The bytes between ``$Name`` and ``$EndName``."""
     _, found, rest = content.partition(b"$" + name)
     # Numbers in binary may look like the end; but the true end is the last one.
     body, closed, _ = rest.rpartition(b"$End" + name)
@@ -127,7 +127,7 @@ class _Numbers:
         return self._words[begin : self._at]
 
     def whole(self, kind: str, count: int) -> NDArray[np.int64]:
-        """The next whole numbers, none of them beyond what a count or a node's number can be."""
+        """The next whole numbers, each below 2^53."""
         taken: NDArray[Any] = self.take(kind, count)
         if not (np.abs(taken.astype(np.float64)) < 2.0**53).all() or (taken % 1 != 0).any():
             raise MeshError("the file has no whole number where one should be")
@@ -289,7 +289,7 @@ _NO_MESH = (
 )
 
 _SIZES = (1e-3, 2.5)  # Sizes of bodies, m: a smaller or larger one is in the wrong unit
-_USUAL_SIZES = (0.01, 0.8)  # Sizes of what is pressed with a probe, m: any other is remarked on
+_USUAL_SIZES = (0.01, 0.8)  # m, sizes of organs: any other is remarked on
 # Cells that a volume mesh may hold beside tetrahedra: their corners, edges and faces.
 _ON_THEIR_SURFACE = ("vertex", "line", "line3", "triangle", "triangle6", "polygon")
 

@@ -33,7 +33,7 @@ _SMALLEST_VOLUME = 1e-9
 
 
 def check_mesh(nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer]) -> None:
-    """Refuse what no solver could work on; disconnected parts are allowed.
+    """Refuse meshes that no solver could work on; disconnected parts are allowed.
 
     Args:
         nodes: (N, 3) m.

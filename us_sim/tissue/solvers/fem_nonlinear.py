@@ -210,7 +210,7 @@ class FemNonlinear(TissueSolver):
             if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
                 self._newton.set_displacement(displacement)
                 if self._newton.overstress is not None:
-                    self._newton.overstress.forget(displacement)
+                    self._newton.overstress.reset(displacement)
         self._recovery.reset(self._newton.displacement)
 
     def _rehearse(self) -> None:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.collider_distance import turned, turned_back
+from us_sim.geometry.collider_distance import rotate, rotate_back
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
@@ -31,10 +31,10 @@ from us_sim.tissue.elasticity.springs import (
     volume_term,
 )
 from us_sim.tissue.elasticity.stability import (
-    ElasticBalance,
-    Tangling,
+    ElasticResidual,
+    InversionWatch,
     highest_frequency,
-    stabilised,
+    stabilise,
     step_limit,
 )
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
@@ -107,7 +107,7 @@ def spring_tissue(
         springs = fitted_springs(mesh, materials, damping, with_volume=settings.volume)
     else:
         springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
-    term = VolumeTerm.nothing(len(mesh.nodes))
+    term = VolumeTerm.empty(len(mesh.nodes))
     if settings.volume:
         term = volume_term(mesh, materials, springs, damping, yielding=yielding)
     return springs.without(model.fixed), term
@@ -159,8 +159,8 @@ class SpringTissue(TissueSolver):
     ) -> None:
         super().__init__(model, settings, progress)
         self._springs, self._volume = spring_tissue(model, settings, yielding=yielding)
-        self._balance = ElasticBalance.of(self._springs, self._volume, model.mesh.nodes)
-        self._tangling = Tangling(model)
+        self._residual_norm = ElasticResidual.of(self._springs, self._volume, model.mesh.nodes)
+        self._inversion = InversionWatch(model)
         self._positions = model.mesh.nodes.copy()
         self._velocity = np.zeros_like(self._positions)
 
@@ -173,17 +173,17 @@ class SpringTissue(TissueSolver):
         self._positions[:] = self.model.mesh.nodes + state.displacement
         self._velocity[:] = state.velocity
         self._velocity[self.model.fixed] = 0.0
-        self._balance.forget()
-        self._tangling.forget()
+        self._residual_norm.reset()
+        self._inversion.reset()
 
     def _untangle(self, touched: bool) -> tuple[str, Intervention]:
         """Put tissue to rest that stayed inside out without a probe; says what was found."""
-        words, hopeless = self._tangling.judge(self._positions, touched)
+        words, hopeless = self._inversion.check(self._positions, touched)
         if not hopeless:
             return words, Intervention.NONE
         self._positions[:] = self.model.mesh.nodes
         self._velocity[:] = 0.0
-        self._balance.forget()
+        self._residual_norm.reset()
         return words, Intervention.PUT_TO_REST
 
     def _stop(self, touched: bool) -> bool:
@@ -193,7 +193,7 @@ class SpringTissue(TissueSolver):
         if touched or not self.model.fixed.any() or not displaced < _NEARLY_RESTING:
             return False
         self._positions[:] = self.model.mesh.nodes
-        self._balance.forget()
+        self._residual_norm.reset()
         return True
 
 
@@ -254,7 +254,7 @@ class Msds(SpringTissue):
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
-        self.mass, self._substeps, self._action = stabilised(
+        self.mass, self._substeps, self._action = stabilise(
             model,
             self._factors,
             settings.time_step,
@@ -351,7 +351,7 @@ class Msds(SpringTissue):
         elastic[self.model.fixed] = 0.0
         touched = self.model.movable_contact_nodes[self._contact.touched]
         normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._contact.touched]
-        residual = self._balance.residual(-elastic, touched, normal)
+        residual = self._residual_norm.residual(-elastic, touched, normal)
 
         frame = max(self._steps * self._substeps * self._time_step, REST_TIME)
         speed = np.abs(self._velocity).max()
@@ -422,11 +422,11 @@ def _stop_at_probe(particles, probe, step, contact, duration):
         a = positions[i, 0] - origin[0]
         b = positions[i, 1] - origin[1]
         c = positions[i, 2] - origin[2]
-        x, y, z = turned_back(r, a, b, c)
+        x, y, z = rotate_back(r, a, b, c)
         gap, u, v, w = pushing_gap(probe.box, probe.forward, 0.0, x, y, z)
         if gap >= 0.0:
             continue
-        nx, ny, nz = turned(r, u, v, w)
+        nx, ny, nz = rotate(r, u, v, w)
         positions[i, 0] -= gap * nx
         positions[i, 1] -= gap * ny
         positions[i, 2] -= gap * nz

@@ -266,7 +266,7 @@ class MsdsImplicit(SpringTissue):
             left = self._unconfined(force)
         self._contact.set_forces(-force[self._touchable])
         load = float(np.linalg.norm(np.maximum(self._contact.normal_force, 0.0)))
-        self._reference = load or self._balance.heaviest
+        self._reference = load or self._residual_norm.largest_load
         return start
 
     def _outcome(self, pose: Pose | None, kinetic: float, initial: float) -> Deformation:
@@ -280,7 +280,7 @@ class MsdsImplicit(SpringTissue):
         normal = contact.normal_at(pose, self._surface())
         loaded = np.einsum("ij,ij->i", elastic[touchable], normal) < 0
         pushed = contact.touched & (loaded | (contact.normal_force > 0))
-        residual = self._balance.residual(-elastic, touchable[pushed], normal[pushed])
+        residual = self._residual_norm.residual(-elastic, touchable[pushed], normal[pushed])
         self._settled = (
             bool(np.abs(self._velocity).max() * self._rest_time < self._rest_tolerance)
             and residual <= self._tolerance

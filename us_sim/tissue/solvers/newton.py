@@ -101,7 +101,7 @@ class Newton:
         # (P,) N, normal forces of the last state that was not just hit
         self._carried_force = self.contact.normal_force
         if self.overstress is not None:
-            self.overstress.forget(self.displacement)
+            self.overstress.reset(self.displacement)
         self._damping = 0.0
         self.iteration_limit = TUNING.first_iteration_limit  # of the next step
         self._needs_factor = False  # whether a step since has needed more iterations than allowed

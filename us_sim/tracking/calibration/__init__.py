@@ -1,1 +1,1 @@
-"""Calibration: what the data of cameras, styluses, landmarks, images and clocks determine."""
+"""Calibration of cameras, styluses, landmarks, probes and clocks."""

@@ -273,7 +273,7 @@ def _fit(seen: _Sightings, start: _Image, **robust: Any) -> tuple[_Image, NDArra
 
 
 def _gain(seen: _Sightings, image: _Image, jacobian: NDArray[np.float64]) -> float:
-    """The image's error at the corners of what was seen, for an error of 1 in every sighting."""
+    """The image's error at the outermost sightings, for an error of 1 in every sighting."""
     free = seen.spacing is None
     scale = np.linalg.norm(jacobian, axis=0)
     if not scale.all():

@@ -73,7 +73,7 @@ def read_signal(
     images: bool = False,
     progress: Callable[[float, str], None] | None = None,
 ) -> PositionSignal:
-    """What moved, as one number over time.
+    """The recorded motion as one number over time.
 
     Args:
         path: a bag, or a recording of Plus.

@@ -51,7 +51,7 @@ class _Written(Settings):
 
 @dataclass(frozen=True, eq=False)
 class TransformFile:
-    """A pose and what its file says of it."""
+    """A pose, and the frames, residuals and method that its file states."""
 
     pose: Pose  # of from_frame in to_frame
     from_frame: str
@@ -143,7 +143,7 @@ def write_transform(
 
 
 def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write what a calibration found as YAML, with the date.
+    """Write the result of a calibration as YAML, with the date.
 
     Raises:
         CalibrationError: the file exists already or cannot be written.

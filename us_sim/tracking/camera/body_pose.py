@@ -57,7 +57,7 @@ def plane_poses(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve(points, rays, turns, shifts, errors):
-    """Fill in both rotations, positions and errors, infinite of what is no pose; whether there
+    """Fill in both rotations, positions and errors (infinite for no pose); return whether there
     are any.
     """
     count = len(points)
@@ -307,7 +307,7 @@ class PlaneAmbiguity:
         self._evidence = 0.0  # log likelihood ratio of the pose that is followed to the other
 
     def reset(self) -> None:
-        """Forget what was seen."""
+        """Forget all images."""
         self._evidence = 0.0
 
     def chosen(self, found: list[BodyPose], before: Pose | None) -> BodyPose:

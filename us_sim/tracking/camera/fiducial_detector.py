@@ -32,7 +32,7 @@ _SMALL = 48.0  # pixels, of the longest edge up to which all of a marker's patte
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What was found of a body in one image; pixel (0, 0) is the middle of the upper left one."""
+    """The markers of a body found in one image; pixel (0, 0) is the upper left one."""
 
     ids: NDArray[np.int64]  # (n,), each once
     corners: NDArray[np.float64]  # (n, 4, 2) pixels, of the markers' black squares

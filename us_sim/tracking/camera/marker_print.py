@@ -47,7 +47,7 @@ _TOLERANCE = 0.05  # mm, between where a marker is and where it is seen on the s
 
 @dataclass(frozen=True)
 class PrintSettings(Settings):
-    """What is printed on what: each field is an option of ``us-sim print-marker``."""
+    """Options of ``us-sim print-marker``: the markers and the paper."""
 
     error = TrackingError
 

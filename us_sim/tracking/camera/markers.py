@@ -137,7 +137,7 @@ def fitted_corners(
 
 
 class _View:
-    """A marker's pattern drawn over a part of an image, and what differs.
+    """A marker's pattern drawn over a part of an image, and the difference.
 
     Args:
         image, corners, cells: as for `fitted_corners`.
@@ -218,7 +218,7 @@ class _View:
         return True
 
     def is_explained(self) -> bool:
-        """Whether what is left over is little, in all and about any place."""
+        """Whether the residual is small, overall and everywhere."""
         inside = self._within(self._judged).astype(np.float32)
         squares = inside * self._left**2
         if squares.sum() > (_UNEXPLAINED * self._contrast) ** 2 * inside.sum():

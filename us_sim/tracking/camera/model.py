@@ -116,7 +116,7 @@ class CameraModel:
         return pixels, slopes
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x / z and y / z (N, 2) of what is seen at pixels (N, 2); NaN where the lens model has
+        """Rays x / z and y / z (N, 2) through pixels (N, 2); NaN where the lens model has
         no such point.
         """
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)

@@ -52,7 +52,7 @@ _STEP = 0.5  # pixels that a body moves between the moments of which an exposure
 
 @dataclass(frozen=True)
 class Conditions:
-    """What degrades the image of a body."""
+    """Noise, blur and light that degrade the image of a body."""
 
     defocus: float = 0.6  # pixels, standard deviation of the lens's blur
     read_noise: float = 1.0  # grey, standard deviation of what every pixel adds
@@ -243,7 +243,7 @@ def _moved(pose: Pose, motion: NDArray[np.float64]) -> Pose:
 
 
 def _sheets(body: RigidBody) -> list[_Sheet]:
-    """White paper first, then what is printed on it."""
+    """White paper first, then the print on it."""
     if body.chessboard is not None:
         return _chessboard(body.chessboard)
     cells = dictionary(body.dictionary).markerSize + 2
@@ -306,7 +306,7 @@ def _background(camera: CameraModel, random: np.random.Generator) -> NDArray[np.
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _print(image, rays, inverse, cells, black, white):
-    """Draw a sheet into a window of the image, over what is there.
+    """Draw a sheet over a window of the image.
 
     Args:
         image: (h, w) grey, changed in place.

@@ -213,7 +213,7 @@ def _require_in_dictionary(name: str, number: int) -> None:
 
 
 def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
-    """Refuse what is no flat convex quadrilateral of a marker's size."""
+    """Refuse corners that are no flat convex quadrilateral of a marker's size."""
     if not np.isfinite(corners).all():
         raise TrackingError(f"marker {number}: a corner is not finite")
     edges = np.roll(corners, -1, axis=0) - corners

@@ -62,7 +62,7 @@ class StrayMarkers:
         self._found = ""
 
     def look(self, image: NDArray[np.uint8], start: str) -> str:
-        """The sentence that begins with ``start`` and goes on with what is there instead."""
+        """A sentence that begins with ``start`` and names the markers seen instead."""
         name = self._families[self._turn % len(self._families)]
         if self._turn % len(self._families) == 0:
             self._found = ""

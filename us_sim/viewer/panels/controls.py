@@ -1,22 +1,12 @@
-"""A part of the page that knows whether a person can see it.
+"""Controls of parameters, each made from what its node says of the parameter.
 
-The part of a parameter's range that a slider covers: a range may span many decades.
-
->>> from us_sim.viewer.panels.controls import slider_span
+>>> from us_sim.viewer.panels.controls import on_sliders, slider_span
 >>> slider_span(-60.0, 60.0, 6.0)
 SliderSpan(low=-60.0, high=60.0, step=0.2, is_logarithmic=False)
 >>> slider_span(1e-6, 1e10, 12.0)  # kPa
 SliderSpan(low=0.12, high=1200.0, step=0.0, is_logarithmic=True)
-
-The control of one parameter, made from what its node says of it.
-
-Gains by depth on the sliders of a console, however many gains the images have.
-
->>> from us_sim.viewer.panels.controls import on_sliders
 >>> on_sliders((0.0, 6.0), 4)
 [0.0, 2.0, 4.0, 6.0]
-
-The sliders of a console for the gain by depth.
 """
 
 from __future__ import annotations
@@ -25,7 +15,7 @@ import asyncio
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -37,14 +27,13 @@ from us_sim.viewer.parameters import Kind, Parameter, ParameterBoard
 
 
 class WhileShown(Element, component="while_shown.js"):
-    """What is within is worked for only while it can be seen.
+    """A part of the page that is kept up to date only while a person can see it.
 
     Args:
         begin: called when a person begins to see it.
-        end: called when nobody sees it any more: another tab is chosen, the drawer is closed, or
-            the browser has gone.
+        end: called when another tab is chosen, the drawer is closed, or the browser has gone.
         every: s between two calls of ``refresh`` while it is seen, the first at once.
-        refresh: brings up to date what is shown.
+        refresh: brings it up to date.
     """
 
     def __init__(
@@ -63,15 +52,12 @@ class WhileShown(Element, component="while_shown.js"):
         self.on("shown", lambda event: self._show(bool(event.args)))
         self.client.on_disconnect(lambda: self._show(False))
         self.client.on_delete(lambda: self._show(False))
-        self.client.on_connect(self._ask)
+        # A page that was away for a moment does not know that it was.
+        self.client.on_connect(lambda: self.run_method("again"))
 
     def close(self) -> None:
-        """It is about to be taken off the page."""
+        """End before it is taken off the page."""
         self._show(False)
-
-    def _ask(self) -> Any:
-        """A page that was away for a moment does not know that it was."""
-        return self.run_method("again")
 
     def _show(self, is_shown: bool) -> None:
         if is_shown == self._is_shown:
@@ -98,7 +84,7 @@ _NOTHING = 1e-12
 
 @dataclass(frozen=True)
 class SliderSpan:
-    """What a slider covers."""
+    """The numbers that a slider covers."""
 
     low: float
     high: float
@@ -113,7 +99,7 @@ class SliderSpan:
 def slider_span(
     low: float, high: float, value: float | None, is_whole: bool = False
 ) -> SliderSpan | None:
-    """What a slider covers around a value; None where no slider makes sense.
+    """The span of a slider around a value; None where no slider makes sense.
 
     Args:
         low, high: the range, in the unit that is shown.
@@ -147,41 +133,8 @@ def _round_number(number: float) -> float:
     return float(f"{factor * power:.6g}")
 
 
-class Change:
-    """Sets a parameter to what a control sends: one change at a time, and of several the last.
-
-    Args:
-        board: where it is set.
-        node, name: of the parameter.
-    """
-
-    def __init__(self, board: ParameterBoard, node: str, name: str) -> None:
-        self._board, self._node, self._name = board, node, name
-        self._wanted: list[tuple[Any, int]] = []
-        self._is_asking = False
-
-    async def want(self, value: Any, turn: int) -> tuple[int, str] | None:
-        """The number of the last change, and the reason if it was refused.
-
-        None is returned where another call is asking already, and asks for this one, too.
-        """
-        self._wanted = [(value, turn)]
-        if self._is_asking:
-            return None
-        self._is_asking = True
-        answer = turn, ""
-        try:
-            while self._wanted:
-                value, turn = self._wanted.pop()
-                future = self._board.set(self._node, self._name, value)
-                answer = turn, await asyncio.wrap_future(future)
-        finally:
-            self._is_asking = False
-        return answer
-
-
-class ParameterControl(Element, component="parameter_control.js"):
-    """A slider with a number field, a choice, a switch, or a text; read-only ones are shown.
+class Control(Element):
+    """A control of one parameter, which sets one value at a time, and of several the last.
 
     Args:
         board: where the parameter is set.
@@ -192,17 +145,16 @@ class ParameterControl(Element, component="parameter_control.js"):
     def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
         super().__init__()
         self.parameter = parameter
-        self._label = label or parameter.label
-        self._change = Change(board, parameter.node, parameter.name)
         self._board = board
-        self._span: SliderSpan | None = None
-        self.props["reason"], self.props["seen"] = "", 0
-        self._show()
+        self._wanted: tuple[Any, int] | None = None  # a value, and the number of the change
+        self._is_asking = False
+        self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
+        self.props.update({"reason": "", "seen": 0})
         self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
         self.on("change", self._changed)
 
     def show(self, parameter: Parameter) -> None:
-        """The parameter is something else now."""
+        """Show another value, or another range."""
         if parameter == self.parameter:
             return
         if parameter.raw != self.parameter.raw:
@@ -211,13 +163,43 @@ class ParameterControl(Element, component="parameter_control.js"):
         self._show()
 
     def _show(self) -> None:
+        raise NotImplementedError
+
+    async def _changed(self, event: GenericEventArguments) -> None:
+        self._wanted = event.args["value"], int(event.args["turn"])
+        if self._is_asking:
+            return
+        self._is_asking = True
+        try:
+            while self._wanted is not None:
+                (value, turn), self._wanted = self._wanted, None
+                future = self._board.set(self.parameter.node, self.parameter.name, value)
+                reason = await asyncio.wrap_future(future)
+        finally:
+            self._is_asking = False
+        if self.is_deleted:
+            return
+        known = self._board.of(self.parameter.node).parameters.get(self.parameter.name)
+        self.parameter = known or self.parameter
+        self.props["seen"], self.props["reason"] = turn, reason
+        self._show()
+
+
+class ParameterControl(Control, component="parameter_control.js"):
+    """A slider with a number field, a choice, a switch, or a text; read-only ones are shown."""
+
+    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
+        super().__init__(board, parameter, label)
+        self._span: SliderSpan | None = None
+        self._show()
+
+    def _show(self) -> None:
         parameter = self.parameter
         value = parameter.value
         self._fit(value)
-        span = self._span
+        span = asdict(self._span) if self._span else None
         self.props.update(
             {
-                "label": self._label,
                 "kind": parameter.kind.value,
                 "value": list(value) if isinstance(value, tuple) else value,
                 "unit": parameter.unit,
@@ -226,13 +208,7 @@ class ParameterControl(Element, component="parameter_control.js"):
                 "optional": parameter.may_be_nothing,
                 "live": parameter.is_live,
                 "tip": tip_of(parameter),
-                "span": span
-                and {
-                    "low": span.low,
-                    "high": span.high,
-                    "step": span.step,
-                    "isLogarithmic": span.is_logarithmic,
-                },
+                "span": span,
             }
         )
         self.update()
@@ -250,20 +226,9 @@ class ParameterControl(Element, component="parameter_control.js"):
         if span is None or not span.holds(value) or is_at_the_end:
             self._span = slider_span(low, high, value, self.parameter.kind is Kind.WHOLE)
 
-    async def _changed(self, event: GenericEventArguments) -> None:
-        answer = await self._change.want(event.args["value"], int(event.args["turn"]))
-        if answer is None or self.is_deleted:
-            return
-        turn, reason = answer
-        known = self._board.of(self.parameter.node).parameters.get(self.parameter.name)
-        if known is not None:
-            self.parameter = known
-        self.props["seen"], self.props["reason"] = turn, reason
-        self._show()
-
 
 def tip_of(parameter: Parameter) -> str:
-    """What it is, from where to where it can be set, and what it is called."""
+    """The description of a parameter, its range, and its full name."""
     unit = f" {parameter.unit}" if parameter.unit else ""
     said = [parameter.description] if parameter.description else []
     if parameter.low is not None and parameter.high is not None:
@@ -278,12 +243,9 @@ def tip_of(parameter: Parameter) -> str:
     return "; ".join(said)
 
 
-USUAL, MOST = 8, 12
-
-
 def slider_count(gains: Sequence[float]) -> int:
-    """How many sliders: one for each gain where those are as many as fit, else as consoles have."""
-    return len(gains) if 2 < len(gains) <= MOST else USUAL
+    """One slider for each gain where those are 3 to 12, else 8, as consoles have."""
+    return len(gains) if 2 < len(gains) <= 12 else 8
 
 
 def on_sliders(gains: Sequence[float], count: int) -> list[float]:
@@ -295,67 +257,27 @@ def on_sliders(gains: Sequence[float], count: int) -> list[float]:
     return [round(float(gain), 6) for gain in shown]
 
 
-REACH = 20.0
-"""dB up and down that the sliders cover, as consoles have it."""
+class TimeGain(Control, component="time_gain.js"):
+    """One slider for the gain in dB at each of some depths, from the face to the beams' end."""
 
-
-class TimeGain(Element, component="time_gain.js"):
-    """One slider for each of some depths.
-
-    Args:
-        board: where it is set.
-        parameter: a list of gains in dB, from the face to the end of the beams.
-        label: in place of the parameter's own.
-    """
+    REACH = 20.0  # dB up and down that the sliders cover, as consoles have it
 
     def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
-        super().__init__()
-        self.parameter = parameter
-        self._board = board
-        self._change = Change(board, parameter.node, parameter.name)
+        super().__init__(board, parameter, label)
         self._count = slider_count(parameter.value)
-        self.props.update(
-            {"label": label or parameter.label, "tip": tip_of(parameter), "reason": "", "seen": 0}
-        )
-        self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
-        self._name_depths(None)
+        self._name_depths(100.0, "%")
         self._show()
-        self.on("change", self._changed)
-
-    def show(self, parameter: Parameter) -> None:
-        """The gains are others now."""
-        if parameter != self.parameter:
-            self.parameter = parameter
-            self.props["reason"] = ""
-            self._show()
 
     def reach(self, depth: Parameter) -> None:
         """The beams end at this depth."""
-        self._name_depths(depth)
+        self._name_depths(float(depth.value), depth.unit)
 
-    def _name_depths(self, depth: Parameter | None) -> None:
-        end, unit = (float(depth.value), depth.unit) if depth else (100.0, "%")
+    def _name_depths(self, end: float, unit: str) -> None:
         names = [f"{place:.0f} {unit}" for place in np.linspace(0.0, end, self._count)]
         if names != self.props.get("depths"):
             self.props["depths"] = names
 
     def _show(self) -> None:
         gains = on_sliders(self.parameter.value, self._count)
-        self.props.update(
-            {
-                "gains": gains,
-                "unit": self.parameter.unit,
-                "low": min(-REACH, *gains),
-                "high": max(REACH, *gains),
-            }
-        )
-
-    async def _changed(self, event: GenericEventArguments) -> None:
-        answer = await self._change.want(event.args["value"], int(event.args["turn"]))
-        if answer is None or self.is_deleted:
-            return
-        known = self._board.of(self.parameter.node).parameters.get(self.parameter.name)
-        if known is not None:
-            self.parameter = known
-        self.props["seen"], self.props["reason"] = answer
-        self._show()
+        low, high = min(-self.REACH, *gains), max(self.REACH, *gains)
+        self.props.update({"gains": gains, "unit": self.parameter.unit, "low": low, "high": high})

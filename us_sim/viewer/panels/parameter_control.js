@@ -54,7 +54,7 @@ export default {
     kind: String,
     value: null,
     unit: { type: String, default: "" },
-    span: { type: Object, default: null }, // low, high, step, isLogarithmic
+    span: { type: Object, default: null }, // low, high, step, is_logarithmic
     choices: { type: Array, default: () => [] },
     meanings: { type: Object, default: () => ({}) }, // of choices, in words
     optional: Boolean, // nothing is a value, too: null
@@ -108,18 +108,18 @@ export default {
       return this.held || this.span;
     },
     sliderLow() {
-      return this.scale.isLogarithmic ? 0 : this.scale.low;
+      return this.scale.is_logarithmic ? 0 : this.scale.low;
     },
     sliderHigh() {
-      return this.scale.isLogarithmic ? POSITIONS : this.scale.high;
+      return this.scale.is_logarithmic ? POSITIONS : this.scale.high;
     },
     sliderStep() {
-      return this.scale.isLogarithmic ? 1 : this.scale.step;
+      return this.scale.is_logarithmic ? 1 : this.scale.step;
     },
     position() {
-      const { low, high, isLogarithmic } = this.scale;
+      const { low, high, is_logarithmic } = this.scale;
       const value = Math.min(Math.max(this.shown ?? low, low), high);
-      return isLogarithmic ? (POSITIONS * Math.log(value / low)) / Math.log(high / low) : value;
+      return is_logarithmic ? (POSITIONS * Math.log(value / low)) / Math.log(high / low) : value;
     },
   },
   watch: {
@@ -135,9 +135,9 @@ export default {
   },
   methods: {
     slide(position) {
-      const { low, high, isLogarithmic, step } = this.scale;
+      const { low, high, is_logarithmic, step } = this.scale;
       let value = position;
-      if (isLogarithmic) {
+      if (is_logarithmic) {
         value = Number((low * (high / low) ** (position / POSITIONS)).toPrecision(3));
       } else if (this.kind !== "whole") {
         value = Number((Math.round(position / step) * step).toPrecision(10));
@@ -176,7 +176,7 @@ export default {
       } else if (this.isNumber && this.span && ["ArrowUp", "ArrowDown"].includes(event.key)) {
         event.preventDefault();
         const up = event.key === "ArrowUp" ? 1 : -1;
-        const by = this.scale.isLogarithmic ? 4 : this.sliderStep;
+        const by = this.scale.is_logarithmic ? 4 : this.sliderStep;
         const to = this.position + up * by * (event.shiftKey ? 10 : 1);
         this.slide(Math.min(Math.max(to, this.sliderLow), this.sliderHigh));
       }

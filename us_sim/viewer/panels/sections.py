@@ -1,8 +1,6 @@
-"""Which parameters of a node stand together under one title, and in which order.
+"""The parameters of one node in sections, as its descriptors say them: new ones come by themselves.
 
-The parameters of one node in sections, as its descriptors say them: new ones come by themselves.
-
-A section's controls are made when it is opened first.
+The controls of a section are made when it is first opened.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from dataclasses import dataclass, field
 from nicegui import ui
 from nicegui.element import Element
 
-from us_sim.viewer.panels.controls import ParameterControl, TimeGain
+from us_sim.viewer.panels.controls import Control, ParameterControl, TimeGain
 from us_sim.viewer.parameters import NodeParameters, Parameter, ParameterBoard, State, in_words
 
 Arrange = Callable[[Mapping[str, Parameter]], list["Section"]]
@@ -102,19 +100,18 @@ def chosen_first(choosing: str) -> Arrange:
 
 
 def given_at_the_start(parameters: Mapping[str, Parameter], names: Iterable[str]) -> list[Section]:
-    """What cannot be changed any more, if there is any."""
+    """A section of those that cannot be changed any more, if there are any."""
     fixed = tuple(name for name in names if not parameters[name].is_live)
     labels = {name: in_words(name) for name in fixed}
     return [Section("fixed", "Given at the start", fixed, labels)] if fixed else []
 
 
 def title_of(group: str) -> str:
-    """What comes before parameters' names, in words."""
+    """The title of a group of parameters."""
     words = in_words(group)
     return words[:1].upper() + words[1:]
 
 
-Control = ParameterControl | TimeGain
 MakeControl = Callable[[ParameterBoard, Parameter, str], Control]
 
 
@@ -177,8 +174,6 @@ class ParameterSections:
 
 
 class _ShownSection:
-    """One section on the page."""
-
     def __init__(
         self, board: ParameterBoard, section: Section, special: Mapping[str, MakeControl]
     ) -> None:
@@ -236,7 +231,6 @@ class _ShownSection:
             if place != len(self._controls):
                 control.move(target_index=place)
             self._controls[name] = control
-        if "time_gain" in self._controls and "depth" in wanted:
-            control = self._controls["time_gain"]
-            if isinstance(control, TimeGain):
-                control.reach(wanted["depth"])
+        gains = self._controls.get("time_gain")
+        if isinstance(gains, TimeGain) and "depth" in wanted:
+            gains.reach(wanted["depth"])

@@ -1,7 +1,4 @@
-"""Scenes and cases to load, each with what its probe sees.
-
-Recording the session, and replaying what was recorded.
-"""
+"""Panels of the session: scenes and cases to load, recording, and replaying recordings."""
 
 from __future__ import annotations
 
@@ -31,8 +28,6 @@ BY_HAND = ("", "pose")
 
 
 class _Cases:
-    """The panel of one page."""
-
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._shown: tuple[object, ...] = ()
@@ -57,12 +52,11 @@ class _Cases:
             self._shown = shown
             self._draw(state)
         for origin, picture in self._pictures.items():
-            jpeg = board.thumbnail(origin)
+            jpeg = board.thumbnails.get(origin)
             if jpeg is not None and not picture.source:
                 picture.set_source(f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}")
 
     def _draw(self, state: SessionState) -> None:
-        """All cards anew."""
         self._list.clear()
         self._pictures.clear()
         cases = [each for each in self._board.scenes if each.kind == "case"]
@@ -133,7 +127,6 @@ class _Cases:
 
 
 def _told(state: SessionState) -> str:
-    """What runs, in a line."""
     if not state.is_there:
         return NOT_THERE
     done = f", {100 * state.fraction:.0f} %" if state.is_busy else ""
@@ -160,8 +153,6 @@ KINDS_FIXED = "While something is replayed this cannot be changed: end the repla
 
 
 class _Session:
-    """The panel of one page."""
-
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._is_dragging = False
@@ -282,7 +273,6 @@ class _Session:
             self._is_following = False
 
     def _propose(self) -> None:
-        """Name the next recording by the present time."""
         self._proposed = _proposed()
         self._file.set_value(self._proposed)
 
@@ -320,7 +310,7 @@ class _Session:
             )
 
     def _by_person(self, change: Callable[[], Awaitable[None]]) -> Callable[[], Any]:
-        """What does that where a person has changed a control, and nothing while it follows."""
+        """The change where a person has moved a control, and nothing while it follows."""
         return lambda: None if self._is_following else change()
 
     async def _set_rate(self) -> None:

@@ -1,0 +1,392 @@
+"""A scene from a case alone, and one that says other things than its case.
+
+A mesh that follows a ball in a box: its volumes, its interface, and how it gives way.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from us_sim.errors import MeshError, SceneError, UsSimError
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.recording.path import read_path
+from us_sim.scene import building
+from us_sim.scene.building import (
+    colour_of,
+    path_of,
+    scanner_of,
+    structures_of,
+    tissue_model_of,
+    volume_of,
+)
+from us_sim.scene.case_tissue import keep_tissue, kept_tissue
+from us_sim.scene.conforming_tissue import conforming_tissue
+from us_sim.scene.reading import load_scene, parse_scene
+from us_sim.settings.reading import Reader
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
+from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
+from us_sim.volume.cases.tissue import read_tissue
+from us_sim.volume.cases.writing import new_case, write_case_settings
+from us_sim.volume.files.writing import write_labels, write_volume
+from us_sim.volume.volume import Volume
+
+TURN = (0.5, 0.5, 0.5, 0.5)
+"""The probe's x, y and z along the volume's y, z and x."""
+
+
+def block() -> Volume:
+    """50 mm deep along x, 80 mm along y, 60 mm along z; a vein along z under the middle."""
+    grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])
+    grid[:3, 3] = [1e-3, -39e-3, -29e-3]
+    grey = np.random.default_rng(1).integers(60, 120, (25, 40, 30), dtype=np.uint8)
+    labels = np.zeros_like(grey)
+    labels[8:11, 18:22, :] = 6
+    labels[22:, :, :] = 2
+    grey[labels == 6] = 10
+    return Volume(grey, grid, labels)
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory) -> Path:
+    """A folder with the case `block`."""
+    probe = {"aperture": "30 mm", "depth": "40 mm", "image": [150, 200]}
+    structures = {"vein": CaseStructure(6), "rib": CaseStructure(2)}
+    settings = CaseSettings(
+        "block",
+        probe=Reader("probe").read(ProbeSettings, probe),
+        start=CaseStart((0.0, 0.0, 0.0), TURN),
+        structures=structures,
+        press=7e-3,
+        nodes=1000,
+    )
+    root = tmp_path_factory.mktemp("cases")
+    with new_case(root / "block") as folder:
+        write_volume(folder / "volume.nrrd", block())
+        write_labels(folder / "labels.nrrd", block())
+        write_case_settings(folder, settings)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def root(cases, monkeypatch, tmp_path):
+    monkeypatch.setenv("US_SIM_CASES", str(cases))
+    monkeypatch.chdir(tmp_path)
+
+
+def test_a_case_alone_is_a_whole_scene(cases):
+    scene = load_scene("case:block")
+    assert scene.origin == f"case:{cases / 'block'}"
+    assert [part.node for part in scene.parts() if part.needed] == [
+        "probe_tracker",
+        "tissue_deformer",
+        "slice_interpolator",
+    ]
+    volume = volume_of(scene)
+    # The probe's z is the volume's x: the vein, 16 to 22 mm deep there, is so in `patient`.
+    centre = volume.patient_to_index @ [0.0, 0.0, 0.019, 1.0]
+    assert volume.labels[tuple(np.rint(centre[:3]).astype(int))] == 6
+    path = path_of(scene, Path(scene.path))
+    assert path.positions[:, 2].max() == pytest.approx(7e-3)
+    assert scene.tissue.fixed == ("bottom", "rib")
+    assert scene.tissue.materials["vein"].lumen_pressure == 1e3
+    assert colour_of(scene, "vein") == (0.25, 0.4, 0.85)
+
+
+def test_its_image_is_of_the_volume_below_the_start():
+    scene = load_scene("case:block")
+    volume = volume_of(scene)
+    labels = scanner_of(scene, volume).labels(Pose())
+    depth = np.arange(200) * 0.2e-3  # m, of rows; the probe images 40 mm
+    rows = np.flatnonzero((labels == 6).any(axis=1))
+    assert depth[rows[0]] == pytest.approx(16e-3, abs=0.3e-3)
+    assert depth[rows[-1]] == pytest.approx(22e-3, abs=0.3e-3)
+    across = np.flatnonzero((labels == 6).any(axis=0)) * 0.2e-3
+    assert np.ptp(across) == pytest.approx(8e-3, abs=0.4e-3)
+
+
+def test_its_tissue_has_the_structures_materials_and_what_is_held():
+    scene = load_scene("case:block")
+    volume = volume_of(scene)
+    model = tissue_model_of(scene, volume)
+    assert len(model.mesh.nodes) <= 1000
+    low, high = model.mesh.nodes.min(axis=0), model.mesh.nodes.max(axis=0)
+    # As wide as the volume or the probe with what is beside it; as deep as the image is.
+    np.testing.assert_allclose(low, [-31e-3, -30e-3, 0.0], atol=1e-9)
+    np.testing.assert_allclose(high, [31e-3, 30e-3, 42e-3], atol=1e-9)
+    vein = model.materials.lumen_fraction @ model.mesh.volumes
+    assert vein == pytest.approx(6e-3 * 8e-3 * 60e-3, rel=0.05)
+    assert model.fixed[model.mesh.nodes[:, 2] > 41e-3].all()
+    (vein,) = structures_of(scene, volume, model.mesh, 2000)  # the rib is below the tissue
+    assert (vein.name, vein.colour) == ("vein", (0.25, 0.4, 0.85))
+
+
+def test_planes_lie_close_where_the_vein_is():
+    scene = load_scene("case:block")
+    x, _, z = tissue_model_of(scene, volume_of(scene)).mesh.planes
+    steps, middle = np.diff(z), (z[1:] + z[:-1]) / 2
+    in_vein = (middle > 16e-3) & (middle < 22e-3)
+    assert in_vein.sum() >= 2
+    assert steps[in_vein].max() < 0.5 * steps.max()
+    assert np.diff(x)[np.abs((x[1:] + x[:-1]) / 2) < 4e-3].max() < 0.6 * np.diff(x).max()
+
+
+def test_tissue_is_made_once_and_made_anew_when_what_it_is_made_from_changes(cases, tmp_path):
+    shutil.copytree(cases / "block", tmp_path / "block")
+    scene = load_scene(f"case:{tmp_path / 'block'}")
+    volume = volume_of(scene)
+    before = tissue_model_of(scene, volume)
+    assert kept_tissue(scene) is None
+    keep_tissue(scene, volume)
+    file = tmp_path / "block" / "tissue.npz"
+    written = file.stat().st_mtime_ns
+    keep_tissue(scene, volume)
+    assert file.stat().st_mtime_ns == written
+    again = tissue_model_of(scene, volume)
+    np.testing.assert_array_equal(again.mesh.nodes, before.mesh.nodes)
+    np.testing.assert_allclose(
+        again.materials.young_modulus, before.materials.young_modulus, rtol=1e-5
+    )
+    case = tmp_path / "block" / "case.yaml"
+    case.write_text(case.read_text().replace("nodes: 1000", "nodes: 1500"))
+    finer = load_scene(f"case:{tmp_path / 'block'}")
+    assert kept_tissue(finer) is None
+    keep_tissue(finer, volume)
+    assert 1000 < len(read_tissue(file).mesh.nodes) <= 1500
+    file.write_bytes(b"broken")
+    assert kept_tissue(finer) is None
+    assert len(tissue_model_of(finer, volume).mesh.nodes) > 1000
+
+
+def test_a_kept_grid_is_not_used_for_a_case_that_wants_a_conforming_mesh(cases, tmp_path):
+    shutil.copytree(cases / "block", tmp_path / "block")
+    scene = load_scene(f"case:{tmp_path / 'block'}")
+    assert scene.tissue.mesh.kind == "grid"
+    keep_tissue(scene, volume_of(scene))
+    case = tmp_path / "block" / "case.yaml"
+    case.write_text(case.read_text() + "mesh: conforming\n")
+    conforming = load_scene(f"case:{tmp_path / 'block'}")
+    assert conforming.tissue.mesh.kind == "conforming"
+    assert kept_tissue(scene) is not None
+    assert kept_tissue(conforming) is None
+
+
+def test_a_case_that_cannot_be_written_is_used_all_the_same(cases, tmp_path, monkeypatch, caplog):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    shutil.copytree(cases / "block", tmp_path / "block")
+    scene = load_scene(f"case:{tmp_path / 'block'}")
+    monkeypatch.setattr("us_sim.volume.cases.tissue.tempfile.mkstemp", refuse)
+    keep_tissue(scene, volume_of(scene))
+    assert "made in every run" in caplog.text
+
+
+def scene_file(folder, text):
+    file = folder / "my.yaml"
+    file.write_text(text)
+    return file
+
+
+def test_a_scene_says_what_it_wants_and_takes_the_rest_from_its_case(tmp_path):
+    file = scene_file(
+        tmp_path,
+        "name: mine\ncase: block\nstructures: [vein]\nprobe: {depth: 3 cm}\n"
+        "tissue: {solver: fem, materials: {vein: {young_modulus: 8 kPa}}}\n",
+    )
+    scene = load_scene(file)
+    assert (scene.name, scene.tissue.solver) == ("mine", "fem")
+    assert scene.tissue.materials["vein"].young_modulus == 8e3
+    assert scene.tissue.materials["vein"].poisson_ratio == 0.1
+    assert list(scene.structures) == ["vein"]
+    assert scene.probe.array.given.depth == 0.03
+    assert scene.probe.array.given.aperture == 0.03
+
+
+def test_a_case_is_named_by_a_path_beside_the_scene(tmp_path, cases, monkeypatch):
+    monkeypatch.setenv("US_SIM_CASES", str(tmp_path / "none"))
+    (tmp_path / "here").mkdir()
+    shutil.copytree(cases / "block", tmp_path / "here" / "mine")
+    assert load_scene(scene_file(tmp_path / "here", "case: mine\n")).name == "block"
+
+
+def test_a_volume_and_a_tissue_of_its_own_may_take_a_cases_volume(tmp_path, cases):
+    file = scene_file(
+        tmp_path, "name: bare\nvolume: {case: block}\nprobe: {aperture: 3 cm, depth: 4 cm}\n"
+    )
+    scene = load_scene(file)
+    assert scene.volume.case == str(cases / "block")
+    assert volume_of(scene).labels is not None
+    assert scene.volume.name == "case block"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("case: blok\n", "there is no case blok; cases are block in"),
+        ("case: 3\n", "must be a text, not 3: name a case"),
+        ("case: ../../../../etc\n", "there is no case"),
+        ("name: a\nvolume: {case: blok}\nprobe: {depth: 4 cm, aperture: 3 cm}\n", "volume.case"),
+        (
+            "name: a\nvolume: {case: block, phantom: upper_arm}\n"
+            "probe: {depth: 4 cm, aperture: 3 cm}\n",
+            "has both `case` and `phantom`",
+        ),
+        ("case: block\ntissue: {mesh: {nodes: 10}}\n", "10 make no box: give 64 or more"),
+        ("case: block\ntissue: {mesh: {nodes: [500, 4, 4]}}\n", "500 is outside 2 to 400"),
+        ("case: block\ntissue: {mesh: {planes: {x: [0, 1]}}}\n", "must be three numbers where"),
+        ("case: block\ntissue: {materials: {fat: {young_modulus: 1 kPa}}}\n", "no such label"),
+    ],
+)
+def test_wrong_cases_are_refused_in_a_sentence_that_names_the_scene(tmp_path, text, sentence):
+    file = scene_file(tmp_path, text)
+
+    def build():
+        scene = load_scene(file)
+        tissue_model_of(scene, volume_of(scene))
+
+    with pytest.raises(UsSimError, match=str(file)) as refused:
+        build()
+    assert sentence in str(refused.value)
+
+
+def test_a_case_that_is_broken_is_said_with_the_file_that_is(tmp_path, cases):
+    shutil.copytree(cases / "block", tmp_path / "broken")
+    (tmp_path / "broken" / "case.yaml").write_text("name: a\nprobes: 3\n")
+    with pytest.raises(SceneError, match=r"broken/case\.yaml: probes: unknown key"):
+        load_scene(f"case:{tmp_path / 'broken'}")
+    os.symlink(tmp_path / "loop", tmp_path / "loop")
+    with pytest.raises(SceneError, match="there is no case"):
+        load_scene(f"case:{tmp_path / 'loop'}")
+
+
+def test_the_press_is_as_deep_as_the_case_says_and_kept_as_a_bag():
+    path = read_path(Path(load_scene("case:block").path))
+    assert path.frame_id == "patient"
+    assert len(path) == 600
+    assert json.dumps(float(path.positions[:, 2].max())) == "0.007"
+
+
+RADIUS, DEPTH = 8e-3, 20e-3
+LOWER, UPPER = np.array([-0.025, -0.025, 0.0]), np.array([0.025, 0.025, 0.045])
+
+
+@pytest.fixture(scope="module")
+def volume():
+    grid = np.diag([0.5e-3, 0.5e-3, 0.5e-3, 1.0])
+    grid[:3, 3] = LOWER - 0.003
+    points = np.moveaxis(np.indices((112, 112, 102)), 0, -1) * 0.5e-3 + grid[:3, 3]
+    labels = (np.linalg.norm(points - [0.0, 0.0, DEPTH], axis=-1) < RADIUS).astype(np.uint8)
+    return Volume(np.zeros_like(labels), grid, labels, {0: "tissue", 1: "cyst"})
+
+
+def scene(nodes, kind):
+    probe = {"aperture": "20 mm", "depth": "40 mm", "image": [64, 64]}
+    probe["collider"] = dict.fromkeys(("length", "width", "height"), "34 mm")
+    probe["collider"] |= {"shape": "rounded_box", "rounding": "4 mm"}
+    mesh = {"lower": LOWER.tolist(), "upper": UPPER.tolist(), "nodes": nodes, "kind": kind}
+    stiff = {"young_modulus": "60 kPa", "poisson_ratio": 0.45, "density": 1000}
+    return parse_scene(
+        {
+            "name": "ball",
+            "volume": {"phantom": "upper_arm"},
+            "probe": probe,
+            "structures": ["cyst"],
+            "tissue": {
+                "solver": "fem_nonlinear",
+                "mesh": mesh,
+                "fixed": ["bottom"],
+                "materials": {"tissue": {**stiff, "young_modulus": "10 kPa"}, "cyst": stiff},
+            },
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where the mesher is called."""
+    return tmp_path_factory.mktemp("called_here")
+
+
+@pytest.fixture(scope="module")
+def conforming(volume, folder):
+    with contextlib.chdir(folder):
+        return conforming_tissue(scene(1000, "conforming"), volume)
+
+
+@pytest.mark.usefixtures("conforming")
+def test_it_leaves_no_files_where_it_is_called(folder):
+    assert not list(folder.iterdir())
+
+
+def test_it_fills_the_box_and_the_ball_within_two_percent(conforming):
+    mesh, fractions = conforming
+    assert 300 < len(mesh.nodes) <= 1000
+    assert mesh.volumes.min() > 0.0
+    np.testing.assert_array_equal(mesh.nodes.min(axis=0), LOWER)
+    np.testing.assert_array_equal(mesh.nodes.max(axis=0), UPPER)
+    assert mesh.volumes.sum() == pytest.approx(np.prod(UPPER - LOWER), rel=1e-6)
+    ball = 4 / 3 * np.pi * RADIUS**3
+    assert set(np.unique(fractions.of(1))) == {0.0, 1.0}
+    assert fractions.of(1) @ mesh.volumes == pytest.approx(ball, rel=0.02)
+
+
+def test_its_interface_is_on_the_ball(conforming):
+    mesh, fractions = conforming
+    inside = np.zeros(len(mesh.nodes), dtype=bool)
+    inside[mesh.tetrahedra[fractions.of(1) == 1.0]] = True
+    outside = np.zeros(len(mesh.nodes), dtype=bool)
+    outside[mesh.tetrahedra[fractions.of(1) == 0.0]] = True
+    radius = np.linalg.norm(mesh.nodes[inside & outside] - [0.0, 0.0, DEPTH], axis=1)
+    assert len(radius) > 30
+    assert np.abs(radius - RADIUS).max() < 0.6e-3
+
+
+def test_it_gives_way_as_a_grid_does(conforming, volume, monkeypatch):
+    moved = []
+    for kind, nodes in (("conforming", 1000), ("grid", 1000)):
+        if kind == "conforming":
+            monkeypatch.setattr(
+                "us_sim.scene.conforming_tissue.conforming_tissue", lambda *_: conforming
+            )
+        given = scene(nodes, kind)
+        model = building.tissue_model_of(given, volume)
+        solver = FemNonlinear(model)
+        for depth in np.linspace(0.0, 6e-3, 7):
+            deformation = solver.deform(Pose(position=[0.0, 0.0, depth]))
+        corners = model.mesh.tetrahedra
+        ball = model.materials.young_modulus > 55e3
+        shift = (deformation.nodes - model.mesh.nodes)[corners].mean(axis=1)
+        weight = model.mesh.volumes * ball
+        moved.append(weight @ shift[:, 2] / weight.sum())
+    assert moved[1] > 1e-3
+    assert moved[0] == pytest.approx(moved[1], rel=0.1)
+
+
+def test_what_the_mesher_cannot_do_is_said_in_a_sentence(volume, monkeypatch):
+    def slow(command, **_):
+        raise subprocess.TimeoutExpired(command, 1.0)
+
+    given = scene(1000, "conforming")
+    monkeypatch.setattr("us_sim.tissue.mesh.conforming.subprocess.run", slow)
+    with pytest.raises(MeshError, match=r"fTetWild made no mesh .*kind: grid"):
+        conforming_tissue(given, volume)
+    crashed = subprocess.CompletedProcess([], -11, b"", b"")
+    monkeypatch.setattr("us_sim.tissue.mesh.conforming.subprocess.run", lambda *_, **__: crashed)
+    with pytest.raises(MeshError, match="status -11"):
+        conforming_tissue(given, volume)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(MeshError, match=r"us_sim\[conforming\]"):
+        conforming_tissue(given, volume)
+
+
+def test_a_conforming_mesh_needs_one_number_of_nodes():
+    with pytest.raises(MeshError, match="one number"):
+        MeshSettings(lower=(0, 0, 0), upper=(1, 1, 1), kind="conforming")

@@ -1,0 +1,442 @@
+"""On which surface the viewer puts the probe, whatever comes of it and in which order.
+
+The hand in the viewer: what it publishes, from when on, until when, and what it refuses.
+"""
+
+import math
+import time
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import PointCloud2
+from shape_msgs.msg import Mesh
+from std_msgs.msg import Int32MultiArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import (
+    cloud_message,
+    mesh_message,
+    nanoseconds_of,
+    pose_message,
+    tetrahedra_message,
+)
+from us_sim.nodes.posted import Posted
+from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.qos import LATCHED
+from us_sim.skin.surface import bent_surface, plane_surface
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.hand import ViewerHand, ViewerSurface
+from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
+from us_sim.viewer.session import SessionBoard, SessionState
+from us_sim.viewer.stream import Feed, Simulator
+
+
+class Stander(GuardedNode):
+    """A node that knows a surface."""
+
+    def __init__(self, **kwargs):
+        super().__init__("stander", **kwargs)
+        self.health = Health(self, "test")
+        self.changes = 0
+        self.surface = ViewerSurface(self, RestMesh(self), self._count)
+
+    def _count(self):
+        self.changes += 1
+
+
+@pytest.fixture
+def stander(bench):
+    return bench.make(Stander)
+
+
+def offer_skin(bench, height):
+    sheet = plane_surface((0.1, 0.1), 0.02)
+    publisher = bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
+    publisher.publish(mesh_message(np.add(sheet.vertices, [0, 0, height]), sheet.triangles))
+    return publisher
+
+
+def offer_tissue(bench, top):
+    sides = ((-0.03, 0.03), (-0.02, 0.02), (top, top + 0.04))
+    mesh = box_mesh(*(uniform_planes(*side, 4) for side in sides))
+    rest = bench.peer.create_publisher(PointCloud2, "tissue/rest", LATCHED)
+    corners = bench.peer.create_publisher(Int32MultiArray, "tissue/tetrahedra", LATCHED)
+    columns = dict(zip("xyz", mesh.nodes.T, strict=True))
+    rest.publish(cloud_message(columns, Time(), "patient"))
+    corners.publish(tetrahedra_message(mesh.tetrahedra))
+    return rest, corners
+
+
+def height(stander):
+    best = stander.surface.best
+    return None if best is None else best.above(0.0, 0.0).point[2]
+
+
+def test_without_anything_it_is_the_plane(stander):
+    assert height(stander) == 0.0
+
+
+def test_the_upper_side_of_the_tissue(bench, stander):
+    offer_tissue(bench, 0.012)
+    bench.spin_until(lambda: stander.changes == 1)
+    surface = stander.surface.best
+    assert height(stander) == pytest.approx(0.012)
+    np.testing.assert_allclose(surface.lower, [-0.03, -0.02, 0.012], atol=1e-6)
+    np.testing.assert_allclose(surface.upper, [0.03, 0.02, 0.012], atol=1e-6)
+    np.testing.assert_allclose(surface.above(0.0, 0.0).normal, [0, 0, -1], atol=1e-9)
+
+
+def test_the_skin_goes_before_the_tissue(bench, stander):
+    offer_tissue(bench, 0.012)
+    skin = offer_skin(bench, 0.01)
+    bench.spin_until(lambda: stander.changes == 2)
+    assert height(stander) == pytest.approx(0.01)
+    bench.peer.destroy_publisher(skin)  # another scene, without
+    bench.spin_until(lambda: height(stander) == pytest.approx(0.012))
+
+
+def test_what_is_offered_is_awaited(bench, stander):
+    bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
+    bench.spin_until(lambda: stander.surface.best is None)
+
+
+def test_a_skin_that_is_none_is_refused_and_said(bench, stander):
+    publisher = bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
+    publisher.publish(mesh_message(np.zeros((3, 3)), np.array([[0, 1, 2]])))
+    bench.spin_until(lambda: stander.health.problems("mesh") == 1)
+    assert "no triangle with an area" in stander.health._last_problem
+
+
+class Holder(GuardedNode):
+    """A node with the hand of a viewer, and no web server."""
+
+    def __init__(self, **kwargs):
+        super().__init__("viewer", **kwargs)
+        self.health = Health(self, "test")
+        self.post = Posted(self)
+        self.simulator = Simulator()
+        self.hand = ViewerHand(self, self.post, self.simulator, RestMesh(self))
+
+
+class Page:
+    """What a page does with the hand."""
+
+    def __init__(self, bench, holder):
+        self._bench, self._holder = bench, holder
+        self.feed, self._sequence = holder.hand.feed, 0
+
+    def __call__(self, **wish):
+        self._sequence += 1
+        asked = {"source": "page", "sequence": self._sequence, **wish}
+        return self._holder.simulator.commands["hand"](asked, 1)
+
+    def open(self):
+        self.feed.watch(self.nothing)
+
+    def close(self):
+        self.feed.unwatch(self.nothing)
+
+    def nothing(self) -> None:
+        """It is told nothing."""
+
+    @property
+    def state(self):
+        packet = self.feed.newest()
+        return packet.header if packet else {"leader": "unknown", "obstacle": "unknown"}
+
+    def await_leader(self, name):
+        self._bench.spin_until(lambda: self.state["leader"] == name)
+
+
+@pytest.fixture
+def page(bench):
+    return Page(bench, bench.make(Holder))
+
+
+@pytest.fixture
+def tracked(bench):
+    """Poses that the probe's tracker publishes."""
+    tracker = bench.tracker = bench.make(ProbeTracker)
+    poses = bench.collect(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: tracker.count_subscribers("probe/pose") > 0)
+    return poses
+
+
+def depth(pose):
+    return pose.pose.position.z
+
+
+def test_without_a_page_nothing_is_published(bench, page, tracked):
+    topic = "tracker/pose"
+    bench.spin_for(10)
+    assert bench.peer.count_publishers(topic) == 0
+    page.open()
+    bench.spin_until(lambda: len(tracked) > 2)
+    page.close()
+    bench.spin_until(lambda: bench.peer.count_publishers(topic) == 0)
+    count = len(tracked)
+    bench.spin_for(30)
+    assert len(tracked) == count
+
+
+def test_it_begins_on_the_skin_and_repeats_the_pose_at_rest(bench, page, tracked):
+    page.open()
+    bench.spin_until(lambda: len(tracked) >= 4)
+    assert depth(tracked[0]) == pytest.approx(0.001)
+    gaps = np.diff([nanoseconds_of(pose.header.stamp) for pose in tracked]) * 1e-9
+    assert 0.15 < np.median(gaps) < 0.45  # images are stale after 0.5 s
+    assert {pose.header.frame_id for pose in tracked} == {"patient"}
+
+
+def test_while_blood_or_time_is_watched_the_resting_probe_is_imaged_as_if_it_moved(
+    bench, page, tracked
+):
+    page.open()
+    bench.spin_until(lambda: len(tracked) >= 2 and page.state.get("is_resting"))
+    simulator = page._holder.simulator
+    overlay = Parameter("slice_interpolator", "overlay", Kind.TEXT, "velocity")
+    simulator.nodes.tell(NodeParameters("slice_interpolator", State.THERE, {"overlay": overlay}))
+    for kind in ("m_mode", "spectrum", "annotated"):
+        simulator.add(Feed(kind))
+        simulator.feeds[kind].watch(page.nothing)
+        bench.spin_until(lambda: not page.state["is_resting"])
+        count, began = len(tracked), time.monotonic()
+        bench.spin_until(lambda count=count: len(tracked) > count + 15)
+        assert time.monotonic() - began < 2.0  # at rest it takes three seconds
+        simulator.feeds[kind].unwatch(page.nothing)
+        bench.spin_until(lambda: page.state["is_resting"])
+
+
+def test_a_press_sets_out_at_once_and_ends_where_it_was_wanted(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) >= 1)
+    waits = []
+    for press in (0.003, 0.006, 0.009):
+        rest, asked = depth(tracked[-1]), time.monotonic()
+        assert page(to={"press": press}) is None
+        bench.spin_until(lambda rest=rest: depth(tracked[-1]) > rest + 1e-4)
+        waits.append(time.monotonic() - asked)
+        bench.spin_until(lambda end=press: depth(tracked[-1]) == pytest.approx(end, abs=1e-5))
+    # It takes some 5 ms. Other work on the machine comes and goes: the quickest is the hand's.
+    assert min(waits) < 0.15
+    depths = np.array([depth(pose) for pose in tracked])
+    stamps = np.array([nanoseconds_of(pose.header.stamp) for pose in tracked]) * 1e-9
+    assert (np.diff(depths) >= -1e-9).all()  # never back
+    assert depths.max() <= 0.009 + 1e-9  # never beyond
+    assert (np.diff(depths) <= 0.15 * np.maximum(np.diff(stamps), 1 / 60) * 1.2).all()
+
+
+def test_the_pose_that_contains_a_wish_is_known_by_its_stamp(bench, page, tracked):
+    hand = page._holder.hand
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) >= 1)
+    first = nanoseconds_of(tracked[-1].header.stamp)
+    assert hand.asked.by(first) is None
+    page(by={"slide": [0.002, 0.0]})
+    page(by={"slide": [0.003, 0.0]})
+    bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.005, abs=1e-5))
+    answers = [hand.asked.by(nanoseconds_of(pose.header.stamp)) for pose in tracked]
+    assert answers[-1] == ("page", 2)
+    moved = [a for a, pose in zip(answers, tracked, strict=True) if pose.pose.position.x > 1e-6]
+    assert moved[0] is not None
+    pressed = [hand.press(nanoseconds_of(pose.header.stamp), None) for pose in tracked]
+    assert pressed == pytest.approx([depth(pose) for pose in tracked])
+    assert hand.press(7, None) is None
+    assert hand.press(7, [0.01, 0.0, 0.004]) == pytest.approx(0.004)  # of somebody else's pose
+
+
+def test_the_page_that_moved_the_probe_last_holds_it_until_another_does_or_it_goes(
+    bench, page, tracked
+):
+    simulator = page._holder.simulator
+
+    def told(holder, *, is_moving):
+        return (page.state["holder"], page.state["is_moving"]) == (holder, is_moving)
+
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) >= 1)
+    assert told("", is_moving=False)
+    page(by={"press": 0.001})
+    bench.spin_until(lambda: told("page", is_moving=True))
+    bench.spin_until(lambda: told("page", is_moving=False))
+    simulator.commands["hand"]({"source": "other", "sequence": 1, "by": {"press": 0.001}}, 2)
+    bench.spin_until(lambda: told("other", is_moving=True))
+    for leave in simulator.leaving:
+        leave(1)  # which was not the holder
+    bench.spin_until(lambda: told("other", is_moving=False))
+    for leave in simulator.leaving:
+        leave(2)
+    bench.spin_until(lambda: told("", is_moving=False))
+    # A page that comes back may hold what nobody holds, and takes it from nobody else.
+    simulator.commands["take"]("other", 3)
+    bench.spin_until(lambda: told("other", is_moving=False))
+    simulator.commands["take"]("page", 4)
+    bench.spin_for(5)
+    assert told("other", is_moving=False)
+
+
+def test_the_probe_stands_on_the_skin_along_its_normal(bench, page, tracked):
+    radius = 0.045
+    arm = bent_surface((0.1, 0.06), 0.002, flat_width=0.0, radius=radius)
+    publisher = bench.peer.create_publisher(Mesh, "skin/mesh", LATCHED)
+    publisher.publish(mesh_message(arm.vertices, arm.triangles))
+    page.open()
+    page.await_leader("hand")
+    side = [radius * math.sin(0.7), 0.01, radius * (1 - math.cos(0.7))]
+    above = [1.2 * side[0], side[1], 1.2 * side[2] - 0.2 * radius]
+    assert page(to={"point": above, "press": 0.0}) is None
+    bench.spin_until(lambda: page.state["stance"]["x"] == pytest.approx(side[0], abs=2e-3))
+    bench.spin_until(lambda: page.state["stance"]["press"] == pytest.approx(0.0, abs=1e-5))
+    bench.spin_until(lambda: page.state["stance"] == pytest.approx(page.state["goal"], abs=1e-4))
+    bench.spin_for(5)
+    last = tracked[-1].pose
+    orientation = [getattr(last.orientation, axis) for axis in "xyzw"]
+    inwards = Pose([last.position.x, last.position.y, last.position.z], orientation).rotation[:, 2]
+    angle = np.arctan2(last.position.x, radius - last.position.z)
+    np.testing.assert_allclose(inwards, [-np.sin(angle), 0, np.cos(angle)], atol=0.01)
+    assert np.hypot(last.position.x, radius - last.position.z) == pytest.approx(radius, abs=5e-5)
+    assert page.state["range"]["y"] == pytest.approx([-0.03, 0.03])
+
+
+def test_somebody_else_leads_as_long_as_he_publishes(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+    page.await_leader("bench")
+    assert "bench moves the probe" in page(by={"press": 0.001})
+    assert bench.peer.count_publishers("tracker/pose") == 1
+    now = bench.peer.get_clock().now
+
+    def has_followed():
+        driver.publish(pose_message(Pose([0.013, 0.0, 0.004]), now().to_msg(), "patient"))
+        return page.state["stance"]["x"] == pytest.approx(0.013)
+
+    bench.spin_until(has_followed)
+    assert page.state["stance"]["press"] == pytest.approx(0.004)
+    bench.peer.destroy_publisher(driver)
+    page.await_leader("hand")
+    bench.spin_until(lambda: tracked[-1].pose.position.x == pytest.approx(0.013, abs=1e-6))
+    assert depth(tracked[-1]) == pytest.approx(0.004, abs=1e-6)
+
+
+def test_who_comes_when_nobody_moves_the_probe_begins_where_it_is(bench, page, tracked):
+    driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+    now = bench.peer.get_clock().now
+    place = Pose([0.013, 0.0, 0.004])
+
+    def has_followed():
+        driver.publish(pose_message(place, now().to_msg(), "patient"))
+        return bool(tracked)
+
+    bench.spin_until(has_followed)
+    bench.peer.destroy_publisher(driver)  # as a viewer that is killed
+    count = len(tracked)
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: len(tracked) > count + 2)
+    positions = [[p.pose.position.x, p.pose.position.z] for p in tracked[count:]]
+    np.testing.assert_allclose(positions, [[0.013, 0.004]] * len(positions), atol=1e-6)
+
+
+@pytest.mark.usefixtures("tracked")
+def test_a_replay_is_ended_on_request_and_nothing_else_is(bench, page):
+    holder, asked = page._holder, []
+    done = Future()
+    done.set_result("")
+    board = SessionBoard(send=lambda values: asked.append(values) or done)
+    holder.hand._session = board
+    take = holder.simulator.commands["take"]
+    page.open()
+    page.await_leader("hand")
+    assert take("page", 1) is None
+    board.state = SessionState(is_there=True, replay="/somewhere/press.mcap")
+    driver = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
+    page.await_leader("bench")
+    assert "bench moves the probe" in take("page", 1)
+    assert not page.state["can_take"]
+    assert asked == []
+    bench.peer.destroy_publisher(driver)
+    player = bench.add(GuardedNode("path_player", context=bench.context))
+    player.create_publisher(PoseStamped, "tracker/pose", 10)
+    page.await_leader("path_player")
+    assert page.state["can_take"]
+    assert "the replay of press.mcap moves the probe" in page.state["obstacle"]
+    assert take("page", 1) is None
+    assert asked == [{"replay": ""}]
+    bench.spin_until(lambda: page.state["holder"] == "page")
+
+
+def test_no_tracker_that_listens_is_said(bench, page):
+    page.open()
+    page.await_leader("nobody")
+    assert page(go="home") == "no simulator with a probe runs yet"
+    bench.peer.create_publisher(PoseStamped, "probe/pose", 10)
+    page.await_leader("tracker")
+    assert "follows the scene's own tracker" in page(go="home")
+
+
+def test_a_simulator_that_does_not_follow_is_said(bench, page, tracked, monkeypatch):
+    monkeypatch.setattr("us_sim.viewer.hand.UNANSWERED", 0.5)
+    page.open()
+    bench.spin_until(lambda: len(tracked) > 2)
+    assert page.state["warning"] == ""
+    bench.executor.remove_node(bench.tracker)  # as one that hangs
+    bench.spin_until(lambda: "does not answer" in page.state["warning"])
+    bench.executor.add_node(bench.tracker)
+    bench.spin_until(lambda: page.state["warning"] == "")
+
+
+def test_a_page_that_comes_back_finds_the_probe_where_it_was(bench, page, tracked):
+    page.open()
+    page.await_leader("hand")
+    page(to={"press": 0.006, "fan": 0.2})
+    bench.spin_until(lambda: tracked and depth(tracked[-1]) == pytest.approx(0.006, abs=1e-5))
+    page.close()
+    bench.spin_until(lambda: bench.peer.count_publishers("tracker/pose") == 0)
+    page.open()
+    page.await_leader("hand")
+    count = len(tracked)
+    bench.spin_until(lambda: len(tracked) > count)
+    assert depth(tracked[-1]) == pytest.approx(0.006, abs=1e-5)
+
+
+def test_a_scene_that_calibrates_such_poses_is_said(bench, page, tmp_path):
+    scene = tmp_path / "moved.yaml"
+    calibration = "tracker: {calibration: {position: [0, 0, 5 mm]}}"
+    scene.write_text(f"based_on: upper_arm\nname: moved\n{calibration}\n")
+    bench.make(ProbeTracker, scene=str(scene))
+    page.open()
+    page.await_leader("hand")
+    bench.spin_until(lambda: "5 mm from where it is held" in page.state["warning"])
+
+
+@pytest.mark.parametrize(
+    ("wish", "said"),
+    [
+        ([1], "is an object, not [1]"),
+        ({"sequence": 1}, "source is a text"),
+        ({"source": "a", "sequence": -1}, "sequence is a count"),
+        ({"source": "a", "sequence": True}, "sequence is a count"),
+        ({"source": "a", "sequence": 1, "go": "away"}, "home, lift, upright"),
+        ({"source": "a", "sequence": 1, "fly": 1}, "has no 'fly'"),
+        ({"source": "a", "sequence": 1, "to": {"press": float("nan")}}, "1 finite number, not nan"),
+        ({"source": "a", "sequence": 1, "to": {"press": 10**400}}, "1 finite number, not 1000"),
+        ({"source": "a", "sequence": 1, "to": {"press": 1e4}}, "press is -10 to 10 m, not 1e+04 m"),
+        ({"source": "a", "sequence": 1, "to": {"fan": 90}}, "fan is -360 to 360°, not 5157°"),
+        ({"source": "a", "sequence": 1, "to": {"point": [1, 2]}}, "3 finite numbers"),
+        ({"source": "a", "sequence": 1, "by": {"slide": "left"}}, "2 finite numbers"),
+        ({"source": "a", "sequence": 1, "by": {"point": [0, 0, 0]}}, "cannot move 'point'"),
+        ({"source": "a", "sequence": 1, "by": 3}, "by is an object"),
+    ],
+)
+def test_what_is_no_wish_is_refused_in_one_sentence(bench, wish, said):
+    holder = bench.make(Holder)
+    assert said in holder.simulator.commands["hand"](wish, 1)

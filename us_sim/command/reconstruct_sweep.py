@@ -1,0 +1,233 @@
+"""`us-sim reconstruct`: a sweep's file in, a volume or a case out, and how well it predicts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from us_sim.command.volume_pictures import draw_slices
+from us_sim.errors import VolumeError
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.setting import Settings, setting
+from us_sim.settings.spelling import counted
+from us_sim.volume.cases.provenance import Source, Step, add_step, settings_said
+from us_sim.volume.cases.settings import CaseSettings
+from us_sim.volume.cases.writing import new_case, write_case_settings
+from us_sim.volume.files.writing import write_volume
+from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
+from us_sim.volume.reconstruction.reconstruction import (
+    APART,
+    Plan,
+    Prediction,
+    Progress,
+    Reconstruction,
+    Rest,
+    leave_one_out,
+    plan,
+    reconstruct,
+)
+from us_sim.volume.reconstruction.scanning_probe import ScanningProbe, scanning_probe
+from us_sim.volume.reconstruction.settings import VOLUME_ENDINGS, Compounding, ImagePart
+from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.sweep import Sweep, shifted, sweep_of
+
+
+@dataclass(frozen=True)
+class SweepSettings(Settings):
+    """Which sweep, where it goes, and how its images are placed."""
+
+    error = VolumeError
+
+    sweep: Path = setting(description="tracked images: .igs.mha, .mha, .igs.nrrd or .seq.nrrd")
+    out: Path = setting(
+        description="file that ends in .nrrd, .mha, .nii or .nii.gz, or else folder of a new case",
+        kw_only=True,
+    )
+    calibration: Path | None = setting(
+        description="where the image lies on the probe: Plus' XML, or YAML of `us-sim calibrate "
+        "probe`",
+        default=None,
+    )
+    image: str = setting(description="name of the images' frame", default="Image")
+    probe: str = setting(description="name of the tracked body's frame", default="Probe")
+    reference: str = setting(description="name of the frame to reconstruct in", default="Reference")
+    time_offset: float = setting(
+        Quantity("time", -10.0, 10.0),
+        "to add to the images' times to find their poses",
+        default=0.0,
+    )
+    smallest_box: bool = setting(
+        description="turn the volume's axes so that it has few voxels", default=False
+    )
+    leave_one_out: int = setting(
+        Quantity("number", 0, 1000),
+        "predict so many frames from the others, and say how like they are",
+        default=0,
+    )
+
+    def check(self) -> None:
+        """Refuse a place that cannot be written to, which is worth knowing before the work."""
+        if self.out.exists():
+            raise self.refused("out", f"{self.out}: exists already; choose another name")
+        if not self.is_volume and 1 < len(self.out.suffix) <= 5:
+            raise self.refused(
+                "out",
+                f"{self.out}: its name ends as no volume's does; write "
+                f"{', '.join(VOLUME_ENDINGS)}, or a folder's name without an ending for a case",
+            )
+        if self.is_volume and not self.out.absolute().parent.is_dir():
+            raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
+        if self.is_volume and self.picture.exists():
+            raise self.refused("out", f"{self.picture}: exists already; choose another name")
+
+    @property
+    def is_volume(self) -> bool:
+        """Whether a volume's file is written, and not a case."""
+        return self.out.name.lower().endswith(VOLUME_ENDINGS)
+
+    @property
+    def picture(self) -> Path:
+        """The picture beside the file."""
+        name = self.out.name
+        ending = next((end for end in VOLUME_ENDINGS[::-1] if name.lower().endswith(end)), "")
+        return self.out.with_name(name[: len(name) - len(ending)] + ".png")
+
+
+def reconstruct_sweep(
+    settings: SweepSettings,
+    compounding: Compounding,
+    part: ImagePart,
+    *,
+    rest_of: Callable[[Sweep, ImagePart], Rest] | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Reconstruct a sweep and write the result; returns a sentence about it.
+
+    Args:
+        settings: which sweep.
+        compounding: how.
+        part: of each image; where it says nothing, the calibration's.
+        rest_of: makes the function that undoes the tissue's deformation, of the placed sweep.
+        progress: is told how far it is.
+
+    Raises:
+        UsSimError: the files cannot be read, or nothing can be made of them.
+    """
+    calibration = SweepCalibration({}, ImagePart())
+    if settings.calibration is not None:
+        calibration = read_calibration(settings.calibration, settings.probe)
+    part = part if part != ImagePart() else calibration.part
+    sweep = sweep_of(
+        read_sequence(settings.sweep),
+        image=settings.image,
+        reference=settings.reference,
+        calibration=calibration.transforms,
+    )
+    if settings.time_offset:
+        sweep = shifted(sweep, settings.time_offset)
+    rest = None if rest_of is None else rest_of(sweep, part)
+    planned = plan(sweep, compounding, part, smallest_box=settings.smallest_box, rest=rest)
+    made = reconstruct(planned, progress=progress)
+    scanner = None if settings.is_volume else scanning_probe(sweep, part, planned.used)
+    prediction = None
+    if settings.leave_one_out:
+        prediction = leave_one_out(planned, settings.leave_one_out, progress)
+    size = (
+        f"{' × '.join(map(str, made.volume.shape))} voxels of {1e3 * planned.grid.spacing:.4g} mm"
+    )
+    if scanner is None:
+        picture = settings.picture
+        write_volume(settings.out, made.volume)
+        draw_slices(picture, made.volume, made.covered, size)
+    else:
+        picture = settings.out / "volume.png"
+        with new_case(settings.out) as folder:
+            write_volume(folder / "volume.nrrd", made.volume)
+            write_case_settings(folder, _case(settings, planned, scanner))
+            add_step(folder, _step(settings, planned, made, prediction))
+            draw_slices(folder / picture.name, made.volume, made.covered, size)
+    sentences = [
+        f"{settings.out}: {size} ({100.0 * made.covered.mean():.0f} % covered, {made.filled} of "
+        f"them filled holes) from {made.frames} frames by {compounding.method} insertion and "
+        f"{compounding.compounding} compounding"
+    ]
+    if left_out := sweep.left_out:
+        why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
+        sentences.append(f"left out are {why}")
+    if sweep.sequence.are_colours:
+        sentences.append("its colour images were made grey")
+    if prediction is not None:
+        sentences.append(_prediction_said(prediction, settings.leave_one_out))
+    if scanner is not None and scanner.probe is not None:
+        sentences.append(f"its images are those of {_array_said(scanner.probe)}")
+    elif scanner is not None:
+        sentences.append("nothing shows the probe's shape, which is guessed")
+    return "; ".join([*sentences, f"slices in {picture}"])
+
+
+def _case(settings: SweepSettings, planned: Plan, scanner: ScanningProbe) -> CaseSettings:
+    """The case's probe and its poses, as the sweep shows them.
+
+    The poses are those of a probe that pressed, so they are not said where that has been undone.
+    """
+    scanned = () if planned.rest else scanner.poses
+    return CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
+
+
+def _step(
+    settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
+) -> Step:
+    """The entry in the provenance, without names of files."""
+    sources = [Source.of(settings.sweep, "tracked sequence")]
+    if settings.calibration is not None:
+        sources.append(Source.of(settings.calibration, "probe calibration"))
+    said = settings_said(dataclasses.replace(planned.compounding, spacing=planned.grid.spacing))
+    counts: dict[str, int | float] = {
+        "frames": made.frames,
+        "frames left out": sum(planned.sweep.left_out.values()),
+        "voxels hit": made.hit,
+        "voxels filled": made.filled,
+    }
+    if prediction is not None:
+        counts["frames predicted"] = len(prediction.frames)
+        counts["correlation median"] = round(prediction.median, 4)
+        counts["correlation worst"] = round(prediction.worst, 4)
+    more = {
+        "method": planned.compounding.method,
+        "compounding": planned.compounding.compounding,
+        "hole_radius": planned.hole_radius,
+        "time_offset": settings.time_offset,
+        "pressure undone": planned.rest is not None,
+        "pixels used": int(planned.used.sum()),
+    }
+    return Step("reconstructed", {**said, **more}, counts, tuple(sources))
+
+
+def _prediction_said(prediction: Prediction, asked: int) -> str:
+    worst = int(prediction.frames[int(np.nanargmin(prediction.correlations))])
+    between = f"{APART - 1} others or more stay between two of them"
+    why = f" (not {asked}: {between})" if len(prediction.frames) < asked else ""
+    return (
+        f"{counted(len(prediction.frames), 'frame')}{why} predicted from the others correlate with "
+        f"what was seen by {prediction.median:.3f} in the median and {prediction.worst:.3f} at "
+        f"worst (frame {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
+    )
+
+
+def _array_said(probe: ProbeSettings) -> str:
+    """The transducer in words."""
+    array: Any = probe.array.given
+    depth = f"{1e3 * array.depth:.0f} mm deep"
+    if probe.geometry == "linear":
+        return f"a linear array of {1e3 * array.aperture:.1f} mm, {depth}"
+    opening = f"{math.degrees(array.opening_angle):.1f}°, {depth}"
+    if probe.geometry == "sector":
+        return f"a phased array, {opening}"
+    return f"a curved array of radius {1e3 * array.radius:.1f} mm, {opening}"
