@@ -1,4 +1,4 @@
-"""How the probe pushes points: its gap, the nodes that it holds, and the flared shape's distance."""
+"""How a probe pushes points: its gap, the nodes that it holds, the flared shape's distance."""
 
 import math
 
