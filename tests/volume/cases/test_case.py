@@ -1,7 +1,4 @@
-"""Cases that are read as they were written, and those of which no good can come.
-
-Cases by name, in several folders.
-"""
+"""Cases as they were written, by name in several folders, and broken ones."""
 
 import os
 import shutil

@@ -1,9 +1,4 @@
-"""A case is made whole or not at all.
-
-Moduli in a case: only they change, and the case says how they were found.
-
-What was done to a case, as its file says it.
-"""
+"""A case is made whole or not at all, moduli alone change, and its history has a form."""
 
 import os
 import signal

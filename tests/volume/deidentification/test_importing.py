@@ -1,7 +1,4 @@
-"""What an import makes, what it refuses, and what it leaves where it ends.
-
-Text in real images is found where a person sees it, and none is seen where there is none.
-"""
+"""Imports: their results, their refusals, their ends, and text that is burned in."""
 
 import os
 import subprocess

@@ -1,9 +1,4 @@
-"""Reconstruction of synthetic sweeps through fields whose values are known everywhere.
-
-Calibrations of sweeps: Plus' XML, and what `us-sim calibrate probe` writes.
-
-The volumes that Plus reconstructed of its own test sweep, and a published sweep's.
-"""
+"""Reconstructions of known fields, calibrations of sweeps, and volumes of Plus."""
 
 import dataclasses
 
