@@ -49,7 +49,7 @@ STORED = {
 
 
 def frame_fields():
-    """What Plus writes of each frame."""
+    """Fields of each frame as Plus writes them."""
     for k, pose in enumerate(POSES):
         yield f"Seq_Frame{k:04d}_ImageToReferenceTransform", pose
         yield f"Seq_Frame{k:04d}_Timestamp", f"{10 + k / 10}"
