@@ -17,7 +17,7 @@ from us_sim.evaluation.independent_forces import (
 from us_sim.evaluation.independent_residual import (
     IndependentResidual,
     flared_distance,
-    push_directions,
+    contact_directions,
 )
 from us_sim.evaluation.stability.cases import StabilityCase, mesh_named, model_of
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
@@ -109,11 +109,11 @@ def test_one_spring_and_one_tetrahedron_by_hand():
     "collider",
     [Sphere(0.03), Sphere(0.001), Capsule(0.012, 0.04), RoundedBox(0.06, 0.05, 0.05, 0.02)],
 )
-def test_push_directions_follow_the_rule_of_contact(collider):
+def test_contact_directions_follow_the_rule_of_contact(collider):
     pose = Pose([0.002, -0.001, 0.01], [0.2, -0.1, 0.3, 0.9])
     points = pose.apply(RANDOM.uniform([-0.02, -0.02, -0.03], [0.02, 0.02, 0.01], (200, 3)))
     gap, normal = push_out(collider, pose, points, 0.002)
-    found = push_directions(collider, pose, points, 0.002)
+    found = contact_directions(collider, pose, points, 0.002)
     assert found[np.isfinite(gap)] == pytest.approx(normal[np.isfinite(gap)], abs=1e-12)
 
 
