@@ -134,8 +134,8 @@ class IndependentResidual:
             deep = 0.35 * float(box[:2].min() + box[3])
             places = _places(nodes, self._surface).reshape(-1, 3)
             # A solver may have gone a long way in strides, and come down on one of them.
-            parts = np.arange(1, 8) / 8 if before else []
-            for there in [*(interpolate(before, pose, float(part)) for part in parts), pose]:
+            way = [interpolate(before, pose, k / 8) for k in range(1, 8)] if before else []
+            for there in [*way, pose]:
                 gap, _ = flared_distance(self._model.collider, there, places, self._spacing)
                 self._deep = bool(gap.min(initial=np.inf) < -deep)
                 if self._deep:

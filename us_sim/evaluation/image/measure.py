@@ -73,7 +73,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """Artefact, probe and tilt."""
         return f"{self.artefact}, {self.probe}, {self.tilt_deg:g}°"
 
 

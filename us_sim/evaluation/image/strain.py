@@ -228,7 +228,7 @@ PLATE = RoundedBox(length=0.4, width=0.3, height=0.05, rounding=0.001)
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball that is stiffer than what is around it."""
+    """A ball that is stiffer than its surroundings."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.045)  # m
     radius: float = 0.018  # m
@@ -332,7 +332,7 @@ class Reference:
     """The linear solution on a fine mesh, for a unit of depth.
 
     Args:
-        ball: what is in the block.
+        ball: in the block.
         size: m, between planes around the ball.
 
     Raises:

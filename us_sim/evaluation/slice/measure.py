@@ -94,7 +94,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The method and its case."""
         return f"{self.method} on {self.size} px, {self.nodes} nodes"
 
 

@@ -86,7 +86,7 @@ class TwoLevel:
         """(3N,) solution with a residual below ``tolerance`` times the right-hand side's norm.
 
         Where the matrix turns out not to be positive definite, which ``is_definite`` says then, the
-        search ends at what was found before, which still descends.
+        search ends at the solution so far, which still descends.
         """
         self.is_definite = True
         solution = np.zeros_like(right)
@@ -399,7 +399,7 @@ class LinearEquations:
             depths: (K,) m.
 
         Returns:
-            (N, 3) m, displacement, and (K,) N, what pushes the touched nodes along the normals.
+            (N, 3) m, displacement, and (K,) N, contact forces along the normals.
 
         Raises:
             SolverError: SciPy's conjugate gradients did not converge.

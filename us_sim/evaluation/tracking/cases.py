@@ -133,7 +133,7 @@ class Case:
         poses = []
         for frame in range(FRAMES):
             moved = exp((frame - FRAMES // 2) / _RATE * velocity)
-            # About the body's middle, which is what the case says the distance of.
+            # About the body's middle, whose distance is the case's.
             turned = Pose(np.zeros(3), (moved @ asked).orientation)
             position = place + moved.position - turned.rotation @ middle
             poses.append(Pose(position, turned.orientation))

@@ -56,14 +56,13 @@ class FilterPoint(Row):
     rotation_lag: float  # s
     jitter: float  # m, at rest, root mean square over all three coordinates
     rotation_jitter: float  # rad
-    moving_jitter: float  # m, of what is left when the lag is taken out
+    moving_jitter: float  # m, without the lag
     error: float  # m, root mean square to where the probe is at that moment
-    stated: float  # s, what the filter itself says of its lag, in motion
+    stated: float  # s, the lag that the filter itself states, in motion
     seconds: float  # a pose
 
     @property
     def values(self) -> dict[str, object]:
-        """By column."""
         return {
             "filter": self.method,
             "setting": self.setting,

@@ -71,7 +71,6 @@ class Point(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """Summary of the case's views, by column."""
         found = self.found
         return {
             "marker": self.case.marker,
@@ -99,7 +98,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The case."""
         return str(self.case)
 
     @property
