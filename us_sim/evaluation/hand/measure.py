@@ -142,7 +142,7 @@ class Motion:
 
     @cached_property
     def poses(self) -> list[Pose]:
-        """One a frame, those of the approach first."""
+        """One a frame, select of the approach first."""
         room = TISSUES[self.tissue].room
         return hand_motion(
             self.kind, self.haste, self.seed, self.duration, room, approach=APPROACH
@@ -375,7 +375,7 @@ def _percentiles(name: str, values: _Array, percents: Sequence[int]) -> dict[str
     return {f"{name}_{'worst' if p == 100 else f'p{p}'}": percentile(known, p) for p in percents}
 
 
-def those(
+def select(
     points: Iterable[Point], *, method: str | None = None, **motion: str | None
 ) -> list[Point]:
     """Points that did not fail, of this method, tissue, kind and haste; None is any."""

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,6 +154,7 @@ def dented(nodes: Array, depth: float) -> Array:
     return np.asarray(nodes + np.hstack([aside, depth * (1.0 - below) ** 2]) * dent)
 
 
+@cache
 def speckle(seed: int = 1) -> Volume:
     """The block's volume, and a little around it: speckle with balls and bright layers."""
     axes = _voxel_axes()
@@ -177,6 +179,7 @@ def speckle(seed: int = 1) -> Volume:
     return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
 
 
+@cache
 def black_and_white(seed: int = 1) -> Volume:
     """Of the same shape and place: every voxel black or white, so that a shift is seen at once."""
     shape = [len(places) for places in _voxel_axes()]
