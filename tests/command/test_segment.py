@@ -155,7 +155,7 @@ def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("us_sim.volume.segmentation.picture.draw_segmentation", full)
+    monkeypatch.setattr("us_sim.command.volume_pictures.draw_segmentation", full)
     assert main(["segment", str(case), "--seeds", seeds]) == 1
     assert "No space left" in capsys.readouterr().err
     assert contents(case.parent) == before

@@ -50,8 +50,8 @@ def volume_seeds(folder: Path) -> Iterator[bytes]:
 def volume(path: Path) -> None:
     """The voxels, and where they are."""
     placed = placed_images([path])
-    voxels = placed.voxels()
-    assert voxels.shape == placed.shape
+    columns, rows = placed.images.form.columns, placed.images.form.rows
+    assert placed.voxels().shape == (columns, rows, len(placed.which))
     assert np.isfinite(placed.placement).all()
 
 

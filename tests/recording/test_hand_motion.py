@@ -14,7 +14,7 @@ from us_sim.recording.hand_motion import HASTES, KINDS, Haste, Room, hand_motion
 from us_sim.recording.hand_motion import main as hand_motion_main
 from us_sim.recording.path import read_path
 from us_sim.recording.press_and_slide import main as press_and_slide_main
-from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.recording.press_and_slide import press_and_slide, pressing_path
 from us_sim.recording.reader import read_bag
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -245,3 +245,11 @@ def test_settings_scale_it():
 def test_impossible_settings(settings):
     with pytest.raises(BagError, match="a path cannot have"):
         press_and_slide(**settings)
+
+
+def test_a_press_of_a_case_is_made_once_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
+    file = pressing_path(7e-3)
+    made = file.stat().st_mtime_ns
+    assert read_path(file).positions[:, 2].max() == pytest.approx(7e-3)
+    assert pressing_path(7e-3).stat().st_mtime_ns == made

@@ -9,7 +9,7 @@ import pytest
 from us_sim.errors import BagError
 from us_sim.recording import writer
 from us_sim.recording.reader import read_bag
-from us_sim.recording.write_behind import Message, WriteBehind
+from us_sim.recording.write_behind import Message, PreRoll, WriteBehind
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"
@@ -142,3 +142,12 @@ def test_an_unknown_type_is_refused_at_once(tmp_path):
         bag.add_topic("/a", "my_msgs/msg/Unheard")
     bag.close()
     assert not [thread for thread in threading.enumerate() if thread.name == "bag writer"]
+
+
+def test_a_pre_roll_keeps_the_last_seconds_and_latched_messages_of_any_age():
+    kept = PreRoll(max_bytes=1000, duration=2.0)
+    kept.add(Message("/mesh", b"....", 0, 0), latched=True)
+    for second in range(5):
+        kept.add(Message("/note", b"....", second * 10**9, 0))
+    assert [m.topic for m in kept.take()] == ["/mesh", *["/note"] * 3]
+    assert kept.take() == []

@@ -67,8 +67,8 @@ def _import(args: argparse.Namespace) -> int:
 
 
 def reconstruct_options(parser: argparse.ArgumentParser) -> None:
+    from us_sim.command.reconstruct_sweep import SweepSettings
     from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-    from us_sim.volume.reconstruction.sweep_command import SweepSettings
 
     for settings in (SweepSettings, Compounding, ImagePart):
         add_setting_options(parser, settings)
@@ -82,8 +82,8 @@ def reconstruct_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _reconstruct(args: argparse.Namespace) -> int:
+    from us_sim.command.reconstruct_sweep import SweepSettings, reconstruct_sweep
     from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-    from us_sim.volume.reconstruction.sweep_command import SweepSettings, reconstruct_sweep
 
     settings = read_settings(args, SweepSettings)
     compounding, part = read_settings(args, Compounding), read_settings(args, ImagePart)
@@ -109,7 +109,7 @@ def segment_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _segment(args: argparse.Namespace) -> int:
-    from us_sim.volume.segmentation.case_segmentation import segment_as_asked
+    from us_sim.command.segment_case import segment_as_asked
     from us_sim.volume.segmentation.settings import SegmentRequest
     from us_sim.volume.surfaces.settings import SurfaceSettings
 

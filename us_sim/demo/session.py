@@ -24,7 +24,6 @@ from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.elasticity.material import kind_of
 from us_sim.tracking.camera.body_pose import rotation_angle
-from us_sim.volume.measure import label_area
 
 VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
 PLAYED = ("/tracker/pose", "/camera/camera_info")  # what comes in, of a path and of a camera
@@ -138,7 +137,7 @@ class Session:
             pose = self.poses[stamp]
             seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
             for i, labels in enumerate(seen):
-                found[i, :, k] = [label_area(labels, numbers[name], pixel) for name in vessels]
+                found[i, :, k] = [pixel * (labels == numbers[name]).sum() for name in vessels]
                 whole[:, k] &= [not (labels[edge] == numbers[name]).any() for name in vessels]
             if progress is not None:
                 progress((k + 1) / len(chosen))

@@ -1,13 +1,6 @@
 """Probe paths as a free hand moves them: smooth, random, as fast as asked, the same for a seed.
 
 ``python -m us_sim.recording.hand_motion FILE.mcap`` writes the one that the project ships.
-
->>> import numpy as np
->>> from us_sim.recording.hand_motion import hand_motion
->>> path = hand_motion("free", "brisk", seed=1)
->>> steps = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
->>> len(path), f"{60e3 * np.median(steps):.3f} mm/s"
-(300, '60.000 mm/s')
 """
 
 from __future__ import annotations
@@ -27,22 +20,11 @@ from scipy.special import erf
 
 from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath
-from us_sim.recording.press_and_slide import write_where_asked
+from us_sim.recording.press_and_slide import EPOCH, write_where_asked
 from us_sim.settings.spelling import unknown
 
 RATE = 60.0
 """Poses per second."""
-_EPOCH = 1_700_000_000 * 10**9  # ns
-
-_WAVES = 6  # in the curve of one coordinate
-_BAND = (0.4, 1.6)  # their frequencies, in cycles of the curve's own unit of time
-_SLOWEST, _FASTEST = 1e-4, 1e4  # of those units in a second
-_HALVINGS = 60  # of the interval that a tempo is in: to a double's last digits
-_BEYOND = 1.25  # of the way from the middle to the edge, where a probe that slides off turns back
-
-_SHIPPED_SEED, _SHIPPED_MOTION = 4, 7.0  # s
-_APPROACH, _EASE, _LIFT, _HOVER = 1.2, 0.5, 0.8, np.array([0.0, 0.0, -0.010])  # s, s, s, m
-
 _Array = NDArray[np.float64]
 _Curve = Callable[[_Array], _Array]
 _T = TypeVar("_T")
@@ -213,16 +195,16 @@ def shipped_hand_path() -> ProbePath:
     The probe hovers above the skin, comes to where the motion begins, takes half a second to get
     under way and as long to stop at the end, and is lifted off. Its seed is 4.
     """
-    motion = np.arange(round(RATE * _SHIPPED_MOTION)) / RATE
+    motion, approach, ease, lift = 7.0, 1.2, 0.5, 0.8  # s
     # Less than the arm has room for, so that the image hardly ever leaves the phantom.
     tilt, yaw = math.radians(12), math.radians(60)
     room = Room(aside=0.012, across=0.010, deepest=0.013, tilt=tilt, yaw=yaw)
-    hand = _hand("free", "brisk", _SHIPPED_SEED, motion, room)
+    hand = _hand("free", "brisk", 4, np.arange(round(RATE * motion)) / RATE, room)
     times = np.arange(round(RATE * 10.0)) / RATE
-    busy = _SHIPPED_MOTION + _EASE
-    positions, orientations = hand.at(_eased(times - _APPROACH, busy))
-    present = _minimum_jerk(times / _APPROACH)
-    present *= 1.0 - _minimum_jerk((times - _APPROACH - busy) / _LIFT)
+    busy = motion + ease
+    positions, orientations = hand.at(_eased(times - approach, busy, ease))
+    present = _minimum_jerk(times / approach)
+    present *= 1.0 - _minimum_jerk((times - approach - busy) / lift)
     return _path(times, *_from_above(present, positions, orientations))
 
 
@@ -249,7 +231,7 @@ def _named(table: Mapping[str, _T], name: str, subject: str) -> _T:
 def _place(motion: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
     side, across = np.array(motion.aside) * room.aside, motion.across * room.across
     if motion.over_the_edge:
-        side = np.array([0.5, _BEYOND]) * room.edge
+        side = np.array([0.5, 1.25]) * room.edge  # it turns back a quarter beyond the edge
     low, high = (part * (room.deepest if part > 0 else room.above) for part in motion.depth)
     x, y, z = (_wander(random, motion.steep) for _ in range(3))
 
@@ -274,13 +256,14 @@ def _turn(motion: HandMotion, room: Room, random: np.random.Generator) -> _Curve
 
 def _wander(random: np.random.Generator, steep: float) -> _Curve:
     """A random curve of times (K,), with values (K,) from 0 to 1."""
-    frequency = random.uniform(*_BAND, _WAVES)
-    phase = random.uniform(0.0, 2 * np.pi, _WAVES)
+    count = 6
+    frequency = random.uniform(0.4, 1.6, count)  # cycles of the curve's own unit of time
+    phase = random.uniform(0.0, 2 * np.pi, count)
 
     def curve(times: _Array) -> _Array:
         waves = np.sin(2 * np.pi * frequency * times[:, None] + phase).sum(axis=1)
         # Its variance is half the number of waves; of a normal variable this is uniform.
-        return np.asarray(0.5 + 0.5 * erf(steep * waves / math.sqrt(_WAVES)))
+        return np.asarray(0.5 + 0.5 * erf(steep * waves / math.sqrt(count)))
 
     return curve
 
@@ -295,15 +278,15 @@ def _tempo(steps: _Curve, asked: float, times: _Array, unit: str) -> float:
     def speed(tempo: float) -> float:
         return float(np.median(steps(tempo * times))) / period
 
-    low = high = _SLOWEST
+    low = high = 1e-4
     while speed(high) < asked:
         low, high = high, 2 * high
-        if high > _FASTEST:
+        if high > 1e4:
             raise BagError(
                 f"a hand's motion cannot reach {asked:.3g} {unit} in that room at "
                 f"{1 / period:.3g} poses a second: give it more of either"
             )
-    for _ in range(_HALVINGS):
+    for _ in range(60):  # to a double's last digits
         middle = 0.5 * (low + high)
         low, high = (middle, high) if speed(middle) < asked else (low, middle)
     return high
@@ -318,15 +301,15 @@ def _angles(orientations: _Array) -> _Array:
     return np.asarray((turns[:-1].inv() * turns[1:]).magnitude())
 
 
-def _eased(times: _Array, busy: float) -> _Array:
-    """(K,) s of a clock that takes `_EASE` to get under way and as long to stop, within ``busy``.
+def _eased(times: _Array, busy: float, ease: float) -> _Array:
+    """(K,) s of a clock that takes ``ease`` s to start and as long to stop, within ``busy``.
 
-    It shows 0 before and ``busy - _EASE`` after.
+    It shows 0 before and ``busy - ease`` after.
     """
     begun = np.clip(times, 0.0, busy)
-    starting, ending = np.minimum(begun, _EASE), np.minimum(busy - begun, _EASE)
-    lost = 0.5 * (_EASE - starting) ** 2 / _EASE - 0.5 * (_EASE - ending) ** 2 / _EASE
-    return np.asarray(begun - 0.5 * _EASE + lost)
+    starting, ending = np.minimum(begun, ease), np.minimum(busy - begun, ease)
+    lost = 0.5 * (ease - starting) ** 2 / ease - 0.5 * (ease - ending) ** 2 / ease
+    return np.asarray(begun - 0.5 * ease + lost)
 
 
 def _minimum_jerk(part: _Array) -> _Array:
@@ -336,14 +319,15 @@ def _minimum_jerk(part: _Array) -> _Array:
 
 
 def _from_above(present: _Array, positions: _Array, orientations: _Array) -> tuple[_Array, _Array]:
-    """Poses on the straight way from `_HOVER`, where ``present`` (K,) is 0, to those given: 1."""
+    """Poses on the straight way from 10 mm above, where ``present`` (K,) is 0, to those given."""
+    hover = np.array([0.0, 0.0, -0.010])
     turns = present[:, None] * Rotation.from_quat(orientations).as_rotvec()
-    places = _HOVER + present[:, None] * (positions - _HOVER)
+    places = hover + present[:, None] * (positions - hover)
     return places, np.asarray(Rotation.from_rotvec(turns).as_quat())
 
 
 def _path(times: _Array, positions: _Array, orientations: _Array) -> ProbePath:
-    stamps = _EPOCH + np.round(times * 1e9).astype(np.int64)
+    stamps = EPOCH + np.round(times * 1e9).astype(np.int64)
     return ProbePath("/tracker/pose", "patient", stamps, positions, orientations)
 
 

@@ -29,7 +29,6 @@ HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 _CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression
 _LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
-_CRC_AT = 33  # bytes from a chunk's opcode
 _INDEX = struct.Struct("<HI")  # channel, length of the entries
 _TIMES = struct.Struct("<QQ")
 _SHORT = struct.Struct("<I")
@@ -70,7 +69,6 @@ _KINDS: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: records.SummaryOffset,
     Opcode.DATA_END: records.DataEnd,
 }
-_LEAST_MESSAGE = 22
 
 _BLOCK, _OVERLAP = 1 << 20, 64
 _LIKE_A_RECORD = re.compile(rb"(?=[\x06\x07\x09\x0c].{4}\0{4})", re.DOTALL)
@@ -217,10 +215,6 @@ def _chunks(offset: int, head: bytes, size: int) -> Iterator[Chunk]:
             yield Chunk(offset, offset + begin, offset + end, name.decode(), unpacked)
 
 
-def _crc_of(head: bytes | memoryview) -> int:
-    return int(_CRC.unpack_from(head, _CRC_AT)[0])
-
-
 def _unpacked(stream: BinaryIO, chunk: Chunk) -> memoryview:
     """The bytes of a chunk's records."""
     if not chunk.offset + _CHUNK.size < chunk.packed <= chunk.end:
@@ -244,7 +238,7 @@ def _unpacked(stream: BinaryIO, chunk: Chunk) -> memoryview:
             raise ValueError(str(error)) from None
     else:
         raise ValueError(f"it is compressed with {chunk.compression!r}, not zstd or lz4")
-    crc = _crc_of(content)
+    crc = _CHUNK.unpack_from(content)[5]
     holds = zlib.crc32(unpacked) == crc if crc else len(unpacked) == chunk.size
     if chunk.is_whole and not holds:
         raise ValueError("its checksum does not match")
@@ -279,7 +273,7 @@ def _ends(stream: BinaryIO, offset: int, opcode: int, length: int) -> Iterator[i
 def _is_sound(opcode: int, content: memoryview) -> bool:
     """Whether these bytes are a record of that kind, no chunk."""
     if opcode == Opcode.MESSAGE:
-        return len(content) >= _LEAST_MESSAGE
+        return len(content) >= 22  # its fields before the data
     try:
         if opcode == Opcode.MESSAGE_INDEX:
             entries = len(content) - _INDEX.size

@@ -1,13 +1,4 @@
-"""The ``metadata.yaml`` of a bag (version 9), written to the letter as ROS 2 Jazzy does.
-
->>> from us_sim.recording.metadata import BagMetadata, FileEntry
->>> empty = BagMetadata(files=(FileEntry("session.mcap"),))
->>> for line in empty.document().splitlines()[:3]:
-...     print(line)
-rosbag2_bagfile_information:
-  version: 9
-  storage_identifier: mcap
-"""
+"""The ``metadata.yaml`` of a bag (version 9), written to the letter as ROS 2 Jazzy does."""
 
 from __future__ import annotations
 

@@ -29,15 +29,12 @@ from numpy.typing import NDArray
 from us_sim.errors import BagError, PoseError, TrackingError
 from us_sim.geometry.pose import FrameTree, Pose
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.topic import BagTopic, QosProfile
 from us_sim.recording.writer import BagWriter
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
 from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, SLICER_TRANSFORMS
-
-__all__ = ["POSE_STAMPED", "ProbePath", "read_path", "write_path", "write_poses"]
-
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
@@ -241,10 +238,10 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
 
     Args:
         path: any bag that ``read_bag`` reads, or a recording.
-        topic: of the bag, or a body's name as above (``/tf:probe``); by
-            default the bag's only PoseStamped topic, among several the one named
-            ``tracker/pose`` (where its poses are of several frames, ``probe/pose``), and without
-            any the only body of other types. In a recording, a transform (``ProbeToReference``).
+        topic: of the bag, or a body's name as above (``/tf:probe``); by default the bag's only
+            PoseStamped topic, among several the one named ``tracker/pose`` (where its poses are of
+            several frames, ``probe/pose``), and without any the only body of other types. In a
+            recording, a transform (``ProbeToReference``).
         option: the option that names the topic, for the sentence on several.
 
     Raises:
@@ -279,53 +276,37 @@ def is_tracker_recording(path: str | Path) -> bool:
     return Path(path).suffix.lower() in (*SEQUENCE_SUFFIXES, *SLICER_SCENES)
 
 
-def write_path(
-    file: str | Path, path: ProbePath, *, qos: QosProfile | None = None, sidecar: bool = True
-) -> None:
+def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> None:
     """Writes a path as a bag of its one topic, compressed.
 
     Args:
         file: as ``BagWriter`` takes it.
         path: recorded at its log times.
-        qos: offered by the topic's publisher; reliable, keep last 10 by default.
         sidecar: False leaves ``metadata.yaml`` away.
 
     Raises:
         BagError: the file exists or cannot be written.
     """
     with BagWriter(file, compression="zstd", sidecar=sidecar) as writer:
-        write_poses(writer, path, qos=qos)
+        write_poses(writer, path)
 
 
-def write_poses(writer: BagWriter, path: ProbePath, *, qos: QosProfile | None = None) -> None:
-    """Writes a path into a bag that is open, as one of its topics.
+def write_poses(writer: BagWriter, path: ProbePath) -> None:
+    """Writes a path into a bag that is open, as one of its topics: reliable, keep last 10.
 
     Raises:
         BagError: it cannot be written.
     """
-    writer.add_topic(path.topic, POSE_STAMPED, [qos or QosProfile()])
+    writer.add_topic(path.topic, POSE_STAMPED, [QosProfile()])
+    types = jazzy_definitions().types
     rows = zip(path.stamps, path.log_times, path.positions, path.orientations, strict=True)
     for stamp, log_time, position, orientation in rows:
-        message = _serialized(int(stamp), path.frame_id, position, orientation)
-        writer.write(path.topic, message, int(log_time), int(stamp))
-
-
-def _serialized(
-    stamp: int, frame_id: str, position: NDArray[np.float64], orientation: NDArray[np.float64]
-) -> memoryview:
-    """A PoseStamped as CDR; stamp in ns."""
-    store = jazzy_definitions()
-    types = store.types
-    message = types[POSE_STAMPED](
-        header=types["std_msgs/msg/Header"](
-            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame_id=frame_id
-        ),
-        pose=types["geometry_msgs/msg/Pose"](
+        pose = types["geometry_msgs/msg/Pose"](
             position=types["geometry_msgs/msg/Point"](*position.tolist()),
             orientation=types["geometry_msgs/msg/Quaternion"](*orientation.tolist()),
-        ),
-    )
-    return store.serialize_cdr(message, POSE_STAMPED, little_endian=True)
+        )
+        message = stamped(POSE_STAMPED, int(stamp), path.frame_id, pose=pose)
+        writer.write(path.topic, message, int(log_time), int(stamp))
 
 
 def _only_body(bag: Bag, option: str) -> str:

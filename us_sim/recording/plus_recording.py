@@ -2,29 +2,6 @@
 a scene or sequence of 3D Slicer (`.mrml`, `.mrb`).
 
 Every sample has a time and named transforms (``ProbeToTracker``), each with a status.
-
->>> import pathlib, tempfile
->>> from us_sim.recording.plus_recording import read_tracker_recording
->>> header = '''ObjectType = Image
-... NDims = 3
-... DimSize = 0 0 2
-... ElementType = MET_OTHER
-... Seq_Frame0000_StylusToTrackerTransform = 1 0 0 10 0 1 0 20 0 0 1 30 0 0 0 1
-... Seq_Frame0000_StylusToTrackerTransformStatus = OK
-... Seq_Frame0000_Timestamp = 7.5
-... Seq_Frame0001_StylusToTrackerTransform = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
-... Seq_Frame0001_StylusToTrackerTransformStatus = INVALID
-... Seq_Frame0001_Timestamp = 7.6
-... ElementDataFile = LOCAL
-... '''
->>> with tempfile.TemporaryDirectory() as folder:
-...     path = pathlib.Path(folder, "stylus.igs.mha")
-...     _ = path.write_text(header)
-...     recording = read_tracker_recording(path)
->>> recording.transforms["StylusToTracker"].matrices[0, :3, 3]
-array([0.01, 0.02, 0.03])
->>> recording.left_out("StylusToTracker")
-{'StylusToTrackerTransformStatus is not OK': 1}
 """
 
 from __future__ import annotations

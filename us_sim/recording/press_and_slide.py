@@ -1,11 +1,6 @@
 """The probe path of the demo: come down, press, hold, slide and rock, release, lift.
 
 ``python -m us_sim.recording.press_and_slide FILE.mcap`` writes it as a bag.
-
->>> from us_sim.recording.press_and_slide import press_and_slide
->>> path = press_and_slide()
->>> len(path), float(path.positions[:, 2].min()), float(path.positions[:, 2].max())
-(600, -0.01, 0.012)
 """
 
 from __future__ import annotations
@@ -47,20 +42,7 @@ def write_where_asked(arguments: Sequence[str], module: str, make: Callable[[], 
     return 0
 
 
-_EPOCH = 1_700_000_000 * 10**9  # ns
-
-_KEYED_DURATION = 10.0
-"""Length of the path in the key poses below, s. Each is a time and a value; between them the probe
-moves smoothly."""
-
-_SLIDE = np.array([[5.0, 0.0], [6.25, 1.0], [7.5, 0.0]])  # of the slide along y, the vessels
-_ROCKS_WHOLLY = 0.008  # m, of slide
-_ROCK = np.array([[5.0, 0.0], [5.625, 4.0], [6.875, -4.0], [7.5, 0.0]])  # degrees about x
-_PRESS = np.array(
-    [[1.0, -1.0], [1.5, 0.0], [3.5, 1.0], [7.5, 1.0], [8.7, 0.0], [9.2, -1.0]],
-)
-"""Height as a fraction: of the hover height above the skin if negative, of the depth if
-positive."""
+EPOCH = 1_700_000_000 * 10**9  # ns
 
 
 def press_and_slide(
@@ -94,40 +76,32 @@ def press_and_slide(
             f"the first two must be positive, the others not negative"
         )
     times = np.arange(round(rate * duration)) / rate
-    phase = times * (_KEYED_DURATION / duration)
-    press = _minimum_jerk(_PRESS, phase)
-    rocked = min(1.0, abs(slide) / _ROCKS_WHOLLY)
-    half_angle = rocked * np.radians(_minimum_jerk(_ROCK, phase)) / 2
+    phase = times * (10.0 / duration)
+    # Keys: times of a path of ten seconds, and values between which it moves smoothly. A height is
+    # a fraction: of the hover height above the skin if negative, of the depth if positive.
+    press = _minimum_jerk(
+        [[1.0, -1.0], [1.5, 0.0], [3.5, 1.0], [7.5, 1.0], [8.7, 0.0], [9.2, -1.0]], phase
+    )
+    slid = _minimum_jerk([[5.0, 0.0], [6.25, 1.0], [7.5, 0.0]], phase)  # along y, the vessels
+    rock = _minimum_jerk([[5.0, 0.0], [5.625, 4.0], [6.875, -4.0], [7.5, 0.0]], phase)  # degrees
+    half_angle = min(1.0, abs(slide) / 0.008) * np.radians(rock) / 2
     positions = np.zeros((len(times), 3))
-    positions[:, 1] = slide * _minimum_jerk(_SLIDE, phase)
+    positions[:, 1] = slide * slid
     positions[:, 2] = press * np.where(press < 0, hover, depth)
     orientations = np.zeros((len(times), 4))
     orientations[:, 0] = np.sin(half_angle)
     orientations[:, 3] = np.cos(half_angle)
-    stamps = _EPOCH + np.round(times * 1e9).astype(np.int64)
+    stamps = EPOCH + np.round(times * 1e9).astype(np.int64)
     return ProbePath("/tracker/pose", "patient", stamps, positions, orientations)
 
 
-def _minimum_jerk(keys: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+def _minimum_jerk(keys: list[list[float]], times: NDArray[np.float64]) -> NDArray[np.float64]:
     """(K,) values at times (K,) s, at rest at each of the keys (N, 2) and outside of them."""
-    at, values = keys.T
+    at, values = np.array(keys).T
     left = np.clip(np.searchsorted(at, times, side="right") - 1, 0, len(at) - 2)
     fraction = np.clip((times - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
     blend = fraction**3 * (10 - 15 * fraction + 6 * fraction**2)
     return values[left] + blend * (values[left + 1] - values[left])
-
-
-def main(arguments: list[str]) -> int:
-    """Writes the path where the one argument says; returns the exit status."""
-    return write_where_asked(arguments, "us_sim.recording.press_and_slide", press_and_slide)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
-
-
-_MADE = 1
-"""Version of `press_and_slide`'s path, so that no older file is taken for it."""
 
 
 def pressing_path(depth: float, slide: float = 0.008) -> Path:
@@ -136,7 +110,8 @@ def pressing_path(depth: float, slide: float = 0.008) -> Path:
     Raises:
         BagError: the cache folder cannot be written.
     """
-    name = f"press-{_MADE}-{depth * 1e3:.1f}-mm-slide-{slide * 1e3:.1f}-mm.mcap"
+    # 1 is the version of the path, so that no older file is taken for it.
+    name = f"press-1-{depth * 1e3:.1f}-mm-slide-{slide * 1e3:.1f}-mm.mcap"
     file = cache_folder() / name
     if file.is_file():
         return file
@@ -153,3 +128,12 @@ def pressing_path(depth: float, slide: float = 0.008) -> Path:
             f"a folder that can be written"
         ) from error
     return file
+
+
+def main(arguments: list[str]) -> int:
+    """Writes the path where the one argument says; returns the exit status."""
+    return write_where_asked(arguments, "us_sim.recording.press_and_slide", press_and_slide)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

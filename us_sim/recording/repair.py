@@ -1,19 +1,4 @@
-"""Repairing a recording: all that can be read of it, in a new bag; and its attached files.
-
->>> import tempfile
->>> from us_sim.recording.reader import read_bag
->>> from us_sim.recording.repair import repair
->>> from us_sim.recording.writer import BagWriter
->>> folder = tempfile.mkdtemp()
->>> with BagWriter(folder + "/session.mcap") as writer:
-...     writer.add_topic("/note", "std_msgs/msg/String")
-...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
->>> content = open(folder + "/session.mcap", "rb").read()
->>> open(folder + "/cut.mcap", "wb").write(content[:-100]) == len(content) - 100
-True
->>> repair(folder + "/cut.mcap", folder + "/whole").message_count
-1
-"""
+"""Repairing a recording: all that can be read of it, in a new bag; and its attached files."""
 
 from __future__ import annotations
 
@@ -101,7 +86,7 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
             cannot be written.
     """
     bag = read_bag(path)
-    damage = [*bag.found_at_once]
+    damage = [*bag.opening_faults]
     with BagWriter(out) as writer:
         for attached in bag.attachments(damage).values():
             writer.attach(attached.name, attached.media_type, attached.data, attached.time)

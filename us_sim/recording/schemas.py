@@ -2,16 +2,6 @@
 
 Where ROS 2 is installed the text is the installed ``.msg`` file, comments and all, exactly as
 rosbag2 writes it; elsewhere the definition of the same fields comes from rosbags.
-
->>> from us_sim.recording.schemas import schema_text, type_hash
->>> print(schema_text("std_msgs/msg/ColorRGBA").replace("float32 ", ""))
-r
-g
-b
-a
-<BLANKLINE>
->>> type_hash("geometry_msgs/msg/PoseStamped")[:19]
-'RIHS01_10f3786d7d40'
 """
 
 from __future__ import annotations
@@ -125,6 +115,15 @@ def _parts(name: str, types: Mapping[str, Any], within: tuple[str, ...]) -> int:
 def jazzy_definitions() -> Typestore:
     """The message types of ROS 2 Jazzy."""
     return get_typestore(Stores.ROS2_JAZZY)
+
+
+def stamped(type_name: str, stamp: int, frame_id: str, **fields: Any) -> memoryview:
+    """A message of Jazzy with a header and these fields as CDR; ``stamp`` in ns since the epoch."""
+    store = jazzy_definitions()
+    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    header = store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+    message = store.types[type_name](header=header, **fields)
+    return store.serialize_cdr(message, type_name, little_endian=True)
 
 
 @cache

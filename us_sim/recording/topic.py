@@ -1,17 +1,6 @@
 """A bag's topics, messages and quality of service, as every kind of storage hands them out.
 
 Quality of service is in the YAML of rosbag2: policies by name since Jazzy, by number before.
-
->>> from us_sim.recording.topic import QosProfile, qos_from_yaml, qos_to_yaml
->>> latched = QosProfile(depth=1, durability="transient_local")
->>> for line in qos_to_yaml([latched]).splitlines()[:4]:
-...     print(line)
-- history: keep_last
-  depth: 1
-  reliability: reliable
-  durability: transient_local
->>> qos_from_yaml(qos_to_yaml([latched])) == (latched,)
-True
 """
 
 from __future__ import annotations

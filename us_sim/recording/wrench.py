@@ -1,27 +1,16 @@
-"""The wrenches of a bag: forces and torques over time, from a simulated probe or from a sensor.
-
->>> import tempfile
->>> import numpy as np
->>> from us_sim.recording.wrench import WrenchRecord, read_wrenches, write_wrenches
->>> file = tempfile.mkdtemp() + "/press.mcap"
->>> pressed = np.array([[0.0, 0.0, -2.5, 0.0, 0.0, 0.0]])
->>> write_wrenches(file, WrenchRecord("/probe/wrench", "probe", np.array([10**18]), pressed))
->>> read_wrenches(file, "probe/wrench").wrenches
-array([[ 0. ,  0. , -2.5,  0. ,  0. ,  0. ]])
-"""
+"""The wrenches of a bag: forces and torques over time, from a simulated probe or from a sensor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 
@@ -109,21 +98,10 @@ def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:
             write_wrenches(writer, record)
         return
     file.add_topic(record.topic, WRENCH_STAMPED, [QosProfile()])
-    for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):
-        file.write(record.topic, _serialized(stamp, record.frame_id, wrench), stamp, stamp)
-
-
-def _serialized(stamp: int, frame_id: str, wrench: list[float]) -> Any:
-    """A WrenchStamped as CDR; stamp in ns."""
-    store = jazzy_definitions()
-    types = store.types
+    types = jazzy_definitions().types
     vector = types["geometry_msgs/msg/Vector3"]
-    message = types[WRENCH_STAMPED](
-        header=types["std_msgs/msg/Header"](
-            stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), frame_id=frame_id
-        ),
-        wrench=types["geometry_msgs/msg/Wrench"](
-            force=vector(*wrench[:3]), torque=vector(*wrench[3:])
-        ),
-    )
-    return store.serialize_cdr(message, WRENCH_STAMPED, little_endian=True)
+    for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):
+        force, torque = vector(*wrench[:3]), vector(*wrench[3:])
+        measured = types["geometry_msgs/msg/Wrench"](force=force, torque=torque)
+        message = stamped(WRENCH_STAMPED, stamp, record.frame_id, wrench=measured)
+        file.write(record.topic, message, stamp, stamp)

@@ -1,17 +1,4 @@
-"""Writing a bag from a thread of its own, so that whoever has messages never waits for the disk.
-
->>> import tempfile
->>> from us_sim.recording.reader import read_bag
->>> from us_sim.recording.writer import BagWriter
->>> file = tempfile.mkdtemp() + "/session.mcap"
->>> bag = WriteBehind(BagWriter(file), max_cache_size=1_000_000)
->>> bag.add_topic("/note", "std_msgs/msg/String")
->>> bag.put("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
-True
->>> bag.close()
->>> read_bag(file).message_count
-1
-"""
+"""Writing a bag from a thread of its own, so that whoever has messages never waits for the disk."""
 
 from __future__ import annotations
 
@@ -62,7 +49,7 @@ class Losses:
             return {t: Loss(self._in_transport[t], self._in_recorder[t]) for t in topics}
 
 
-def news(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
+def losses_between(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
     """Losses between two results of `Losses.by_topic`, of topics that lost something."""
     none = Loss(0, 0)
     return {
@@ -260,7 +247,7 @@ class WriteBehind:
         """Note the losses since the last note."""
         lost = self.losses.by_topic()
         if lost != self._noted and not self.problem:
-            new = news(lost, self._noted)
+            new = losses_between(lost, self._noted)
             self._bag.note(LOST, {topic: str(sum(loss)) for topic, loss in new.items()})
             self._noted = lost
 

@@ -1,27 +1,12 @@
-"""From a case to a scene: what a scene file would say to scan it and press on it.
+"""Scenes made from cases: their keys, and their box of tissue, which is kept in the case.
 
 Frame ``patient`` is the probe's where it touches the skin at the case's start: its origin is the
 middle of the probe's face, and +z goes into the body.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Placement
->>> from us_sim.scene.case_tissue import patient_from_volume
->>> start = Placement((0.0, 0.1, 0.0), (1.0, 0.0, 0.0, 0.0))  # on the volume's face, looking back
->>> pose = patient_from_volume(start).pose
->>> bool(np.allclose(pose.apply(np.array([[0.0, 0.1, -0.03]])), [[0.0, 0.0, 0.03]]))
-True
-
-The box of tetrahedra of a scene's tissue, with its planes where they count.
 
 >>> from us_sim.geometry.collider import RoundedBox
 >>> from us_sim.scene.case_tissue import footprint
 >>> footprint(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
 (0.023, 0.007)
-
-The tissue of a scene that is made from a case: kept in the case, so that it is made once.
-
-Only what the mesh and its labels follow from counts: the box, the probe's shape, where the volume
-is, and the labels. Materials may change without it.
 """
 
 from __future__ import annotations
@@ -102,7 +87,6 @@ def case_document(folder: Path) -> dict[str, Any]:
 
 
 def _path(settings: CaseSettings) -> str:
-    """The path of a press as deep as the case proposes."""
     assert settings.probe is not None
     press = settings.press
     if press is None:
@@ -139,7 +123,6 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
 
 
 def _rounded(corner: NDArray[np.float64]) -> list[float]:
-    """To a tenth of a millimetre, for a person who reads the scene."""
     return [round(float(value), 4) for value in corner]
 
 
@@ -261,7 +244,7 @@ def _is_fitted(scene: Scene) -> bool:
 
 
 def _made_from(scene: Scene) -> dict[str, Any]:
-    """What the tissue follows from, as JSON gives it back."""
+    """All that the tissue follows from, as JSON gives it back."""
     assert scene.tissue is not None
     assert scene.probe.collider is not None
     assert scene.volume.case is not None

@@ -1,13 +1,8 @@
-"""Numbers with units, as a person writes them in a scene: ``0.04``, ``40 mm``, ``12 kPa``.
+"""Numbers with units: read as a person writes them in a scene, and shown in handy units.
 
->>> from us_sim.settings.quantity import Quantity
+>>> from us_sim.settings.quantity import Quantity, amount, dial_unit, span
 >>> Quantity("length", minimum=0.0, maximum=1.0).parse("40 mm")
 0.04
-
-Numbers as a person reads them: in a handy unit, and still exactly the number.
-
->>> from us_sim.settings.quantity import amount, span
->>> from us_sim.settings.quantity import Quantity
 >>> amount(0.0003, "length"), amount(12e3, "pressure"), amount(2.0, "number")
 ('0.3 mm', '12 kPa', '2')
 >>> span(Quantity("length", 0.003, 0.2)), span(Quantity("level", -60.0, 0.0))
@@ -231,6 +226,5 @@ def _plain(value: float) -> str:
 
 
 def _tidy(text: str) -> str:
-    """Without the zeros and the plus sign of an exponent."""
     mantissa, e, exponent = text.partition("e")
     return f"{mantissa}e{int(exponent)}" if e else mantissa

@@ -36,7 +36,7 @@ NUMBER = Quantity("number")
 
 @dataclass(frozen=True)
 class Rule:
-    """What is said of a setting beside its name, type and default."""
+    """Properties of a setting beside its name, type and default."""
 
     quantity: Quantity | None = None  # unit and range of a number, or of each number of a list
     description: str = ""  # for a person, without the unit
@@ -98,13 +98,13 @@ class Settings:
     """
 
     section: ClassVar[str] = ""
-    """What these settings are of, for sentences: ``probe.collider``."""
+    """The keys that lead to these settings, for sentences: ``probe.collider``."""
     error: ClassVar[type[UsSimError]] = SettingsError
-    """What is raised for a value that will not do."""
+    """The class of errors."""
     live: ClassVar[bool] = False
     """Whether all of these settings may change while what they set is running."""
     alternatives: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Settings of which one takes the place of the others, each with those that belong to it."""
+    """Mutually exclusive settings and their dependants."""
 
     def __post_init__(self) -> None:
         kinds = kinds_of(type(self))

@@ -4,13 +4,6 @@ The C library comes with the PyPI package `cyclonedds`. Its Python classes are n
 the interpreter's lock while a write blocks, describe every type by XTypes (which Jazzy does not
 send and need not agree with), and turn each sample into objects. Calls through ctypes release the
 lock.
-
->>> from us_sim.standalone.ddsc import EndpointQos, lib
->>> lib.dds_time() > 0
-True
->>> latched = EndpointQos(depth=1, durability=EndpointQos.TRANSIENT_LOCAL)
->>> latched.reliability == EndpointQos.RELIABLE
-True
 """
 
 from __future__ import annotations
@@ -229,7 +222,10 @@ _LONGEST_BLOCK = 100_000_000  # ns; DDS's own default, where rmw_cyclonedds woul
 
 @dataclass(frozen=True)
 class EndpointQos:
-    """The policies of one endpoint, with the numbers that rclpy's enumerations have."""
+    """The policies of one endpoint, with the numbers that rclpy's enumerations have.
+
+    A duration of 0 is "not specified", which is infinite, as in rmw.
+    """
 
     RELIABLE: ClassVar[int] = 1
     BEST_EFFORT: ClassVar[int] = 2

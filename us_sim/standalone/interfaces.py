@@ -2,12 +2,6 @@
 
 The .msg files come from rosbags' type store. Written down here are the services, which it lacks,
 and two events of rosbag2 that are newer than Jazzy.
-
->>> from us_sim.standalone.interfaces import interface, type_hash
->>> [(field.name, field.idl_type) for field in interface("sensor_msgs/msg/Image").fields][-2:]
-[('step', 'uint32'), ('data', 'sequence<uint8>')]
->>> type_hash("sensor_msgs/msg/Image")[:16]
-'RIHS01_d31d41a9a'
 """
 
 from __future__ import annotations
@@ -22,43 +16,42 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 PLACEHOLDER = "structure_needs_at_least_one_member"
 
-_SERVICES = {
-    "rcl_interfaces/srv/DescribeParameters": (
-        "string[] names",
-        "rcl_interfaces/ParameterDescriptor[] descriptors",
-    ),
-    "rcl_interfaces/srv/GetParameterTypes": ("string[] names", "uint8[] types"),
-    "rcl_interfaces/srv/GetParameters": (
-        "string[] names",
-        "rcl_interfaces/ParameterValue[] values",
-    ),
-    "rcl_interfaces/srv/ListParameters": (
-        "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth",
-        "rcl_interfaces/ListParametersResult result",
-    ),
-    "rcl_interfaces/srv/SetParameters": (
-        "rcl_interfaces/Parameter[] parameters",
-        "rcl_interfaces/SetParametersResult[] results",
-    ),
-    "rcl_interfaces/srv/SetParametersAtomically": (
-        "rcl_interfaces/Parameter[] parameters",
-        "rcl_interfaces/SetParametersResult result",
-    ),
-    "rosbag2_interfaces/srv/GetRate": ("", "float64 rate"),
-    "rosbag2_interfaces/srv/IsPaused": ("", "bool paused"),
-    "rosbag2_interfaces/srv/Pause": ("", ""),
-    "rosbag2_interfaces/srv/Record": ("string uri", "int32 return_code\nstring error_string"),
-    "rosbag2_interfaces/srv/Resume": ("", ""),
-    "rosbag2_interfaces/srv/Seek": ("builtin_interfaces/Time time", "bool success"),
-    "rosbag2_interfaces/srv/SetRate": ("float64 rate", "bool success"),
-    "rosbag2_interfaces/srv/Snapshot": ("", "bool success"),
-    "rosbag2_interfaces/srv/SplitBagfile": ("", ""),
-    "rosbag2_interfaces/srv/Stop": ("", ""),
-    "rosbag2_interfaces/srv/TogglePaused": ("", ""),
-    "std_srvs/srv/Empty": ("", ""),
-    "std_srvs/srv/SetBool": ("bool data", "bool success\nstring message"),
-    "std_srvs/srv/Trigger": ("", "bool success\nstring message"),
+# Services by package: a name, and the fields of its request and of its response.
+_SERVICE_TEXTS = {
+    "rcl_interfaces": """
+        DescribeParameters | string[] names | rcl_interfaces/ParameterDescriptor[] descriptors
+        GetParameterTypes | string[] names | uint8[] types
+        GetParameters | string[] names | rcl_interfaces/ParameterValue[] values
+        ListParameters | uint64 DEPTH_RECURSIVE=0; string[] prefixes; uint64 depth \
+            | rcl_interfaces/ListParametersResult result
+        SetParameters | rcl_interfaces/Parameter[] parameters \
+            | rcl_interfaces/SetParametersResult[] results
+        SetParametersAtomically | rcl_interfaces/Parameter[] parameters \
+            | rcl_interfaces/SetParametersResult result""",
+    "rosbag2_interfaces": """
+        GetRate | | float64 rate
+        IsPaused | | bool paused
+        Pause | |
+        Record | string uri | int32 return_code; string error_string
+        Resume | |
+        Seek | builtin_interfaces/Time time | bool success
+        SetRate | float64 rate | bool success
+        Snapshot | | bool success
+        SplitBagfile | |
+        Stop | |
+        TogglePaused | |""",
+    "std_srvs": """
+        Empty | |
+        SetBool | bool data | bool success; string message
+        Trigger | | bool success; string message""",
 }
+_SERVICES: dict[str, list[str]] = {}
+for _package, _text in _SERVICE_TEXTS.items():
+    for _line in _text.strip().splitlines():
+        _name, *_parts = _line.split("|")
+        _SERVICES[f"{_package}/srv/{_name.strip()}"] = [
+            part.strip().replace("; ", "\n") for part in _parts
+        ]
 
 # Newer than Jazzy, as is the service Record.
 _MESSAGES = {

@@ -165,7 +165,6 @@ class ViewerSurface:
         self._changed()
 
     def _make_tissue(self) -> None:
-        """The tissue's upper side, of the mesh that is there now."""
         if self._rest.mesh is not None:
             self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
             self._changed()
@@ -265,7 +264,6 @@ class ViewerHand:
         return None
 
     def _watched(self, _: bool) -> None:
-        """Called in a page's thread."""
         self._post(self._watch)
 
     def _watch(self) -> None:
@@ -345,7 +343,6 @@ class ViewerHand:
         self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:
-        """Publish no more."""
         self._moving_timer.cancel()
         self._warning = ""
         if self._publisher is not None:
@@ -372,7 +369,6 @@ class ViewerHand:
         self._update()
 
     def _be_elsewhere(self) -> None:
-        """Poses come, or came a moment ago: of this hand, if it has had the probe."""
         self._is_found |= self._motion is not None
 
     def _follow(self, pose: Pose) -> None:
@@ -407,7 +403,6 @@ class ViewerHand:
             self._advance(1.0 / MOVING if rested else LONGEST_STEP)
 
     def _tick(self) -> None:
-        """The next pose of a movement, if it is due."""
         now = time.monotonic()
         is_streaming = now - self.asked.at < STREAMING / MOVING
         if now - self._sent_at > (LATEST if is_streaming else 0.9) / MOVING:
@@ -428,7 +423,6 @@ class ViewerHand:
             self._tell()
 
     def _publish(self) -> None:
-        """Where the probe is held."""
         assert self._motion is not None
         assert self._standing is not None
         stamp = self._node.get_clock().now()
@@ -452,7 +446,7 @@ class ViewerHand:
         return f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
 
     def _tell(self) -> None:
-        """The pages how the probe is held, and by whom."""
+        """Tell the pages how the probe is held, and by whom."""
         motion, surface = self._motion, self._standing
         stance = motion.stance if motion is not None else None
         goal = motion.goal if motion is not None else None

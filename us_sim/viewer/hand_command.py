@@ -1,23 +1,15 @@
-"""What a page asks of the hand that moves the probe.
+"""Commands of the pages to the hand that moves the probe, and the poses that obey them.
 
->>> from us_sim.tracking.virtual_hand import RestSurface
->>> from us_sim.tracking.virtual_hand import Stance
->>> from us_sim.viewer.hand_command import HandCommand
+>>> from us_sim.tracking.virtual_hand import RestSurface, Stance
+>>> from us_sim.viewer.hand_command import AskedPoses, HandCommand
 >>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
 >>> asked = asked.stance(Stance(rotation=0.1), RestSurface.plane(0.1))
 >>> asked.press, asked.rotation
 (0.004, 0.1)
-
-What pages are told of how the probe is held: the header of the stream ``hand``.
-
-Which page asked for which pose of the probe, and which holds it.
-
->>> from us_sim.viewer.hand_command import AskedPoses
->>> asked = AskedPoses()
->>> asked.published(stamp=1)
->>> asked.ask("a page", 7)
->>> asked.published(stamp=2)
->>> asked.by(1), asked.by(2), asked.holder, asked.is_moving
+>>> poses = AskedPoses()
+>>> poses.ask("a page", 7)
+>>> poses.published(stamp=2)
+>>> poses.by(1), poses.by(2), poses.holder, poses.is_moving
 (None, ('a page', 7), 'a page', True)
 """
 
@@ -115,7 +107,6 @@ def is_source(value: Any) -> TypeGuard[str]:
 
 
 def _with(stance: Stance, numbers: dict[str, Any]) -> Stance:
-    """Other values of the numbers by name."""
     return replace(stance, **numbers)
 
 
@@ -201,7 +192,7 @@ _MOVES_S = 2.0  # after its last wish a page holds the probe, and moves it no mo
 
 
 class AskedPoses:
-    """What pages have asked, and the poses that contain it.
+    """The commands of pages, and the poses that obey them.
 
     It is written in one thread, and may be read in others.
     """

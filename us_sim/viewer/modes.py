@@ -47,8 +47,6 @@ _LOOK_S = 0.3
 
 
 class _Modes:
-    """The bar of one page."""
-
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
         self._mode = "b-mode"

@@ -1,9 +1,4 @@
-"""The header's words: which scene runs, and what is being done with it.
-
-The one page: header, 3D scene, ultrasound image, and panels that can be opened.
-
-What the web server serves: the page, its own files, and the stream.
-"""
+"""The one page: header, 3D scene, image, and panels that can be opened; and the application."""
 
 from __future__ import annotations
 
@@ -144,7 +139,6 @@ def build_page(simulator: Simulator) -> None:
 
 
 def _block(name: str) -> None:
-    """An element that a module of the page fills."""
     ui.element("div").props["id"] = name
 
 

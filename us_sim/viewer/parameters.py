@@ -6,15 +6,6 @@
 ... )
 >>> depth.value, depth.low, depth.high, depth.raw_of(45)
 (40.0, 5.0, 400.0, 0.045)
-
-The parameters of all nodes that pages look at; pages and the graph meet here.
-
->>> from us_sim.viewer.parameters import ParameterBoard
->>> board = ParameterBoard(on_watch=lambda: print("somebody looks, or nobody does any more"))
->>> board.watch("tissue_deformer")
-somebody looks, or nobody does any more
->>> board.of("tissue_deformer").state.value
-'is not running'
 """
 
 from __future__ import annotations
@@ -61,7 +52,7 @@ class Kind(Enum):
 
 
 class State(Enum):
-    """What is known of a node's parameters."""
+    """Progress of asking a node for its parameters."""
 
     ABSENT = "is not running"
     ASKED = "is being asked for its parameters"
@@ -109,7 +100,7 @@ class Parameter:
 
     @property
     def group(self) -> str:
-        """What comes before the last dot of its name."""
+        """Its name up to the last dot."""
         return self.name.rpartition(".")[0]
 
     @property
@@ -118,7 +109,7 @@ class Parameter:
         return in_words(self.name.rpartition(".")[2])
 
     def raw_of(self, value: Any) -> Any:
-        """What the node is sent for a value that a person has set, in ``unit``.
+        """The value in SI units of one that a person has set, in ``unit``.
 
         Raises:
             SettingsError: it is no value of this kind, or outside the range.
@@ -153,7 +144,6 @@ class Parameter:
         return nothing.get(self.kind)
 
     def _item(self, value: Any) -> Any:
-        """One of a list."""
         if self.kind is Kind.TEXTS:
             return str(value)
         return self._whole(value) if self.kind is Kind.WHOLES else self._number(value)
@@ -198,7 +188,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class NodeParameters:
-    """What is known of the parameters of one node, at one moment."""
+    """The parameters of one node, as far as they are known."""
 
     node: str
     state: State = State.ABSENT
@@ -264,7 +254,7 @@ class ParameterBoard:
             self._on_watch()
 
     def of(self, node: str) -> NodeParameters:
-        """What is known; it is another object whenever it has changed."""
+        """The parameters of a node; another object whenever they have changed."""
         with self._lock:
             return self._known.get(node) or NodeParameters(node)
 

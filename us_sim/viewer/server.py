@@ -1,7 +1,4 @@
-"""The address at which the page is served: taken, or refused with a sentence.
-
-The web server of the viewer, in a thread of its own.
-"""
+"""The web server of the viewer, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -148,7 +145,6 @@ def _outward() -> list[str]:
 
 
 def _made(simulator: Simulator) -> tuple[Any, Any]:
-    """The server's library, and the application."""
     # NiceGUI would make a folder of its own wherever the program was started.
     os.environ.setdefault("NICEGUI_STORAGE_PATH", str(cache_folder() / "viewer"))
     try:

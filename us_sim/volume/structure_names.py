@@ -1,9 +1,7 @@
-"""Names of structures that say what is there and not whose it is.
+"""Names of structures, which must not say whose they are, and their colours.
 
 A segmentation's names are free text, and some hold a patient's. Of those that come from a file only
 names made of known words are kept; those that a person writes here are checked for their form.
-
-Colours of structures by their names, as anatomical atlases paint them.
 """
 
 from __future__ import annotations
@@ -83,7 +81,7 @@ def is_anatomical(name: str) -> bool:
 
 
 def coded_name(codes: Sequence[str]) -> str:
-    """What SNOMED codes of a type and its modifier mean in DICOM; empty where nothing is known.
+    """The meaning of SNOMED codes of a type and its modifier; empty where none is known.
 
     The words are those of pydicom's dictionary of the standard, never a file's own.
     """
@@ -110,7 +108,7 @@ def readable(name: str) -> str:
 
 
 def problem_with(name: str) -> str | None:
-    """What keeps a text that a person wrote from being a structure's name; None where it is one."""
+    """The problem with a structure's name that a person wrote; None where there is none."""
     if not name.strip() or len(name) > _LONGEST or not name.isprintable():
         return f"must have 1 to {_LONGEST} printable characters"
     if not re.fullmatch(r"[^\W_][\w \-']*", name):

@@ -1,7 +1,4 @@
-"""A volume of grey values placed in frame ``patient``, with labels when it has been segmented.
-
-What each voxel of a volume is: numbers, with the names and colours of the structures.
-"""
+"""A volume of grey values placed in frame ``patient``, and labels of its voxels."""
 
 from __future__ import annotations
 
@@ -28,8 +25,8 @@ class Volume:
         intensities: (i, j, k) uint8, axis 0 along the grid's x.
         index_to_patient: (4, 4) affine, m, from voxel indices to frame ``patient``; it may be
             oblique or mirrored.
-        labels: (i, j, k) uint8, what each voxel is, or None.
-        label_names: what the labels' numbers mean; 0 needs no name.
+        labels: (i, j, k) uint8, the structure of each voxel, or None.
+        label_names: of the labels' numbers; 0 needs no name.
 
     Raises:
         VolumeError: an array is not three-dimensional uint8, the two shapes differ, an axis has
@@ -129,7 +126,7 @@ class LabelMap:
     names: Mapping[int, str]
     colours: Mapping[int, Colour] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    """What a person should know of how they came about, a sentence each."""
+    """On how they came about, a sentence each."""
 
     def __post_init__(self) -> None:
         names = dict(self.names)

@@ -1,4 +1,9 @@
-"""A case is made whole or not at all."""
+"""A case is made whole or not at all.
+
+Moduli in a case: only they change, and the case says how they were found.
+
+What was done to a case, as its file says it.
+"""
 
 import os
 import signal
@@ -9,11 +14,16 @@ import time
 
 import pytest
 
-from us_sim.errors import CaseError
+from us_sim.errors import CaseError, MaterialError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.cases.provenance import Source, Step, add_step
+from us_sim.volume.cases.provenance import Source, Step, add_step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
-from us_sim.volume.cases.writing import changed_case, new_case, write_case_settings
+from us_sim.volume.cases.writing import (
+    changed_case,
+    new_case,
+    write_case_settings,
+    write_moduli_into,
+)
 from us_sim.volume.files.writing import write_volume
 
 
@@ -147,3 +157,49 @@ def test_a_provenance_that_is_none_is_refused(make_case, text):
     (folder / "provenance.yaml").write_text(text)
     with pytest.raises(CaseError, match=r"provenance\.yaml"):
         read_case(folder)
+
+
+STEP = Step("fitted stiffness to a press", {"confidence": 0.95}, {"poses": 48})
+
+
+def test_moduli_change_and_nothing_else(make_case):
+    folder = make_case()
+    before = read_case(folder).settings
+    write_moduli_into(folder, {"vein": 2345.0, "tissue": 9876.0}, STEP)
+    case = read_case(folder)
+    assert case.settings.material_of("vein").young_modulus == 2345.0
+    assert case.settings.material_of("tissue").young_modulus == 9876.0
+    for name in ("vein", "tissue"):
+        was, now = before.material_of(name), case.settings.material_of(name)
+        assert (now.poisson_ratio, now.density) == (was.poisson_ratio, was.density)
+    assert case.settings.structures["vein"].label == before.structures["vein"].label
+    assert case.steps[-1].what == STEP.what
+    assert case.steps[-1].counts == {"poses": 48}
+
+
+@pytest.mark.parametrize(
+    ("moduli", "error", "sentence"),
+    [({"vien": 1e3}, CaseError, "vien"), ({"vein": -1.0}, MaterialError, "young_modulus")],
+)
+def test_what_cannot_be_written_leaves_the_case_as_it_was(make_case, moduli, error, sentence):
+    folder = make_case()
+    before = (folder / "case.yaml").read_bytes()
+    with pytest.raises(error, match=sentence):
+        write_moduli_into(folder, moduli, STEP)
+    assert (folder / "case.yaml").read_bytes() == before
+    assert read_case(folder).steps == ()
+
+
+@pytest.mark.parametrize(
+    ("step", "why"),
+    [
+        ("what: a\n  us_sim: '1'\n  counts:", "counts: must be keys with values"),
+        ("what: a\n  us_sim: '1'\n  settings: 4", "settings: must be keys with values"),
+        ("what: a\n  us_sim: '1'\n  sources: 4", "not iterable"),
+        ("3", "a step must be keys with values"),
+    ],
+)
+def test_a_step_of_another_shape_is_refused_in_a_sentence(tmp_path, step, why):
+    (tmp_path / "provenance.yaml").write_text(f"steps:\n- {step}\n")
+    with pytest.raises(CaseError, match=f"is no provenance that us_sim wrote: .*{why}"):
+        read_steps(tmp_path)

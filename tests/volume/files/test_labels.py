@@ -1,6 +1,7 @@
 """Labels of other programs: names, colours, layers, grids; and what is no labels."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -142,7 +143,7 @@ def test_every_labelled_voxel_keeps_its_place_in_the_patient(order, signs, shift
     labels[1, 2, 2] = 2
     affine = VOLUME.index_to_patient @ turn
     try:
-        made, _ = on_grid(labels, affine, (6, 6, 6), VOLUME.index_to_patient)
+        made, _ = on_grid(Path("labels.nrrd"), labels, affine, (6, 6, 6), VOLUME.index_to_patient)
     except VolumeError:
         made = np.zeros((6, 6, 6), np.uint8)
     expected = np.zeros((6, 6, 6), np.uint8)

@@ -1,12 +1,25 @@
-"""The upper arm: its anatomy in numbers, its echoes, and the same bytes every time."""
+"""The upper arm: its anatomy in numbers, its echoes, and the same bytes every time.
+
+Noise, sheets and tubes, against their laws.
+
+Speckle: Rayleigh statistics, the size of a speckle, interfaces, and the display's scale.
+"""
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from us_sim.errors import VolumeError
-from us_sim.volume.measure import label_area
 from us_sim.volume.phantom.phantom import cached_phantom, upper_arm
-from us_sim.volume.phantom.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
+from us_sim.volume.phantom.speckle import PointSpread, echo_envelope, log_compress
+from us_sim.volume.phantom.upper_arm import (
+    UPPER_ARM_BLOCK,
+    UPPER_ARM_LABELS,
+    SmoothNoise,
+    Tube,
+    UpperArm,
+    sheets,
+)
 from us_sim.volume.volume import Volume
 
 COARSE = 0.8e-3
@@ -49,7 +62,7 @@ def test_default_voxels_are_three_tenths_of_a_millimetre():
 
 def test_structures_lie_and_measure_as_in_an_arm(section):
     area = {
-        name: label_area(section.labels, number, 0.1e-3**2)
+        name: 0.1e-3**2 * np.count_nonzero(section.labels == number)
         for name, number in UPPER_ARM_LABELS.items()
     }
     # Ellipses of 4.5 × 4.5, 7 × 5.5 and 4.8 × 3.8 mm, each within its 4 % of size.
@@ -160,3 +173,174 @@ def test_muscle_behind_a_vein_scatters_as_that_beside_it():
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(VolumeError, match=message):
         upper_arm(**arguments)
+
+
+BLOCK = np.array([[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]])
+
+
+def _noise(seed: int) -> SmoothNoise:
+    return SmoothNoise(np.random.Generator(np.random.PCG64(seed)), BLOCK, (2e-3, 3e-3, 1e-3))
+
+
+def test_noise_has_mean_0_and_variance_1():
+    x, z = np.linspace(0, 0.1, 101), np.linspace(0, 0.1, 201)
+    values = np.stack([_noise(3).plane(x, y, z) for y in np.linspace(0.0, 0.1, 21)])
+    assert abs(values.mean()) < 0.02
+    assert values.var() == pytest.approx(1.0, abs=0.03)
+
+
+def test_noise_does_not_depend_on_where_else_it_is_sampled():
+    noise = _noise(4)
+    x, z = np.array([0.0213, 0.05]), np.array([0.07, 0.0712, 0.08])
+    fine = noise.plane(np.array([0.01, 0.05, 0.06]), 0.033, np.array([0.0712]))
+    assert noise.plane(x, 0.033, z)[1, 1] == pytest.approx(fine[1, 0], abs=1e-12)
+
+
+def test_noise_is_smooth_and_goes_on_beyond_its_block():
+    noise = _noise(5)
+    x = np.linspace(-0.01, 0.11, 12001)
+    values = noise.plane(x, 0.05, np.array([0.05]))[:, 0]
+    assert np.isfinite(values).all()
+    assert np.abs(np.diff(values)).max() < 0.05
+    assert values[0] == pytest.approx(noise.plane(np.array([0.0]), 0.05, np.array([0.05]))[0, 0])
+
+
+def test_a_line_of_noise_lies_in_the_lower_face():
+    noise = _noise(6)
+    x = np.linspace(0.01, 0.02, 7)
+    np.testing.assert_allclose(noise.line(x, 0.02), noise.plane(x, 0.02, np.zeros(1))[:, 0])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2])
+def test_a_tilted_plane_is_one_sheet_of_the_given_thickness(angle):
+    step, thickness = 0.05e-3, 0.2e-3
+    x, z = np.meshgrid(np.arange(100) * step, np.arange(120) * step, indexing="ij")
+    across = (x - 2.5e-3) * np.sin(angle) + (z - 3e-3) * np.cos(angle)
+    profile, facing = sheets(700.0 * across, (step, step), thickness)
+    np.testing.assert_allclose(profile, np.exp(-0.5 * (across / thickness) ** 2), atol=1e-9)
+    np.testing.assert_allclose(facing, np.cos(angle) ** 2, atol=1e-9)
+
+
+def test_a_round_tube_has_the_distance_of_a_circle():
+    tube = Tube((1e-3, 10e-3), (3e-3, 3e-3))
+    x, z = np.linspace(-5e-3, 7e-3, 25), np.linspace(4e-3, 16.3e-3, 24)
+    distance = tube.distance(x, 0.0, z)
+    radius = np.hypot(x[:, None] - 1e-3, z - 10e-3)
+    np.testing.assert_allclose(distance, radius - 3e-3, atol=1e-8)
+
+
+def test_an_elliptical_tube_follows_its_middle():
+    tube = Tube((2e-3, 13e-3), (3.5e-3, 2.75e-3), swing=(1e-3, 0.5e-3), phase=0.3)
+    for y in (-0.03, 0.0, 0.02):
+        middle_x, middle_z = tube.middle(y)
+        x = np.array([middle_x, middle_x + 3.5e-3])
+        z = np.array([middle_z - 2.75e-3, middle_z])
+        distance = tube.distance(x, y, z)
+        assert distance[0, 0] == pytest.approx(0.0, abs=1e-12)
+        assert distance[1, 1] == pytest.approx(0.0, abs=1e-12)
+        assert distance[0, 1] < -2e-3
+        assert abs(middle_x - 2e-3) <= 1e-3
+        assert abs(middle_z - 13e-3) <= 0.5e-3
+
+
+VOXEL = 0.3e-3
+SHAPE = (90, 80, 100)
+DEPTH = (np.arange(SHAPE[2]) + 0.5) * VOXEL
+SPREAD = PointSpread()
+
+
+def _random() -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(7))
+
+
+@pytest.fixture(scope="module")
+def even() -> np.ndarray:
+    """The envelope of evenly scattering tissue, without the edges that the spread reaches."""
+    scatterers = np.full(SHAPE, 0.02, dtype=np.float32)
+    nothing = np.zeros(SHAPE, dtype=np.float32)
+    envelope = echo_envelope(scatterers, nothing, VOXEL, DEPTH, SPREAD, _random())
+    reach = np.ceil(np.array(SPREAD.reach(DEPTH)) / VOXEL).astype(int)
+    inside = tuple(slice(r, n - r) for r, n in zip(reach, SHAPE, strict=True))
+    return envelope[inside]
+
+
+def test_mean_over_deviation_is_that_of_a_rayleigh_distribution(even):
+    # sqrt(pi / (4 - pi)) = 1.913: the signal-to-noise ratio of fully developed speckle.
+    assert even.mean() / even.std() == pytest.approx(np.sqrt(np.pi / (4 - np.pi)), rel=0.02)
+
+
+def test_the_power_of_the_scatterers_is_kept(even):
+    assert np.sqrt((even.astype(float) ** 2).mean()) == pytest.approx(0.02, rel=0.02)
+
+
+def test_the_whole_distribution_is_rayleigh(even):
+    # Every fifth to eighth voxel, beyond the point spread's width, so that samples are independent.
+    samples = even[::5, ::8, ::4].ravel()
+    test = stats.kstest(samples, stats.rayleigh(scale=0.02 / np.sqrt(2)).cdf)
+    assert len(samples) > 2000
+    assert test.pvalue > 0.01
+    assert test.statistic < 0.03
+
+
+def test_speckle_correlates_as_the_point_spread_says():
+    # Voxels of 0.15 mm resolve the point spread; so do the default ones, but for its axial width.
+    step = 0.15e-3
+    depth = SPREAD.focus + (np.arange(60) - 30) * step
+    scatterers = np.ones((120, 100, 60), np.float32)
+    power = echo_envelope(scatterers, 0 * scatterers, step, depth, SPREAD, _random())[
+        20:-20, 20:-20
+    ]
+    power = power.astype(float) ** 2
+    power -= power.mean()
+
+    def correlation(axis: int, lag: int) -> float:
+        first = np.take(power, np.arange(power.shape[axis] - lag), axis)
+        return float((first * np.take(power, np.arange(lag, power.shape[axis]), axis)).mean())
+
+    # Power correlates as the square of the field, whose correlation is √2 as wide as the point
+    # spread: so exp(-lag² / 2σ²) with the σ of the point spread.
+    for axis, width, lag in (
+        (0, SPREAD.lateral, 2),
+        (1, SPREAD.elevational, 4),
+        (2, SPREAD.axial, 1),
+    ):
+        sigma = width / np.sqrt(8 * np.log(2))
+        expected = np.exp(-((lag * step) ** 2) / (2 * sigma**2))
+        assert correlation(axis, lag) / power.var() == pytest.approx(expected, abs=0.05)
+
+
+def test_the_beam_is_narrowest_at_its_focus():
+    at_focus = SPREAD.widths(SPREAD.focus)
+    assert at_focus == (SPREAD.lateral, SPREAD.elevational)
+    assert SPREAD.widths(SPREAD.focus + SPREAD.lateral_range)[0] == pytest.approx(
+        np.sqrt(2) * SPREAD.lateral
+    )
+    assert min(SPREAD.widths(0.0)) > SPREAD.lateral
+
+
+def test_an_interface_alone_does_not_speckle():
+    sheet = np.zeros((40, 40, 40), np.float32)
+    sheet[:, :, 20] = 1.0
+    depth = DEPTH[:40]
+    envelope = echo_envelope(0 * sheet, sheet, VOXEL, depth, SPREAD, _random())[12:-12, 12:-12]
+    sigma = SPREAD.axial / np.sqrt(8 * np.log(2)) / VOXEL
+    profile = np.exp(-0.5 * ((np.arange(40) - 20) / sigma) ** 2)
+    profile[np.abs(np.arange(40) - 20) > np.ceil(3 * sigma)] = 0.0
+    profile /= profile.sum()
+    np.testing.assert_allclose(envelope, np.broadcast_to(profile, envelope.shape), atol=1e-5)
+
+
+def test_voxels_coarser_than_a_speckle_are_rayleigh_too():
+    scatterers = np.ones((30, 30, 30), np.float32)
+    depth = (np.arange(30) + 0.5) * 2e-3
+    envelope = echo_envelope(scatterers, 0 * scatterers, 2e-3, depth, SPREAD, _random())
+    assert envelope[2:-2, 2:-2].mean() / envelope[2:-2, 2:-2].std() == pytest.approx(
+        1.913, rel=0.02
+    )
+
+
+def test_sixty_decibels_fill_the_grey_scale():
+    levels = np.array([20.0, 0.0, -20.0, -40.0, -60.0, -80.0, -np.inf])
+    grey = log_compress((10.0 ** (levels / 20.0)).astype(np.float32))
+    np.testing.assert_array_equal(grey, [255, 255, 170, 85, 0, 0, 0])
+    assert log_compress(np.float32([0.1]), dynamic_range=40.0)[0] == 128

@@ -1,4 +1,9 @@
-"""Reconstruction of synthetic sweeps through fields whose values are known everywhere."""
+"""Reconstruction of synthetic sweeps through fields whose values are known everywhere.
+
+Calibrations of sweeps: Plus' XML, and what `us-sim calibrate probe` writes.
+
+The volumes that Plus reconstructed of its own test sweep, and a published sweep's.
+"""
 
 import dataclasses
 
@@ -10,12 +15,16 @@ from sweep_file import write_sweep
 
 from us_sim.errors import VolumeError
 from us_sim.geometry.pose import Pose
+from us_sim.tracking.calibration.transform_file import write_transform
+from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction import grid as grids
-from us_sim.volume.reconstruction.grid import axes_of_smallest_box, grid_around, image_mask
+from us_sim.volume.reconstruction.calibration_file import read_calibration
+from us_sim.volume.reconstruction.grid import Grid, axes_of_smallest_box, grid_around, image_mask
 from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
 from us_sim.volume.reconstruction.reconstruction import leave_one_out, plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
-from us_sim.volume.sequences.sweep import read_sweep, shifted
+from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.sweep import read_sweep, shifted, sweep_of
 
 PIXEL = 0.5e-3  # m
 ROWS, COLUMNS, FRAMES = 40, 30, 25
@@ -219,3 +228,123 @@ def test_axes_are_those_of_a_slanted_box():
     frame[:3, :3] = turn
     axes = axes_of_smallest_box(corners @ turn.T, frame[None])
     np.testing.assert_allclose(np.prod(np.ptp(corners @ turn.T @ axes, axis=0)), 6.0)
+
+
+def test_what_calibrate_probe_writes_is_read(tmp_path):
+    matrix = np.diag([1e-4, 2e-4, 1.5e-4, 1.0])
+    matrix[:3, 3] = (0.01, 0.02, 0.03)
+    file = tmp_path / "probe.yaml"
+    more = {"image_to_body": matrix}
+    write_transform(file, Pose(), from_frame="probe", to_frame="body", method="", more=more)
+    found = read_calibration(file, "Transducer").transforms
+    np.testing.assert_allclose(found["ImageToTransducer"], matrix)
+
+
+MATRIX = "0.1 0 0 5 0 0.1 0 0 0 0 0.1 0 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.xml", "<a", "is not XML"),
+        ("a.xml", "<a/>", "holds no <Transform"),
+        ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a/>', "defines entities"),
+        ("a.xml", '<a><Transform From="I" To="P" Matrix="1 2"/></a>', "not 16 numbers"),
+        ("a.xml", f'<a><Transform From="I" To="P" Matrix="{"0 " * 16}"/></a>', "singular"),
+        (
+            "a.xml",
+            f'<a><Transform From="I" To="P" Matrix="{MATRIX}"/>'
+            '<VolumeReconstruction FanAnglesDeg="4"/></a>',
+            "FanAnglesDeg is '4' where 2 numbers belong",
+        ),
+        (
+            "a.xml",
+            f'<a><Transform From="I" To="P" Matrix="{MATRIX}"/><VolumeReconstruction '
+            'FanAnglesDeg="-4 4" FanRadiusStartPixel="9" FanRadiusStopPixel="2"/></a>',
+            "9 must be less than 2",
+        ),
+        ("a.yaml", "position: [0, 0, 0]", "holds no image_to_body"),
+        ("a.yaml", "image_to_body: 3", "holds no image_to_body"),
+        ("a.yaml", "image_to_body: [[1, 2], [3, 4]]", "holds no image_to_body"),
+        ("a.yaml", "a: [", "neither XML nor YAML"),
+        ("a.yaml", None, "cannot be read: No such file"),
+    ],
+)
+def test_a_file_without_a_calibration_is_refused(tmp_path, name, text, message):
+    file = tmp_path / name
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(VolumeError, match=message) as refused:
+        read_calibration(file, "Probe")
+    assert str(refused.value).startswith(f"{file}: ")
+
+
+SPINE = "plus-spine-freehand"
+LIVER = "imfusion-liver-sweep"
+PLUS = {
+    "NNMEAN": ("SpinePhantom_NN_MEAN", "nearest", "plus_mean"),
+    "LNMAXI": ("SpinePhantom_LN_MAXI", "linear", "max"),
+    "NNLATE": ("SonixRP_TRUS_D70mm_NN_LATE", "nearest", "latest"),
+    "LNMEAN": ("SonixRP_TRUS_D70mm_LN_MEAN", "linear", "plus_mean"),
+}
+
+
+def of_plus(folder, name, **settings):
+    """The reconstruction with the settings of a configuration, and what Plus made with it."""
+    configuration, method, compounding = PLUS[name]
+    calibration = read_calibration(
+        folder / f"Config_VolumeReconstruction_{configuration}.xml", "Probe"
+    )
+    sequence = read_sequence(folder / "SpinePhantomFreehand.igs.mha")
+    sweep = sweep_of(sequence, calibration=calibration.transforms)
+    how = {"spacing": 0.5e-3, "method": method, "compounding": compounding, "hole_radius": 0.0}
+    made = reconstruct(plan(sweep, Compounding(**{**how, **settings}), calibration.part))
+    return made, read_volume(folder / f"VolumeReconstructorTest{name}volumeRef.mha")
+
+
+def within(made, reference, levels):
+    difference = made.volume.intensities.astype(int) - reference.intensities
+    return (np.abs(difference)[made.covered] <= levels).mean()
+
+
+@pytest.mark.parametrize("name", PLUS)
+def test_volumes_of_plus_come_out_as_plus_made_them(shared_data, name):
+    folder = shared_data / SPINE
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    made, reference = of_plus(folder, name, plus_rounding=True)
+    assert made.volume.shape == reference.shape
+    # The file gives its place to six digits.
+    np.testing.assert_allclose(made.volume.index_to_patient, reference.index_to_patient, atol=1e-6)
+    assert within(made, reference, 2) >= 0.999
+    if name.startswith("NN"):
+        assert within(made, reference, 0) == 1.0
+
+
+def test_the_mean_is_two_levels_brighter_than_the_one_that_plus_rounds_down(shared_data):
+    folder = shared_data / SPINE
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    made, reference = of_plus(folder, "NNMEAN", compounding="mean")
+    difference = made.volume.intensities.astype(int) - reference.intensities
+    assert difference[made.covered].mean() == pytest.approx(2.4, abs=0.3)  # as its source says
+
+
+def test_the_liver_sweep_comes_out_as_others_compounded_it(shared_data):
+    folder = shared_data / LIVER
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    reference = read_volume(folder / "liver_sweep_compounded_1mm.mha")
+    sweep = read_sweep(folder / "liver_sweep.igs.mha")
+    fan = ImagePart(
+        fan_origin=(369.0, 22.01 - 161.34),
+        fan_radius=(161.34, 724.35),
+        fan_angles=("-30.28 deg", "30.28 deg"),
+    )
+    planned = plan(sweep, Compounding(spacing="1 mm", method="nearest"), fan)
+    grid = Grid(reference.index_to_patient, reference.shape)
+    made = reconstruct(dataclasses.replace(planned, grid=grid))
+    both = made.covered & (reference.intensities > 0)
+    assert both.sum() > 2_200_000
+    difference = made.volume.intensities.astype(int) - reference.intensities
+    assert (np.abs(difference)[both] <= 2).mean() >= 0.98

@@ -2,14 +2,6 @@
 
 Values differ from YAML's: `1e3` is a number, `yes` and `on` are true, `0x10` is sixteen, a sequence
 holds one type only, and a mapping is no value.
-
->>> arguments = parse_arguments(["prog", "--ros-args", "-p", "rate:=60.0", "-r", "a:=b", "--", "x"])
->>> arguments.overrides_for("/probe"), arguments.others
-({'rate': 60.0}, ('prog', 'x'))
->>> parse_value("[1.5, 2e3]"), parse_value("on"), parse_value("'on'")
-([1.5, 2000.0], True, 'on')
->>> parse_parameter_file("/**: {ros__parameters: {rate: 60.0, image: {width: 512}}}", "p.yaml")
-[('/**', 'rate', 60.0), ('/**', 'image.width', 512)]
 """
 
 import re

@@ -1,13 +1,4 @@
-"""Names of nodes, namespaces, topics and services: which are allowed, expansion and remapping.
-
->>> error_in_topic_name("us/7image")
-('topic name token must not start with a number', 3)
->>> expand("~/image", "probe", "/left")
-'/left/probe/image'
->>> rule = parse_remap_rule("probe:~/image:=/left/image")
->>> remap([rule], TOPIC, "/probe/image", "probe", "/")
-'/left/image'
-"""
+"""Names of nodes, namespaces, topics and services: which are allowed, expansion and remapping."""
 
 import re
 from collections.abc import Sequence

@@ -2,12 +2,6 @@
 
 As in rclpy, SIGINT shuts all contexts down and also does what Python does (KeyboardInterrupt in the
 main thread), while SIGTERM ends nothing by itself: `spin` raises ExternalShutdownException.
-
->>> with Context() as context:
-...     context.ok()
-True
->>> context.ok()
-False
 """
 
 import _thread
@@ -18,7 +12,6 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
 from enum import Enum
 from inspect import ismethod
 from threading import TIMEOUT_MAX, RLock
@@ -33,7 +26,11 @@ from .logging import configure, release
 
 
 class WakeUp:
-    """One thread waits; any thread or signal handler wakes it, now or for its next wait."""
+    """One thread waits; any thread or signal handler wakes it, now or for its next wait.
+
+    `threading.Event` takes a lock inside `set()`, so a handler that interrupts the waiting thread
+    at the wrong moment would wait for itself. Releasing a bare lock never blocks.
+    """
 
     __slots__ = ("__weakref__", "_lock")
 
@@ -126,16 +123,6 @@ def _shut_down_contexts(number: int, frame: FrameType | None) -> None:
 Callback = Callable[[], None]
 
 
-@dataclass(eq=False)
-class LocalNode:
-    """A node of this process as others see it: its name, its readers and its writers."""
-
-    name: str
-    namespace: str
-    readers: list[bytes] = field(default_factory=list)
-    writers: list[bytes] = field(default_factory=list)
-
-
 class Context(AbstractContextManager["Context"]):
     """Encapsulates the life of init and shutdown. Used as a context manager it inits itself."""
 
@@ -144,7 +131,7 @@ class Context(AbstractContextManager["Context"]):
         self._callbacks: list[weakref.WeakMethod[Callback] | Callback] = []
         self._initialized = self._valid = self._logging_initialized = False
         self._waiting: tuple[weakref.ReferenceType[WakeUp], ...] = ()
-        self._nodes: list[LocalNode] = []
+        self._nodes: dict[object, GraphNode] = {}  # of this context, by keys of their own
         self._postponing = 0
 
     def init(
@@ -265,16 +252,16 @@ class Context(AbstractContextManager["Context"]):
             alive = tuple(reference for reference in self._waiting if reference() is not None)
             self._waiting = (*alive, weakref.ref(waiting))
 
-    def _add_node(self, node: LocalNode) -> None:
+    def _set_node(self, key: object, node: GraphNode | None) -> None:
+        """Have a node known to others as it is now, or no more."""
         with self._lock:
-            self._nodes.append(node)
-        self._announce()
-
-    def _remove_node(self, node: LocalNode) -> None:
-        with self._lock:
-            if node in self._nodes:
-                self._nodes.remove(node)
-        self._announce()
+            if node == self._nodes.get(key):
+                return
+            if node is None:
+                del self._nodes[key]
+            else:
+                self._nodes[key] = node
+            self._announce()
 
     @contextmanager
     def _announced_once(self) -> Iterator[None]:
@@ -292,10 +279,7 @@ class Context(AbstractContextManager["Context"]):
         """Tell others which nodes there are, and with which endpoints."""
         with self._lock:
             if not self._postponing:
-                self._graph.announce(
-                    GraphNode(node.namespace, node.name, tuple(node.readers), tuple(node.writers))
-                    for node in self._nodes
-                )
+                self._graph.announce(self._nodes.values())
 
 
 def _domain_from_environment() -> int:

@@ -1,29 +1,6 @@
-"""The errors that rclpy raises, with the sentences that rclpy writes.
-
->>> str(ParameterNotDeclaredException("rate"))
-'Invalid access to undeclared parameter(s): rate'
-"""
+"""The errors that rclpy raises, with the sentences that rclpy writes."""
 
 from typing import Any
-
-__all__ = [
-    "InvalidHandle",
-    "InvalidNamespaceException",
-    "InvalidNodeNameException",
-    "InvalidParameterException",
-    "InvalidParameterTypeException",
-    "InvalidParameterValueException",
-    "InvalidServiceNameException",
-    "InvalidTopicNameException",
-    "NameValidationException",
-    "NoTypeSupportImportedException",
-    "NotInitializedException",
-    "ParameterAlreadyDeclaredException",
-    "ParameterException",
-    "ParameterImmutableException",
-    "ParameterNotDeclaredException",
-    "ParameterUninitializedException",
-]
 
 
 class RCLError(RuntimeError):

@@ -1,10 +1,6 @@
 """Executors: they wait until something is ready and run its callback.
 
 Waiting costs nothing: data, triggers, shutdown and the like wake the waiting thread.
-
->>> from us_sim.standalone.rclpy.context import Context
->>> with Context() as context, SingleThreadedExecutor(context=context) as executor:
-...     executor.spin_once(timeout_sec=0.0)
 """
 
 import os

@@ -1,13 +1,6 @@
 """Loggers by name; their levels; and where messages go: standard error and the topic /rosout.
 
 Names with dots form a tree: a logger without a level takes its parent's, at the top the default.
-
->>> set_logger_level("skin", LoggingSeverity.ERROR)
->>> get_logger("skin").get_effective_level().name
-'ERROR'
->>> logger = RcutilsLogger("probe").get_child("camera")
->>> logger.name, logger.is_enabled_for(LoggingSeverity.DEBUG)
-('probe.camera', False)
 """
 
 from __future__ import annotations

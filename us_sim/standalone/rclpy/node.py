@@ -18,7 +18,7 @@ from itertools import chain
 from operator import attrgetter
 from typing import Any
 
-from ..graph import Graph, GraphEndpoint
+from ..graph import Graph, GraphEndpoint, GraphNode
 from ..messages import message_class
 from ._arguments import parse_arguments
 from ._names import (
@@ -35,7 +35,7 @@ from ._names import (
     require_topic_name,
 )
 from ._node_parameters import NodeParameters
-from .context import Context, LocalNode, get_default_context
+from .context import Context, get_default_context
 from .endpoints import (
     CallbackGroup,
     Client,
@@ -200,7 +200,6 @@ class Node(NodeParameters):
         path = self._rcl_namespace.strip("/").replace("/", ".")
         logger_name = f"{path}.{self._rcl_name}" if path else self._rcl_name
         self._rcl_link = NodeLink(self._context, logger_name, _waker_of(self))
-        self._rcl_local_node = LocalNode(self._rcl_name, self._rcl_namespace)
         self._publishers: list[Publisher] = []
         self._subscriptions: list[Subscription] = []
         self._clients: list[Client] = []
@@ -218,7 +217,8 @@ class Node(NodeParameters):
         self._rcl_keep_parameters(overrides, allow_undeclared_parameters)
 
         with self._context._announced_once():
-            self._context._add_node(self._rcl_local_node)
+            self._rcl_exists = True
+            self._rcl_changed()
             if enable_rosout and "rosout" not in self._context._arguments.disabled_outputs:
                 self._rcl_rosout = Rosout(self._rcl_link)
             self._logger = get_logger(logger_name)
@@ -252,7 +252,8 @@ class Node(NodeParameters):
             if self._rcl_rosout is not None:
                 self._rcl_rosout.destroy()
                 self._rcl_rosout = None
-            self._context._remove_node(self._rcl_local_node)
+            self._rcl_exists = False
+            self._context._set_node(self._rcl_link, None)
         self._rcl_wake_executor()
 
     def get_name(self) -> str:
@@ -540,16 +541,16 @@ class Node(NodeParameters):
 
     def _rcl_changed(self) -> None:
         """Tell others which endpoints this node has now, and the executor to look anew."""
-        owners: Iterator[Any] = chain(
-            *(self._publishers, self._subscriptions, self._clients, self._services),
-            [self._rcl_rosout.publisher] if self._rcl_rosout else [],
-        )
-        gids = [owner._gids for owner in owners]
-        readers = [gid for ours, _ in gids for gid in ours]
-        writers = [gid for _, ours in gids for gid in ours]
-        if (readers, writers) != (self._rcl_local_node.readers, self._rcl_local_node.writers):
-            self._rcl_local_node.readers, self._rcl_local_node.writers = readers, writers
-            self._context._announce()
+        if self._rcl_exists:
+            owners: Iterator[Any] = chain(
+                *(self._publishers, self._subscriptions, self._clients, self._services),
+                [self._rcl_rosout.publisher] if self._rcl_rosout else [],
+            )
+            gids = [owner._gids for owner in owners]
+            readers = tuple(gid for ours, _ in gids for gid in ours)
+            writers = tuple(gid for _, ours in gids for gid in ours)
+            known = GraphNode(self._rcl_namespace, self._rcl_name, readers, writers)
+            self._context._set_node(self._rcl_link, known)
         self._rcl_wake_executor()
 
     def _rcl_wake_executor(self) -> None:

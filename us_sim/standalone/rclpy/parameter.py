@@ -1,12 +1,4 @@
-"""Parameters: a name, a type and a value; their services, and a client of another node's.
-
->>> Parameter("rate", value=60.0).type_.name
-'DOUBLE'
->>> Parameter("rate", Parameter.Type.INTEGER, 60.0)
-Traceback (most recent call last):
-    ...
-ValueError: Type 'Type.INTEGER' and value '60.0' do not agree
-"""
+"""Parameters: a name, a type and a value; their services, and a client of another node's."""
 
 import array
 import math

@@ -2,9 +2,6 @@
 
 A person may set `qos_overrides./topic.publisher.depth:=1` and the like when a node starts, for the
 policies that the node allows.
-
->>> QoSProfile(depth=10).reliability.name
-'RELIABLE'
 """
 
 import copy

@@ -1,10 +1,4 @@
-"""Results that come later.
-
->>> future = Future()
->>> future.add_done_callback(lambda done: print("got", done.result()))
->>> future.set_result(3)
-got 3
-"""
+"""Results that come later."""
 
 import sys
 import threading

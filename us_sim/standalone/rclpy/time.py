@@ -1,14 +1,4 @@
-"""Points in time, spans, and the clocks that tell them: system, steady, and ROS time.
-
->>> start = Time(seconds=2, nanoseconds=5)
->>> start + Duration(seconds=1.5) - start
-Duration(nanoseconds=1500000000)
->>> clock = Clock(clock_type=ClockType.ROS_TIME)
->>> clock.set_ros_time_override(Time(seconds=3, clock_type=ClockType.ROS_TIME))
->>> clock._set_ros_time_is_active(True)
->>> clock.now()
-Time(nanoseconds=3000000000, clock_type=ROS_TIME)
-"""
+"""Points in time, spans, and the clocks that tell them: system, steady, and ROS time."""
 
 import time as wall
 import weakref
@@ -18,9 +8,6 @@ from operator import attrgetter
 from typing import Any, Protocol
 
 from ..messages import message_class
-
-__all__ = ["Clock", "ClockType", "ROSClock"]
-
 
 S_TO_NS = 1_000_000_000
 

@@ -28,8 +28,6 @@ BY_HAND = ("", "pose")
 
 
 class _Cases:
-    """The panel of one page."""
-
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._shown: tuple[object, ...] = ()
@@ -59,7 +57,6 @@ class _Cases:
                 picture.set_source(f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}")
 
     def _draw(self, state: SessionState) -> None:
-        """All cards anew."""
         self._list.clear()
         self._pictures.clear()
         cases = [each for each in self._board.scenes if each.kind == "case"]
@@ -130,7 +127,6 @@ class _Cases:
 
 
 def _told(state: SessionState) -> str:
-    """What runs, in a line."""
     if not state.is_there:
         return NOT_THERE
     done = f", {100 * state.fraction:.0f} %" if state.is_busy else ""
@@ -157,8 +153,6 @@ KINDS_FIXED = "While something is replayed this cannot be changed: end the repla
 
 
 class _Session:
-    """The panel of one page."""
-
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._is_dragging = False
@@ -279,7 +273,6 @@ class _Session:
             self._is_following = False
 
     def _propose(self) -> None:
-        """Name the next recording by the present time."""
         self._proposed = _proposed()
         self._file.set_value(self._proposed)
 
@@ -317,7 +310,7 @@ class _Session:
             )
 
     def _by_person(self, change: Callable[[], Awaitable[None]]) -> Callable[[], Any]:
-        """What does that where a person has changed a control, and nothing while it follows."""
+        """The change where a person has moved a control, and nothing while it follows."""
         return lambda: None if self._is_following else change()
 
     async def _set_rate(self) -> None:

@@ -4,12 +4,8 @@
 values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/``, ``tissue.npz`` and
 ``provenance.yaml`` may be there. All names are these: a case names no files of its own choice.
 
-Where cases are kept, and which there are.
-
 Folders of cases are those in the environment variable US_SIM_CASES, or the folder ``cases`` in the
 user's data folder. A case is named by its folder in one of them, or by its path.
-
-A line about each case: its name, region, probe, size and structures.
 """
 
 from __future__ import annotations
@@ -42,9 +38,6 @@ LABELS = "labels.nrrd"
 SURFACES = "surfaces"
 TISSUE = "tissue.npz"
 
-_SAME_PLACE = 1e-6
-"""m, by which two grids may differ at their corners and still be one."""
-
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -52,7 +45,7 @@ class Case:
 
     folder: Path
     settings: CaseSettings
-    steps: tuple[Step, ...]  # what was done to make it
+    steps: tuple[Step, ...]  # how it was made
 
     @property
     def has_labels(self) -> bool:
@@ -96,9 +89,10 @@ class Case:
             return volume
         self.check_grids()
         labels = read_volume(self.folder / LABELS).intensities
+        names = self.settings.label_names
         there = np.bincount(labels.reshape(-1), minlength=256) > 0
         for label in np.flatnonzero(there):
-            if int(label) not in self.settings.label_names:
+            if int(label) not in names:
                 raise CaseError(
                     f"{self.folder / LABELS}: has the label {label}, which is no structure in "
                     f"{CASE}: name it there"
@@ -109,7 +103,6 @@ class Case:
                     f"{self.folder / CASE}: structures.{name}: label {structure.label} occurs "
                     f"nowhere in {LABELS}: segment it, or remove the structure"
                 )
-        names = self.settings.label_names
         return dataclasses.replace(volume, labels=labels, label_names=names)
 
     def check_grids(self) -> None:
@@ -128,8 +121,8 @@ class Case:
             )
         last = np.array([*(np.array(shape) - 1.0), 1.0])
         corners = np.array([[0.0, 0.0, 0.0, 1.0], last, [last[0], 0, 0, 1], [0, last[1], 0, 1]])
-        apart = np.abs((placement - of_labels) @ corners.T).max()
-        if shape != other or apart > _SAME_PLACE:
+        apart = np.abs((placement - of_labels) @ corners.T).max()  # m
+        if shape != other or apart > 1e-6:
             raise CaseError(
                 f"{self.folder / LABELS}: is on another grid than {VOLUME} "
                 f"({' × '.join(map(str, other))} voxels, {' × '.join(map(str, shape))} there, up "
@@ -143,11 +136,11 @@ def is_case(folder: str | os.PathLike[str]) -> bool:
 
 
 def read_case(folder: str | os.PathLike[str]) -> Case:
-    """The case in a folder; of its volume nothing but the name is looked at.
+    """The case in a folder; its volume is not opened.
 
     Raises:
-        CaseError: there is none, a file of it leads out of the folder or in a circle, or what it
-            says cannot be used.
+        CaseError: there is none, a file of it leads out of the folder or in a circle, or its
+            settings cannot be used.
     """
     folder = Path(folder)
     try:
@@ -166,7 +159,17 @@ def read_case(folder: str | os.PathLike[str]) -> Case:
     for name in (CASE, VOLUME):
         if not (folder / name).is_file():
             raise CaseError(f"{folder}: is no case, as it has no {name}; `us-sim cases` lists some")
-    return Case(folder, _settings(folder / CASE), read_steps(folder))
+    path = folder / CASE
+    try:
+        document = load_yaml(read_text(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaseError(f"{path}: cannot be read: {error}") from error
+    except YamlError as error:
+        raise CaseError(f"{path}: {error}") from error
+    if document is None:
+        raise CaseError(f"{path}: is empty; a case has at least a name")
+    settings = Reader(str(path), None, CaseError).read(CaseSettings, document)
+    return Case(folder, settings, read_steps(folder))
 
 
 def _check_inside(folder: Path, name: str) -> None:
@@ -183,18 +186,6 @@ def _check_inside(folder: Path, name: str) -> None:
             f"{path}: is a link that leads out of the case, nowhere, or in a circle: put the file "
             f"itself there"
         )
-
-
-def _settings(path: Path) -> CaseSettings:
-    try:
-        document = load_yaml(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaseError(f"{path}: cannot be read: {error}") from error
-    except YamlError as error:
-        raise CaseError(f"{path}: {error}") from error
-    if document is None:
-        raise CaseError(f"{path}: is empty; a case has at least a name")
-    return Reader(str(path), None, CaseError).read(CaseSettings, document)
 
 
 def _placement(path: Path) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
@@ -239,20 +230,20 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
         CaseError: there is none; the sentence says which there are.
     """
     path = Path(os.path.expanduser(name))
-    for folder in (*folders, Path.cwd()):
-        if str(name) and is_case(folder / path):
-            return (folder / path).resolve()
+    places = [folder / path for folder in (*folders, Path.cwd())] if str(name) else []
+    for place in places:
+        if is_case(place):
+            return place.resolve()
     roots = case_roots()
     known: dict[str, Path] = {}
     for root in roots:
-        if root.is_dir():
-            for case in cases_in(root):
-                known.setdefault(case.name, case)
+        for case in cases_in(root) if root.is_dir() else []:
+            known.setdefault(case.name, case)
     if str(name) in known:
         return known[str(name)].resolve()
-    for folder in (*folders, Path.cwd()):
-        if str(name) and (folder / path).exists():
-            kind = f"folder without a {CASE}" if (folder / path).is_dir() else "file"
+    for place in places:
+        if place.exists():
+            kind = f"folder without a {CASE}" if place.is_dir() else "file"
             raise CaseError(f"{name}: is a {kind}, and there is no case of that name")
     like = nearest(name, known)
     there = f"cases are {', '.join(known)}" if known else "there is none"
@@ -262,13 +253,9 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
     )
 
 
-_TITLES = ("case", "region", "probe", "size", "structures")
-_LONGEST = 60  # characters of a column
-
-
 @dataclass(frozen=True)
 class ListedCase:
-    """What a listing says of a case."""
+    """A line of a list of cases."""
 
     folder: Path
     name: str
@@ -280,7 +267,7 @@ class ListedCase:
 
 
 def listed(folder: Path) -> ListedCase:
-    """What there is to say of the case in a folder, from its texts and headers alone."""
+    """The facts of the case in a folder, from its texts and headers alone."""
     try:
         case = read_case(folder)
         matrix, shape = case.placement()
@@ -303,10 +290,11 @@ def listed(folder: Path) -> ListedCase:
 
 
 def table(cases: Sequence[ListedCase]) -> str:
-    """The cases in columns, and under them what is wrong with those that cannot be used."""
+    """The cases in columns, and under them the problems of those that cannot be used."""
     good = [case for case in cases if not case.problem]
-    rows = [_TITLES, *((c.name, c.region, c.probe, c.size, c.structures) for c in good)]
-    cut = [[text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..." for text in r] for r in rows]
+    titles = ("case", "region", "probe", "size", "structures")
+    rows = [titles, *((c.name, c.region, c.probe, c.size, c.structures) for c in good)]
+    cut = [[text if len(text) <= 60 else f"{text[:60]}..." for text in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*cut, strict=True)]
     lines = [
         "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()

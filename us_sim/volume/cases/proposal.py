@@ -33,29 +33,18 @@ from us_sim.volume.volume import Volume
 _MOST_POINTS = 200_000
 _FEW_POINTS = 8_000
 _DIRECTIONS = 2000
-_BATCH = 100
 _WIDENS = -0.12
 """Skewness of the distances along the beams below which the region is said to widen with them: a
 wedge that becomes half as wide again has -0.2, a box 0."""
 _LIKELY = 0.7
 """Of the least skewness: directions with less of it than this are tried. A fan of 60 degrees has
 three such corners, and echoes are brightest near one of them."""
-_SAME_CORNER = 0.9  # cosine
 _BESIDE = 4e-3  # m, from the middle beam, within which the skin is looked for
 _FARTHEST = 0.04  # m, along its elevation, that the probe is moved to see structures
-_OFFSET = 2e-3  # m
-_SLID, _SHOWN = (
-    4e-3,
-    6e-3,
-)  # m: the press slides 8 mm along y; its middle, and half of what it shows
+_SLID, _SHOWN = 4e-3, 6e-3
+"""m: the press slides 8 mm along y; its middle, and half of what it shows."""
 _BETTER = 1.02
 _ROCK = math.radians(4.0)  # to both sides, in the middle of a whole slide
-_STILL = 0.9  # of what the start's image shows, that each image of the slide does
-_PLACES, _LENGTHS = 24, 8  # points along each side of an image; slides that are tried
-_ENDS = 0.1  # of a sweep, at both sides
-_FLAT = 0.015  # m, that the skin may be nearer or farther there
-_WIDEST = 0.05  # m, of a linear array's face
-_DEPTHS = (0.01, 0.25)  # m
 
 
 def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
@@ -101,13 +90,11 @@ def proposed_start(volume: Volume) -> CaseStart:
     across /= np.linalg.norm(across)
     if across[np.argmax(np.abs(across))] < 0.0:
         across = -across
-    near = np.linalg.norm(aside, axis=1) <= max(_BESIDE, _spacing(volume))
+    near = np.linalg.norm(aside, axis=1) <= _beside(volume)
     near = near if near.any() else np.ones(len(points), dtype=bool)
     depth = np.percentile((points[near] - middle) @ along, 1.0)
     rotation = np.column_stack([across, np.cross(along, across), along])
-    orientation = Rotation.from_matrix(rotation).as_quat()
-    pose = Pose(middle + depth * along, orientation)
-    return _start(pose)
+    return _start(Pose(middle + depth * along, Rotation.from_matrix(rotation).as_quat()))
 
 
 def _start(pose: Pose) -> CaseStart:
@@ -117,14 +104,14 @@ def _start(pose: Pose) -> CaseStart:
 
 
 def _of_scanned(settings: CaseSettings, volume: Volume, probe: ProbeSettings) -> CaseStart:
-    """The pose of the sweep whose image, and what is beside it, shows most of the structures.
+    """The pose of the sweep whose image and surroundings show most of the structures.
 
     The middle one where there are none; none of those at the ends, beside which nothing was seen.
     """
     poses = settings.scanned
     best, first = 0.0, len(poses) // 2
-    end = math.floor(_ENDS * len(poses))
-    counted = _counted(settings, volume)
+    end = math.floor(0.1 * len(poses))
+    counted = _in_structures(settings, volume)
     step = _step(volume)
     structures = _points(volume, counted, step) if counted is not None else np.empty((0, 3))
     for k in range(end, len(poses) - end):
@@ -137,9 +124,9 @@ def _of_scanned(settings: CaseSettings, volume: Volume, probe: ProbeSettings) ->
 
 
 def _slide(volume: Volume, start: CaseStart, probe: ProbeSettings) -> float:
-    """m, how far the press may slide along the probe's y: its images show what was scanned."""
+    """m, how far the press may slide along the probe's y while its images show scanned tissue."""
     array: Any = probe.array.settings(PROBES)
-    places = np.linspace(0.0, 1.0, _PLACES)
+    places = np.linspace(0.0, 1.0, 24)
     x, z = np.meshgrid(array.width * (places - 0.5), array.depth * places)
     image = _in_image(np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()]), probe)
 
@@ -151,8 +138,8 @@ def _slide(volume: Volume, start: CaseStart, probe: ProbeSettings) -> float:
         found = volume.intensities[tuple(index[inside].astype(np.int64).T)] > 0
         return float(found.sum() / len(image))
 
-    least = _STILL * shown(Pose())
-    for part in np.linspace(1.0, 0.0, _LENGTHS, endpoint=False):
+    least = 0.9 * shown(Pose())
+    for part in np.linspace(1.0, 0.0, 8, endpoint=False):
         for slide in (part * SLIDE, -part * SLIDE):
             rocked = [Rotation.from_euler("x", sign * part * _ROCK).as_quat() for sign in (-1, 1)]
             poses = [Pose(np.array([0.0, slide / 2, 0.0]), turned) for turned in rocked]
@@ -162,7 +149,7 @@ def _slide(volume: Volume, start: CaseStart, probe: ProbeSettings) -> float:
     return 0.0
 
 
-def _counted(settings: CaseSettings, volume: Volume) -> NDArray[np.bool_] | None:
+def _in_structures(settings: CaseSettings, volume: Volume) -> NDArray[np.bool_] | None:
     """Which of every so many voxels are in structures; None without structures to look at."""
     labels = [
         structure.label
@@ -174,8 +161,9 @@ def _counted(settings: CaseSettings, volume: Volume) -> NDArray[np.bool_] | None
     return np.asarray(np.isin(volume.labels[(slice(None, None, _step(volume)),) * 3], labels))
 
 
-def _step(volume: Volume) -> int:
-    return max(1, math.ceil((volume.intensities.size / _MOST_POINTS / 5) ** (1 / 3)))
+def _step(volume: Volume, most: float = 5 * _MOST_POINTS) -> int:
+    """Voxels from one that is looked at to the next, so that there are few enough of them."""
+    return max(1, math.ceil((volume.intensities.size / most) ** (1 / 3)))
 
 
 def _in_image(seen: NDArray[np.float64], probe: ProbeSettings) -> NDArray[np.float64]:
@@ -190,33 +178,31 @@ def _at_structures(
     settings: CaseSettings, volume: Volume, start: CaseStart, probe: ProbeSettings
 ) -> CaseStart:
     """The start, moved along the probe's y to where most of the structures is in the image."""
-    counted = _counted(settings, volume)
+    counted = _in_structures(settings, volume)
     if counted is None:
         return start
     pose, step = start.pose, _step(volume)
-    every = (slice(None, None, step),) * 3
-    seen = _in_image(_placed(volume, counted, step, pose), probe)
-    scanned = _placed(volume, volume.intensities[every] > 0, step, pose)
-    beam = scanned[np.abs(scanned[:, 0]) < max(_BESIDE, _spacing(volume))]
+
+    def placed(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+        return np.asarray((_points(volume, mask, step) - pose.position) @ pose.rotation)
+
+    seen = _in_image(placed(counted), probe)
+    scanned = placed(volume.intensities[(slice(None, None, step),) * 3] > 0)
+    beam = scanned[np.abs(scanned[:, 0]) < _beside(volume)]
     best, moved = 0.0, pose
-    for offset in np.arange(-_FARTHEST, _FARTHEST + _OFFSET / 2, _OFFSET):
+    for offset in np.arange(-_FARTHEST, _FARTHEST + 1e-3, 2e-3):
         shown = float((np.abs(seen[:, 1] - offset - _SLID) < _SHOWN).sum())
-        depths = beam[np.abs(beam[:, 1] - offset) < max(_BESIDE, _spacing(volume)), 2]
+        depths = beam[np.abs(beam[:, 1] - offset) < _beside(volume), 2]
         if len(depths) == 0 or shown <= best * _BETTER:
             continue
         skin = float(np.percentile(depths, 1.0))
-        if abs(skin) < _FLAT:
+        if abs(skin) < 0.015:  # m, that the skin may be nearer or farther there
             best, moved = shown, pose @ Pose(np.array([0.0, offset, skin]))
     return _start(moved)
 
 
-def _placed(volume: Volume, mask: NDArray[np.bool_], step: int, pose: Pose) -> NDArray[np.float64]:
-    """(N, 3) m, in the frame of a probe, voxels of a mask that has every ``step``-th of them."""
-    return np.asarray((_points(volume, mask, step) - pose.position) @ pose.rotation)
-
-
-def _points(volume: Volume, mask: NDArray[np.bool_], step: int) -> NDArray[np.float64]:
-    """(N, 3) m, the same in the volume's frame."""
+def _points(volume: Volume, mask: NDArray[np.generic], step: int) -> NDArray[np.float64]:
+    """(N, 3) m, in the volume's frame, voxels of a mask that has every ``step``-th of them."""
     matrix = volume.index_to_patient
     return np.asarray((np.argwhere(mask) * step) @ matrix[:3, :3].T + matrix[:3, 3])
 
@@ -230,13 +216,13 @@ def proposed_probe(volume: Volume, start: Placement) -> ProbeSettings:
     points = _scanned(volume)
     _, widens = _beams(volume, points)
     placed = (points - start.pose.position) @ start.pose.rotation
-    depth = float(np.clip(np.percentile(placed[:, 2], 99.5), *_DEPTHS))
+    depth = float(np.clip(np.percentile(placed[:, 2], 99.5), 0.01, 0.25))  # m
     width = 2 * float(np.percentile(np.abs(placed[:, 0]), 99.0))
     values: dict[str, float]
     if widens:
         kind, values = "convex", {"radius": 0.05, "opening_angle": math.radians(60.0)}
     else:
-        kind, values = "linear", {"aperture": float(np.clip(width, 5e-3, _WIDEST))}
+        kind, values = "linear", {"aperture": float(np.clip(width, 5e-3, 0.05))}
     made: Any = PROBES.settings(kind)
     array = Chosen(kind, made(**values, depth=round(depth, 4)))
     return ProbeSettings(array=array, image=512, collider=proposed_collider(array))
@@ -247,68 +233,52 @@ def proposed_collider(array: Chosen) -> Chosen:
     given: Any = array.settings(PROBES)
     if array.name == "convex":
         chord = 2 * given.radius * math.sin(given.opening_angle / 2)
-        size = {
-            "radius": given.radius,
-            "length": round(chord + 0.011, 4),
-            "width": 0.018,
-            "height": 0.06,
-        }
-        return _shape("convex", size | {"rounding": 0.006})
-    length = getattr(given, "aperture", 0.02) + 0.006
-    return _shape(
-        "rounded_box", {"length": length, "width": 0.014, "height": 0.04, "rounding": 0.004}
-    )
-
-
-def _shape(name: str, size: dict[str, float]) -> Chosen:
+        name, size = "convex", {"radius": given.radius, "length": round(chord + 0.011, 4)}
+        size |= {"width": 0.018, "height": 0.06, "rounding": 0.006}
+    else:
+        name, size = "rounded_box", {"length": getattr(given, "aperture", 0.02) + 0.006}
+        size |= {"width": 0.014, "height": 0.04, "rounding": 0.004}
     kind: Any = COLLIDERS.settings(name)
     return Chosen(name, kind(**size))
 
 
-def _spacing(volume: Volume) -> float:
-    return float(np.linalg.norm(volume.index_to_patient[:3, :3], axis=0).max())
+def _beside(volume: Volume) -> float:
+    """m, from the middle beam, within which the skin is looked for; a voxel or more."""
+    return max(_BESIDE, float(np.linalg.norm(volume.index_to_patient[:3, :3], axis=0).max()))
+
+
+def _coarse(volume: Volume) -> tuple[NDArray[np.uint8], int]:
+    step = _step(volume, _MOST_POINTS)
+    return volume.intensities[::step, ::step, ::step], step
 
 
 def _scanned(volume: Volume) -> NDArray[np.float64]:
     """(N, 3) m, centres of voxels that are not 0, of a grid coarse enough for a few of them."""
-    coarse, step = _coarse(volume)
-    found = np.argwhere(coarse) * step
-    if not len(found):
+    points = _points(volume, *_coarse(volume))
+    if not len(points):
         raise CaseError("all voxels of the volume are 0, so there is nothing to scan")
-    matrix = volume.index_to_patient
-    return np.asarray(found @ matrix[:3, :3].T + matrix[:3, 3])
-
-
-def _coarse(volume: Volume) -> tuple[NDArray[np.uint8], int]:
-    """Every so many voxels along each axis, and how many."""
-    step = max(1, math.ceil((volume.intensities.size / _MOST_POINTS) ** (1 / 3)))
-    return volume.intensities[::step, ::step, ::step], step
-
-
-def _brightness(volume: Volume) -> NDArray[np.float64]:
-    """(N,) of the points that `_scanned` gives."""
-    coarse, _ = _coarse(volume)
-    return coarse[coarse > 0].astype(np.float64)
+    return points
 
 
 def _beams(volume: Volume, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     """The unit direction (3,) of the beams, and whether the region widens along them."""
     aside = points - points.mean(axis=0)
-    brightness = _brightness(volume)
+    coarse, _ = _coarse(volume)
+    brightness = coarse[coarse > 0].astype(np.float64)
     brighter = brightness @ aside / brightness.sum()  # m, from the middle to the brighter side
     few = aside
     if len(aside) > _FEW_POINTS:  # at random, since every so many would lie on a few planes
         few = aside[np.random.default_rng(0).choice(len(aside), _FEW_POINTS, replace=False)]
     directions = _spiral(_DIRECTIONS)
     skewness = np.empty(_DIRECTIONS)
-    for first in range(0, _DIRECTIONS, _BATCH):
-        distance = few @ directions[first : first + _BATCH].T
+    for first in range(0, _DIRECTIONS, 100):
+        distance = few @ directions[first : first + 100].T
         squared = distance * distance
         cubed = np.einsum("ij,ij->j", squared, distance) / len(few)
-        skewness[first : first + _BATCH] = cubed / squared.mean(axis=0) ** 1.5
+        skewness[first : first + 100] = cubed / squared.mean(axis=0) ** 1.5
     likely = skewness <= _LIKELY * skewness.min()
     side = np.argmin(np.where(likely, skewness + directions @ brighter / aside.std(), np.inf))
-    near = directions @ directions[side] > _SAME_CORNER
+    near = directions @ directions[side] > 0.9  # cosine of directions about the same corner
     best = int(np.argmin(np.where(near, skewness, np.inf)))
     if skewness[best] < _WIDENS:
         return directions[best], True

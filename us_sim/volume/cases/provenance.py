@@ -1,15 +1,13 @@
-"""What was done to make a case: ``provenance.yaml``, without anything that says whose it is.
+"""The history of a case: ``provenance.yaml``, without anything that says whose it is.
 
-A step says what was done, by which version of us_sim, with which settings, and what there was to
-count. Of a file that went in it keeps its kind and checksum, and never its name or path, which
-carry patients' names.
+A step has a name, the version of us_sim, settings and counts. Of a file that went in it keeps the
+kind and checksum, and never its name or path, which carry patients' names.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,14 +22,12 @@ from us_sim.settings.reading import document_of
 from us_sim.settings.setting import Settings, rules_of
 from us_sim.settings.spelling import shown
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.volume.partial_file import partial_file
 
 PROVENANCE = "provenance.yaml"
 
-_MOST_STEPS = 1000
 _WORDS = re.compile(r"[\w .,:;()\[\]%+*=°µ'|-]{0,120}")
 _FILE_NAME = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,5}$")
-_KEY = re.compile(r"[A-Za-z_][\w .-]{0,60}")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ class Source:
 
     def __post_init__(self) -> None:
         _check_text("sources.kind", self.kind)
-        if not _SHA256.fullmatch(self.sha256):
+        if not re.fullmatch(r"[0-9a-f]{64}", self.sha256):
             raise CaseError(f"provenance: sources.sha256: {shown(self.sha256)} is no SHA-256")
 
     @classmethod
@@ -99,14 +95,14 @@ class Step:
 
 
 def settings_said(settings: Settings) -> dict[str, Any]:
-    """What a step says of settings: all that are not by default, without those that name files."""
+    """The settings that a step keeps: those not by default, without those that name files."""
     files = {name for name, rule in rules_of(type(settings)).items() if rule.file}
     said = {key: value for key, value in document_of(settings).items() if key not in files}
     return {key: value for key, value in said.items() if not isinstance(value, Path)}
 
 
 def read_steps(folder: Path) -> tuple[Step, ...]:
-    """What was done, in order; nothing where there is no ``provenance.yaml``.
+    """The steps in order; none where there is no ``provenance.yaml``.
 
     Raises:
         CaseError: it cannot be read, or says something else.
@@ -121,7 +117,7 @@ def read_steps(folder: Path) -> tuple[Step, ...]:
     except YamlError as error:
         raise CaseError(f"{path}: {error}") from error
     steps = document.get("steps") if isinstance(document, dict) else None
-    if not isinstance(steps, list) or len(steps) > _MOST_STEPS or set(document) != {"steps"}:
+    if not isinstance(steps, list) or len(steps) > 1000 or set(document) != {"steps"}:
         raise CaseError(f"{path}: must have one key, `steps`, with a list of what was done")
     try:
         return tuple(_step(step) for step in steps)
@@ -130,7 +126,7 @@ def read_steps(folder: Path) -> tuple[Step, ...]:
 
 
 def add_step(folder: Path, step: Step) -> None:
-    """Say in ``provenance.yaml`` that one more thing was done.
+    """Add a step to ``provenance.yaml``.
 
     Raises:
         CaseError: what is there cannot be read, or it cannot be written.
@@ -138,12 +134,8 @@ def add_step(folder: Path, step: Step) -> None:
     steps = [_document(one) for one in (*read_steps(folder), step)]
     text = yaml.safe_dump({"steps": steps}, sort_keys=False, allow_unicode=True, width=100)
     path = folder / PROVENANCE
-    partial = path.with_name(f".{PROVENANCE}.partial")
-    try:
+    with partial_file(path, error_type=CaseError) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise CaseError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _document(step: Step) -> dict[str, Any]:
@@ -166,10 +158,10 @@ def _step(document: Mapping[str, Any]) -> Step:
 
 
 def _checked(key: str, value: Any, depth: int = 0) -> Any:
-    """A value as YAML holds it, if it may be kept."""
     if isinstance(value, Mapping) and depth < 8:
         for name in value:
-            if not isinstance(name, str) or not _KEY.fullmatch(name) or _FILE_NAME.search(name):
+            is_key = isinstance(name, str) and re.fullmatch(r"[A-Za-z_][\w .-]{0,60}", name)
+            if not is_key or _FILE_NAME.search(name):
                 raise CaseError(f"provenance: {key}: {shown(name)} is no key")
         return {name: _checked(f"{key}.{name}", item, depth + 1) for name, item in value.items()}
     if isinstance(value, bool | None):

@@ -1,4 +1,4 @@
-"""What ``case.yaml`` says: what the case is of, its structures, and how to scan it."""
+"""The keys of ``case.yaml``: the body part, its structures, and how to scan it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RESERVED = (AROUND, *_FACES)
 
 
 def check_name(name: str) -> str | None:
-    """What is wrong with the name of a case or of a structure, which become names of files."""
+    """The problem with the name of a case or of a structure, which become names of files."""
     if not name.strip() or len(name) > _LONGEST_NAME or not name.isprintable():
         return f"{shown(name)}: a name has 1 to {_LONGEST_NAME} printable characters"
     if set(name) & set('/\\:*?"<>|') or name.startswith(".") or name != name.strip():
@@ -175,5 +175,5 @@ class CaseSettings(Settings):
 
     @property
     def label_names(self) -> dict[int, str]:
-        """What the labels' numbers mean, 0 included."""
+        """The structures by the labels' numbers, 0 included."""
         return {0: AROUND} | {one.label: name for name, one in self.structures.items()}

@@ -6,9 +6,7 @@ It says what it was made from, and is made anew when that has changed.
 from __future__ import annotations
 
 import json
-import os
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -22,16 +20,16 @@ from numpy.typing import NDArray
 from us_sim.errors import CaseError, MeshError
 from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.volume.partial_file import partial_file
 
-_LARGEST = 1 << 29
-"""Bytes of the arrays together: a million nodes take less."""
+_LARGEST = 1 << 29  # bytes of the arrays together: a million nodes take less
 
 _DAMAGED = (
     *(OSError, EOFError, KeyError, ValueError, TypeError, ArithmeticError, MemoryError),
     *(AttributeError, NotImplementedError, RuntimeError, MeshError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-"""What zipfile and NumPy raise for files that are none or are changed."""
+"""Errors of zipfile and NumPy for files that are none or are changed."""
 
 _ARRAYS = ("nodes", "tetrahedra", "labels", "fractions", "made_from")
 _PLANES = ("planes_x", "planes_y", "planes_z")
@@ -39,7 +37,7 @@ _PLANES = ("planes_x", "planes_y", "planes_z")
 
 @dataclass(frozen=True, eq=False)
 class CaseTissue:
-    """A mesh in frame ``patient``, and what is in it."""
+    """A mesh in frame ``patient``, and the labels in it."""
 
     mesh: TetrahedralMesh
     labels: NDArray[np.uint8]  # (L,) those that occur in it, ascending
@@ -67,25 +65,12 @@ def write_tissue(path: Path, tissue: CaseTissue) -> None:
     }
     if tissue.mesh.planes is not None:
         arrays |= dict(zip(_PLANES, tissue.mesh.planes, strict=True))
-    try:
-        number, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
-    except OSError as error:
-        raise CaseError(f"{path}: cannot be written: {error.strerror}") from error
-    try:
-        with os.fdopen(number, "wb") as file:
-            np.savez(file, **arrays)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
-    except OSError as error:
-        raise CaseError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        Path(name).unlink(missing_ok=True)
+    with partial_file(path, error_type=CaseError) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def read_tissue(path: Path) -> CaseTissue:
-    """What `write_tissue` wrote.
+    """Read ``tissue.npz``.
 
     Raises:
         CaseError: it cannot be read, or holds something else.

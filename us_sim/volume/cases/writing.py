@@ -1,9 +1,7 @@
 """Making and changing case folders: all of a change is there, or nothing.
 
 A case is written into a folder beside its place, checked, and renamed; on any error that folder is
-removed. What a program that was killed left behind is removed by the next that writes there.
-
-Young's moduli that were found for a case, written into its ``case.yaml``.
+removed. Rests of a program that was killed are removed by the next that writes there.
 """
 
 from __future__ import annotations
@@ -26,6 +24,7 @@ from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
 from us_sim.volume.cases.provenance import Step, add_step
 from us_sim.volume.cases.settings import AROUND, CaseSettings, check_name
+from us_sim.volume.partial_file import partial_file
 
 
 @contextmanager
@@ -42,20 +41,22 @@ def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         CaseError: there is something at that place already, it cannot be made, or what was written
             is no case.
     """
-    folder = _place(folder)
-    if os.path.lexists(folder):
-        raise CaseError(f"{folder}: exists already; choose another name, or remove it")
+    place = Path(os.path.abspath(os.path.expanduser(folder)))
+    if problem := check_name(place.name):
+        raise CaseError(f"{folder}: {problem}")
+    if os.path.lexists(place):
+        raise CaseError(f"{place}: exists already; choose another name, or remove it")
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
+        place.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
-    with _partial(folder) as partial:
+        raise CaseError(f"{place}: cannot be made: {error.strerror}") from error
+    with partial_folder(place, CaseError) as partial:
         yield partial
-        _finish(folder, partial)
+        _finish(place, partial)
         try:
-            os.rename(partial, folder)
+            os.rename(partial, place)
         except OSError as error:
-            raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
+            raise CaseError(f"{place}: cannot be made: {error.strerror}") from error
 
 
 @contextmanager
@@ -66,24 +67,30 @@ def changed_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         CaseError: there is no case, another program is changing it, or what was written is none.
     """
     folder = read_case(folder).folder
-    with _locked(folder), _partial(folder) as partial:
-        try:
-            shutil.copytree(folder, partial, dirs_exist_ok=True)
-        except (OSError, shutil.Error) as error:
-            raise CaseError(f"{folder}: cannot be copied: {error}") from error
-        yield partial
-        _finish(folder, partial)
-        before = partial.with_name(partial.name.replace(".partial-", ".before-"))
-        try:
-            os.rename(folder, before)
+    held = _held(folder)
+    if held is None or not os.path.samestat(os.fstat(held), folder.stat()):
+        raise CaseError(f"{folder}: another program is changing this case; try again when it ended")
+    try:
+        with partial_folder(folder, CaseError) as partial:
             try:
-                os.rename(partial, folder)
-            except OSError:
-                os.rename(before, folder)
-                raise
-        except OSError as error:
-            raise CaseError(f"{folder}: cannot be changed: {error.strerror}") from error
-        shutil.rmtree(before, ignore_errors=True)
+                shutil.copytree(folder, partial, dirs_exist_ok=True)
+            except (OSError, shutil.Error) as error:
+                raise CaseError(f"{folder}: cannot be copied: {error}") from error
+            yield partial
+            _finish(folder, partial)
+            before = partial.with_name(partial.name.replace(".partial-", ".before-"))
+            try:
+                os.rename(folder, before)
+                try:
+                    os.rename(partial, folder)
+                except OSError:
+                    os.rename(before, folder)
+                    raise
+            except OSError as error:
+                raise CaseError(f"{folder}: cannot be changed: {error.strerror}") from error
+            shutil.rmtree(before, ignore_errors=True)
+    finally:
+        os.close(held)
 
 
 def write_case_settings(folder: Path, settings: CaseSettings) -> None:
@@ -96,96 +103,12 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
     text = yaml.safe_dump(
         document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
     )
-    partial = folder / f".{CASE}.partial"
-    try:
+    with partial_file(folder / CASE, error_type=CaseError) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, folder / CASE)
-    except OSError as error:
-        raise CaseError(f"{folder / CASE}: cannot be written: {error.strerror}") from error
-
-
-def _place(folder: str | os.PathLike[str]) -> Path:
-    path = Path(os.path.abspath(os.path.expanduser(folder)))
-    if problem := check_name(path.name):
-        raise CaseError(f"{folder}: {problem}")
-    return path
-
-
-def _finish(folder: Path, partial: Path) -> None:
-    """Propose where to start where that is not said; refuse what is no case.
-
-    Errors name the place that it was meant for.
-    """
-    try:
-        case = read_case(partial)
-        case.placement()
-        if case.has_labels:
-            case.check_grids()
-        start = case.settings.start
-        if start is None or start.proposed or case.settings.probe is None:
-            write_case_settings(partial, with_proposal(case.settings, case.volume()))
-    except (CaseError, VolumeError) as error:
-        raise type(error)(str(error).replace(str(partial.resolve()), str(folder))) from error
-
-
-@contextmanager
-def _partial(folder: Path) -> Iterator[Path]:
-    """A folder beside another, removed at the end if it is still there."""
-    for left_over in folder.parent.glob(f".{folder.name}.partial-*"):
-        _remove_if_left(left_over)
-    try:
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
-    except OSError as error:
-        raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
-    mask = os.umask(0)
-    os.umask(mask)
-    partial.chmod(0o777 & ~mask)  # as any folder; mkdtemp's are the owner's alone
-    held = _held(partial)
-    try:
-        yield partial
-    finally:
-        if held is not None:
-            os.close(held)
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _remove_if_left(folder: Path) -> None:
-    """Remove what a program that ended has left; one that is at work holds it."""
-    held = _held(folder)
-    if held is not None:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(held)
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    held = _held(folder)
-    if held is None or not os.path.samestat(os.fstat(held), folder.stat()):
-        raise CaseError(f"{folder}: another program is changing this case; try again when it ended")
-    try:
-        yield
-    finally:
-        os.close(held)
-
-
-def _held(folder: Path) -> int | None:
-    """A lock on a folder, which ends with the program; None where another has it."""
-    try:
-        number = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(number)
-        return None
-    except OSError:
-        pass  # a file system without locks, such as some of networks
-    return number
 
 
 def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSettings:
-    """A case with these moduli (Pa) by structure, `AROUND` for what is in none.
+    """A case with these Young's moduli (Pa) by structure, `AROUND` for tissue outside of all.
 
     Raises:
         CaseError: there is no such structure.
@@ -207,7 +130,7 @@ def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSett
 def write_moduli_into(
     folder: str | os.PathLike[str], moduli: Mapping[str, float], step: Step
 ) -> None:
-    """Write moduli (Pa) by structure into a case, and what was done for that.
+    """Write moduli (Pa) by structure into a case, and how they were found.
 
     Raises:
         CaseError: there is no such case or structure, or it cannot be written.
@@ -216,3 +139,64 @@ def write_moduli_into(
     with changed_case(folder) as partial:
         write_case_settings(partial, settings)
         add_step(partial, step)
+
+
+def _finish(folder: Path, partial: Path) -> None:
+    """Propose where to start where that is not said; refuse what is no case.
+
+    Errors name the place that it was meant for.
+    """
+    try:
+        case = read_case(partial)
+        case.placement()
+        if case.has_labels:
+            case.check_grids()
+        start = case.settings.start
+        if start is None or start.proposed or case.settings.probe is None:
+            write_case_settings(partial, with_proposal(case.settings, case.volume()))
+    except (CaseError, VolumeError) as error:
+        raise type(error)(str(error).replace(str(partial.resolve()), str(folder))) from error
+
+
+@contextmanager
+def partial_folder(folder: Path, error_type: type[CaseError | VolumeError]) -> Iterator[Path]:
+    """A folder to fill beside another, removed at the end if it is still there.
+
+    Raises:
+        CaseError, VolumeError: as asked for, it cannot be made.
+    """
+    for left_over in folder.parent.glob(f".{folder.name}.partial-*"):
+        held = _held(left_over)  # None where the program that made it is still at work
+        if held is not None:
+            shutil.rmtree(left_over, ignore_errors=True)
+            os.close(held)
+    try:
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+    except OSError as error:
+        raise error_type(f"{folder}: cannot be made: {error.strerror}") from error
+    mask = os.umask(0)
+    os.umask(mask)
+    partial.chmod(0o777 & ~mask)  # as any folder; mkdtemp's are the owner's alone
+    held = _held(partial)
+    try:
+        yield partial
+    finally:
+        if held is not None:
+            os.close(held)
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _held(folder: Path) -> int | None:
+    """A lock on a folder, which ends with the program; None where another has it."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(number)
+        return None
+    except OSError:
+        pass  # a file system without locks, such as some of networks
+    return number

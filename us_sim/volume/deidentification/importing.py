@@ -1,18 +1,14 @@
-"""What an import made, and what it left out: the facts of its report.
-
-Writing what goes on: a volume's file, a case, or a sequence of images.
-
-Files of scanners and other programs into a volume, a case or a sequence of images.
+"""Files of scanners and other programs into a volume, a case or a sequence of images.
 
 Only voxels, where and when they lie, and the values of `kept_values` go on. The source is read,
-what is not kept is blanked, and the result is written anew: nothing is copied.
+the rest is blanked, and the result is written anew: nothing is copied.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,187 +18,129 @@ from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.kept_values import sorted_out
 from us_sim.volume.deidentification.settings import ImportSettings, Rectangle
-from us_sim.volume.deidentification.source import Progress, Regions, Source, file_source
+from us_sim.volume.deidentification.source import (
+    Progress,
+    Regions,
+    Source,
+    dicom_source,
+    file_source,
+)
 from us_sim.volume.deidentification.text_detection import find_text, proposed_part
 from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
 from us_sim.volume.files.readers import ENDINGS
 from us_sim.volume.files.writing import write_image_sequence, write_volume
 from us_sim.volume.volume import Volume
 
-
-@dataclass(frozen=True, eq=False)
-class Imported:
-    """An import, before or after it is written."""
-
-    kind: str  # what the files hold: "Enhanced US Volume Storage", "NRRD volume"
-    files: int
-    what: str  # what is made of them, with its size, for a person
-    kept: Mapping[str, str]  # values that go on, by their fields
-    used: Mapping[str, int]  # elements of which only the effect goes on, and how many of each
-    dropped: Mapping[str, int]  # all others
-    conversions: tuple[str, ...]
-    blanked: str  # what of the images is not kept, for a person
-    first: NDArray[np.uint8]  # (rows, columns) the first image as it was: it may show a name
-    regions: tuple[Rectangle, ...]  # what of it is kept
-    text: tuple[Rectangle, ...]  # where text may be, in `first`
-    remaining: tuple[Rectangle, ...]  # of these, what is kept: partly or wholly
-    undecided: str = ""  # why nothing can be written before a person has decided
-    blanking_settles: bool = False  # that --blank-text would be a decision
-    proposal: Rectangle | None = None  # what to keep, by what moves and shines
-    counts: Mapping[str, int] = field(default_factory=dict)
-
+_MARGIN = 3
+"""Pixels around text that are blanked with it: shadows and blurred edges."""
 
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 
-def is_images(out: Path) -> bool:
-    """Whether a name is one of those that 2D images may have."""
-    return out.name.lower().endswith(".mha")
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """The facts of an import's report, before or after it is written."""
 
-
-def refuse_taken(out: Path) -> None:
-    """Refuse a place where something is already, or a name that is none.
-
-    Raises:
-        VolumeError: it is taken.
-    """
-    if os.path.lexists(out):
-        raise VolumeError(f"{out}: exists already; choose another name, or remove it")
-    if out.suffix and not out.name.lower().endswith(_VOLUMES) and len(out.suffix) <= 5:
-        raise VolumeError(
-            f"{out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, .igs.mha for "
-            f"2D images, or a folder's name without an ending for a case"
-        )
-
-
-def write_images(
-    out: Path,
-    source: Source,
-    keep: NDArray[np.bool_] | None,
-    part: Rectangle | None,
-    progress: Progress | None,
-) -> None:
-    """Images without a place, one after another in time.
-
-    Raises:
-        VolumeError: they cannot be read or written.
-    """
-    assert source.images is not None
-    columns, rows, count = source.shape
-    cut = part.slices if part else (slice(None), slice(None))
-    columns, rows = part.size if part else (columns, rows)
-
-    def told() -> Iterator[NDArray[np.uint8]]:
-        assert source.images is not None
-        for number, image in enumerate(source.images(keep), start=1):
-            yield image[cut]
-            if progress:
-                progress(number / count, f"{number} of {count} images")
-
-    write_image_sequence(
-        out, told(), (count, rows, columns), source.times, source.pixel_mm, source.kept
-    )
-
-
-def write_grid(
-    out: Path,
-    source: Source,
-    keep: NDArray[np.bool_] | None,
-    imported: Imported,
-    settings: ImportSettings,
-    progress: Progress | None,
-) -> None:
-    """A volume as a file, or as a new case where the name has no ending.
-
-    Raises:
-        VolumeError: it cannot be read or written.
-        CaseError: the case cannot be made.
-    """
-    assert source.voxels is not None
-    assert source.placement is not None
-    volume = _cropped(source.voxels(keep, progress), source.placement, settings.part)
-    if out.name.lower().endswith(_VOLUMES):
-        fields = {} if out.name.lower().endswith((".nii", ".nii.gz")) else dict(source.kept)
-        write_volume(out, volume, fields)
-        return
-    from us_sim.volume.cases.provenance import Step, add_step
-    from us_sim.volume.cases.settings import CaseSettings
-    from us_sim.volume.cases.writing import new_case, write_case_settings
-
-    with new_case(out) as folder:
-        write_volume(folder / "volume.nrrd", volume, source.kept)
-        del volume  # it is read again at the end, to propose where to start
-        write_case_settings(folder, CaseSettings(name=settings.name or out.name))
-        add_step(folder, Step("imported", _said(imported, settings), _counted(imported)))
-
-
-def _said(imported: Imported, settings: ImportSettings) -> dict[str, object]:
-    """For provenance: what was done, by nothing that the source's header says."""
-    said: dict[str, object] = {"kind": imported.kind, "values kept": sorted(imported.kept)}
-    if settings.crop:
-        said["crop"] = settings.crop
-    if settings.keep_whole_image:
-        said["whole image"] = True
-    if imported.conversions:
-        said["converted"] = list(imported.conversions)
-    return said
-
-
-def _counted(imported: Imported) -> dict[str, int]:
-    return {
-        "files": imported.files,
-        "elements dropped": sum(imported.dropped.values()),
-        "regions kept": len(imported.regions),
-        "places that may be text": len(imported.remaining),
-    }
-
-
-def _cropped(
-    voxels: NDArray[np.uint8], placement: NDArray[np.float64], part: Rectangle | None
-) -> Volume:
-    """The part of every image, where it was."""
-    if part is None:
-        return Volume(voxels, placement)
-    if min(part.size) < 2:
-        raise VolumeError(f"--crop {part}: a volume needs two columns and rows or more")
-    rows, columns = part.slices
-    moved = placement.copy()
-    moved[:, 3] = placement @ [part.left, part.top, 0.0, 1.0]
-    return Volume(voxels[columns, rows], moved)
-
-
-_MARGIN = 3
-"""Pixels around text that are blanked with it: shadows and blurred edges."""
+    kind: str  # of the files: "DICOM, Enhanced US Volume Storage", "NRRD volume"
+    files: int
+    what: str  # the result, with its size, for a person
+    kept: Mapping[str, str]  # values that go on, by their fields
+    used: Mapping[str, int]  # elements of which only the effect goes on, and how many of each
+    dropped: Mapping[str, int]  # all others
+    conversions: tuple[str, ...]
+    blanked: str  # the part of the images that is not kept, for a person
+    first: NDArray[np.uint8]  # (rows, columns) the first image as it was: it may show a name
+    regions: tuple[Rectangle, ...]  # its parts that are kept
+    text: tuple[Rectangle, ...]  # where text may be, in `first`
+    remaining: tuple[Rectangle, ...]  # of these, those that are kept: partly or wholly
+    undecided: str = ""  # why nothing can be written before a person has decided
+    blanking_settles: bool = False  # that --blank-text would be a decision
+    proposal: Rectangle | None = None  # the part to keep, by its movement and brightness
 
 
 @dataclass(frozen=True, eq=False)
 class Import:
-    """Files that were looked at, and what would be made of them."""
+    """Files that were looked at, and the result that is planned."""
 
     paths: list[Path]
     out: Path | None
     settings: ImportSettings
     source: Source
-    imported: Imported  # the facts of the report
+    imported: Imported
     keep: NDArray[np.bool_] | None  # (rows, columns) of every image; None: all of it
 
     def write(self, progress: Progress | None = None) -> None:
-        """Write what goes on.
+        """Write the result.
 
         Raises:
-            VolumeError: a person has to say first what of the images is kept; or they cannot be
-                read, or the result not written.
+            VolumeError: a person has to say first which part of the images is kept; or they cannot
+                be read, or the result not written.
             CaseError: the case cannot be made.
         """
+        facts = self.imported
         assert self.out is not None
-        if self.imported.undecided:
+        if facts.undecided:
+            blank = "--blank-text, " if facts.blanking_settles else ""
+            proposed = f"{facts.proposal} (a proposal)" if facts.proposal else "X0,Y0,X1,Y1"
             raise VolumeError(
-                f"{self.paths[0]}: {self.imported.undecided}; {_advice(self.imported)}"
+                f"{self.paths[0]}: {facts.undecided}; look at the picture of --report, then give "
+                f"--crop {proposed}, {blank}or --keep-whole-image if there is nothing to hide"
             )
         if self.source.placement is None:
-            write_images(self.out, self.source, self.keep, self.settings.part, progress)
+            self._write_images(self.out, progress)
         else:
-            write_grid(self.out, self.source, self.keep, self.imported, self.settings, progress)
+            self._write_volume(self.out, self.source.placement, progress)
+
+    def _write_images(self, out: Path, progress: Progress | None) -> None:
+        """Images without a place, one after another in time."""
+        source, part = self.source, self.settings.part
+        columns, rows, count = source.shape
+        cut = part.slices if part else (slice(None), slice(None))
+        columns, rows = part.size if part else (columns, rows)
+
+        def images() -> Iterator[NDArray[np.uint8]]:
+            assert source.images is not None
+            for number, image in enumerate(source.images(self.keep), start=1):
+                yield image[cut]
+                if progress:
+                    progress(number / count, f"{number} of {count} images")
+
+        shape = (count, rows, columns)
+        write_image_sequence(out, images(), shape, source.times, source.pixel_mm, source.kept)
+
+    def _write_volume(
+        self, out: Path, placement: NDArray[np.float64], progress: Progress | None
+    ) -> None:
+        """A volume as a file, or as a new case where the name has no ending."""
+        source, facts = self.source, self.imported
+        assert source.voxels is not None
+        volume = _cropped(source.voxels(self.keep, progress), placement, self.settings.part)
+        if out.name.lower().endswith(_VOLUMES):
+            fields = {} if out.name.lower().endswith((".nii", ".nii.gz")) else dict(source.kept)
+            write_volume(out, volume, fields)
+            return
+        from us_sim.volume.cases.provenance import Step, add_step
+        from us_sim.volume.cases.settings import CaseSettings
+        from us_sim.volume.cases.writing import new_case, write_case_settings
+
+        said: dict[str, object] = {"kind": facts.kind, "values kept": sorted(facts.kept)}
+        if self.settings.crop:
+            said["crop"] = self.settings.crop
+        if self.settings.keep_whole_image:
+            said["whole image"] = True
+        if facts.conversions:
+            said["converted"] = list(facts.conversions)
+        counts = {
+            "files": facts.files,
+            "elements dropped": sum(facts.dropped.values()),
+            "regions kept": len(facts.regions),
+            "places that may be text": len(facts.remaining),
+        }
+        with new_case(out) as folder:
+            write_volume(folder / "volume.nrrd", volume, source.kept)
+            del volume  # it is read again at the end, to propose where to start
+            write_case_settings(folder, CaseSettings(name=self.settings.name or out.name))
+            add_step(folder, Step("imported", said, counts))
 
 
 def look_at(
@@ -215,17 +153,21 @@ def look_at(
             volume.
         out: a new case's folder, or a file with a volume's ending, or for 2D images .igs.mha; None
             where nothing will be written.
-        settings: what is kept.
+        settings: which part is kept.
 
     Raises:
         VolumeError: a file cannot be read, the files do not belong together, there is something at
             ``out`` already, or it needs a volume and the files hold none.
     """
-    paths = _listed(files)
+    paths: list[Path] = []
+    for each in map(Path, files):
+        if not each.is_dir() and not each.is_file():
+            raise VolumeError(f"{each}: there is no such file")
+        paths += dicom_files(each) if each.is_dir() else [each]
     if out is not None:
-        refuse_taken(out)
+        _check_free(out)
     source = _source(paths, out, settings)
-    imported, keep = _looked_at(paths, source, settings)
+    imported, keep = _planned(paths, source, settings)
     return Import(paths, out, settings, source, imported, keep)
 
 
@@ -241,23 +183,21 @@ def import_files(
     return found.imported
 
 
-def _listed(files: Sequence[str | os.PathLike[str]]) -> list[Path]:
-    """The files, and in place of a folder the DICOM files in it."""
-    paths: list[Path] = []
-    for each in map(Path, files):
-        if each.is_dir():
-            paths += dicom_files(each)
-        elif not each.is_file():
-            raise VolumeError(f"{each}: there is no such file")
-        else:
-            paths.append(each)
-    return paths
+def _check_free(out: Path) -> None:
+    """Refuse a place where something is already, or a name that is none."""
+    if os.path.lexists(out):
+        raise VolumeError(f"{out}: exists already; choose another name, or remove it")
+    if out.suffix and not out.name.lower().endswith(_VOLUMES) and len(out.suffix) <= 5:
+        raise VolumeError(
+            f"{out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, .igs.mha for "
+            f"2D images, or a folder's name without an ending for a case"
+        )
 
 
 def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> Source:
     others = [path for path in paths if path.name.lower().endswith(ENDINGS)]
     spacing = settings.spacing_mm
-    needs_volume = out is not None and not is_images(out)
+    needs_volume = out is not None and not out.name.lower().endswith(".mha")
     if spacing and len(spacing) != (3 if others or needs_volume else 2):
         raise VolumeError(
             "--spacing: write three numbers for a volume, X,Y,Z, and two for 2D images, X,Y"
@@ -272,16 +212,13 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
             f"{strange[0]}: is no DICOM file; give the DICOM files of one series, or one MHA, NRRD "
             f"or NIfTI volume"
         )
-    # Imported where it is needed: DICOM is an extra.
-    from us_sim.volume.deidentification.source import dicom_source
-
     return dicom_source(paths, settings.volume, spacing, needs_volume=needs_volume)
 
 
-def _looked_at(
+def _planned(
     paths: list[Path], source: Source, settings: ImportSettings
 ) -> tuple[Imported, NDArray[np.bool_] | None]:
-    """What would be done, and what of every image is kept where that is not all of it."""
+    """The facts of an import, and the part of every image that is kept where that is not all."""
     regions, undecided = _kept_part(source, settings)
     columns, rows, _ = source.shape
     keep = regions.mask(rows, columns) if regions.kept else np.ones((rows, columns), bool)
@@ -300,7 +237,7 @@ def _looked_at(
     imported = Imported(
         kind=source.kind,
         files=len(paths),
-        what=_what(source, settings.part),
+        what=_result(source, settings.part),
         kept=source.kept,
         used=used,
         dropped=dropped,
@@ -318,7 +255,7 @@ def _looked_at(
 
 
 def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
-    """What is kept of every image, and why a person has to decide, where that is so."""
+    """The part of every image that is kept, and why a person has to decide, where that is so."""
     part = settings.part
     if part is not None:
         columns, rows, _ = source.shape
@@ -338,17 +275,7 @@ def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
     return source.regions, ""
 
 
-def _advice(imported: Imported) -> str:
-    blank = "--blank-text, " if imported.blanking_settles else ""
-    proposed = f"{imported.proposal} (a proposal)" if imported.proposal else "X0,Y0,X1,Y1"
-    return (
-        f"look at the picture of --report, then give --crop {proposed}, {blank}or "
-        f"--keep-whole-image if there is nothing to hide"
-    )
-
-
-def _what(source: Source, part: Rectangle | None) -> str:
-    """What is made, with its size."""
+def _result(source: Source, part: Rectangle | None) -> str:
     columns, rows, count = source.shape
     if part is not None:
         columns, rows = part.size
@@ -374,3 +301,16 @@ def _blanked(
     kept = ", ".join(map(str, regions.kept))
     others = f", and {regions.blanked} of other kinds" if regions.blanked else ""
     return f"everything outside the ultrasound regions {kept}{others}{marked}"
+
+
+def _cropped(
+    voxels: NDArray[np.uint8], placement: NDArray[np.float64], part: Rectangle | None
+) -> Volume:
+    if part is None:
+        return Volume(voxels, placement)
+    if min(part.size) < 2:
+        raise VolumeError(f"--crop {part}: a volume needs two columns and rows or more")
+    rows, columns = part.slices
+    moved = placement.copy()
+    moved[:, 3] = placement @ [part.left, part.top, 0.0, 1.0]
+    return Volume(voxels[columns, rows], moved)

@@ -1,4 +1,4 @@
-"""The report of an import: what went on and what did not, by names and never by values.
+"""The report of an import: its facts by names and never by values.
 
 The picture shows the first image as it was, so that a person sees what is burned in. It belongs
 where the original is kept, and not to the case.
@@ -21,23 +21,37 @@ from us_sim.volume.deidentification.importing import Imported
 from us_sim.volume.deidentification.kept_values import NUMBERS
 from us_sim.volume.deidentification.settings import Rectangle
 
-_GREEN, _RED, _YELLOW = (80, 220, 80), (60, 60, 255), (0, 220, 255)  # of OpenCV: blue, green, red
 _REPORT, _PICTURE = "report.md", "first_image.png"
 
 
-def report_text(imported: Imported) -> str:
-    """The report as Markdown, without its picture."""
-    lines = ["# Import", ""]
-    lines += [f"{_files(imported)}: {imported.kind}. Made of it: {imported.what}.", ""]
+def report_text(imported: Imported, picture: str = "") -> str:
+    """The report as Markdown, with the name of its picture where there is one."""
+    files = "1 file" if imported.files == 1 else f"{imported.files} files"
+    lines = ["# Import", "", f"{files}: {imported.kind}. Made of it: {imported.what}.", ""]
     if imported.undecided:
-        lines += [f"**Nothing can be written yet**: {imported.undecided}. {_decide(imported)}", ""]
+        blank = "`--blank-text` or " if imported.blanking_settles else ""
+        proposed = imported.proposal
+        proposal = f" `{proposed}` is proposed: the yellow box." if proposed else ""
+        lines += [
+            f"**Nothing can be written yet**: {imported.undecided}. Say `--crop X0,Y0,X1,Y1`, "
+            f"{blank}`--keep-whole-image`.{proposal}",
+            "",
+        ]
     lines += [f"Blanked: {imported.blanked}.", ""]
     if imported.conversions:
         lines += [f"Converted: {'; '.join(imported.conversions)}.", ""]
     lines += [*_text_lines(imported), ""]
-    lines += ["## Kept as they are", ""]
+    if picture:
+        lines += [
+            f"![The first image]({picture})",
+            "",
+            "*The first image as it was. Green: kept. Red: may be text. Yellow: proposed for "
+            "--crop. It may show a name: keep it where the original is kept.*",
+            "",
+        ]
     reasons = {one.name: f": {one.why}" for one in NUMBERS}
     reasons["frame_of_reference_uid"] = ": a new one of random numbers, in place of the original's"
+    lines += ["## Kept as they are", ""]
     lines += _listed({name + reasons.get(name, ""): 1 for name in imported.kept})
     lines += ["", "## Used, so that their effect goes on", ""]
     lines += ["The grid, the times, the grey values and what is blanked come of these.", ""]
@@ -62,11 +76,18 @@ def summary(imported: Imported) -> str:
 
 
 def report_picture(imported: Imported) -> NDArray[np.uint8]:
-    """(rows, columns, 3) the first image as it was, with what is kept and what may be text."""
+    """(rows, columns, 3) the first image as it was, with its kept parts and those of text."""
     picture = np.asarray(cv2.cvtColor(imported.first, cv2.COLOR_GRAY2BGR), np.uint8)
-    _draw(picture, imported.regions, _GREEN)
-    _draw(picture, imported.text, _RED, margin=2)
-    _draw(picture, [imported.proposal] if imported.proposal else [], _YELLOW)
+    proposed = [imported.proposal] if imported.proposal else []
+    boxes: Iterable[tuple[Iterable[Rectangle], tuple[int, int, int], int]] = (
+        (imported.regions, (80, 220, 80), 0),  # blue, green, red, and pixels around a box
+        (imported.text, (60, 60, 255), 2),
+        (proposed, (0, 220, 255), 0),
+    )
+    for each, colour, margin in boxes:
+        for box in each:
+            first = (box.left - margin, box.top - margin)
+            cv2.rectangle(picture, first, (box.right + margin, box.bottom + margin), colour, 1)
     return picture
 
 
@@ -77,19 +98,19 @@ def write_report(folder: Path, imported: Imported) -> list[Path]:
         VolumeError: there is one already, or it cannot be written.
     """
     refuse_report(folder)
-    text = report_text(imported)
-    seen = (
-        f"![The first image]({_PICTURE})\n\n*The first image as it was. Green: kept. Red: may be "
-        f"text. Yellow: proposed for --crop. It may show a name: keep it where the original is "
-        f"kept.*\n\n"
-    )
-    text = text.replace("## Kept as they are", f"{seen}## Kept as they are", 1)
     done, data = cv2.imencode(".png", report_picture(imported))
     assert done
+    written = {_PICTURE: data.tobytes(), _REPORT: report_text(imported, _PICTURE).encode()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write(folder / _PICTURE, data.tobytes())
-        _write(folder / _REPORT, text.encode())
+        for name, content in written.items():
+            number, partial = tempfile.mkstemp(prefix=f".{name}.partial-", dir=folder)
+            try:
+                with os.fdopen(number, "wb") as file:  # the owner's alone, as mkstemp makes it
+                    file.write(content)
+                os.replace(partial, folder / name)
+            finally:
+                Path(partial).unlink(missing_ok=True)
     except OSError as error:
         raise VolumeError(f"{folder}: cannot be written: {error.strerror}") from error
     return [folder / _REPORT, folder / _PICTURE]
@@ -107,51 +128,20 @@ def refuse_report(folder: Path) -> None:
         raise VolumeError(f"--report {folder}: holds a report already; name another folder")
 
 
-def _write(path: Path, data: bytes) -> None:
-    number, partial = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
-    try:
-        with os.fdopen(number, "wb") as file:  # the owner's alone, as mkstemp makes it
-            file.write(data)
-        os.replace(partial, path)
-    finally:
-        Path(partial).unlink(missing_ok=True)
-
-
-def _files(imported: Imported) -> str:
-    return "1 file" if imported.files == 1 else f"{imported.files} files"
-
-
-def _decide(imported: Imported) -> str:
-    proposed = f" `{imported.proposal}` is proposed: the yellow box." if imported.proposal else ""
-    blank = "`--blank-text` or " if imported.blanking_settles else ""
-    return f"Say `--crop X0,Y0,X1,Y1`, {blank}`--keep-whole-image`.{proposed}"
-
-
 def _text_lines(imported: Imported) -> list[str]:
-    if not imported.text:
+    found, remaining = len(imported.text), imported.remaining
+    if not found:
         return ["Nothing that looks like text was found, which is no proof that there is none."]
-    blanked = len(imported.text) - len(imported.remaining)
-    lines = [
-        f"{counted(len(imported.text), 'place')} may be text; {blanked} of them blanked or cut "
-        f"off, and {len(imported.remaining)} would go on:"
-    ]
-    if not imported.remaining:
-        return [lines[0].replace("would go on:", "would go on.")]
-    return [*lines, "", *(f"- columns and rows {line}" for line in imported.remaining)]
+    said = (
+        f"{counted(found, 'place')} may be text; {found - len(remaining)} of them blanked or cut "
+        f"off, and {len(remaining)} would go on"
+    )
+    if not remaining:
+        return [f"{said}."]
+    return [f"{said}:", "", *(f"- columns and rows {line}" for line in remaining)]
 
 
 def _listed(names: Mapping[str, int]) -> list[str]:
     if not names:
         return ["Nothing."]
     return [f"- {name}{f' ({count} times)' if count > 1 else ''}" for name, count in names.items()]
-
-
-def _draw(
-    picture: NDArray[np.uint8],
-    boxes: Iterable[Rectangle],
-    colour: tuple[int, int, int],
-    margin: int = 0,
-) -> None:
-    for box in boxes:
-        first = (box.left - margin, box.top - margin)
-        cv2.rectangle(picture, first, (box.right + margin, box.bottom + margin), colour, 1)

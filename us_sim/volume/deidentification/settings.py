@@ -1,16 +1,9 @@
-"""A rectangle of pixels, as DICOM gives the regions of an ultrasound image: its last ones belong
-to it.
-
-What an import can be told.
-"""
+"""Settings of an import, and the rectangle of pixels that it may keep."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
@@ -19,7 +12,7 @@ from us_sim.settings.setting import Settings, setting
 
 @dataclass(frozen=True)
 class Rectangle:
-    """From a first column and row to last ones."""
+    """From a first column and row to last ones that belong to it, as in DICOM's regions."""
 
     left: int
     top: int
@@ -31,17 +24,17 @@ class Rectangle:
         """From ``X0,Y0,X1,Y1``.
 
         Raises:
-            VolumeError: it is written otherwise, or holds no pixel.
+            ValueError: it is written otherwise, or holds no pixel.
         """
         words = [word.strip() for word in text.split(",")]
         if len(words) != 4 or not all(re.fullmatch(r"[0-9]{1,5}", word) for word in words):
-            raise VolumeError(
-                f"crop: {text[:80]!r} is no rectangle; write X0,Y0,X1,Y1: its first column and row "
-                f"and its last ones, counted from 0"
+            raise ValueError(
+                f"{text[:80]!r} is no rectangle; write X0,Y0,X1,Y1: its first column and row and "
+                f"its last ones, counted from 0"
             )
         made = cls(*map(int, words))
         if min(made.size) < 1:
-            raise VolumeError(f"crop: {text[:80]!r} holds no pixel: X1 and Y1 are the last ones")
+            raise ValueError(f"{text[:80]!r} holds no pixel: X1 and Y1 are the last ones")
         return made
 
     @property
@@ -56,26 +49,16 @@ class Rectangle:
 
     def grown(self, margin: int) -> Rectangle:
         """With so many more pixels on every side; none before the first column and row."""
-        return Rectangle(
-            max(self.left - margin, 0),
-            max(self.top - margin, 0),
-            self.right + margin,
-            self.bottom + margin,
-        )
+        left, top = max(self.left - margin, 0), max(self.top - margin, 0)
+        return Rectangle(left, top, self.right + margin, self.bottom + margin)
 
     def __str__(self) -> str:
         return f"{self.left},{self.top},{self.right},{self.bottom}"
 
-    def mask(self, rows: int, columns: int) -> NDArray[np.bool_]:
-        """(rows, columns) true within."""
-        made = np.zeros((rows, columns), bool)
-        made[self.slices] = True
-        return made
-
 
 @dataclass(frozen=True)
 class ImportSettings(Settings):
-    """What of scanners' images goes on."""
+    """The part of scanners' images that goes on."""
 
     error = VolumeError
 
@@ -111,18 +94,16 @@ class ImportSettings(Settings):
                 raise self.refused("crop", "cannot be given with --keep-whole-image; keep one")
             try:
                 Rectangle.read(self.crop)
-            except VolumeError as error:
-                raise self.refused("crop", str(error).removeprefix("crop: ")) from error
-
+            except ValueError as error:
+                raise self.refused("crop", str(error)) from error
         if self.spacing is not None and not self.spacing_mm:
             raise self.refused("spacing", "is no two or three numbers of mm; write 0.3,0.3,1")
 
     @property
     def spacing_mm(self) -> tuple[float, ...]:
         """(3,) or (2,) mm, of files that do not state it; empty where it is not given."""
-        words = (self.spacing or "").split(",")
         try:
-            found = tuple(float(word) for word in words)
+            found = tuple(float(word) for word in (self.spacing or "").split(","))
         except ValueError:
             return ()
         return found if len(found) in (2, 3) and all(1e-4 <= each <= 100 for each in found) else ()

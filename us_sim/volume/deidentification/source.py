@@ -1,18 +1,10 @@
-"""Which part of every image goes on: what the scanner's own header says is echo, or a rectangle.
+"""Sources of an import: images of any format, with the facts of their header.
 
 A scanner writes names, dates and hospitals around the echoes. Where its header has a sequence of
 ultrasound regions (PS3.3, C.8.5.5) only its two-dimensional regions of tissue and flow are kept:
 grey bars, electrocardiograms, spectra and graphics are blanked with all that lies outside. Where
-there is no such sequence, or one that cannot be true, a person has to say what is kept.
-
-What is imported: images of any format with what their header says, before any is left out.
-
-A volume of another format, MetaImage, NRRD or NIfTI, as a source of an import.
-
-Of its header nothing goes on but where the voxels lie: comments, descriptions and fields that some
-programs copy there from DICOM are dropped.
-
-DICOM files as a source of an import.
+there is no such sequence, or one that cannot be true, a person has to say what is kept. Of a
+MetaImage, NRRD or NIfTI header nothing goes on but where the voxels lie.
 """
 
 from __future__ import annotations
@@ -37,118 +29,10 @@ from us_sim.volume.files.dicom.planes import frame_times, is_cartesian
 from us_sim.volume.files.readers import grey_voxels, open_image
 from us_sim.volume.files.segments import holds_segments, no_grey_values
 
-_TWO_DIMENSIONAL = 1  # Region Spatial Format
-_ECHOES = (1, 2)  # Region Data Type: tissue, colour flow
-_CENTIMETRES = 3  # Physical Units
-_GROUPS = ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
 _ENHANCED_US_VOLUME = "1.2.840.10008.5.1.4.1.1.6.2"
-
-
-@dataclass(frozen=True)
-class Regions:
-    """What a header's sequence of ultrasound regions says."""
-
-    kept: tuple[Rectangle, ...]
-    blanked: int = 0  # regions of other kinds
-    doubt: str = ""  # why it is not believed, or that there is none
-
-    def mask(self, rows: int, columns: int) -> NDArray[np.bool_]:
-        """(rows, columns) what is kept."""
-        made = np.zeros((rows, columns), bool)
-        for region in self.kept:
-            made[region.slices] = True
-        return made
-
-
-def ultrasound_regions(file: DicomFile, rows: int, columns: int) -> Regions:
-    """The regions of echoes, if the sequence is there and can be true."""
-    listed = items(file.header, "SequenceOfUltrasoundRegions")
-    if not listed:
-        return Regions((), doubt="there is no sequence of ultrasound regions")
-    kept, blanked = [], 0
-    for region in listed:
-        edges = [
-            whole(region, f"RegionLocation{key}") for key in ("MinX0", "MinY0", "MaxX1", "MaxY1")
-        ]
-        if any(edge is None for edge in edges):
-            return Regions((), doubt="a region has no edges")
-        left, top, right, bottom = (int(edge or 0) for edge in edges)
-        # Some scanners write the first column beyond a region as its last.
-        if right > columns or bottom > rows or min(left, top) < 0:
-            return Regions(
-                (),
-                doubt=f"a region reaches to {right},{bottom} in an image of {columns} × {rows} "
-                f"pixels",
-            )
-        right, bottom = min(right, columns - 1), min(bottom, rows - 1)
-        if right < left or bottom < top:
-            return Regions((), doubt="a region holds no pixel")
-        if _holds_echoes(region):
-            kept.append(Rectangle(left, top, right, bottom))
-        else:
-            blanked += 1
-    if not kept:
-        return Regions((), blanked, doubt="no region is a two-dimensional image of tissue or flow")
-    return Regions(tuple(kept), blanked)
-
-
-def _holds_echoes(region: object) -> bool:
-    return (
-        whole(region, "RegionSpatialFormat") == _TWO_DIMENSIONAL
-        and whole(region, "RegionDataType") in _ECHOES
-    )
-
-
-def never_holds_text(file: DicomFile) -> bool:
-    """Whether it is of a kind of which the standard says that nothing is burned in.
-
-    That is the Enhanced US Volume (PS3.3, C.8.24.3: Burned In Annotation is NO).
-    """
-    return (
-        text(file.header, "SOPClassUID") == _ENHANCED_US_VOLUME
-        and text(file.header, "BurnedInAnnotation") != "YES"
-    )
-
-
-def pixel_size(file: DicomFile, regions: Regions) -> tuple[tuple[float, float], bool]:
-    """Width and height of a pixel in mm, and whether the header states them.
-
-    Where all kept regions agree about it that counts, then `PixelSpacing` and what secondary
-    captures have in its place. Of images that state their `PixelAspectRatio` alone the width is
-    taken for 1 mm.
-    """
-    found = set()
-    header = file.header
-    for region in items(header, "SequenceOfUltrasoundRegions") if regions.kept else ():
-        units = (whole(region, "PhysicalUnitsXDirection"), whole(region, "PhysicalUnitsYDirection"))
-        delta = (number(region, "PhysicalDeltaX"), number(region, "PhysicalDeltaY"))
-        if _holds_echoes(region) and units == (_CENTIMETRES, _CENTIMETRES) and all(delta):
-            found.add((abs(delta[0] or 0.0) * 10.0, abs(delta[1] or 0.0) * 10.0))
-    if len(found) == 1:
-        return found.pop(), True
-    for source in (header, *(each for key in _GROUPS for each in _measures(header, key))):
-        # Between rows, then between columns (PS3.3, 10.7.1.3).
-        stated = numbers(source, "PixelSpacing", 2)
-        stated = stated or numbers(source, "NominalScannedPixelSpacing", 2)
-        if stated and all(1e-4 <= each <= 100.0 for each in stated):
-            return (stated[1], stated[0]), True
-    ratio = numbers(header, "PixelAspectRatio", 2)  # vertical, then horizontal
-    if ratio and min(ratio) > 0.0:
-        return (1.0, ratio[0] / ratio[1]), False
-    return (1.0, 1.0), False
-
-
-def _measures(header: Any, key: str) -> list[Any]:
-    """What the groups of values of an enhanced object say of its first image's pixels."""
-    return [
-        each for group in items(header, key)[:1] for each in items(group, "PixelMeasuresSequence")
-    ]
-
+_REGIONS = "SequenceOfUltrasoundRegions"
 
 Progress = Callable[[float, str], None]
-
-LOOKED_AT = 12
-"""Images in which text is looked for."""
 
 
 class Voxels(Protocol):
@@ -166,21 +50,37 @@ class Images(Protocol):
 
 
 class Sides(Protocol):
-    """Some slices across each of the other two axes, of what is kept of the images."""
+    """Some slices across each of the other two axes, of the kept part of the images."""
 
     def __call__(self, keep: NDArray[np.bool_] | None, /) -> Iterator[list[NDArray[np.uint8]]]: ...
+
+
+@dataclass(frozen=True)
+class Regions:
+    """The regions of echoes that a header states."""
+
+    kept: tuple[Rectangle, ...]
+    blanked: int = 0  # regions of other kinds
+    doubt: str = ""  # why it is not believed, or that there is none
+
+    def mask(self, rows: int, columns: int) -> NDArray[np.bool_]:
+        """(rows, columns) true where an image is kept."""
+        made = np.zeros((rows, columns), bool)
+        for region in self.kept:
+            made[region.slices] = True
+        return made
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
     """Images of one volume or of one recording, as they come."""
 
-    kind: str  # what the files hold, for a person and for provenance
+    kind: str  # of the files, for a person and for provenance
     shape: tuple[int, int, int]  # columns, rows, images
     samples: list[NDArray[np.uint8]]  # some images as they are, from all over
-    names: Mapping[str, int]  # what the header has, and how often
+    names: Mapping[str, int]  # elements of the header, and how often each is there
     kept: Mapping[str, str]  # values that may go on, by their fields
-    conversions: tuple[str, ...]  # what is made of stored values
+    conversions: tuple[str, ...]  # of the stored values
     regions: Regions  # of echoes, as the header says
     placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
     times: list[float]  # s, of images that are no volume
@@ -190,17 +90,13 @@ class Source:
     sides: Sides | None = None  # of a volume whose axes may be in another order than a scanner's
 
 
-def spread(count: int) -> list[int]:
-    """Up to `LOOKED_AT` numbers from all over a count."""
-    return sorted({int(n) for n in np.linspace(0, count - 1, min(count, LOOKED_AT))})
-
-
-_KINDS = {"m": "MetaImage volume", "nr": "NRRD volume", "nh": "NRRD volume"}
-"""By the beginning of a name's ending; all others are NIfTI."""
+def _spread(count: int) -> list[int]:
+    """Up to 12 numbers from all over a count, of the images in which text is looked for."""
+    return sorted({int(n) for n in np.linspace(0, count - 1, min(count, 12))})
 
 
 def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> Source:
-    """The slices of a volume along its last axis.
+    """The slices of a MetaImage, NRRD or NIfTI volume along its last axis.
 
     Args:
         path: of the file.
@@ -229,7 +125,7 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
     def sides(keep: NDArray[np.bool_] | None) -> Iterator[list[NDArray[np.uint8]]]:
         for axis in (0, 1):
             stack = []
-            for n in spread(voxels.shape[axis]):
+            for n in _spread(voxels.shape[axis]):
                 image = np.ascontiguousarray(np.take(voxels, n, axis))
                 if keep is not None:
                     image[~np.take(keep, n, 1 - axis)] = 0
@@ -237,11 +133,11 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
             yield stack
 
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
-    kinds = (kind for start, kind in _KINDS.items() if ending.startswith(start))
+    kind = {"mha": "MetaImage", "mhd": "MetaImage", "nrrd": "NRRD", "nhdr": "NRRD"}
     return Source(
-        kind=next(kinds, "NIfTI volume"),
+        kind=f"{kind.get(ending, 'NIfTI')} volume",
         shape=image.shape,
-        samples=[np.ascontiguousarray(voxels[:, :, k].T) for k in spread(count)],
+        samples=[np.ascontiguousarray(voxels[:, :, k].T) for k in _spread(count)],
         names=other_names(path),
         kept={},
         conversions=conversions,
@@ -253,9 +149,6 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
         images=slices,
         sides=sides,
     )
-
-
-_ASSUMED = 0.04  # s, between images of which nothing says it
 
 
 def dicom_source(
@@ -277,7 +170,9 @@ def dicom_source(
     which = placed.which if placed else images.all
     regions = _regions(images)
     conversions = list(images.conversions)
-    times = _times(images)
+    times = None  # images of several files have none in common
+    if len(images.files) == 1:
+        times = frame_times(images.files[0], images.form.frames)
     if placed is None and times is None:
         conversions.append("times of images are not stated: one every 40 ms is assumed")
     pixel, is_stated = pixel_size(images.files[0], regions)
@@ -291,29 +186,29 @@ def dicom_source(
         )
     if placed is not None and placed.volumes > 1:
         conversions.append(f"volume {volume} of {placed.volumes} in time")
-
-    def read(keep: NDArray[np.bool_] | None) -> Iterator[NDArray[np.uint8]]:
-        return images.images(which, keep)
-
+    names: Counter[str] = Counter()
+    for file in images.files:
+        names.update(dicom_names(file.header))
+        names["PixelData"] += 1
     return Source(
-        kind=_kind(images),
+        kind=_kind(images.files[0]),
         shape=(images.form.columns, images.form.rows, len(which)),
-        samples=list(images.images([which[n] for n in spread(len(which))])),
-        names=_names(images),
-        kept=_values(images),
+        samples=list(images.images([which[n] for n in _spread(len(which))])),
+        names=dict(names),
+        kept=_agreed_values(images.files),
         conversions=tuple(conversions),
         regions=regions,
         placement=placed.placement if placed else None,
-        times=[n * _ASSUMED for n in range(len(which))] if times is None else times,
+        times=[n * 0.04 for n in range(len(which))] if times is None else times,
         pixel_mm=pixel,
         voxels=placed.voxels if placed else None,
-        images=read,
+        images=lambda keep: images.images(which, keep),
     )
 
 
 def _regions(images: GreyImages) -> Regions:
     """The regions on which all files agree; of kinds of volumes that need none, all of it."""
-    if all(never_holds_text(file) or is_cartesian(file) for file in images.files):
+    if all(_never_holds_text(file) for file in images.files):
         return Regions(())
     rows, columns = images.form.rows, images.form.columns
     every = [ultrasound_regions(file, rows, columns) for file in images.files]
@@ -325,42 +220,102 @@ def _regions(images: GreyImages) -> Regions:
     return every[0]
 
 
-def _times(images: GreyImages) -> list[float] | None:
-    """Of all images; those of several files have none in common."""
-    if len(images.files) > 1:
-        return None
-    return frame_times(images.files[0], images.form.frames)
+def _never_holds_text(file: DicomFile) -> bool:
+    """Whether nothing is burned into images of this kind: Philips' Cartesian export, and the
+    Enhanced US Volume (PS3.3, C.8.24.3: Burned In Annotation is NO)."""
+    is_enhanced = text(file.header, "SOPClassUID") == _ENHANCED_US_VOLUME
+    return is_cartesian(file) or (is_enhanced and text(file.header, "BurnedInAnnotation") != "YES")
 
 
-def _values(images: GreyImages) -> dict[str, str]:
+def ultrasound_regions(file: DicomFile, rows: int, columns: int) -> Regions:
+    """The regions of echoes, if the sequence is there and can be true."""
+    listed = items(file.header, _REGIONS)
+    if not listed:
+        return Regions((), doubt="there is no sequence of ultrasound regions")
+    kept, blanked = [], 0
+    for region in listed:
+        edges = [
+            whole(region, f"RegionLocation{key}") for key in ("MinX0", "MinY0", "MaxX1", "MaxY1")
+        ]
+        if any(edge is None for edge in edges):
+            return Regions((), doubt="a region has no edges")
+        left, top, right, bottom = (int(edge or 0) for edge in edges)
+        # Some scanners write the first column beyond a region as its last.
+        if right > columns or bottom > rows or min(left, top) < 0:
+            doubt = f"a region reaches to {right},{bottom} in an image of {columns} × {rows} pixels"
+            return Regions((), doubt=doubt)
+        right, bottom = min(right, columns - 1), min(bottom, rows - 1)
+        if right < left or bottom < top:
+            return Regions((), doubt="a region holds no pixel")
+        if _holds_echoes(region):
+            kept.append(Rectangle(left, top, right, bottom))
+        else:
+            blanked += 1
+    if not kept:
+        return Regions((), blanked, doubt="no region is a two-dimensional image of tissue or flow")
+    return Regions(tuple(kept), blanked)
+
+
+def _holds_echoes(region: Any) -> bool:
+    """Whether a region is two-dimensional, and of tissue or colour flow."""
+    return whole(region, "RegionSpatialFormat") == 1 and whole(region, "RegionDataType") in (1, 2)
+
+
+def pixel_size(file: DicomFile, regions: Regions) -> tuple[tuple[float, float], bool]:
+    """Width and height of a pixel in mm, and whether the header states them.
+
+    Where all kept regions agree about it that counts, then `PixelSpacing` and its counterparts in
+    secondary captures. Of images that state their `PixelAspectRatio` alone the width is taken for
+    1 mm.
+    """
+    found = set()
+    header = file.header
+    for region in items(header, _REGIONS) if regions.kept else ():
+        units = (whole(region, "PhysicalUnitsXDirection"), whole(region, "PhysicalUnitsYDirection"))
+        delta = (number(region, "PhysicalDeltaX"), number(region, "PhysicalDeltaY"))
+        if _holds_echoes(region) and units == (3, 3) and all(delta):  # centimetres
+            found.add((abs(delta[0] or 0.0) * 10.0, abs(delta[1] or 0.0) * 10.0))
+    if len(found) == 1:
+        return found.pop(), True
+    measures = [
+        each
+        for key in ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
+        for group in items(header, key)[:1]
+        for each in items(group, "PixelMeasuresSequence")
+    ]
+    for source in (header, *measures):
+        # Between rows, then between columns (PS3.3, 10.7.1.3).
+        stated = numbers(source, "PixelSpacing", 2)
+        stated = stated or numbers(source, "NominalScannedPixelSpacing", 2)
+        if stated and all(1e-4 <= each <= 100.0 for each in stated):
+            return (stated[1], stated[0]), True
+    ratio = numbers(header, "PixelAspectRatio", 2)  # vertical, then horizontal
+    if ratio and min(ratio) > 0.0:
+        return (1.0, ratio[0] / ratio[1]), False
+    return (1.0, 1.0), False
+
+
+def _agreed_values(files: Sequence[DicomFile]) -> dict[str, str]:
     """Values on which all files agree, and a frame of reference that leads nowhere."""
-    first, *others = (kept_values(file.header) for file in images.files)
+    first, *others = (kept_values(file.header) for file in files)
     agreed = {
         name: value
         for name, value in first.items()
         if all(other.get(name) == value for other in others)
     }
-    header = images.files[0].header
+    header = files[0].header
     if text(header, "FrameOfReferenceUID") or text(header, "VolumeFrameOfReferenceUID"):
         # Of random numbers (PS3.5, B.2), and not of the original's digits by any function.
         agreed["frame_of_reference_uid"] = f"2.25.{uuid.uuid4().int}"
     return agreed
 
 
-def _names(images: GreyImages) -> dict[str, int]:
-    names: Counter[str] = Counter()
-    for file in images.files:
-        names.update(dicom_names(file.header))
-        names["PixelData"] += 1
-    return dict(names)
-
-
-def _kind(images: GreyImages) -> str:
-    """The standard's name of what the files are, which is no text of theirs."""
+def _kind(file: DicomFile) -> str:
+    """The standard's name of the kind of files, which is no text of theirs."""
     from pydicom.uid import UID
 
-    uid = text(images.files[0].header, "SOPClassUID")
-    if is_cartesian(images.files[0]):
+    uid = text(file.header, "SOPClassUID")
+    if is_cartesian(file):
         return "DICOM, Cartesian export of Philips"
     name = UID(uid).name
     return f"DICOM, {name}" if name != uid else "DICOM of an unknown class"

@@ -1,11 +1,9 @@
 """Text that is burned into images: where it may be, without reading it.
 
-What is looked for is what all text of scanners is: thin strokes, brighter or darker than what is
-around them, the same in every image, of about one brightness, and beside one another on a line.
-Speckle has the strokes, but neither the one brightness nor the line. It is a help for a person who
-looks at the picture, and no proof: it misses letters across bright tissue, handwriting, and faces.
-
-Which part of images to keep, proposed to a person: where the echoes seem to be.
+All text of scanners has thin strokes, brighter or darker than their surroundings, the same in every
+image, of about one brightness, and beside one another on a line. Speckle has the strokes, but
+neither the one brightness nor the line. It is a help for a person who looks at the picture, and no
+proof: it misses letters across bright tissue, handwriting, and faces.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Headers of MetaImage files: their fields, and what they say of the image."""
+"""Headers of MetaImage files (itk.org/Wiki/MetaIO/Documentation), read without trust in them."""
 
 from __future__ import annotations
 
@@ -16,31 +16,13 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
 from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
 
-_LARGEST_HEADER = 1 << 26
-"""Bytes; an hour of tracked frames takes less."""
-
-_LONGEST_LINE = 1 << 16
-
+_LARGEST_HEADER = 1 << 26  # bytes; an hour of tracked frames takes less
 _TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2",
+    "MET_INT": "i4", "MET_UINT": "u4", "MET_LONG": "i4", "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
+}  # fmt: skip
 """MetaImage's element types (MetaIO, metaTypes.h)."""
-
-_SPACINGS = ("ElementSpacing", "ElementSize")
-_ORIGINS = ("Offset", "Position", "Origin")
-_MATRICES = ("TransformMatrix", "Rotation", "Orientation")
-"""Names of the same, of which the first that is there counts."""
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
@@ -51,7 +33,7 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
     """
     fields: dict[str, str] = {}
     with path.open("rb") as file:
-        while line := file.readline(_LONGEST_LINE):
+        while line := file.readline(1 << 16):
             key, _, value = line.decode("latin-1").partition("=")
             fields[key.strip()] = value.strip()
             if key.strip() == "ElementDataFile":
@@ -65,7 +47,7 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
 
 
 def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -> StoredVoxels:
-    """What a MetaImage header says of its voxels.
+    """The voxels that a MetaImage header describes.
 
     Raises:
         VolumeError: a field is missing or not made of the numbers that belong there, the data file
@@ -87,12 +69,11 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
             f"{path}: its DimSize is {fields['DimSize']!r} where NDims says {dimension} numbers; "
             f"export it again"
         )
-    element = fields["ElementType"]
+    element, name = fields["ElementType"], fields["ElementDataFile"]
     if element not in _TYPES:
         raise VolumeError(
             f"{path}: its ElementType is {element[:80]!r}; save it with one of {', '.join(_TYPES)}"
         )
-    name = fields["ElementDataFile"]
     if name.upper().startswith("LIST") or "%" in name:
         raise VolumeError(f"{path}: keeps its voxels in several files; save it as one .mha file")
     is_local = name.upper() == "LOCAL"
@@ -102,11 +83,10 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
     start = header_bytes if is_local else 0
     packed = _is_true(fields.get("CompressedData", "False"))
     if packed and "CompressedDataSize" in fields:
-        (said,) = _whole_numbers(path, fields, "CompressedDataSize", 1)
-        there = data.stat().st_size - start
-        if said != there:
+        (stated,) = _whole_numbers(path, fields, "CompressedDataSize", 1)
+        if stated != (there := data.stat().st_size - start):
             raise VolumeError(
-                f"{path}: holds {there} bytes of image data where its header says {said} "
+                f"{path}: holds {there} bytes of image data where its header says {stated} "
                 f"compressed ones; copy or export it again"
             )
     order = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False"))
@@ -130,7 +110,7 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
 
 
 def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
-    """What a header says of its image.
+    """The image that a header describes.
 
     Args:
         path: of the file.
@@ -141,27 +121,25 @@ def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """
     fields, header_bytes = metaimage_header(path)
     voxels = metaimage_voxels(path, fields, header_bytes)
-    components = voxels.size[0] if len(voxels.size) > len(fields["DimSize"].split()) else 1
-    return StoredImage(voxels, components, lambda: _placement(path, fields, given))
-
-
-def _placement(
-    path: Path, fields: Mapping[str, str], given: ArrayLike | None
-) -> NDArray[np.float64]:
-    """(4, 4) m of the first three axes; the matrix has one axis after another."""
     count = len(fields["DimSize"].split())
-    unit = millimetres(path, fields.get("DistanceUnits", "mm"))
-    spacing = _numbers(path, fields, _SPACINGS, count)
-    origin = _numbers(path, fields, _ORIGINS, count)
-    matrix = _numbers(path, fields, _MATRICES, count**2)
-    axes = np.eye(count) if matrix is None else matrix.reshape(count, count).T
-    return checked_placement(
-        path,
-        None if spacing is None else unit * spacing[:3],
-        axes[:3, :3],
-        np.zeros(3) if origin is None else unit * origin[:3],
-        given,
-    )
+    components = voxels.size[0] if len(voxels.size) > count else 1
+
+    def placement() -> NDArray[np.float64]:
+        """(4, 4) m of the first three axes; the matrix has one axis after another."""
+        unit = millimetres(path, fields.get("DistanceUnits", "mm"))
+        spacing = _numbers(path, fields, ("ElementSpacing", "ElementSize"), count)
+        origin = _numbers(path, fields, ("Offset", "Position", "Origin"), count)
+        matrix = _numbers(path, fields, ("TransformMatrix", "Rotation", "Orientation"), count**2)
+        axes = np.eye(count) if matrix is None else matrix.reshape(count, count).T
+        return checked_placement(
+            path,
+            None if spacing is None else unit * spacing[:3],
+            axes[:3, :3],
+            np.zeros(3) if origin is None else unit * origin[:3],
+            given,
+        )
+
+    return StoredImage(voxels, components, placement)
 
 
 def _numbers(
@@ -188,17 +166,14 @@ def _whole_numbers(
 ) -> tuple[int, ...]:
     """The whole numbers of a field; ``count`` of them where it is given."""
     words = fields[key].split()
-    if not words or len(words) != (count or len(words)) or not all(map(_is_whole, words)):
+    # int() would also take 1_000 and the digits of other scripts.
+    are_whole = all(re.fullmatch(r"0*[1-9][0-9]{0,17}", word) for word in words)
+    if not words or len(words) != (count or len(words)) or not are_whole:
         raise VolumeError(
             f"{path}: its {key} is {fields[key][:80]!r} where whole numbers above zero belong; "
             f"export it again"
         )
     return tuple(map(int, words))
-
-
-def _is_whole(word: str) -> bool:
-    # int() would also take 1_000 and the digits of other scripts.
-    return re.fullmatch(r"0*[1-9][0-9]{0,17}", word) is not None
 
 
 def _is_true(text: str) -> bool:

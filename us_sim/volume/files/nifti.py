@@ -18,56 +18,37 @@ from us_sim.volume.files.stored_image import StoredImage, StoredVoxels
 
 _TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4"}
 _TYPES |= {1024: "i8", 1280: "u8"}
-_COLOURS = {128: 3, 2304: 4}
-"""Bytes of a voxel's colour."""
+_COLOURS = {128: 3, 2304: 4}  # bytes of a voxel's colour
 
-_VERSION_1 = {
-    "data_type": (4, "10s"),
-    "db_name": (14, "18s"),
-    "dim": (40, "8h"),
-    "datatype": (70, "h"),
-    "pixdim": (76, "8f"),
-    "vox_offset": (108, "f"),
-    "scaling": (112, "2f"),
-    "xyzt_units": (123, "B"),
-    "descrip": (148, "80s"),
-    "aux_file": (228, "24s"),
-    "qform_code": (252, "h"),
-    "sform_code": (254, "h"),
-    "quaternion": (256, "3f"),
-    "qoffset": (268, "3f"),
-    "srow": (280, "12f"),
-    "intent_name": (328, "16s"),
-    "extension": (348, "4s"),
+_LAYOUT = {
+    "dim": ("8h", 40, "8q", 16),
+    "datatype": ("h", 70, "h", 12),
+    "pixdim": ("8f", 76, "8d", 104),
+    "vox_offset": ("f", 108, "q", 168),
+    "scaling": ("2f", 112, "2d", 176),
+    "xyzt_units": ("B", 123, "i", 500),
+    "qform_code": ("h", 252, "i", 344),
+    "sform_code": ("h", 254, "i", 348),
+    "quaternion": ("3f", 256, "3d", 352),
+    "qoffset": ("3f", 268, "3d", 376),
+    "srow": ("12f", 280, "12d", 400),
+    "descrip": ("80s", 148, "80s", 240),
+    "aux_file": ("24s", 228, "24s", 320),
+    "intent_name": ("16s", 328, "16s", 508),
+    "extension": ("4s", 348, "4s", 540),
+    "data_type": ("10s", 4, "", 0),
+    "db_name": ("18s", 14, "", 0),
 }
-_VERSION_2 = {
-    "dim": (16, "8q"),
-    "datatype": (12, "h"),
-    "pixdim": (104, "8d"),
-    "vox_offset": (168, "q"),
-    "scaling": (176, "2d"),
-    "xyzt_units": (500, "i"),
-    "descrip": (240, "80s"),
-    "aux_file": (320, "24s"),
-    "qform_code": (344, "i"),
-    "sform_code": (348, "i"),
-    "quaternion": (352, "3d"),
-    "qoffset": (376, "3d"),
-    "srow": (400, "12d"),
-    "intent_name": (508, "16s"),
-    "extension": (540, "4s"),
-}
-"""First byte and form of each field (nifti1.h, nifti2.h)."""
+"""Form and first byte of each field in version 1 (nifti1.h), then in version 2 (nifti2.h)."""
 
 NIFTI_TEXTS = ("data_type", "db_name", "descrip", "aux_file", "intent_name", "extension")
 """Fields in which anything may be written, of the first version or of both."""
-_UNITS = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}  # mm; 0 is not stated, and millimetres by custom
+
 _TO_LPS = np.diag([-1.0, -1.0, 1.0])  # NIfTI's x goes to the right, its y to the front
-_SQUARE = 1e-3  # products of directions that are at right angles
 
 
 def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
-    """What a NIfTI header says of its image; header and voxels may each be packed by gzip.
+    """The image that a NIfTI header describes; header and voxels may each be packed by gzip.
 
     Args:
         path: of the file, or of one of the pair ``.hdr`` and ``.img``.
@@ -93,25 +74,22 @@ def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
         )
     while len(size) > 3 and size[-1] == 1:
         size = size[:-1]
-    file = _beside(path, ".img") if fields["pair"] else path
+    file = _of_pair(path, ".img") if fields["pair"] else path
     with file.open("rb") as data:
         packed = data.read(2) == b"\x1f\x8b"
     components = _COLOURS.get(kind, 1)
-    slope, offset_of_values = fields["scaling"]
-    usable = math.isfinite(slope) and math.isfinite(offset_of_values) and slope != 0.0
-    return StoredImage(
-        StoredVoxels(
-            (components, *size) if components > 1 else tuple(size),
-            np.dtype(f"{fields['order']}{_TYPES.get(kind, 'u1')}"),
-            file,
-            path,
-            skip=int(offset),
-            encoding="packed" if packed else "raw",
-        ),
-        components,
-        placement=lambda: _placement(path, fields, given),
-        scaling=(slope, offset_of_values) if usable else (1.0, 0.0),
+    voxels = StoredVoxels(
+        (components, *size) if components > 1 else tuple(size),
+        np.dtype(f"{fields['order']}{_TYPES.get(kind, 'u1')}"),
+        file,
+        path,
+        skip=int(offset),
+        encoding="packed" if packed else "raw",
     )
+    slope, intercept = fields["scaling"]
+    usable = math.isfinite(slope) and math.isfinite(intercept) and slope != 0.0
+    scaling = (slope, intercept) if usable else (1.0, 0.0)
+    return StoredImage(voxels, components, lambda: _placement(path, fields, given), scaling)
 
 
 def nifti_fields(path: Path) -> dict[str, Any]:
@@ -120,7 +98,7 @@ def nifti_fields(path: Path) -> dict[str, Any]:
     Raises:
         VolumeError: it is no such header, or the compression is broken.
     """
-    file = _beside(path, ".hdr") if ".nii" not in path.name.lower() else path
+    file = _of_pair(path, ".hdr") if ".nii" not in path.name.lower() else path
     with file.open("rb") as opened:
         start = opened.read(4096)
     if start.startswith(b"\x1f\x8b"):
@@ -133,19 +111,19 @@ def nifti_fields(path: Path) -> dict[str, Any]:
     start = start.ljust(1024, b"\0")
     for order in "<>":
         (first,) = struct.unpack_from(f"{order}i", start)
-        magic = start[344:347] if first == 348 else start[4:7]
         if first not in (348, 540):
             continue
+        magic = start[344:347] if first == 348 else start[4:7]
         if magic not in (b"n+1", b"ni1", b"n+2", b"ni2"):
             break
-        layout = _VERSION_1 if first == 348 else _VERSION_2
         found: dict[str, Any] = {"order": order, "pair": magic[1:2] == b"i"}
-        for name, (at, form) in layout.items():
-            values = struct.unpack_from(f"{order}{form}", start, at)
-            found[name] = values if len(values) > 1 else values[0]
+        for name, layout in _LAYOUT.items():
+            form, at = layout[:2] if first == 348 else layout[2:]
+            if form:
+                values = struct.unpack_from(f"{order}{form}", start, at)
+                found[name] = values if len(values) > 1 else values[0]
         return found
-    is_analyze = struct.unpack_from("<i", start)[0] == 348 or start[:4] == b"\0\0\1\x5c"
-    if is_analyze:
+    if struct.unpack_from("<i", start)[0] == 348 or start[:4] == b"\0\0\1\x5c":
         raise VolumeError(
             f"{path}: cannot be read as an image: it is of Analyze 7.5, which does not say which "
             f"side is left; save it as NIfTI where that is known"
@@ -156,8 +134,8 @@ def nifti_fields(path: Path) -> dict[str, Any]:
     )
 
 
-def _beside(path: Path, ending: str) -> Path:
-    """The other one of a pair of files, or this one; either may be packed."""
+def _of_pair(path: Path, ending: str) -> Path:
+    """The file of a pair that has an ending; either may be packed."""
     stem = path.name.removesuffix(".gz").removesuffix(".GZ")[:-4]
     for name in (stem + ending, stem + ending.upper()):
         for packed in ("", ".gz"):
@@ -173,14 +151,15 @@ def _placement(
 
     A matrix whose axes are not at right angles gives way to a quaternion, as in ITK.
     """
-    unit = _UNITS.get(fields["xyzt_units"] & 7, 1.0)
+    # mm of metres, millimetres and micrometres; 0 is not stated, and millimetres by custom
+    unit = {1: 1e3, 2: 1.0, 3: 1e-3}.get(fields["xyzt_units"] & 7, 1.0)
     rows = np.array(fields["srow"], np.float64).reshape(3, 4)
     spacing = np.array(fields["pixdim"][1:4], np.float64)
     stated = np.isfinite(spacing).all() and (spacing != 0.0).all()
     lengths = np.linalg.norm(rows[:, :3], axis=0)
     with np.errstate(all="ignore"):
         along = rows[:, :3] / lengths
-        is_square = np.abs(along.T @ along - np.eye(3)).max() < _SQUARE
+        is_square = np.abs(along.T @ along - np.eye(3)).max() < 1e-3
     if fields["sform_code"] > 0 and (is_square or fields["qform_code"] <= 0):
         origin, spacing, stated = rows[:, 3], lengths, True
     elif fields["qform_code"] > 0:

@@ -1,6 +1,4 @@
-"""Headers of NRRD files: their fields, and what they say of the image
-(teem.sourceforge.net/nrrd/format.html).
-"""
+"""Headers of NRRD files (teem.sourceforge.net/nrrd/format.html), read without trust in them."""
 
 from __future__ import annotations
 
@@ -17,11 +15,7 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
 from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
 
-_LARGEST_HEADER = 1 << 26
-"""Bytes; an hour of tracked frames takes less."""
-
 _LONGEST_LINE = 1 << 16
-
 _TYPES = {
     "i1": "signed char|int8|int8_t",
     "u1": "uchar|unsigned char|uint8|uint8_t",
@@ -35,10 +29,8 @@ _TYPES = {
     "f8": "double",
 }
 _TYPE = {name: kind for kind, names in _TYPES.items() for name in names.split("|")}
-
 _ENCODINGS: dict[str, Encoding] = {"raw": "raw", "gzip": "packed", "gz": "packed"}
 _ENCODINGS |= {"bzip2": "bzip2", "bz2": "bzip2", "ascii": "text", "text": "text", "txt": "text"}
-
 _TO_LPS = {
     "left-posterior-superior": (1, 1, 1),
     "right-anterior-superior": (-1, -1, 1),
@@ -47,12 +39,50 @@ _TO_LPS = {
 _TO_LPS |= {"lps": (1, 1, 1), "ras": (-1, -1, 1), "las": (1, -1, 1)}
 """Signs that turn a space's axes to left-posterior-superior; others are taken for that."""
 
-_PLACES = {"domain", "space"}  # kinds of axes along which the body extends
-_UNSTATED = {"???", "none", ""}
+
+def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
+    """The fields of a header, its further keys and values, and the bytes up to its voxels.
+
+    The fields' names are in lower case; keys are as they were written (``key:=value``).
+
+    Raises:
+        VolumeError: it is no NRRD header, has a field twice, or does not end.
+    """
+    fields: dict[str, str] = {}
+    pairs: dict[str, str] = {}
+    with path.open("rb") as file:
+        if not file.readline(64).startswith(b"NRRD"):
+            raise VolumeError(
+                f"{path}: cannot be read as an image: it does not begin as NRRD does; give an "
+                f"MHA, NRRD, NIfTI or DICOM volume"
+            )
+        while line := _text(file.readline(_LONGEST_LINE)).rstrip("\r\n"):
+            if file.tell() > 1 << 26:  # an hour of tracked frames takes less
+                raise VolumeError(f"{path}: cannot be read as an image: its header does not end")
+            if line.startswith("#"):
+                continue
+            key, colon, value = line.partition(":")
+            if value.startswith("="):
+                pairs[key.strip()] = value[1:].strip()
+                continue
+            key = key.strip().lower()
+            if colon and value.startswith(" "):
+                if key in fields:
+                    raise VolumeError(f"{path}: its header has {key!r} twice; export it again")
+                fields[key] = value.strip()
+        return fields, pairs, file.tell()
+
+
+def _text(line: bytes) -> str:
+    """A line, which most programs write as UTF-8."""
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
 
 
 def nrrd_voxels(path: Path) -> StoredVoxels:
-    """What an NRRD header says of its numbers.
+    """The numbers that an NRRD header describes.
 
     Raises:
         VolumeError: it is no such header, its data file is missing, or they are stored in a way
@@ -86,16 +116,9 @@ def nrrd_voxels(path: Path) -> StoredVoxels:
         for _ in range(lines):
             data.readline(_LONGEST_LINE)
         start = data.tell()
-    order = ">" if fields.get("endian", "").lower() == "big" else "<"
-    voxels = StoredVoxels(
-        tuple(map(int, size)),
-        np.dtype(f"{order}{_TYPE[kind]}"),
-        file,
-        path,
-        start,
-        max(skip, 0),
-        _ENCODINGS[encoding],
-    )
+    number = np.dtype(f"{'>' if fields.get('endian', '').lower() == 'big' else '<'}{_TYPE[kind]}")
+    shape = tuple(map(int, size))
+    voxels = StoredVoxels(shape, number, file, path, start, max(skip, 0), _ENCODINGS[encoding])
     if skip == -1 and encoding == "raw":  # the last bytes of the file
         return replace(voxels, start=max(file.stat().st_size - voxels.expected, start))
     if skip < 0:
@@ -111,7 +134,7 @@ def _skipped(path: Path, fields: Mapping[str, str], unit: str) -> int:
 
 
 def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
-    """What a header says of its image, whose first axis may be numbers of a voxel and whose last
+    """The image that a header describes, whose first axis may be numbers of a voxel and whose last
     one several volumes.
 
     Args:
@@ -123,19 +146,19 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """
     fields, pairs, _ = nrrd_header(path)
     voxels = nrrd_voxels(path)
-    places = _places(path, fields, len(voxels.size))
-    first, last = (places[0], places[-1] + 1) if places else (0, 0)
-    if len(places) != last - first or len(voxels.size) - last > 1 or first > 1:
+    axes = _axes_of_space(path, fields, len(voxels.size))
+    first, last = (axes[0], axes[-1] + 1) if axes else (0, 0)
+    if len(axes) != last - first or len(voxels.size) - last > 1 or first > 1:
         raise VolumeError(
             f"{path}: of its {len(voxels.size)} axes these are of space: "
-            f"{', '.join(str(n + 1) for n in places) or 'none'}; save it with three in a row"
+            f"{', '.join(str(n + 1) for n in axes) or 'none'}; save it with three in a row"
         )
     if last - first != 3:
         raise VolumeError(f"{path}: is {last - first}-dimensional; a volume has three dimensions")
     return StoredImage(
         voxels,
         voxels.size[0] if first else 1,
-        lambda: _placement(path, fields, places, given),
+        lambda: _placement(path, fields, axes, given),
         texts=pairs,
     )
 
@@ -153,54 +176,46 @@ def _entries(path: Path, fields: Mapping[str, str], key: str, dimension: int) ->
     return [word.strip('"') for word in found]
 
 
-def _places(path: Path, fields: Mapping[str, str], dimension: int) -> list[int]:
-    """Which axes are of space: those with a direction, or of a kind that is; else the first 3."""
+def _axes_of_space(path: Path, fields: Mapping[str, str], dimension: int) -> list[int]:
+    """The axes with a direction, or of a kind along which the body extends; else the first 3."""
     if directions := _entries(path, fields, "space directions", dimension):
         return [n for n, each in enumerate(directions) if each != "none"]
-    kinds = _entries(path, fields, "kinds", dimension)
-    if kinds and any(kind.lower() in _PLACES for kind in kinds):
-        return [n for n, kind in enumerate(kinds) if kind.lower() in _PLACES]
-    return list(range(min(dimension, 3)))
+    kinds = _entries(path, fields, "kinds", dimension) or []
+    of_space = [n for n, kind in enumerate(kinds) if kind.lower() in ("domain", "space")]
+    return of_space or list(range(min(dimension, 3)))
 
 
 def _placement(
-    path: Path, fields: Mapping[str, str], places: list[int], given: ArrayLike | None
+    path: Path, fields: Mapping[str, str], axes: list[int], given: ArrayLike | None
 ) -> NDArray[np.float64]:
     """(4, 4) m of the axes of space."""
     dimension = len(fields["sizes"].split())
-    space = fields.get("space", "").lower()
-    turn = np.array(_TO_LPS.get(space, (1, 1, 1)), np.float64)
     directions = _entries(path, fields, "space directions", dimension)
-    units = _entries(
-        path, fields, "space units" if directions else "units", 3 if directions else dimension
-    )
     if directions is None:
+        units = _entries(path, fields, "units", dimension)
+        scale = [_millimetres(path, units[n]) if units else 1.0 for n in axes]
         spacings = _entries(path, fields, "spacings", dimension)
         starts = _entries(path, fields, "axis mins", dimension) or ["0"] * dimension
-        scale = [millimetres(path, _unit(units[n])) if units else 1.0 for n in places]
-        spacing = [_number(path, "spacings", spacings[n]) for n in places] if spacings else None
-        if spacing and np.isnan(spacing).all():
-            spacing = None
-        origin = np.nan_to_num([_number(path, "axis mins", starts[n]) for n in places])
-        return checked_placement(
-            path,
-            None if spacing is None else np.array(spacing) * scale,
-            np.eye(3),
-            origin * scale,
-            given,
-        )
-    to_lps = turn * [millimetres(path, _unit(unit)) for unit in units or ("", "", "")]
-    axes = np.column_stack([_vector(path, "space directions", directions[n]) for n in places])
+        spacing = None
+        if spacings:
+            spacing = np.array([_number(path, "spacings", spacings[n]) for n in axes]) * scale
+            spacing = None if np.isnan(spacing).all() else spacing
+        origin = np.nan_to_num([_number(path, "axis mins", starts[n]) for n in axes])
+        return checked_placement(path, spacing, np.eye(3), origin * scale, given)
+    signs = _TO_LPS.get(fields.get("space", "").lower(), (1, 1, 1))
+    units = _entries(path, fields, "space units", 3) or ["", "", ""]
+    to_lps = np.array(signs, np.float64) * [_millimetres(path, unit) for unit in units]
+    steps = np.column_stack([_vector(path, "space directions", directions[n]) for n in axes])
     origin = _vector(path, "space origin", fields.get("space origin", "(0,0,0)"))
-    axes = axes * to_lps[:, None]
-    spacing = np.linalg.norm(axes, axis=0)
+    steps = steps * to_lps[:, None]
+    spacing = np.linalg.norm(steps, axis=0)
     return checked_placement(
-        path, spacing, axes / np.where(spacing > 0.0, spacing, 1.0), origin * to_lps, given
+        path, spacing, steps / np.where(spacing > 0.0, spacing, 1.0), origin * to_lps, given
     )
 
 
-def _unit(text: str) -> str:
-    return "" if text.lower() in _UNSTATED else text
+def _millimetres(path: Path, unit: str) -> float:
+    return millimetres(path, "" if unit.lower() in ("???", "none", "") else unit)
 
 
 def _number(path: Path, key: str, text: str) -> float:
@@ -221,44 +236,3 @@ def _vector(path: Path, key: str, text: str) -> NDArray[np.float64]:
             f"{path}: its {key} is not made of vectors of three finite numbers; export it again"
         )
     return vector
-
-
-def _text(line: bytes) -> str:
-    """A line, which most programs write as UTF-8."""
-    try:
-        return line.decode("utf-8")
-    except UnicodeDecodeError:
-        return line.decode("latin-1")
-
-
-def nrrd_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
-    """The fields of a header, its further keys and values, and the bytes up to its voxels.
-
-    The fields' names are in lower case; keys are as they were written (``key:=value``).
-
-    Raises:
-        VolumeError: it is no NRRD header, has a field twice, or does not end.
-    """
-    fields: dict[str, str] = {}
-    pairs: dict[str, str] = {}
-    with path.open("rb") as file:
-        if not file.readline(64).startswith(b"NRRD"):
-            raise VolumeError(
-                f"{path}: cannot be read as an image: it does not begin as NRRD does; give an "
-                f"MHA, NRRD, NIfTI or DICOM volume"
-            )
-        while line := _text(file.readline(_LONGEST_LINE)).rstrip("\r\n"):
-            if file.tell() > _LARGEST_HEADER:
-                raise VolumeError(f"{path}: cannot be read as an image: its header does not end")
-            if line.startswith("#"):
-                continue
-            key, colon, value = line.partition(":")
-            if value.startswith("="):
-                pairs[key.strip()] = value[1:].strip()
-                continue
-            key = key.strip().lower()
-            if colon and value.startswith(" "):
-                if key in fields:
-                    raise VolumeError(f"{path}: its header has {key!r} twice; export it again")
-                fields[key] = value.strip()
-        return fields, pairs, file.tell()

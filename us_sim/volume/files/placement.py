@@ -1,7 +1,4 @@
-"""Where the voxels of an image file lie, checked: spacing, axes and origin that a body may have.
-
-Every reader hands its header's numbers over in millimetres, whatever unit they are written in.
-"""
+"""Where the voxels of an image file lie, checked: spacing, axes and origin that a body may have."""
 
 from __future__ import annotations
 
@@ -17,10 +14,8 @@ MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 
 MILLIMETRES |= {"meter": 1e3, "centimeter": 10.0, "millimeter": 1.0, "micron": 1e-3, "inch": 25.4}
 """By the names of units in image files."""
 
-_METRES = 1e-3  # image files hold millimetres
 _SPACINGS = (1e-4, 1e2)  # mm, from a microscope's to one voxel for half a limb
 _FARTHEST = 1e5  # mm
-_ORTHONORMAL = 1e-3  # what rounding may do to the products of a direction matrix's columns
 
 
 def millimetres(path: Path | str, unit: str) -> float:
@@ -68,35 +63,35 @@ def checked_placement(
             f"{path}: does not state how far its voxels are apart: find out, and say it with "
             f"`us-sim import --spacing X,Y,Z` (mm)"
         )
-    spacing = given if spacing is None else spacing
-    spacing, origin = np.asarray(spacing, np.float64), np.asarray(origin, np.float64)
+    spacing = np.asarray(given if spacing is None else spacing, np.float64)
+    origin = np.asarray(origin, np.float64)
     direction = np.asarray(direction, np.float64).reshape(3, 3)
+    sides = " × ".join(f"{side:g}" for side in spacing)
     # MetaImage turns a spacing that is not a number into 0 before it comes here.
     if not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
-        raise VolumeError(
-            f"{path}: has the voxel spacing {' × '.join(f'{s:g}' for s in spacing)} mm; every "
-            f"spacing must be a number above zero"
+        problem = f"has the voxel spacing {sides} mm; every spacing must be a number above zero"
+    elif not (np.isfinite(direction).all() and np.isfinite(origin).all()):
+        problem = "has an origin or a direction matrix that is not finite"
+    elif abs(np.linalg.det(direction)) < 1e-6:
+        problem = "has a singular direction matrix, so its axes span no volume"
+    elif np.abs(direction.T @ direction - np.eye(3)).max() > 1e-3:  # more than rounding
+        problem = (
+            "has axes that are sheared or scaled by its direction matrix; resample it on a grid "
+            "with right angles"
         )
-    if not (np.isfinite(direction).all() and np.isfinite(origin).all()):
-        raise VolumeError(f"{path}: has an origin or a direction matrix that is not finite")
-    if abs(np.linalg.det(direction)) < 1e-6:
-        raise VolumeError(f"{path}: has a singular direction matrix, so its axes span no volume")
-    if np.abs(direction.T @ direction - np.eye(3)).max() > _ORTHONORMAL:
-        raise VolumeError(
-            f"{path}: has axes that are sheared or scaled by its direction matrix; resample it on "
-            f"a grid with right angles"
+    elif not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):
+        problem = (
+            f"has the voxel spacing {sides} mm; that of a body is {_SPACINGS[0]:g} to "
+            f"{_SPACINGS[1]:g} mm: correct it"
         )
-    if not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):
-        raise VolumeError(
-            f"{path}: has the voxel spacing {' × '.join(f'{s:g}' for s in spacing)} mm; that of a "
-            f"body is {_SPACINGS[0]:g} to {_SPACINGS[1]:g} mm: correct it"
+    elif np.abs(origin).max() > _FARTHEST:
+        problem = (
+            f"lies {np.abs(origin).max() / 1e3:.3g} m from its origin; {_FARTHEST / 1e3:g} m are "
+            f"possible at most: correct it"
         )
-    if np.abs(origin).max() > _FARTHEST:
-        raise VolumeError(
-            f"{path}: lies {np.abs(origin).max() / 1e3:.3g} m from its origin; {_FARTHEST / 1e3:g} "
-            f"m are possible at most: correct it"
-        )
-    placement = np.eye(4)
-    placement[:3, :3] = direction * spacing * _METRES
-    placement[:3, 3] = origin * _METRES
-    return placement
+    else:
+        placement = np.eye(4)
+        placement[:3, :3] = direction * spacing * 1e-3
+        placement[:3, 3] = origin * 1e-3
+        return placement
+    raise VolumeError(f"{path}: {problem}")

@@ -1,15 +1,4 @@
-"""Whether the header of an image file is that of a sequence of frames, or of one volume.
-
-Plus leaves ``Seq_Frame0000_ImageStatus`` in the header of volumes that it has reconstructed, so
-that a field of a frame alone says nothing.
-
->>> from us_sim.volume.files.readers import is_sequence
->>> is_sequence("domain domain domain", ["Seq_Frame0000_ImageStatus"])
-False
->>> is_sequence("domain domain list", []), is_sequence("list domain domain domain", [])
-(True, False)
-
-Volume files into frame ``patient``: MetaImage, NRRD, NIfTI and DICOM.
+"""Volume files into frame ``patient``: MetaImage, NRRD, NIfTI and DICOM.
 
 >>> import tempfile, SimpleITK
 >>> from us_sim.volume.files.readers import read_volume
@@ -40,68 +29,14 @@ from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
 from us_sim.volume.files.stored_image import GreyLevels, StoredImage, volume_of_slices
 from us_sim.volume.volume import Volume
 
-_OVER_TIME = {"list", "time"}
-FRAME_KEY = re.compile(r"Seq_Frame([0-9]{1,9})_(\w+)")
-"""Keys of a frame's fields: its number, and the field's name."""
+_READERS = {"mha": metaimage_image, "mhd": metaimage_image, "nrrd": nrrd_image, "nhdr": nrrd_image}
+_READERS |= {"nii": nifti_image, "hdr": nifti_image, "img": nifti_image}
 
-
-def is_sequence(kinds: str, keys: Iterable[str]) -> bool:
-    """Whether a header is that of a sequence.
-
-    Args:
-        kinds: of its axes, as NRRD and Plus write them (``domain domain list``), of which the last
-            one counts: a list that comes first is the layers of a segmentation. They may be empty,
-            and then transforms of frames, or fields of several frames, make a sequence.
-        keys: of the header.
-    """
-    if words := kinds.lower().split():
-        return words[-1] in _OVER_TIME
-    frames = [match for match in map(FRAME_KEY.fullmatch, keys) if match]
-    described = {int(match[1]) for match in frames}
-    return len(described) > 1 or any(match[2].endswith("Transform") for match in frames)
-
-
-def sequence_remedy(path: Path) -> str | None:
-    """What a MetaImage or NRRD file of a sequence is, and what can be made of it; None of others.
-
-    Raises:
-        VolumeError: its header does not end.
-    """
-    name = path.name.lower()
-    if name.endswith((".nrrd", ".nhdr")):
-        fields, keys, _ = nrrd_header(path)
-        kinds, sizes = fields.get("kinds", ""), fields.get("sizes", "").split()
-    elif name.endswith((".mha", ".mhd")):
-        keys, _ = metaimage_header(path)
-        kinds, sizes = keys.get("Kinds", ""), keys.get("DimSize", "").split()
-    else:
-        return None
-    if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != "1" and sizes[0] != "0"):
-        return None  # several volumes in time are no sequence of flat images
-    tracked = any(match and match[2].endswith("Transform") for match in map(FRAME_KEY.match, keys))
-    if "0" in sizes:
-        return f"a recording of poses without images; play it with `--path {path.name}`"
-    if not tracked:
-        return "a sequence of images without poses; record it again with a tracked probe"
-    return (
-        f"a sequence of tracked frames; make a volume of it with `us-sim reconstruct {path.name} "
-        f"--out volume.nrrd`"
-    )
-
-
-_READERS = {
-    "mha": metaimage_image,
-    "mhd": metaimage_image,
-    "nrrd": nrrd_image,
-    "nhdr": nrrd_image,
-    "nii": nifti_image,
-    "hdr": nifti_image,
-    "img": nifti_image,
-}
-_PACKED = (".nii.gz", ".hdr.gz", ".img.gz")
-
-ENDINGS = (*(f".{ending}" for ending in _READERS), *_PACKED)
+ENDINGS = (*(f".{ending}" for ending in _READERS), ".nii.gz", ".hdr.gz", ".img.gz")
 """Of the files of these formats; all others are DICOM, or none."""
+
+FRAME_KEY = re.compile(r"Seq_Frame([0-9]{1,9})_(\w+)")
+"""Keys of the fields of a frame of a tracked sequence: its number, and the field's name."""
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:
@@ -129,9 +64,7 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
 
         placed = placed_images(files)
         return Volume(placed.voxels(), placed.placement)
-    image = open_image(path)
-    _refuse_several(image)
-    placement = image.placement()
+    image, placement = _placed(path)
     return Volume(grey_voxels(image)[0], placement)
 
 
@@ -146,9 +79,7 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
         from us_sim.volume.files.dicom.placed_images import placed_images
 
         return placed_images(files).placement
-    image = open_image(path)
-    _refuse_several(image)
-    placement = image.placement()
+    image, placement = _placed(path)
     image.voxels.check_bytes()
     return placement
 
@@ -156,7 +87,7 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 def open_image(
     path: Path, *, layers: bool = False, spacing: ArrayLike | None = None
 ) -> StoredImage:
-    """What the header of a MetaImage, NRRD or NIfTI file says of its image.
+    """The image that the header of a MetaImage, NRRD or NIfTI file describes.
 
     Args:
         path: of the file.
@@ -177,7 +108,7 @@ def open_image(
             f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume, which "
             f"3D Slicer makes of others"
         )
-    if remedy := sequence_remedy(path):
+    if remedy := _sequence_remedy(path):
         raise VolumeError(f"{path}: is no volume but {remedy}")
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
     image = _READERS[ending](path, spacing)
@@ -186,7 +117,7 @@ def open_image(
 
 
 def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
-    """The grey values (i, j, k) of an image, and what was made of its numbers, for a person.
+    """The grey values (i, j, k) of an image, and the conversion of its numbers in words.
 
     Args:
         image: as `open_image` returns it.
@@ -202,30 +133,68 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
     levels, said = GreyLevels(), []
     if image.voxels.type != np.uint8 or image.scaling != (1.0, 0.0):
         levels = GreyLevels.over(image.voxels.header, image.slices(volume))
-        said = levels.said(8 * image.voxels.type.itemsize)
+        said = levels.described(8 * image.voxels.type.itemsize)
     if image.volumes > 1:
         said.append(f"volume {volume} of {image.volumes}")
     slices = (levels(plane) for plane in image.slices(volume))
     return volume_of_slices(slices, image.shape[2]), tuple(said)
 
 
-def _refuse_several(image: StoredImage) -> None:
+def is_sequence(kinds: str, keys: Iterable[str]) -> bool:
+    """Whether a header is that of a sequence of frames, not of one volume.
+
+    Plus leaves ``Seq_Frame0000_ImageStatus`` in the header of volumes that it has reconstructed, so
+    that a field of a frame alone says nothing.
+
+    Args:
+        kinds: of its axes, as NRRD and Plus write them (``domain domain list``), of which the last
+            one counts: a list that comes first is the layers of a segmentation. They may be empty,
+            and then transforms of frames, or fields of several frames, make a sequence.
+        keys: of the header.
+    """
+    if words := kinds.lower().split():
+        return words[-1] in ("list", "time")
+    frames = [match for match in map(FRAME_KEY.fullmatch, keys) if match]
+    described = {int(match[1]) for match in frames}
+    return len(described) > 1 or any(match[2].endswith("Transform") for match in frames)
+
+
+def _sequence_remedy(path: Path) -> str | None:
+    """Kind and use of a MetaImage or NRRD file of a sequence; None of others."""
+    name = path.name.lower()
+    if name.endswith((".nrrd", ".nhdr")):
+        fields, keys, _ = nrrd_header(path)
+        kinds, sizes = fields.get("kinds", ""), fields.get("sizes", "").split()
+    elif name.endswith((".mha", ".mhd")):
+        keys, _ = metaimage_header(path)
+        kinds, sizes = keys.get("Kinds", ""), keys.get("DimSize", "").split()
+    else:
+        return None
+    if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != "1" and sizes[0] != "0"):
+        return None  # several volumes in time are no sequence of flat images
+    if "0" in sizes:
+        return f"a recording of poses without images; play it with `--path {path.name}`"
+    if not any(match and match[2].endswith("Transform") for match in map(FRAME_KEY.match, keys)):
+        return "a sequence of images without poses; record it again with a tracked probe"
+    return (
+        f"a sequence of tracked frames; make a volume of it with `us-sim reconstruct {path.name} "
+        f"--out volume.nrrd`"
+    )
+
+
+def _placed(path: Path) -> tuple[StoredImage, NDArray[np.float64]]:
+    """The image of a file with one volume, and its placement."""
+    image = open_image(path)
     if image.volumes > 1:
-        path = image.voxels.header
         raise VolumeError(
             f"{path}: holds {image.volumes} volumes; make one of them a file with `us-sim import "
             f"{path.name} --volume 1 --out volume.nrrd`"
         )
+    return image, image.placement()
 
 
 def _dicom_files(path: Path) -> list[Path]:
-    """The DICOM files that a path names; none where it is of another format.
-
-    A file with another format's name is taken for what that says.
-
-    Raises:
-        VolumeError: it is a folder without DICOM files.
-    """
+    """The DICOM files that a path names; none where its name is that of another format."""
     if path.is_dir():
         return dicom_files(path)
     named = path.name.lower().endswith(ENDINGS)

@@ -1,4 +1,4 @@
-"""What the header of a 3D Slicer segmentation (``.seg.nrrd``) says of its segments.
+"""Segments in the header of a 3D Slicer segmentation (``.seg.nrrd``).
 
 Several segments share a layer as long as they do not overlap; in a layer each has a number. Files
 of Slicer before 5 have a layer for each segment, in which it is 1
@@ -29,21 +29,42 @@ class Segment:
     layer: int
     colour: Colour | None  # red, green, blue, 0 to 1
     extent: tuple[int, ...] | None  # first and last index along i, j and k within which it is
-    codes: tuple[str, ...] = ()  # of SNOMED CT: what it is, and which one of several
+    codes: tuple[str, ...] = ()  # of SNOMED CT: the structure, and which one of several
 
 
-def segments_of(pairs: Mapping[str, str]) -> list[Segment]:
-    """The segments that the keys and values of a header tell of, in their order; often none.
+def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
+    """The segments that the keys and values of a header describe, in their order; often none.
 
     Raises:
-        VolumeError: a value of one is none; the sentence does not say of which file.
+        VolumeError: a value of one is none, or they are not stored as voxels in or out.
     """
+    for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
+        said = pairs.get(key, "Binary labelmap")
+        if said.lower() != "binary labelmap":
+            raise VolumeError(
+                f"{path}: holds segments as {shown(said)}; save it with `Binary labelmap` as the "
+                f"source representation"
+            )
     found: dict[int, dict[str, str]] = {}
     for key, value in pairs.items():
         if match := _FIELD.fullmatch(key):
             found.setdefault(int(match[1]), {})[match[2]] = value
     shared = any("LabelValue" in fields for fields in found.values())
-    return [_segment(number, at, found[number], shared) for at, number in enumerate(sorted(found))]
+    segments = []
+    for at, number in enumerate(sorted(found)):
+        fields = found[number]
+        name = "".join(c if c.isprintable() else " " for c in fields.get("Name", "")).strip()
+        segments.append(
+            Segment(
+                name or f"structure {number + 1}",
+                _whole(path, number, fields, "LabelValue", 1, least=1),
+                _whole(path, number, fields, "Layer", 0 if shared else at, least=0),
+                _colour(fields.get("Color", "")),
+                _extent(path, number, fields.get("Extent")),
+                _codes(fields.get("Tags", "")),
+            )
+        )
+    return segments
 
 
 def holds_segments(pairs: Mapping[str, str]) -> bool:
@@ -59,33 +80,6 @@ def no_grey_values(path: Path) -> VolumeError:
     )
 
 
-def check_representation(pairs: Mapping[str, str]) -> None:
-    """Refuse a segmentation that is stored as something else than voxels in or out.
-
-    Raises:
-        VolumeError: it is.
-    """
-    for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
-        said = pairs.get(key, "Binary labelmap")
-        if said.lower() != "binary labelmap":
-            raise VolumeError(
-                f"holds segments as {shown(said)}; save it with `Binary labelmap` as the source "
-                f"representation"
-            )
-
-
-def _segment(number: int, at: int, fields: Mapping[str, str], shared: bool) -> Segment:
-    layer = _whole(number, fields, "Layer", 0 if shared else at, least=0)
-    return Segment(
-        _printable(fields.get("Name", "")) or f"structure {number + 1}",
-        _whole(number, fields, "LabelValue", 1, least=1),
-        layer,
-        _colour(fields.get("Color", "")),
-        _extent(number, fields.get("Extent")),
-        _codes(fields.get("Tags", "")),
-    )
-
-
 def _codes(tags: str) -> tuple[str, ...]:
     """The codes of type and modifier in ``TerminologyEntry:context~category~type~modifier~…``."""
     _, found, entry = tags.partition("TerminologyEntry:")
@@ -93,14 +87,16 @@ def _codes(tags: str) -> tuple[str, ...]:
     return tuple(part[1] for part in parts if part[0] == "SCT" and len(part) > 1)
 
 
-def _whole(number: int, fields: Mapping[str, str], key: str, default: int, least: int) -> int:
+def _whole(
+    path: Path, number: int, fields: Mapping[str, str], key: str, default: int, least: int
+) -> int:
     text = fields.get(key)
     if text is None:
         return default
     if not re.fullmatch(r"\d{1,9}", text) or int(text) < least:
         raise VolumeError(
-            f"its Segment{number}_{key} is {shown(text)} where a whole number from {least} on "
-            f"belongs; save it again"
+            f"{path}: its Segment{number}_{key} is {shown(text)} where a whole number from {least} "
+            f"on belongs; save it again"
         )
     return int(text)
 
@@ -116,17 +112,13 @@ def _colour(text: str) -> Colour | None:
     return red, green, blue
 
 
-def _extent(number: int, text: str | None) -> tuple[int, ...] | None:
+def _extent(path: Path, number: int, text: str | None) -> tuple[int, ...] | None:
     if text is None:
         return None
     words = text.split()
     if len(words) != 6 or not all(re.fullmatch(r"-?\d{1,9}", word) for word in words):
         raise VolumeError(
-            f"its Segment{number}_Extent is {shown(text)} where six whole numbers belong; save it "
-            f"again"
+            f"{path}: its Segment{number}_Extent is {shown(text)} where six whole numbers belong; "
+            f"save it again"
         )
     return tuple(map(int, words))
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text).strip()

@@ -1,21 +1,8 @@
-"""Numbers of an image in a file: how many its header says there are, how they are stored, reading
-them piece by piece.
+"""Images in files: their numbers as a header says that they are stored, read piece by piece.
 
 A header is a stranger's claim: memory is taken only for what can be, and where a file holds less
-or more than its header says it is refused.
-
-An image in a MetaImage, NRRD or NIfTI file: how its numbers are stored, and where they lie.
-
-Numbers of any kind as grey values from 0 to 255, image by image.
-
-Whole numbers of 8 bits are taken as they are. All others are spread, so that the least finite one
-becomes 0 and the greatest 255; what is no number becomes 0, and infinities the end on their side.
-
-Between the order of axes in memory, where the last index is fastest, and in image files.
-
-A volume in memory is (i, j, k), and a file has its slices one after another: (k, j, i). NumPy turns
-one into the other element by element across memory; OpenCV, plane by plane and in blocks that fit
-the cache, takes a tenth of the time.
+or more than its header says it is refused. SimpleITK's readers take the memory that a header asks
+for, and read packed data of any length, so they are not used for reading.
 """
 
 from __future__ import annotations
@@ -58,7 +45,7 @@ class StoredVoxels:
     type: np.dtype[Any]  # of a number, in the file's byte order
     file: Path
     header: Path  # the file with the header, which errors name
-    start: int = 0  # byte of the file at which they, or what is packed, begin
+    start: int = 0  # byte of the file at which they, or the packed bytes, begin
     skip: int = 0  # bytes before them, after unpacking
     encoding: Encoding = "raw"
 
@@ -67,18 +54,8 @@ class StoredVoxels:
         """Bytes that the header says there are."""
         return math.prod(self.size) * self.type.itemsize
 
-    def check(self) -> None:
-        """Compare the bytes with what the header says, packed ones by unpacking them in steps.
-
-        Raises:
-            VolumeError: there are more or fewer, the compression is broken, or an image of that
-                size is not read.
-        """
-        check_claim(self.header, self.size, self.type.itemsize)
-        self.check_bytes()
-
     def check_bytes(self) -> None:
-        """The same for an image of any size.
+        """Compare the bytes with the header, packed ones by unpacking them in steps.
 
         Raises:
             VolumeError: there are more or fewer, or the compression is broken.
@@ -124,7 +101,7 @@ class StoredVoxels:
             with self.file.open("rb") as file:
                 file.seek(self.start)
                 if self.encoding == "text":
-                    yield io.BytesIO(self._said(file))
+                    yield io.BytesIO(self._words(file))
                 elif self.encoding == "bzip2":
                     with bz2.BZ2File(file) as unpacked:
                         yield unpacked
@@ -137,8 +114,7 @@ class StoredVoxels:
                 f"{self.header}: its compression is broken or cut short; copy it again"
             ) from error
 
-    def _said(self, file: BinaryIO) -> bytes:
-        """Numbers that are written as words."""
+    def _words(self, file: BinaryIO) -> bytes:
         most = 32 * math.prod(self.size) + _STEP
         text = file.read(most + 1)
         try:
@@ -146,8 +122,7 @@ class StoredVoxels:
         except ValueError:
             words = np.array([math.nan])
         # Only numbers with a fraction may be something else than finite.
-        whole = self.type.kind != "f"
-        limits = np.iinfo(self.type) if whole else None
+        limits = np.iinfo(self.type) if self.type.kind != "f" else None
         if len(text) > most or (
             limits and not ((words >= limits.min) & (words <= limits.max) & (words % 1 == 0)).all()
         ):
@@ -167,7 +142,7 @@ class StoredVoxels:
 
 
 def _pass(stream: _Stream, count: int) -> int:
-    """Bytes that were passed over: ``count``, or fewer at the end."""
+    """Skip bytes; returns ``count``, or fewer at the end."""
     if isinstance(stream, io.BufferedReader):
         stream.seek(count, io.SEEK_CUR)
         return count
@@ -185,12 +160,7 @@ class _Inflated:
         self._inflate = zlib.decompressobj(_ZLIB_OR_GZIP)
 
     def read(self, count: int, /) -> bytes:
-        """The next ``count`` bytes; fewer at the end.
-
-        Raises:
-            EOFError: the stream breaks off.
-            zlib.error: it is damaged.
-        """
+        """The next ``count`` bytes, fewer at the end; EOFError where the stream breaks off."""
         pieces = []
         while count:
             if self._inflate.eof:  # gzip may come in members
@@ -211,6 +181,11 @@ class _Inflated:
 def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
     """Refuse an image that is larger than `LARGEST_VOLUME` or than the memory that is free.
 
+    Args:
+        path: which errors name.
+        size: numbers along each axis.
+        value: bytes of a number.
+
     Raises:
         VolumeError: it is.
     """
@@ -221,8 +196,7 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
             f"{path}: says it holds {shown} numbers; {LARGEST_VOLUME} are read at most: cut out "
             f"the part that is needed, or resample it"
         )
-    # As they are stored, and as grey values.
-    needed, free = numbers * (value + 1), free_memory()
+    needed, free = numbers * (value + 1), free_memory()  # as they are stored, and as grey values
     if needed > free:
         raise VolumeError(
             f"{path}: says it holds {shown} numbers, which take {needed / 1e9:.1f} GB of memory "
@@ -242,12 +216,12 @@ def free_memory() -> float:
 
 @dataclass(frozen=True)
 class StoredImage:
-    """What a header says."""
+    """An image in a MetaImage, NRRD or NIfTI file, as its header says."""
 
     voxels: StoredVoxels
     components: int  # numbers of a voxel; where there are several they are the first axis
     placement: Callable[[], NDArray[np.float64]]  # (4, 4) m, from indices; raises VolumeError
-    scaling: tuple[float, float] = (1.0, 0.0)  # slope and offset of what the numbers stand for
+    scaling: tuple[float, float] = (1.0, 0.0)  # slope and offset of the stored numbers
     texts: Mapping[str, str] = field(default_factory=dict)  # further keys and values
 
     @property
@@ -267,7 +241,7 @@ class StoredImage:
         return self.axes[3] if len(self.axes) == 4 else 1
 
     def check(self, *, layers: bool = False) -> None:
-        """Refuse what is no volume, or none that can be read.
+        """Refuse an image that is no volume, or none that can be read.
 
         Args:
             layers: a voxel may have several numbers, as segmentations of 3D Slicer have.
@@ -291,7 +265,7 @@ class StoredImage:
         check_claim(path, (*self.shape, self.components), self.voxels.type.itemsize)
 
     def slices(self, volume: int = 1) -> Iterator[NDArray[Any]]:
-        """The slices (j, i) of a volume, or (j, i, component), with what their numbers stand for.
+        """The slices (j, i) of a volume, or (j, i, component), scaled as the header says.
 
         Args:
             volume: which one where there are several.
@@ -313,11 +287,14 @@ class StoredImage:
 
 @dataclass(frozen=True)
 class GreyLevels:
-    """What becomes black and what becomes white."""
+    """The numbers that become black and white; all others are spread between.
+
+    NaN becomes 0, and infinities the end on their side.
+    """
 
     low: float = 0.0
     high: float = 255.0
-    missing: int = 0  # how many are no numbers
+    missing: int = 0  # how many are NaN
     infinite: int = 0  # how many are +Inf or -Inf
 
     @classmethod
@@ -341,7 +318,7 @@ class GreyLevels:
         return cls(low, high, missing, infinite)
 
     def __call__(self, image: NDArray[Any]) -> NDArray[np.uint8]:
-        """An image as grey values."""
+        """An image as grey values; 8-bit ones between 0 and 255 are taken as they are."""
         if image.dtype == np.uint8 and (self.low, self.high) == (0.0, 255.0):
             return np.array(image, dtype=np.uint8)
         # Halves, since the whole range of a float64 image may exceed what float64 can hold.
@@ -350,8 +327,8 @@ class GreyLevels:
         level = np.clip(np.nan_to_num(level, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
         return np.asarray(np.floor(level * 255.0 + 0.5).astype(np.uint8))
 
-    def said(self, bits: int) -> list[str]:
-        """What is made of the numbers, for a person."""
+    def described(self, bits: int) -> list[str]:
+        """The conversion in words, for a person."""
         said = [f"{bits}-bit values spread over 0 to 255"]
         if self.missing:
             said.append(f"{self.missing} values that are no number are black")
@@ -360,11 +337,11 @@ class GreyLevels:
         return said
 
 
-_SLAB = 1 << 23  # bytes that are turned at a time
-
-
 def file_order(voxels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(k, j, i) C-contiguous, of a part (i, j, k) of a volume."""
+    """(k, j, i) C-contiguous, the order of files, of a part (i, j, k) of a volume.
+
+    OpenCV turns a plane in blocks that fit the cache, in a tenth of NumPy's time.
+    """
     made = np.empty(voxels.shape[::-1], np.uint8)
     for j in range(voxels.shape[1]):
         made[:, j, :] = cv2.transpose(voxels[:, j, :])
@@ -376,7 +353,7 @@ def volume_of_slices(
     count: int,
     progress: Callable[[float, str], None] | None = None,
 ) -> NDArray[np.uint8]:
-    """A volume (i, j, k) of ``count`` slices (j, i), of which a few are in memory at a time.
+    """A volume (i, j, k) of slices (j, i), of which a few are in memory at a time.
 
     Args:
         slices: in order; the first is read before memory is taken for all.
@@ -389,7 +366,7 @@ def volume_of_slices(
         if voxels is None:
             voxels = np.empty((*image.shape[::-1], count), np.uint8)
         slab.append(image)
-        if len(slab) * image.size >= _SLAB or k == count:
+        if len(slab) * image.size >= 1 << 23 or k == count:
             stack = np.stack(slab)
             for j in range(stack.shape[1]):
                 voxels[:, j, k - len(slab) : k] = cv2.transpose(stack[:, j, :])

@@ -1,22 +1,15 @@
-"""Voxels into NRRD and MetaImage files as they are, a slab at a time.
+"""Volumes, labels and image sequences into files: NRRD, MetaImage and NIfTI.
 
-SimpleITK would need the whole image a second time, turned to the files' order of axes. A file is
-written beside its place under another name and renamed, so it is whole or absent.
-
-Volumes and labels into files: NRRD, MetaImage and NIfTI, through SimpleITK.
-
-A file is written beside its place under another name and renamed, so it is whole or absent.
-
-Writing images and their times as a sequence file, without poses: a MetaImage as Plus writes it.
+A file is written beside its place under another name and renamed, so it is whole or absent. Grey
+values go into NRRD and MetaImage files a slab at a time: SimpleITK, which writes the others, needs
+the whole image a second time, turned to the files' order of axes.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,155 +18,12 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_image import file_order
+from us_sim.volume.partial_file import partial_file
 from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
-_MILLIMETRES = 1e3  # these formats hold millimetres
-_ORTHONORMAL = 1e-6  # of a direction matrix's columns; the readers' own limit is wider
-_SLAB = 1 << 23  # bytes that are turned at a time
-
-
-def write_plain(
-    path: Path,
-    voxels: NDArray[np.uint8],
-    index_to_patient: NDArray[np.float64],
-    fields: Mapping[str, str],
-) -> None:
-    """Voxels (i, j, k) as .nrrd or .mha, not compressed; a file of that name is replaced.
-
-    Raises:
-        VolumeError: as `us_sim.volume.files.writing.write_volume`.
-    """
-    grid = grid_in_mm(path, voxels.shape, index_to_patient)
-    check_fields(path, fields)
-    header = _nrrd if path.name.lower().endswith(".nrrd") else _metaimage
-    text = header(voxels.shape, *grid, fields)
-    step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
-    with partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
-        file.write(text.encode("utf-8"))
-        for k in range(0, voxels.shape[2], step):
-            file.write(file_order(voxels[:, :, k : k + step]).data)
-
-
-def grid_in_mm(
-    path: Path, shape: tuple[int, ...], index_to_patient: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Spacing (3,) mm, direction (3, 3) and origin (3,) mm of a grid.
-
-    Raises:
-        VolumeError: it has no right angles, or one voxel only along an axis.
-    """
-    matrix = index_to_patient[:3, :3] * _MILLIMETRES
-    spacing = np.linalg.norm(matrix, axis=0)
-    direction = matrix / spacing
-    if np.abs(direction.T @ direction - np.eye(3)).max() > _ORTHONORMAL:
-        raise VolumeError(
-            f"{path}: the volume's axes are not at right angles, which image files cannot hold; "
-            f"resample it on a grid with right angles"
-        )
-    if min(shape) < 2:
-        raise VolumeError(
-            f"{path}: the volume has {' × '.join(map(str, shape))} voxels; two or more along each "
-            f"axis can be written"
-        )
-    return spacing, direction, index_to_patient[:3, 3] * _MILLIMETRES
-
-
-def check_fields(path: Path, fields: Mapping[str, str]) -> None:
-    """Refuse fields that would be read as something else.
-
-    Raises:
-        VolumeError: a field cannot stand in a header.
-    """
-    for key, value in fields.items():
-        if not (key.isprintable() and value.isprintable()) or set(key) & set(":= ") or not key:
-            raise VolumeError(
-                f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
-                f"without blanks, colons and equals signs, and one line of text"
-            )
-
-
-@contextmanager
-def partial_file(path: Path, name: str) -> Iterator[Path]:
-    """The path of a file to write; at the end it takes the place of another.
-
-    Raises:
-        VolumeError: it cannot be written there.
-    """
-    try:
-        folder = tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.parent)
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-    partial = Path(folder, name)
-    try:
-        yield partial
-        os.replace(partial, path)
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
-        os.rmdir(folder)
-
-
-def _nrrd(
-    shape: tuple[int, ...],
-    spacing: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    fields: Mapping[str, str],
-) -> str:
-    """teem.sourceforge.net/nrrd/format.html, with pairs of keys and values behind the fields."""
-    steps = " ".join(f"({_joined(axis, ',')})" for axis in (direction * spacing).T)
-    lines = [
-        "NRRD0004",
-        "type: unsigned char",
-        "dimension: 3",
-        "space: left-posterior-superior",
-        f"sizes: {' '.join(map(str, shape))}",
-        f"space directions: {steps}",
-        "kinds: domain domain domain",
-        "endian: little",
-        "encoding: raw",
-        f"space origin: ({_joined(origin, ',')})",
-        *(f"{key}:={value}" for key, value in fields.items()),
-    ]
-    return "\n".join([*lines, "", ""])
-
-
-def _metaimage(
-    shape: tuple[int, ...],
-    spacing: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    fields: Mapping[str, str],
-) -> str:
-    """itk.org/Wiki/MetaIO/Documentation, with further fields in between."""
-    said = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
-        "TransformMatrix": _joined(direction.T.ravel(), " "),
-        "Offset": _joined(origin, " "),
-        "CenterOfRotation": "0 0 0",
-        "ElementSpacing": _joined(spacing, " "),
-        "DimSize": " ".join(map(str, shape)),
-        **fields,
-        "ElementType": "MET_UCHAR",
-        "ElementDataFile": "LOCAL",
-    }
-    return "".join(f"{key} = {value}\n" for key, value in said.items())
-
-
-def _joined(numbers: NDArray[np.float64], between: str) -> str:
-    """Numbers to their last digit; without -0, which says nothing."""
-    return between.join(f"{number + 0.0:.17g}" for number in numbers)
-
-
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
-_SLAB_VOXELS = 1 << 24  # voxels that are turned at a time
-_FASTEST = 1  # zlib's level; speckle hardly becomes smaller with any other
+_Grid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
 def write_volume(
@@ -194,13 +44,20 @@ def write_volume(
             in a header, or the file cannot be written.
     """
     path = Path(path)
-    if path.name.lower().endswith(".seg.nrrd"):
+    name = path.name.lower()
+    if name.endswith(".seg.nrrd"):
         raise VolumeError(f"{path}: .seg.nrrd is for labels; name the volume .nrrd")
-    fields = dict(header or {})
-    if path.name.lower().endswith((".nrrd", ".mha")):
-        write_plain(path, volume.intensities, volume.index_to_patient, fields)
+    fields, voxels = dict(header or {}), volume.intensities
+    if not name.endswith((".nrrd", ".mha")):
+        _write_by_itk(path, voxels, volume, fields, packed=False)
         return
-    _write(path, _image(path, volume.intensities, volume), fields, packed=False)
+    grid = _grid_in_mm(path, volume)
+    _check_fields(path, fields)
+    head = (_nrrd_header if name.endswith(".nrrd") else _metaimage_header)(volume, *grid, fields)
+    with partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
+        file.write(head.encode("utf-8"))
+        for k, step in _slabs(voxels):
+            file.write(file_order(voxels[:, :, k : k + step]).data)
 
 
 def write_labels(
@@ -225,11 +82,155 @@ def write_labels(
         raise VolumeError(f"{path}: the volume has no labels to write: segment it")
     fields = {}
     if path.name.lower().endswith(".nrrd"):
-        fields = _segments(volume.labels, volume.label_names, dict(colours or {}))
-    _write(path, _image(path, volume.labels, volume), fields, packed=True)
+        fields = _segment_fields(volume.labels, volume.label_names, dict(colours or {}))
+    _write_by_itk(path, volume.labels, volume, fields, packed=True)
 
 
-def _segments(
+def write_image_sequence(
+    path: Path,
+    images: Iterable[NDArray[np.uint8]],
+    shape: tuple[int, int, int],
+    times: Sequence[float],
+    pixel_mm: tuple[float, float] = (1.0, 1.0),
+    header: Mapping[str, str] | None = None,
+) -> None:
+    """Images and their times as a new sequence file, without poses: a MetaImage as Plus writes it.
+
+    Args:
+        path: ends in .mha.
+        images: (rows, columns), in order.
+        shape: number of images, rows, columns.
+        times: s, of each image.
+        pixel_mm: width and height of a pixel.
+        header: further fields of one line each.
+
+    Raises:
+        VolumeError: the name ends otherwise, or the file cannot be written.
+    """
+    if not path.name.lower().endswith(".mha"):
+        raise VolumeError(f"{path}: a sequence of images is written as .igs.mha or .mha")
+    count, rows, columns = shape
+    assert len(times) == count
+    assert all(map(math.isfinite, times))
+    fields = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "DimSize": f"{columns} {rows} {count}",
+        "ElementSpacing": f"{pixel_mm[0]:.9g} {pixel_mm[1]:.9g} 1",
+        "ElementType": "MET_UCHAR",
+        "Kinds": "domain domain list",
+        "UltrasoundImageOrientation": "MFA",
+        "UltrasoundImageType": "BRIGHTNESS",
+        **(header or {}),
+    }
+    for number, time in enumerate(times):
+        fields[f"Seq_Frame{number:04}_ImageStatus"] = "OK"
+        fields[f"Seq_Frame{number:04}_Timestamp"] = f"{time:.9g}"
+    fields["ElementDataFile"] = "LOCAL"
+    with partial_file(path, "image.mha") as partial, partial.open("wb") as file:
+        file.write(_lines(fields).encode("ascii"))
+        for image in images:
+            file.write(np.ascontiguousarray(image).tobytes())
+
+
+def _grid_in_mm(path: Path, volume: Volume) -> _Grid:
+    """Spacing (3,) mm, direction (3, 3) and origin (3,) mm of a volume's grid."""
+    matrix = volume.index_to_patient[:3, :3] * 1e3
+    spacing = np.linalg.norm(matrix, axis=0)
+    direction = matrix / spacing
+    if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-6:  # readers allow more
+        raise VolumeError(
+            f"{path}: the volume's axes are not at right angles, which image files cannot hold; "
+            f"resample it on a grid with right angles"
+        )
+    if min(volume.shape) < 2:
+        raise VolumeError(
+            f"{path}: the volume has {' × '.join(map(str, volume.shape))} voxels; two or more "
+            f"along each axis can be written"
+        )
+    return spacing, direction, volume.index_to_patient[:3, 3] * 1e3
+
+
+def _check_fields(path: Path, fields: Mapping[str, str]) -> None:
+    """Refuse fields that would be read as something else."""
+    for key, value in fields.items():
+        if not (key.isprintable() and value.isprintable()) or set(key) & set(":= ") or not key:
+            raise VolumeError(
+                f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
+                f"without blanks, colons and equals signs, and one line of text"
+            )
+
+
+def _slabs(voxels: NDArray[np.uint8]) -> Iterator[tuple[int, int]]:
+    """First slice and number of slices of parts of 8 MiB."""
+    step = max(1, (1 << 23) // (voxels.shape[0] * voxels.shape[1]))
+    return ((k, step) for k in range(0, voxels.shape[2], step))
+
+
+def _nrrd_header(
+    volume: Volume,
+    spacing: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    fields: Mapping[str, str],
+) -> str:
+    """teem.sourceforge.net/nrrd/format.html, with pairs of keys and values behind the fields."""
+    steps = " ".join(f"({_joined(axis, ',')})" for axis in (direction * spacing).T)
+    lines = [
+        "NRRD0004",
+        "type: unsigned char",
+        "dimension: 3",
+        "space: left-posterior-superior",
+        f"sizes: {' '.join(map(str, volume.shape))}",
+        f"space directions: {steps}",
+        "kinds: domain domain domain",
+        "endian: little",
+        "encoding: raw",
+        f"space origin: ({_joined(origin, ',')})",
+        *(f"{key}:={value}" for key, value in fields.items()),
+    ]
+    return "\n".join([*lines, "", ""])
+
+
+def _metaimage_header(
+    volume: Volume,
+    spacing: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    fields: Mapping[str, str],
+) -> str:
+    """itk.org/Wiki/MetaIO/Documentation, with further fields in between."""
+    said = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
+        "TransformMatrix": _joined(direction.T.ravel(), " "),
+        "Offset": _joined(origin, " "),
+        "CenterOfRotation": "0 0 0",
+        "ElementSpacing": _joined(spacing, " "),
+        "DimSize": " ".join(map(str, volume.shape)),
+        **fields,
+        "ElementType": "MET_UCHAR",
+        "ElementDataFile": "LOCAL",
+    }
+    return _lines(said)
+
+
+def _lines(fields: Mapping[str, str]) -> str:
+    return "".join(f"{key} = {value}\n" for key, value in fields.items())
+
+
+def _joined(numbers: NDArray[np.float64], between: str) -> str:
+    """Numbers to their last digit; without -0, which says nothing."""
+    return between.join(f"{number + 0.0:.17g}" for number in numbers)
+
+
+def _segment_fields(
     labels: NDArray[np.uint8], names: Mapping[int, str], colours: Mapping[int, Colour]
 ) -> dict[str, str]:
     """The fields by which 3D Slicer knows the segments of a label image (i, j, k)."""
@@ -257,101 +258,32 @@ def _segments(
     return fields
 
 
-def _image(path: Path, voxels: NDArray[np.uint8], volume: Volume) -> sitk.Image:
-    """The voxels (i, j, k) where the volume places them; a slab is turned at a time."""
-    spacing, direction, origin = grid_in_mm(path, voxels.shape, volume.index_to_patient)
+def _write_by_itk(
+    path: Path,
+    voxels: NDArray[np.uint8],
+    volume: Volume,
+    fields: Mapping[str, str],
+    *,
+    packed: bool,
+) -> None:
+    """Voxels (i, j, k) where the volume places them."""
+    spacing, direction, origin = _grid_in_mm(path, volume)
+    ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
+    if ending is None:
+        raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
+    _check_fields(path, fields)
     image = sitk.Image(list(voxels.shape), sitk.sitkUInt8)
-    step = max(1, _SLAB_VOXELS // (voxels.shape[0] * voxels.shape[1]))
-    for k in range(0, voxels.shape[2], step):
+    for k, step in _slabs(voxels):
         slab = sitk.GetImageFromArray(file_order(voxels[:, :, k : k + step]))
         image[:, :, k : k + step] = slab
     image.SetSpacing(spacing.tolist())
     image.SetOrigin(origin.tolist())
     image.SetDirection(direction.ravel().tolist())
-    return image
-
-
-def _write(path: Path, image: sitk.Image, fields: Mapping[str, str], *, packed: bool) -> None:
-    ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
-    if ending is None:
-        raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
-    check_fields(path, fields)
     for key, value in fields.items():
         image.SetMetaData(key, value)
     with partial_file(path, f"image{ending}") as partial:
         try:
-            sitk.WriteImage(image, str(partial), packed, _FASTEST)
+            # zlib's fastest level; speckle hardly becomes smaller with any other
+            sitk.WriteImage(image, str(partial), packed, 1)
         except RuntimeError as error:
             raise VolumeError(f"{path}: cannot be written: the disk may be full") from error
-
-
-def write_image_sequence(
-    path: Path,
-    images: Iterator[NDArray[np.uint8]],
-    shape: tuple[int, int, int],
-    times: Sequence[float],
-    pixel_mm: tuple[float, float] = (1.0, 1.0),
-    header: Mapping[str, str] | None = None,
-) -> None:
-    """Images (rows, columns), one after another, into a new file.
-
-    Args:
-        path: ends in .mha.
-        images: in order.
-        shape: number of images, rows, columns.
-        times: s, of each image.
-        pixel_mm: width and height of a pixel.
-        header: further fields of one line each.
-
-    Raises:
-        VolumeError: the name ends otherwise, or the file cannot be written.
-    """
-    if not path.name.lower().endswith(".mha"):
-        raise VolumeError(f"{path}: a sequence of images is written as .igs.mha or .mha")
-    assert len(times) == shape[0]
-    assert all(map(math.isfinite, times))
-    try:
-        number, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.parent)
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-    try:
-        with os.fdopen(number, "wb") as file:
-            file.write(_header(shape, times, pixel_mm, header or {}).encode("ascii"))
-            for image in images:
-                file.write(np.ascontiguousarray(image).tobytes())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)  # as any file; mkstemp's are the owner's alone
-        os.replace(name, path)
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        Path(name).unlink(missing_ok=True)
-
-
-def _header(
-    shape: tuple[int, int, int],
-    times: Sequence[float],
-    pixel_mm: tuple[float, float],
-    more: Mapping[str, str],
-) -> str:
-    count, rows, columns = shape
-    fields = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
-        "DimSize": f"{columns} {rows} {count}",
-        "ElementSpacing": f"{pixel_mm[0]:.9g} {pixel_mm[1]:.9g} 1",
-        "ElementType": "MET_UCHAR",
-        "Kinds": "domain domain list",
-        "UltrasoundImageOrientation": "MFA",
-        "UltrasoundImageType": "BRIGHTNESS",
-        **more,
-    }
-    for number, time in enumerate(times):
-        fields[f"Seq_Frame{number:04}_ImageStatus"] = "OK"
-        fields[f"Seq_Frame{number:04}_Timestamp"] = f"{time:.9g}"
-    fields["ElementDataFile"] = "LOCAL"
-    return "".join(f"{key} = {value}\n" for key, value in fields.items())

@@ -1,16 +1,4 @@
-"""Volumes in the user's cache folder, memory-mapped by all processes that use them.
-
->>> import os, tempfile
->>> from us_sim.volume.phantom.phantom import kept_volume
->>> from us_sim.volume.phantom.phantom import upper_arm
->>> with tempfile.TemporaryDirectory() as os.environ["US_SIM_CACHE"]:
-...     made = kept_volume("arm", lambda: upper_arm(seed=1, voxel_size=3e-3))
-...     kept = kept_volume("arm", lambda: 1 / 0)
-...     bool((made.labels == kept.labels).all())
-True
->>> del os.environ["US_SIM_CACHE"]
-
-Procedural phantoms: labelled ultrasound volumes made from a seed, and cached.
+"""Procedural phantoms: labelled ultrasound volumes made from a seed, and cached.
 
 >>> from us_sim.volume.phantom.phantom import upper_arm
 >>> arm = upper_arm(seed=1, voxel_size=2e-3)
@@ -34,43 +22,6 @@ from us_sim.settings.registry import PHANTOMS
 from us_sim.volume.settings import SEED, VOXEL_SIZE
 from us_sim.volume.volume import Volume
 
-__all__ = ["cache_folder", "kept_volume"]
-
-
-def kept_volume(
-    key: str, make: Callable[[], Volume], waiting: Callable[[], None] | None = None
-) -> Volume:
-    """The labelled volume cached under a key, made first if it is not there.
-
-    Args:
-        key: a file name that contains everything on which the volume's bytes depend.
-        make: makes the volume; called by one process at a time.
-        waiting: called every half second while another process makes it.
-    """
-    return kept(key, _FORM, make, waiting)
-
-
-def _pack(volume: Volume) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    assert volume.labels is not None  # phantoms are labelled
-    arrays: dict[str, NDArray] = {"intensities": volume.intensities, "labels": volume.labels}
-    return arrays, {
-        "index_to_patient": volume.index_to_patient.tolist(),
-        "label_names": volume.label_names,
-    }
-
-
-def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> Volume:
-    return Volume(
-        arrays["intensities"],
-        np.array(facts["index_to_patient"]),
-        arrays["labels"],
-        {int(label): name for label, name in facts["label_names"].items()},
-    )
-
-
-_FORM = Form("volume.json", _pack, _unpack)
-
-
 Progress = Callable[[float, str], None]
 
 _GENERATOR = 2
@@ -89,7 +40,7 @@ def upper_arm(
     Args:
         seed: not negative.
         voxel_size: m, 0.2 mm (1.1 GB while it is made) to 5 mm.
-        progress: told the fraction done and what is being done.
+        progress: told the fraction done and the work in progress.
 
     Raises:
         VolumeError: the seed or the voxel size is out of range.
@@ -103,7 +54,7 @@ def upper_arm(
             quantity.parse(value)
         except ValueError as error:
             raise VolumeError(f"the {name} of a phantom: {error}") from error
-    report = progress or _silent
+    report = progress or (lambda *_: None)
     shape = np.ceil(np.diff(UPPER_ARM_BLOCK, axis=0)[0] / voxel_size - 1e-6).astype(int)
     lower = UPPER_ARM_BLOCK.mean(axis=0) - shape / 2 * voxel_size
     lower[2] = UPPER_ARM_BLOCK[0, 2]
@@ -133,10 +84,11 @@ def upper_arm(
     envelope = echo_envelope(diffuse, specular, voxel_size, z, spread, random)
     del diffuse, specular
     report(0.95, "compressing")
-    envelope = np.ascontiguousarray(envelope[inside])
+    placement = np.diag([voxel_size, voxel_size, voxel_size, 1.0])
+    placement[:3, 3] = lower + 0.5 * voxel_size
     volume = Volume(
-        log_compress(envelope),
-        _placement(lower + 0.5 * voxel_size, voxel_size),
+        log_compress(np.ascontiguousarray(envelope[inside])),
+        placement,
         labels[inside],
         {number: name for name, number in UPPER_ARM_LABELS.items()},
     )
@@ -156,19 +108,19 @@ def cached_phantom(
         name: one of PHANTOMS.
         seed: see the phantom.
         voxel_size: m.
-        progress: told the fraction done and what is being done; not called where the phantom is
+        progress: told the fraction done and the work in progress; not called where the phantom is
             in the cache already.
 
     Raises:
         VolumeError: there is no such phantom, or the seed or voxel size is out of its range.
     """
     make: Callable[[int, float, Progress | None], Volume] = PHANTOMS.load(name)
-    key = _key(name, seed, voxel_size)
 
     def waiting() -> None:
         if progress is not None:
             progress(0.0, "waiting for another process that makes it")
 
+    key = _key(name, seed, voxel_size)
     return kept_volume(key, lambda: make(seed, voxel_size, progress), waiting)
 
 
@@ -177,17 +129,37 @@ def is_phantom_kept(name: str, seed: int, voxel_size: float) -> bool:
     return (cache_folder() / _key(name, seed, voxel_size)).is_dir()
 
 
+def kept_volume(
+    key: str, make: Callable[[], Volume], waiting: Callable[[], None] | None = None
+) -> Volume:
+    """The labelled volume cached under a key, made first if it is not there.
+
+    Args:
+        key: a file name that contains everything on which the volume's bytes depend.
+        make: makes the volume; called by one process at a time.
+        waiting: called every half second while another process makes it.
+    """
+    return kept(key, Form("volume.json", _pack, _unpack), make, waiting)
+
+
 def _key(name: str, seed: int, voxel_size: float) -> str:
-    """A file name that says all that decides the phantom's bytes."""
+    """A file name of all that decides the phantom's bytes."""
     decided_by = f"{name} {_GENERATOR} {int(seed)} {float(voxel_size)!r}"
     return f"{name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:16]}"
 
 
-def _silent(fraction: float, text: str) -> None:
-    del fraction, text
+def _pack(volume: Volume) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    assert volume.labels is not None  # phantoms are labelled
+    return {"intensities": volume.intensities, "labels": volume.labels}, {
+        "index_to_patient": volume.index_to_patient.tolist(),
+        "label_names": volume.label_names,
+    }
 
 
-def _placement(first: NDArray[np.float64], voxel_size: float) -> NDArray[np.float64]:
-    placement = np.diag([voxel_size, voxel_size, voxel_size, 1.0])
-    placement[:3, 3] = first
-    return placement
+def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> Volume:
+    return Volume(
+        arrays["intensities"],
+        np.array(facts["index_to_patient"]),
+        arrays["labels"],
+        {int(label): name for label, name in facts["label_names"].items()},
+    )

@@ -1,18 +1,11 @@
-"""An elliptical tube along y that swings gently: a vessel, a nerve or the shaft of a bone.
-
-Random textures of tissue: smooth noise, and the thin sheets where it is zero.
-
-The noise is fixed by its seed and its lengths alone, so the same tissue comes out of every voxel
-size.
-
-The anatomy of a virtual upper arm: its structures, and how they scatter.
+"""The anatomy of a virtual upper arm: its structures, their textures, and how they scatter.
 
 A block of the inner side of the arm, the skin at z = 0, vessels and humerus along y. Proportions
-follow what ultrasound shows at mid-arm: the brachial artery between a vein and the median nerve,
-in a sheath under the fascia, biceps above and brachialis below, the humerus to one side.
+follow ultrasound images of the mid-arm: the brachial artery between a vein and the median nerve, in
+a sheath under the fascia, biceps above and brachialis below, the humerus to one side.
 
-What depends on where the probe is has no place in it: loss, shadows, the borders of structures and
-the noise of a scanner, see `us_sim.slicing.acoustics`. Sheets of connective tissue within fat and
+Effects of the probe's place have no part in it: loss, shadows, the borders of structures and the
+noise of a scanner, see `us_sim.slicing.acoustics`. Sheets of connective tissue within fat and
 muscle lie along the skin for the most part, so those that do are the stronger ones.
 """
 
@@ -63,14 +56,15 @@ class Tube:
 
 
 _SPLINE_VARIANCE = 151.0 / 315.0
-"""The mean over a cell of the sum of squared cubic B-spline weights: the variance that
-interpolation leaves along an axis."""
+"""The variance that interpolation leaves along an axis: the mean over a cell of the sum of squared
+cubic B-spline weights."""
 
 
 class SmoothNoise:
     """Stationary noise of mean 0 and variance 1, twice continuously differentiable.
 
-    A tensor product cubic B-spline with normally distributed coefficients.
+    A tensor product cubic B-spline with normally distributed coefficients, which its seed and its
+    lengths alone decide, so the same tissue comes out of every voxel size.
 
     Args:
         random: source of the coefficients.
@@ -144,15 +138,7 @@ UPPER_ARM_BLOCK = np.array([[-36e-3, -30e-3, 0.0], [36e-3, 30e-3, 54e-3]])
 _MARGIN = np.array([[-5e-3], [5e-3]])
 """Texture continues this far beyond the block, m: echoes at its edges come from there too."""
 
-UPPER_ARM_LABELS = {
-    "skin": 1,
-    "fat": 2,
-    "muscle": 3,
-    "bone": 4,
-    "artery": 5,
-    "vein": 6,
-    "nerve": 7,
-}
+UPPER_ARM_LABELS = {"skin": 1, "fat": 2, "muscle": 3, "bone": 4, "artery": 5, "vein": 6, "nerve": 7}
 
 _SIDE_LOBES = -27.0  # dB
 _BLOOD = -60.0  # dB, all but free of echoes
@@ -311,7 +297,6 @@ class UpperArm:
             section.diffuse[squares_x[:, None] + squares_z < 1.0] = _echo(-48.0)
 
     def _bone(self, section: ArmSection) -> None:
-        """Add the humerus, which scatters little."""
         x, y, z = section.x, section.y, section.depth
         distance = self.humerus.distance(x, y, z)
         distance -= 0.35e-3 * self._cloud.plane(x, y, z)  # no shaft is an ellipse

@@ -1,7 +1,7 @@
 """Where the image lies on the probe, from a file: Plus' configuration, or `us-sim calibrate probe`.
 
 Plus' XML may hold several transforms (``<Transform From="Image" To="Probe" Matrix=.../>``, mm),
-and which part of an image is tissue (``<VolumeReconstruction ClipRectangleOrigin=... />``).
+and the part of an image that is tissue (``<VolumeReconstruction ClipRectangleOrigin=... />``).
 """
 
 from __future__ import annotations
@@ -19,19 +19,10 @@ from us_sim.settings.text_files import YamlError, load_yaml, read_bytes
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.transforms import frame_matrix, in_metres
 
-_PART = {
-    "ClipRectangleOrigin": 2,
-    "ClipRectangleSize": 2,
-    "FanOriginPixel": 2,
-    "FanAnglesDeg": 2,
-    "FanRadiusStartPixel": 1,
-    "FanRadiusStopPixel": 1,
-}
-
 
 @dataclass(frozen=True, eq=False)
 class SweepCalibration:
-    """What a calibration file says of a sweep."""
+    """The calibration of a sweep."""
 
     transforms: Mapping[str, NDArray[np.float64]]  # (4, 4) m (pixels of images), by name
     part: ImagePart  # of an image that is tissue
@@ -41,7 +32,7 @@ def read_calibration(path: Path, probe: str) -> SweepCalibration:
     """The fixed transforms of a sweep.
 
     Args:
-        path: a configuration of Plus (.xml), or what `us-sim calibrate probe` wrote (.yaml).
+        path: a configuration of Plus (.xml), or a result of `us-sim calibrate probe` (.yaml).
         probe: the frame of the tracked body that the image lies on, for the latter, which does
             not say its name.
 
@@ -81,17 +72,14 @@ def _plus(path: Path, data: bytes) -> SweepCalibration:
             f"{path}: holds no <Transform From=... To=... Matrix=...>; give a configuration of "
             f"Plus with the image's calibration"
         )
-    try:
-        return SweepCalibration(transforms, _part(path, root.find(".//VolumeReconstruction")))
-    except UsSimError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise VolumeError(f"{path}: VolumeReconstruction: {error}") from error
+    return SweepCalibration(transforms, _part(path, root.find(".//VolumeReconstruction")))
 
 
 def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
     said: dict[str, list[float]] = {}
-    for key, count in _PART.items():
+    counts = {"ClipRectangleOrigin": 2, "ClipRectangleSize": 2, "FanOriginPixel": 2}
+    counts |= {"FanAnglesDeg": 2, "FanRadiusStartPixel": 1, "FanRadiusStopPixel": 1}
+    for key, count in counts.items():
         text = None if element is None else element.get(key)
         if text is None:
             continue
@@ -114,7 +102,10 @@ def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
         given["fan_origin"] = said.get("FanOriginPixel", [0.0, 0.0])
         start, stop = said.get("FanRadiusStartPixel", [0.0]), said.get("FanRadiusStopPixel", [1e5])
         given["fan_radius"] = [*start, *stop]
-    return ImagePart(**given)  # type: ignore[arg-type]
+    try:
+        return ImagePart(**given)  # type: ignore[arg-type]
+    except UsSimError as error:
+        raise VolumeError(f"{path}: VolumeReconstruction: {error}") from error
 
 
 def _image_to_body(path: Path, data: bytes) -> NDArray[np.float64]:
@@ -126,10 +117,9 @@ def _image_to_body(path: Path, data: bytes) -> NDArray[np.float64]:
     rows = document.get("image_to_body") if isinstance(document, dict) else None
     try:
         text = " ".join(str(float(number)) for row in rows or () for number in row)
-        matrix = frame_matrix({"image_to_body": text}, "image_to_body")
+        return frame_matrix({"image_to_body": text}, "image_to_body")
     except (TypeError, ValueError) as error:
         raise VolumeError(
             f"{path}: holds no image_to_body, a 4 × 4 matrix from pixels to metres on the tracked "
             f"body, as `us-sim calibrate probe` writes it"
         ) from error
-    return matrix

@@ -1,12 +1,9 @@
-"""The grid of voxels that a sweep's images are inserted into.
-
-Which pixels of an image are tissue: those in a rectangle, in a fan, or in both.
-"""
+"""The grid of voxels that a sweep's images are inserted into, and the pixels that are inserted."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,13 +100,26 @@ def axes_of_smallest_box(
         points: (N, 3) m.
         image_to_reference: (K, 4, 4) m, of the images.
     """
-    boxes = [np.eye(3), _mean_rotation(image_to_reference), _principal_axes(points)]
+    steps = image_to_reference[:, :3, :2]
+    steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    across, down = steps.mean(axis=0).T
+    left, _, right = np.linalg.svd(np.column_stack([across, down, np.cross(across, down)]))
+    _, _, principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    boxes = [np.eye(3), left @ right, principal.T]
     sizes = [float(np.prod(np.maximum(np.ptp(points @ box, axis=0), 1e-6))) for box in boxes]
-    return _like_the_frames(boxes[int(np.argmin(sizes))])
+    axes = boxes[int(np.argmin(sizes))]
+    # The same axes in the order and directions that turn the frame's least, right-handed.
+    orders = [
+        axes[:, order] * (1.0 - 2.0 * np.array(signs))
+        for order in itertools.permutations(range(3))
+        for signs in np.ndindex(2, 2, 2)
+    ]
+    right_handed = [ordered for ordered in orders if np.linalg.det(ordered) > 0]
+    return np.ascontiguousarray(max(right_handed, key=lambda each: float(np.trace(each))))
 
 
-def check_memory(needed: float, what: str) -> None:
-    """Refuse what takes more than the free memory.
+def check_memory(needed: float, purpose: str) -> None:
+    """Refuse a purpose that takes more bytes than the free memory has.
 
     Raises:
         VolumeError: it does.
@@ -117,40 +127,9 @@ def check_memory(needed: float, what: str) -> None:
     free = free_memory()
     if needed > free:
         raise VolumeError(
-            f"{what} takes {needed / 1e9:.2f} GB of memory where {free / 1e9:.2f} GB are free: "
+            f"{purpose} takes {needed / 1e9:.2f} GB of memory where {free / 1e9:.2f} GB are free: "
             f"give a larger --spacing, or end other programs"
         )
-
-
-def _mean_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation nearest to the mean of the images' axes."""
-    steps = matrices[:, :3, :2] / np.linalg.norm(matrices[:, :3, :2], axis=1, keepdims=True)
-    across, down = steps.mean(axis=0).T
-    axes = np.column_stack([across, down, np.cross(across, down)])
-    left, _, right = np.linalg.svd(axes)
-    return np.asarray(left @ right, dtype=np.float64)
-
-
-def _principal_axes(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    return np.asarray(axes.T, dtype=np.float64)
-
-
-def _like_the_frames(axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same axes in the order and directions that turn the frame's least, right-handed."""
-    turned = max(_orders(axes), key=lambda ordered: float(np.trace(ordered)))
-    return np.ascontiguousarray(turned)
-
-
-def _orders(axes: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    orders: Iterable[tuple[int, int, int]] = (
-        (0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)
-    )  # fmt: skip
-    for order in orders:
-        for signs in np.ndindex(2, 2, 2):
-            ordered = axes[:, order] * (1.0 - 2.0 * np.array(signs))
-            if np.linalg.det(ordered) > 0:
-                yield ordered
 
 
 def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
@@ -158,7 +137,7 @@ def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
 
     A rectangle holds the pixels whose centres lie in it or on its border. A fan holds those that
     lie a pixel along the row or more inside its beams and its outer radius, since those on the
-    border mix tissue with what is beside it. Both are as Plus has them.
+    border mix tissue with its surroundings. Both are as Plus has them.
 
     Raises:
         VolumeError: no pixel is.
@@ -183,7 +162,7 @@ def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
 
 
 def outline(part: ImagePart, used: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(N, 4) column, row, 0, 1 of what is around the used pixels (rows, columns).
+    """(N, 4) column, row, 0, 1 of points around the used pixels (rows, columns).
 
     The corners of the rectangle where there is one, else the first and last pixel of every row.
     """

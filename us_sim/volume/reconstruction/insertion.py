@@ -1,15 +1,13 @@
-"""Inserting images into voxels: every pixel goes to the nearest voxel, or to the eight around it.
+"""Inserting images into voxels, and filling the holes between the voxels that were hit.
 
-Pixels are distributed onto voxels (pixel-based methods in Solberg et al., Freehand 3D ultrasound
-reconstruction algorithms - a review, Ultrasound in Medicine and Biology 33, 2007), one image
-after the other, so that a volume grows while a probe is still moving.
+Pixels are distributed onto voxels, the nearest or the eight around each (pixel-based methods in
+Solberg et al., Freehand 3D ultrasound reconstruction algorithms - a review, Ultrasound in Medicine
+and Biology 33, 2007), one image after the other, so that a volume grows while a probe is moving.
 
-Filling voxels that no pixel hit, between voxels that some did, up to a distance.
-
-A voxel is filled from two that were hit, on both sides of it along one of 13 directions: the
-nearest such pair, linearly by distance (as the sticks of Plus; Vaughan et al., Hole filling with
-oriented sticks in ultrasound volume reconstruction, Journal of Medical Imaging 2, 2015). So
-nothing grows out of what was scanned.
+A voxel that no pixel hit is filled from two that were, on both sides of it along one of 13
+directions: the nearest such pair, linearly by distance (as the sticks of Plus; Vaughan et al., Hole
+filling with oriented sticks in ultrasound volume reconstruction, Journal of Medical Imaging 2,
+2015). So nothing grows beyond the scanned part.
 """
 
 from __future__ import annotations
@@ -22,15 +20,13 @@ from numpy.typing import NDArray
 from us_sim.kernels import njit
 from us_sim.volume.reconstruction.grid import Grid, check_memory
 
-VOXEL_BYTES = 10
-"""Of memory a voxel while images are inserted: what it gathers, its grey value and coverage."""
+VOXEL_BYTES = 10  # of memory a voxel while images are inserted: sum, weight, grey, coverage
 
 _MODES = {"mean": 0, "max": 1, "latest": 2, "plus_mean": 3}
 _MEAN, _MAX, _LATEST, _PLUS_MEAN, _COUNT, _COLLECT = range(6)
 _LEAST_WEIGHT = 0.125
 """Of a voxel that takes a pixel whole: the weight of all eight around a pixel in their middle."""
-_TILE = 32
-"""Pixels along a side."""
+_TILE = 32  # pixels along a side
 _PLUS_PLACES = 2.0**14
 """Of a voxel; its fixed-point numbers have 14 bits behind the point (IGSIO, fixed.h)."""
 _PLUS_ONE, _PLUS_FULL, _PLUS_MOST = 256.0, 65279.0, 65535.0
@@ -83,17 +79,8 @@ class Insertion:
         if self._mode == _MEAN and not self._linear:
             _add_nearest(image, used, step, shape, self._gathered)
             return
-        _insert_image(
-            image,
-            used,
-            step,
-            shape,
-            self._linear,
-            self._mode,
-            self._gathered,
-            _NO_CURSOR,
-            _NO_VALUES,
-        )
+        places = self._linear, self._mode, self._gathered, _NO_CURSOR, _NO_VALUES
+        _insert_image(image, used, step, shape, *places)
 
     def insert_points(self, values: NDArray[np.uint8], points: NDArray[np.float64]) -> None:
         """Insert pixels wherever they lie.
@@ -104,16 +91,9 @@ class Insertion:
         """
         to_index = self.grid.reference_to_index
         placed = points @ to_index[:3, :3].T + to_index[:3, 3]
-        _insert_points(
-            values,
-            np.ascontiguousarray(placed),
-            np.array(self.grid.shape, dtype=np.int64),
-            self._linear,
-            self._mode,
-            self._gathered,
-            _NO_CURSOR,
-            _NO_VALUES,
-        )
+        shape = np.array(self.grid.shape, dtype=np.int64)
+        places = self._linear, self._mode, self._gathered, _NO_CURSOR, _NO_VALUES
+        _insert_points(values, np.ascontiguousarray(placed), shape, *places)
 
     def clear(self) -> None:
         """Forget every image."""
@@ -121,7 +101,6 @@ class Insertion:
 
     def result(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Grey values (i, j, k), 0 where no pixel came, and where some did."""
-        # What stays zero takes no time and no memory.
         grey = np.zeros(self.grid.voxels, dtype=np.uint8)
         covered = np.zeros(self.grid.voxels, dtype=np.bool_)
         _finish(self._gathered, self._mode == _MEAN, grey, covered)
@@ -185,17 +164,9 @@ class Collection:
         used: NDArray[np.bool_],
         mode: int,
     ) -> None:
-        _insert_image(
-            image,
-            used,
-            _step(self.grid, image_to_reference),
-            self._shape,
-            self._linear,
-            mode,
-            self._counts,
-            self._cursor,
-            self._values,
-        )
+        step = _step(self.grid, image_to_reference)
+        places = self._linear, mode, self._counts, self._cursor, self._values
+        _insert_image(image, used, step, self._shape, *places)
 
 
 _NO_CURSOR = np.zeros(1, dtype=np.int64)

@@ -1,17 +1,9 @@
-"""A volume from a tracked sweep: its grid, its images inserted, its holes filled.
-
-How well a reconstruction predicts images that it has not seen.
-
-The honest test of the whole chain of calibration, tracking and compounding: frames that are left
-out are cut from the volume of the others and compared with what the probe saw there.
-
-A volume that grows while a probe scans: images inserted at poses, in a box that is fixed.
-"""
+"""Volumes from tracked images: of a whole sweep, and live while a probe scans."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,18 +25,20 @@ from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
 Progress = Callable[[float, str], None]
-"""Is told the fraction done, and what is being done."""
+"""Is told the fraction done, and the work in progress."""
 
 Rest = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Takes the index of a frame and points (N, 3) m of it; where these lie while nothing presses."""
 
-_HOLES = 2.0  # voxels, where nobody says
+APART = 8
+"""Frames from one that is left out to the next: the seven between are enough to predict it."""
+
 _FILLING = 0.9  # fraction done when holes are filled
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is inserted where."""
+    """The images of a sweep and the grid that they are inserted into."""
 
     sweep: Sweep
     grid: Grid
@@ -54,9 +48,16 @@ class Plan:
 
     @property
     def hole_radius(self) -> float:
-        """m."""
+        """m; two voxels where nobody says."""
         asked = self.compounding.hole_radius
-        return _HOLES * self.grid.spacing if asked is None else asked
+        return 2.0 * self.grid.spacing if asked is None else asked
+
+    def points(self, k: int) -> NDArray[np.float64]:
+        """(N, 3) m of a frame's used pixels, at rest where that is known."""
+        rows, columns = np.nonzero(self.used)
+        matrix = self.sweep.image_to_reference[k]
+        points = columns[:, None] * matrix[:3, 0] + rows[:, None] * matrix[:3, 1] + matrix[:3, 3]
+        return points if self.rest is None else self.rest(k, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +93,7 @@ def plan(
     """
     part = part or ImagePart()
     used = image_mask(part, sweep.columns, sweep.rows)
-    around = outline(part, used)
-    points = np.einsum("kij,nj->kni", sweep.image_to_reference, around)[..., :3]
+    points = np.einsum("kij,nj->kni", sweep.image_to_reference, outline(part, used))[..., :3]
     if rest is not None:
         points = np.stack([rest(k, frame) for k, frame in enumerate(points)])
     points = points.reshape(-1, 3)
@@ -114,7 +114,7 @@ def reconstruct(
     """The volume of a sweep's images.
 
     Args:
-        planned: what is inserted where.
+        planned: the sweep and its grid.
         which: indices of the frames that are inserted, ascending; all without it.
         progress: is told how far it is.
 
@@ -122,11 +122,17 @@ def reconstruct(
         VolumeError: the images are damaged, the free memory does not hold the volume, or nothing
             of them lies in the grid.
     """
-    sweep, settings = planned.sweep, planned.compounding
+    sweep, settings, used = planned.sweep, planned.compounding, planned.used
     frames = list(range(len(sweep.numbers)) if which is None else which)
     tell = progress or (lambda *_: None)
+    inserted: Insertion | Collection
     if settings.compounding == "median":
-        grey, covered = _medians(planned, frames, tell)
+        if planned.rest is not None:
+            raise VolumeError("compounding by the median cannot undo the pressure: use mean or max")
+        inserted = Collection(planned.grid, method=settings.method)
+        for k in frames:
+            inserted.count(sweep.image_to_reference[k], used)
+        inserted.reserve()
     else:
         inserted = Insertion(
             planned.grid,
@@ -134,53 +140,22 @@ def reconstruct(
             compounding=settings.compounding,
             plus_rounding=settings.plus_rounding,
         )
-        for done, (k, image) in enumerate(zip(frames, sweep.images(frames), strict=True)):
-            tell(_FILLING * done / len(frames), "inserting images")
-            if planned.rest is None:
-                inserted.insert(image, sweep.image_to_reference[k], planned.used)
-            else:
-                points = planned.rest(k, _places(planned, k))
-                inserted.insert_points(image[planned.used], points)
-        grey, covered = inserted.result()
-        del inserted
+    for done, (k, image) in enumerate(zip(frames, sweep.images(frames), strict=True)):
+        tell(_FILLING * done / len(frames), "inserting images")
+        if planned.rest is None or isinstance(inserted, Collection):
+            inserted.insert(image, sweep.image_to_reference[k], used)
+        else:
+            inserted.insert_points(image[used], planned.points(k))
+    grey, covered = inserted.result()
+    del inserted
     hit = int(np.count_nonzero(covered))
     if not hit:
         raise VolumeError(f"{sweep.path}: no pixel of its images lies in the grid")
     tell(_FILLING, "filling holes")
     filled = fill_holes(grey, covered, planned.hole_radius / planned.grid.spacing)
     tell(1.0, "")
-    return Reconstruction(
-        Volume(grey, planned.grid.index_to_reference), covered, len(frames), hit, filled
-    )
-
-
-def _places(planned: Plan, k: int) -> NDArray[np.float64]:
-    """(N, 3) m of a frame's used pixels."""
-    rows, columns = np.nonzero(planned.used)
-    matrix = planned.sweep.image_to_reference[k]
-    return columns[:, None] * matrix[:3, 0] + rows[:, None] * matrix[:3, 1] + matrix[:3, 3]
-
-
-def _medians(
-    planned: Plan, frames: Iterable[int], tell: Progress
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    frames = list(frames)
-    sweep, used = planned.sweep, planned.used
-    if planned.rest is not None:
-        raise VolumeError("compounding by the median cannot undo the pressure: use mean or max")
-    pixels = Collection(planned.grid, method=planned.compounding.method)
-    for k in frames:
-        pixels.count(sweep.image_to_reference[k], used)
-    pixels.reserve()
-    for done, (k, image) in enumerate(zip(frames, sweep.images(frames), strict=True)):
-        tell(_FILLING * done / len(frames), "inserting images")
-        pixels.insert(image, sweep.image_to_reference[k], used)
-    return pixels.result()
-
-
-APART = 8
-"""Frames from one that is left out to the next: the seven between are enough to predict it."""
-_LEAST = 100  # pixels for a correlation
+    volume = Volume(grey, planned.grid.index_to_reference)
+    return Reconstruction(volume, covered, len(frames), hit, filled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,39 +178,39 @@ class Prediction:
 
 
 def leave_one_out(planned: Plan, count: int, progress: Progress | None = None) -> Prediction:
-    """Predict some frames of a sweep from all others.
+    """Predict some frames of a sweep from all others: cut them from the volume of the others.
 
-    The frames are spread over the sweep, with seven others between two of them or more, so that
-    each is predicted as if it alone were left out; one reconstruction does for all of them.
+    This tests the whole chain of calibration, tracking and compounding. The frames are spread over
+    the sweep, with seven others between two of them or more, so that each is predicted as if it
+    alone were left out; one reconstruction does for all of them.
 
     Args:
-        planned: what is inserted where.
+        planned: the sweep and its grid.
         count: how many frames, fewer where the sweep is short.
         progress: is told how far it is.
 
     Raises:
         VolumeError: the sweep has fewer than three frames, or the others predict nothing of those.
     """
-    total = len(planned.sweep.numbers)
+    sweep = planned.sweep
+    total = len(sweep.numbers)
     if total < 3:
-        raise VolumeError(
-            f"{planned.sweep.path}: has {total} usable frames; leaving one out needs 3 or more"
-        )
+        raise VolumeError(f"{sweep.path}: has {total} usable frames; leaving one out needs 3")
     count = max(1, min(count, total // APART))
     chosen = np.unique(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1])
     others = np.setdiff1d(np.arange(total), chosen)
     made = reconstruct(planned, [int(k) for k in others], progress)
     correlations, covered = [], []
-    for k, image in zip(chosen, planned.sweep.images(chosen.tolist()), strict=True):
+    for k, image in zip(chosen, sweep.images(chosen.tolist()), strict=True):
         seen, predicted, fraction = _pair(planned, made, int(k), image)
         covered.append(fraction)
-        correlations.append(correlation(seen, predicted) if len(seen) >= _LEAST else math.nan)
+        correlations.append(correlation(seen, predicted) if len(seen) >= 100 else math.nan)
     if np.isnan(correlations).all():
         raise VolumeError(
-            f"{planned.sweep.path}: the other frames predict nothing of the {len(chosen)} left "
-            f"out: the frames are too far apart; give a larger --hole-radius or --spacing"
+            f"{sweep.path}: the other frames predict nothing of the {len(chosen)} left out: the "
+            f"frames are too far apart; give a larger --hole-radius or --spacing"
         )
-    return Prediction(planned.sweep.numbers[chosen], np.array(correlations), np.array(covered))
+    return Prediction(sweep.numbers[chosen], np.array(correlations), np.array(covered))
 
 
 def correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
@@ -249,13 +224,8 @@ def _pair(
     planned: Plan, made: Reconstruction, k: int, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """The used pixels of a frame whose eight voxels are covered, their prediction, and how many."""
-    rows, columns = np.nonzero(planned.used)
-    matrix = planned.sweep.image_to_reference[k]
-    points = columns[:, None] * matrix[:3, 0] + rows[:, None] * matrix[:3, 1] + matrix[:3, 3]
-    if planned.rest is not None:
-        points = planned.rest(k, points)
     to_index = planned.grid.reference_to_index
-    index = (points @ to_index[:3, :3].T + to_index[:3, 3]).T
+    index = (planned.points(k) @ to_index[:3, :3].T + to_index[:3, 3]).T
     size = np.array(planned.grid.shape)[:, None]
     inside = (np.isfinite(index) & (index >= -0.5) & (index < size - 0.5)).all(axis=0)
     index = np.where(inside, index, 0.0)
@@ -265,12 +235,11 @@ def _pair(
     predicted = ndimage.map_coordinates(
         made.volume.intensities, index[:, used], np.float64, order=1, mode="nearest"
     )
-    seen = image[rows[used], columns[used]].astype(np.float64)
-    return seen, predicted, float(used.mean())
+    return image[planned.used][used].astype(np.float64), predicted, float(used.mean())
 
 
 class LiveReconstruction:
-    """Inserts one image after the other.
+    """A volume that grows while a probe scans: images inserted at poses, in a box that is fixed.
 
     Args:
         box: where, and how.
@@ -281,10 +250,8 @@ class LiveReconstruction:
 
     def __init__(self, box: LiveBox) -> None:
         self.box = box
-        corners = np.array([box.lower, box.upper])
-        self._insertion = Insertion(
-            grid_around(corners, box.spacing), method=box.method, compounding=box.compounding
-        )
+        grid = grid_around(np.array([box.lower, box.upper]), box.spacing)
+        self._insertion = Insertion(grid, method=box.method, compounding=box.compounding)
         self._used = np.ones((0, 0), dtype=np.bool_)
         self.frames = 0
 
@@ -307,10 +274,10 @@ class LiveReconstruction:
         self.frames = 0
 
     def volume(self) -> Volume:
-        """What has been inserted so far, its holes filled.
+        """The volume of all images so far, its holes filled.
 
         Raises:
-            VolumeError: nothing has, within the box.
+            VolumeError: no pixel lies within the box.
         """
         grey, covered = self._insertion.result()
         if not covered.any():

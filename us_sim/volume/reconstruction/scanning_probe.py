@@ -1,8 +1,7 @@
-"""The shape of what a probe scans, found in its images: the fan or the rectangle that is not black.
+"""The probe that made a sweep and where it was, as the sweep's images show them.
 
-Only what its edges prove is said: a shape that does not fit them well is none.
-
-The probe that made a sweep and where it was, as far as the sweep's images tell.
+The scanned part of the images is the fan or the rectangle that is not black. A shape that does not
+fit its edges well is none.
 """
 
 from __future__ import annotations
@@ -27,19 +26,16 @@ from us_sim.settings.registry import PROBES
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
-_LOOKED_AT = 32  # frames
 _OFTEN = 0.7
-"""Of these frames, in how many a pixel is not black where it was scanned: lossy compression spills
+"""Of some frames, in how many a pixel is not black where it was scanned: lossy compression spills
 a few grey levels beyond the border, other ones in every frame."""
-_OVERLAP = 0.95  # intersection over union of what was seen with the shape
-_OFF = 0.01  # of the depth, that edges may be off, and this many pixels more
-_OFF_PIXELS = 1.5
-_COUNTED = 80.0  # percent of an edge's points that may not be farther off
+_OVERLAP = 0.95  # intersection over union of the seen pixels with the shape
+_COUNTED = 80.0  # percent of an edge's points that may not be farther off than is allowed
 _LEAST_POINTS = 16  # of an edge
-_LEAST_SIDE = 0.25  # of the height, that is not cut off by the image's border
-_SMALL = np.ones((3, 3))  # pixels of specks and threads
 _CORNER = 0.1  # of the opening angle, beside which a fan's top is its side rather than its face
 _NARROW = math.radians(4.0)  # opening angle below which it is no fan
+_POSES = 33
+_POINT = 5e-3  # m: beams from a smaller arc are a phased array's, which all leave one place
 
 
 @dataclass(frozen=True)
@@ -76,14 +72,52 @@ class Rectangle:
         return np.asarray(held)
 
 
+@dataclass(frozen=True)
+class ScanningProbe:
+    """The probe of a sweep, and its places."""
+
+    probe: ProbeSettings | None  # None where nothing says which it was
+    poses: tuple[Placement, ...]  # in the sweep's reference frame, evenly along its path
+
+
+def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> ScanningProbe:
+    """The probe of a sweep, and where its face was.
+
+    It is the fan that the part names, or the shape that fits the images, or a linear array as wide
+    as the rectangle that the part names. Where there is none of these, the middle of the pixels
+    that are not black at the images' top is taken for the middle of its face.
+
+    Args:
+        sweep: with poses.
+        part: of the images.
+        used: (rows, columns) the pixels of that part.
+
+    Raises:
+        VolumeError: the images are damaged.
+    """
+    matrices = sweep.image_to_reference
+    steps = np.linalg.norm(matrices[:, :3, :2], axis=1)
+    across, down = np.moveaxis(matrices[:, :3, :2] / steps[:, None, :], -1, 0)
+    pixel = np.median(steps, axis=0)
+    seen = seen_pixels(sweep)
+    shape: Fan | Rectangle | None = None
+    if np.abs((across * down).sum(axis=1)).max() <= 0.05:  # more than a calibration is inexact
+        shape = _named_fan(part, used, pixel) or fitted_part(seen, pixel, used)
+    if shape is not None:
+        return ScanningProbe(_probe(shape), _poses(matrices, shape, pixel))
+    has_clip = part.clip is not None
+    box = _box_around(used if has_clip or not (seen & used).any() else seen & used, pixel)
+    return ScanningProbe(_probe(box) if has_clip else None, _poses(matrices, box, pixel))
+
+
 def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
-    """(rows, columns) whether a pixel is not black in most of some frames all over a sweep.
+    """(rows, columns) whether a pixel is not black in most of 32 frames all over a sweep.
 
     Raises:
         VolumeError: the images are damaged.
     """
     count = len(sweep.numbers)
-    picked = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int))
+    picked = np.unique(np.linspace(0, count - 1, min(count, 32)).round().astype(int))
     often = np.zeros((sweep.rows, sweep.columns), dtype=np.int32)
     for image in sweep.images(picked.tolist()):
         often += image > 0
@@ -121,13 +155,23 @@ def fitted_part(
     return best
 
 
-def box_around(seen: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
-    """The smallest rectangle of pixels around the largest part of those seen (rows, columns).
+def _named_fan(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Fan | None:
+    if part.fan_origin is None or part.fan_radius is None or part.fan_angles is None:
+        return None
+    if abs(pixel[0] / pixel[1] - 1.0) > 0.1:  # an arc in pixels is none in metres
+        return None
+    rows, columns = np.nonzero(used)
+    farthest = np.hypot(columns - part.fan_origin[0], rows - part.fan_origin[1]).max()
+    begins, ends = part.fan_radius
+    if ends > farthest + 2.0:  # pixels; `image_mask` leaves out the border
+        ends = float(farthest)
+    x, z = (float(place) for place in np.array(part.fan_origin) * pixel)
+    side = float(pixel.mean())
+    return Fan((x, z), (begins * side, ends * side), part.fan_angles)
 
-    Args:
-        seen: some of them.
-        pixel: as in `fitted_part`.
-    """
+
+def _box_around(seen: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
+    """The smallest rectangle of pixels around the largest part of those seen (rows, columns)."""
     body = _body(seen)
     rows, columns = np.nonzero(seen if body is None else body)
     x, z = (
@@ -139,8 +183,8 @@ def box_around(seen: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle
 
 def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     """The largest connected part, without its holes; letters and scales beside it are others."""
-    around = np.pad(seen, 1)
-    smooth = binary_opening(binary_fill_holes(binary_closing(around, _SMALL)), _SMALL)
+    around, small = np.pad(seen, 1), np.ones((3, 3))
+    smooth = binary_opening(binary_fill_holes(binary_closing(around, small)), small)
     parts, count = connected_parts(smooth[1:-1, 1:-1])
     if not count:
         return None
@@ -148,7 +192,10 @@ def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
 
 
 class _Edges:
-    """Points (N, 2) m, x and z, on the border of a part; those that the image cuts are left out."""
+    """Points (N, 2) m, x and z, on the left, right, upper and lower border of a part.
+
+    Of the ``free`` ones those that the image cuts are left out.
+    """
 
     def __init__(
         self, body: NDArray[np.bool_], within: NDArray[np.bool_], pixel: NDArray[np.float64]
@@ -162,36 +209,25 @@ class _Edges:
         bottom = body.shape[0] - 1 - body[::-1, columns].argmax(axis=0)
         self.pixel = pixel
         self.height = len(rows) * float(pixel[1])
-        self.all = [
-            _placed(first - 0.5, rows, pixel),
-            _placed(last + 0.5, rows, pixel),
-            _placed(columns, top - 0.5, pixel),
-            _placed(columns, bottom + 0.5, pixel),
-        ]
+        places = (
+            (first - 0.5, rows), (last + 0.5, rows), (columns, top - 0.5), (columns, bottom + 0.5)
+        )  # fmt: skip
+        self.all = [np.column_stack(place) * pixel for place in places]
         left = around[rows + 1, first] & (np.arange(len(rows)) <= np.argmin(first))
         right = around[rows + 1, last + 2] & (np.arange(len(rows)) <= np.argmax(last))
-        over = around[top, columns + 1]
-        under = around[bottom + 2, columns + 1]
-        free = (left, right, over, under)
+        free = (left, right, around[top, columns + 1], around[bottom + 2, columns + 1])
         self.free = [points[kept] for points, kept in zip(self.all, free, strict=True)]
 
-
-def _placed(
-    columns: NDArray[np.generic], rows: NDArray[np.generic], pixel: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return np.asarray(np.column_stack([columns, rows]) * pixel)
-
-
-def _allowed(edges: _Edges, depth: float) -> float:
-    """m, by which most points of an edge may be off at most."""
-    return _OFF * depth + _OFF_PIXELS * float(edges.pixel.max())
+    def allowed(self, depth: float) -> float:
+        """m, by which most points of an edge may be off."""
+        return 0.01 * depth + 1.5 * float(self.pixel.max())
 
 
 def _rectangle(edges: _Edges) -> Rectangle | None:
     places = [float(np.median(edges.all[k][:, k // 2])) for k in range(4)]
     left, right, top, bottom = places
     off = [np.percentile(np.abs(edges.all[k][:, k // 2] - places[k]), _COUNTED) for k in range(4)]
-    if max(off) > _allowed(edges, bottom - top):
+    if max(off) > edges.allowed(bottom - top):
         return None
     return Rectangle((left, right), (top, bottom))
 
@@ -212,7 +248,6 @@ def _fan(edges: _Edges) -> Fan | None:
     if min(len(left), len(right)) < _LEAST_POINTS:
         return None
     begins, ends = (float(np.median(np.hypot(*(each - apex).T))) for each in (over, under))
-    start = [*apex, *lines[1:], begins, ends]
 
     def off(shape: NDArray[np.float64] | list[float]) -> list[NDArray[np.float64]]:
         x, z, first, last, begins, ends = shape
@@ -225,17 +260,16 @@ def _fan(edges: _Edges) -> Fan | None:
 
     fitted = least_squares(
         lambda shape: np.concatenate(off(shape)),
-        start,
+        [*apex, *lines[1:], begins, ends],
         loss="soft_l1",
         f_scale=float(edges.pixel.max()),
         x_scale=[1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3],
     )
     x, z, first, last, begins, ends = map(float, fitted.x)
-    depth = ends - begins
     if not (0.0 <= begins < ends and last - first > _NARROW):
         return None
     worst = [np.percentile(np.abs(each), _COUNTED) for each in off(fitted.x) if len(each)]
-    if max(worst) > _allowed(edges, depth):
+    if max(worst) > edges.allowed(ends - begins):
         return None
     return Fan((x, z), (begins, ends), (first, last))
 
@@ -254,96 +288,29 @@ def _on_fan(
 
 def _lines(edges: _Edges) -> tuple[NDArray[np.float64], float, float] | None:
     """A fan's apex (2,) m and the angles of its sides, at first."""
-    least = _LEAST_SIDE * edges.height
+    fits = []
     for side in edges.free[:2]:
-        if len(side) < _LEAST_POINTS or np.ptp(side[:, 1]) < least:
+        if len(side) < _LEAST_POINTS or np.ptp(side[:, 1]) < 0.25 * edges.height:
             return None
-    (slope, base), (other, further) = (
-        theilslopes(side[:: 1 + len(side) // 200, 0], side[:: 1 + len(side) // 200, 1])[:2]
-        for side in edges.free[:2]
-    )
+        some = side[:: 1 + len(side) // 200]
+        fits.append(theilslopes(some[:, 0], some[:, 1])[:2])
+    (slope, base), (other, further) = fits
     if math.atan(other) - math.atan(slope) < _NARROW:
         return None
     z = (base - further) / (other - slope)
     return np.array([slope * z + base, z]), math.atan(slope), math.atan(other)
 
 
-_POSES = 33
-_SKEWED = 0.05  # cosine between columns and rows, more than a calibration is inexact
-_UNLIKE = 0.1  # of the two sides of pixels, beyond which an arc in pixels is none in metres
-_BORDER = 2.0  # pixels of a fan, which `image_mask` leaves out
-_POINT = 5e-3  # m: beams from a smaller arc are a phased array's, which all leave one place
-_PHASED = 0.02  # m, the aperture of usual phased arrays, which their images do not show
-_WIDEST = 0.08  # m, of a linear array: a wider rectangle is something else
-
-
-@dataclass(frozen=True)
-class ScanningProbe:
-    """What scanned, and where."""
-
-    probe: ProbeSettings | None  # None where nothing says which it was
-    poses: tuple[Placement, ...]  # in the sweep's reference frame, evenly along its path
-
-
-def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> ScanningProbe:
-    """The probe of a sweep, and where its face was.
-
-    It is the fan that the part names, or what the images prove, or a linear array as wide as the
-    rectangle that the part names. Where there is none of these, the middle of what is not black at
-    the images' top is taken for the middle of its face.
-
-    Args:
-        sweep: with poses.
-        part: of the images.
-        used: (rows, columns) the pixels of that part.
-
-    Raises:
-        VolumeError: the images are damaged.
-    """
-    matrices = sweep.image_to_reference
-    steps = np.linalg.norm(matrices[:, :3, :2], axis=1)
-    across, down = np.moveaxis(matrices[:, :3, :2] / steps[:, None, :], -1, 0)
-    pixel = np.median(steps, axis=0)
-    seen = seen_pixels(sweep)
-    shape: Fan | Rectangle | None = None
-    if np.abs((across * down).sum(axis=1)).max() <= _SKEWED:
-        shape = _given(part, used, pixel) or fitted_part(seen, pixel, used)
-    if shape is not None:
-        return ScanningProbe(_probe(shape), _poses(matrices, shape, pixel))
-    box = box_around(
-        used if part.clip is not None or not (seen & used).any() else seen & used, pixel
-    )
-    return ScanningProbe(
-        _probe(box) if part.clip is not None else None, _poses(matrices, box, pixel)
-    )
-
-
-def _given(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Fan | None:
-    """The fan that a person or a calibration names."""
-    if part.fan_origin is None or part.fan_radius is None or part.fan_angles is None:
-        return None
-    if abs(pixel[0] / pixel[1] - 1.0) > _UNLIKE:
-        return None
-    rows, columns = np.nonzero(used)
-    farthest = np.hypot(columns - part.fan_origin[0], rows - part.fan_origin[1]).max()
-    begins, ends = part.fan_radius
-    if ends > farthest + _BORDER:
-        ends = float(farthest)
-    x, z = (float(place) for place in np.array(part.fan_origin) * pixel)
-    side = float(pixel.mean())
-    return Fan((x, z), (begins * side, ends * side), part.fan_angles)
-
-
 def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
-    """None where there is no such probe."""
     if isinstance(shape, Rectangle):
         kind, depth = "linear", shape.z[1] - shape.z[0]
         values = {"aperture": round(shape.x[1] - shape.x[0], 5)}
-        if values["aperture"] > _WIDEST:
+        if values["aperture"] > 0.08:  # m: a wider rectangle is something else
             return None
     elif shape.radius[0] < _POINT:
         kind, depth = "sector", shape.radius[1]
-        values = {"aperture": _PHASED, "opening_angle": round(shape.opening_angle, 5)}
+        # Images do not show the aperture, m; this is that of usual phased arrays.
+        values = {"aperture": 0.02, "opening_angle": round(shape.opening_angle, 5)}
     else:
         kind, depth = "convex", shape.radius[1] - shape.radius[0]
         values = {"radius": round(shape.radius[0], 5)}
@@ -360,24 +327,20 @@ def _poses(
     matrices: NDArray[np.float64], shape: Fan | Rectangle, pixel: NDArray[np.float64]
 ) -> tuple[Placement, ...]:
     """Of the middle of the probe's face at some frames, as far apart along the sweep as can be."""
-    face, ahead, depth = _beam(shape)
+    if isinstance(shape, Rectangle):
+        face, ahead = np.array([0.5 * (shape.x[0] + shape.x[1]), shape.z[0]]), np.array([0.0, 1.0])
+        depth = shape.z[1] - shape.z[0]
+    else:
+        angle = 0.5 * (shape.angles[0] + shape.angles[1])
+        ahead = np.array([math.sin(angle), math.cos(angle)])
+        begins = shape.radius[0] if shape.radius[0] >= _POINT else 0.0
+        face, depth = shape.apex + begins * ahead, shape.radius[1] - begins
     middle = np.array([*((face + 0.5 * depth * ahead) / pixel), 0.0, 1.0])
     seen = (matrices @ middle)[:, :3]
     moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
     evenly = np.linspace(0.0, moved[-1], _POSES)
     picked = np.unique(np.abs(moved[:, None] - evenly).argmin(axis=0))
     return tuple(_pose(matrices[k], face / pixel, ahead) for k in picked)
-
-
-def _beam(shape: Fan | Rectangle) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """The middle beam in the image: its start (2,) m, its direction (2,), its length."""
-    if isinstance(shape, Rectangle):
-        start = np.array([0.5 * (shape.x[0] + shape.x[1]), shape.z[0]])
-        return start, np.array([0.0, 1.0]), shape.z[1] - shape.z[0]
-    angle = 0.5 * (shape.angles[0] + shape.angles[1])
-    ahead = np.array([math.sin(angle), math.cos(angle)])
-    begins = shape.radius[0] if shape.radius[0] >= _POINT else 0.0
-    return shape.apex + begins * ahead, ahead, shape.radius[1] - begins
 
 
 def _pose(

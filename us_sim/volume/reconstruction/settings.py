@@ -1,7 +1,4 @@
-"""The settings of a freehand reconstruction.
-
-What can be set of a volume that grows while a probe scans.
-"""
+"""Settings of freehand reconstructions: of a sweep, and live while a probe scans."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ METHODS = ("nearest", "linear")
 """How a pixel is inserted: into the nearest voxel, or into the eight around it by their weights."""
 
 COMPOUNDINGS = ("mean", "median", "max", "latest", "plus_mean")
-"""What becomes of several pixels in one voxel; ``plus_mean`` is Plus' running mean, which is made
+"""Combinations of several pixels in one voxel; ``plus_mean`` is Plus' running mean, which is made
 a whole number after every pixel and so comes out 2 grey levels darker."""
 
 _PIXEL = Quantity("image distance", -1e5, 1e5)
@@ -92,7 +89,8 @@ LIVE_COMPOUNDINGS = ("mean", "max", "latest")
 """Those that need no image twice."""
 
 _PLACE = Quantity("length", -100.0, 100.0)
-_VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
+VOLUME_ENDINGS = (".nrrd", ".mha", ".nii", ".nii.gz")
+"""Of the names of files that volumes are written to."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +144,8 @@ class LiveVolume(Settings):
 
     def check(self) -> None:
         """Refuse a file that could not be written at the end."""
-        if not self.file.lower().endswith(_VOLUMES):
-            raise self.refused("file", f"{self.file}: must end in {', '.join(_VOLUMES)}")
+        if not self.file.lower().endswith(VOLUME_ENDINGS):
+            raise self.refused("file", f"{self.file}: must end in {', '.join(VOLUME_ENDINGS)}")
 
     @property
     def image_to_probe(self) -> NDArray[np.float64]:

@@ -1,9 +1,9 @@
 """A proposal for vessels in an ultrasound volume: dark tubes within brighter tissue.
 
-Blood hardly echoes. So does a shadow, what lies behind air or bone, and depth that no beam reaches:
-a place is proposed only if it is darker than what surrounds it on all sides, and hangs together
-with a place that looks like a tube. What surrounds a place is taken from a closing of the grey
-values by a ball that no vessel can hold; tubes are found by `tubeness`.
+Blood hardly echoes, and neither do shadows, air, bone, and depth that no beam reaches: a place is
+proposed only if it is darker than its surroundings on all sides, and hangs together with a place
+that looks like a tube. The surroundings of a place are taken from a closing of the grey values by a
+ball that no vessel can hold; tubes are found by `tubeness`.
 """
 
 from __future__ import annotations
@@ -32,25 +32,15 @@ from us_sim.volume.segmentation.region import (
 _DIAMETER = Quantity("length", 5e-4, 0.05)
 _PART = Quantity("number", 0.0, 1.0)
 
-_VOXELS_ACROSS = 3.0
-"""Voxels across the thinnest vessel on the grid that is worked on."""
-
-_LOCAL = 8e-3  # m, within which a place without data gets its neighbours' grey
-_TUBE_PERCENTILE = 98.0
-"""Of the tissue's response to the search for tubes, what counts as one."""
-
+_VOXELS_ACROSS = 3.0  # the thinnest vessel on the grid that is worked on
+_TUBE_PERCENTILE = 98.0  # of the tissue's response to the search for tubes, from which on one is
 _LEAST_LENGTH = 15.0
 """Diameters of the thinnest vessel whose length is proposed; of a thicker one it may be shorter."""
-
 _BRIGHT, _FAINTEST = 90.0, 0.65
 """A percentile of the levels around places that is tissue for certain, and how much fainter other
 tissue may be."""
-
 _LEAST_TUBE = 0.15
 """Fraction of a vessel that is dark and like a tube; of a shadow it is a few percent."""
-
-_COARSE = 2
-"""The closing is made on a grid so many times coarser: a ball of many voxels takes long."""
 
 
 @dataclass(frozen=True)
@@ -90,16 +80,7 @@ class DarkVessels(Settings):
         found = self._search(grey, data, region.spacing * factor, region.progress)
         if (factor == 1).all():
             return found
-        # A coarse voxel's centre lies amid the fine ones that it is the mean of.
-        fine = ndimage.affine_transform(
-            found.astype(np.float32),
-            np.diag(1.0 / factor),
-            -(factor - 1.0) / (2.0 * factor),
-            output_shape=region.grey.shape,
-            order=1,
-            mode="nearest",
-        )
-        return np.asarray(fine > 0.5)
+        return _grown(found.astype(np.float32), factor, region.grey.shape) > 0.5
 
     def _search(
         self,
@@ -116,29 +97,23 @@ class DarkVessels(Settings):
         tissue = ball_eroded(data, self.margin, spacing) & (around > _least_of_tissue(around[data]))
         if not tissue.any():
             return tissue
-        # A closing keeps the peaks of speckle, so tissue itself is fainter than what is around.
+        # A closing keeps the peaks of speckle, so tissue itself is fainter than its surroundings.
         contrast = 1.0 - relative / np.median(relative[tissue])
         tubes = tubeness(
             image_of(np.log(level + 0.05), spacing),
             tube_scales(self.thinnest, self.thickest / 1.4),
             bright=False,
-            progress=lambda done, what: progress(0.35 + 0.45 * done, what),
+            progress=lambda done, part: progress(0.35 + 0.45 * done, part),
         )
         progress(0.8, "parts")
         edge = ball_opened(tissue & (contrast > self.edge_contrast), self.thinnest / 3.0, spacing)
         clear = edge & (contrast > self.contrast)
         clear &= tubes > np.percentile(tubes[tissue], _TUBE_PERCENTILE)
-        found = _mostly(edge, clear, _LEAST_TUBE)
+        parts, count = ndimage.label(edge, np.ones((3, 3, 3)))
+        fraction = ndimage.mean(clear, parts, np.arange(count + 1))
+        fraction[0] = 0.0
         least = _LEAST_LENGTH * np.pi / 4.0 * self.thinnest**3
-        return parts_at_least(found, least / float(np.prod(spacing)))
-
-
-def _mostly(mask: NDArray[np.bool_], wanted: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
-    """The parts of which at least that fraction is wanted."""
-    parts, count = ndimage.label(mask, np.ones((3, 3, 3)))
-    fraction = ndimage.mean(wanted, parts, np.arange(count + 1))
-    fraction[0] = 0.0
-    return np.asarray((fraction >= least)[parts])
+        return parts_at_least((fraction >= _LEAST_TUBE)[parts], least / float(np.prod(spacing)))
 
 
 def _shrunk(grey: NDArray[np.float32], factor: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -149,6 +124,18 @@ def _shrunk(grey: NDArray[np.float32], factor: NDArray[np.int64]) -> NDArray[np.
     missing = [(0, int(-size % by)) for size, by in zip(grey.shape, factor, strict=True)]
     image = image_of(np.pad(grey, missing, mode="edge"), np.ones(3))
     return array_of(sitk.BinShrink(image, factor.tolist())).astype(np.float32)
+
+
+def _grown(
+    coarse: NDArray[np.float32], factor: NDArray[np.int64], shape: tuple[int, ...]
+) -> NDArray[np.float32]:
+    """Shrunk values on the fine grid; a coarse centre lies amid the voxels of its block."""
+    offset = -(factor - 1.0) / (2.0 * factor)
+    return np.asarray(
+        ndimage.affine_transform(
+            coarse, np.diag(1.0 / factor), offset, output_shape=shape, order=1, mode="nearest"
+        )
+    )
 
 
 def _filled(
@@ -172,31 +159,23 @@ def _filled(
         mean = np.float32(level[data].mean())
         return np.asarray(np.where(below > 1e-3, above / np.maximum(below, 1e-3), mean))
 
-    return np.where(data, smooth(smoothing), smooth(_LOCAL)).astype(np.float32)
+    # A place without data gets the grey of its neighbours within 8 mm.
+    return np.where(data, smooth(smoothing), smooth(8e-3)).astype(np.float32)
 
 
 def _closed(
     level: NDArray[np.float32], radius: float, spacing: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """A closing by a ball of that radius (m), made on a coarser grid and brought back."""
-    factor = np.array([_COARSE] * 3)
+    """A closing by a ball of that radius (m); half as fine, since a large ball takes long."""
+    factor = np.array([2, 2, 2])
     coarse = image_of(_shrunk(level, factor), spacing * factor)
     reach = np.maximum(1, np.rint(radius / (spacing * factor))).astype(int)
-    ball = sitk.GrayscaleMorphologicalClosing(coarse, reach.tolist(), sitk.sitkBall)
-    return np.asarray(
-        ndimage.affine_transform(
-            array_of(ball).astype(np.float32),
-            np.diag(1.0 / factor),
-            -(factor - 1.0) / (2.0 * factor),
-            output_shape=level.shape,
-            order=1,
-            mode="nearest",
-        )
-    )
+    closed = sitk.GrayscaleMorphologicalClosing(coarse, reach.tolist(), sitk.sitkBall)
+    return _grown(array_of(closed).astype(np.float32), factor, level.shape)
 
 
 def _least_of_tissue(levels: NDArray[np.float32]) -> float:
-    """The level that parts tissue from what has no echoes (N. Otsu, 1979).
+    """The level that parts tissue from places without echoes (N. Otsu, 1979).
 
     Where there is nothing but tissue that would part it in two, so it is never near its own level.
     """

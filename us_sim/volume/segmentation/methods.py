@@ -1,17 +1,4 @@
-"""Structures by their grey values: thresholds, seeded growing, and growing by confidence.
-
-Structures up to the strongest edge between their seeds and others: the watershed from markers.
-
-S. Beucher and F. Meyer, "The morphological approach to segmentation: the watershed transformation",
-1993; ITK's MorphologicalWatershedFromMarkers.
-
-Tubes by the Hessian of grey values at several scales.
-
-A. Frangi and others, "Multiscale vessel enhancement filtering", MICCAI 1998, as ITK's
-ObjectnessMeasure has it (L. Antiga, Insight Journal 2007).
-
-Where a volume has data at all: the body against air, and what no beam has reached.
-"""
+"""Methods that find a structure: thresholds, growing, watershed, tubes, and the scanned part."""
 
 from __future__ import annotations
 
@@ -37,6 +24,8 @@ from us_sim.volume.segmentation.region import (
 )
 
 _GREY = Quantity("number", 0.0, 255.0)
+_DIAMETER = Quantity("length", 2e-4, 0.05)
+_INSIDE, _OUTSIDE = 1, 2
 
 
 @dataclass(frozen=True)
@@ -60,7 +49,7 @@ class Threshold(Settings):
 
 @dataclass(frozen=True)
 class SeededGrowing(Threshold):
-    """What hangs together with a seed through grey values in a range (ITK's ConnectedThreshold)."""
+    """The part connected with a seed through grey values in a range (ITK's ConnectedThreshold)."""
 
     def found_in(self, region: Region) -> NDArray[np.bool_]:
         """(i, j, k) where the structure is.
@@ -83,7 +72,7 @@ class SeededGrowing(Threshold):
 
 @dataclass(frozen=True)
 class ConfidenceConnected(Settings):
-    """Growing into what is like what was grown: mean and deviation, several times over.
+    """Growing into voxels like the grown ones by mean and deviation, several times over.
 
     It is ITK's ConfidenceConnected: the first mean is that around the seeds.
     """
@@ -111,21 +100,21 @@ class ConfidenceConnected(Settings):
         return array_of(grown).astype(bool)
 
 
-_LENGTH = Quantity("length", 0.0, 0.05)
-_INSIDE, _OUTSIDE = 1, 2
-
-
 @dataclass(frozen=True)
 class Watershed(Settings):
     """From the seeds up to the strongest edge before what is outside.
 
     Outside are `outside_mm`, the seeds of other structures, and the border of what is looked at.
+    S. Beucher and F. Meyer, "The morphological approach to segmentation: the watershed
+    transformation", 1993; ITK's MorphologicalWatershedFromMarkers.
     """
 
     error = VolumeError
 
     marker: float = setting(
-        _LENGTH, "radius of a ball around each seed that is in it", default=1e-3
+        Quantity("length", 0.0, 0.05),
+        "radius of a ball around each seed that is in it",
+        default=1e-3,
     )
     edge: float = setting(
         Quantity("length", 1e-4, 0.02), "width of the edges that are looked for", default=1e-3
@@ -152,10 +141,9 @@ class Watershed(Settings):
             for axis in range(3):
                 face = np.moveaxis(markers, axis, 0)
                 face[0] = face[-1] = _OUTSIDE
-        for seed in region.outside:
-            self._mark(markers, region, seed, _OUTSIDE)
-        for seed in region.seeds:
-            self._mark(markers, region, seed, _INSIDE)
+        for mark, seeds in ((_OUTSIDE, region.outside), (_INSIDE, region.seeds)):
+            for seed in seeds:
+                self._mark(markers, region, seed, mark)
         edges = sitk.GradientMagnitudeRecursiveGaussian(region.image, self.edge * 1e3)
         flooded = sitk.MorphologicalWatershedFromMarkers(
             edges, image_of(markers, region.spacing), markWatershedLine=False
@@ -163,23 +151,13 @@ class Watershed(Settings):
         return array_of(flooded) == _INSIDE
 
     def _mark(self, markers: NDArray[np.uint8], region: Region, seed: Index, mark: int) -> None:
-        """Put a ball around a seed into markers."""
         reach = np.floor(self.marker / region.spacing).astype(int)
         first = np.maximum(np.array(seed) - reach, 0)
         last = np.minimum(np.array(seed) + reach + 1, markers.shape)
         box = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
-        grid = np.meshgrid(*[np.arange(s.start, s.stop) for s in box], indexing="ij")
-        away = np.stack(grid, axis=-1) - np.array(seed)
+        away = np.moveaxis(np.asarray(np.mgrid[box]), 0, -1) - np.array(seed)
         near = np.linalg.norm(away * region.spacing, axis=-1) <= self.marker
         markers[box][near] = mark
-
-
-_DIAMETER = Quantity("length", 2e-4, 0.05)
-_STEP = 1.0
-"""Standard deviations between voxels of the grid on which the Hessian is taken."""
-
-_STRONG = 99.5
-"""Percentile of the tubes' response that counts as 1: the strongest few are stray echoes."""
 
 
 @dataclass(frozen=True)
@@ -202,16 +180,13 @@ class Vesselness(Settings):
 
     def found_in(self, region: Region) -> NDArray[np.bool_]:
         """(i, j, k) where the structure is."""
-        response = tubeness(
-            region.image,
-            tube_scales(self.thinnest, self.thickest),
-            bright=self.bright,
-            progress=region.progress,
-        )
+        scales = tube_scales(self.thinnest, self.thickest)
+        response = tubeness(region.image, scales, bright=self.bright, progress=region.progress)
         there = response[response > 0]
         if not there.size:
             return np.zeros(response.shape, bool)
-        return np.asarray(response > self.least * np.percentile(there, _STRONG))
+        # The strongest few are stray echoes.
+        return np.asarray(response > self.least * np.percentile(there, 99.5))
 
 
 def tube_scales(thinnest: float, thickest: float) -> NDArray[np.float64]:
@@ -230,14 +205,18 @@ def tubeness(
     bright: bool,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> NDArray[np.float32]:
-    """(i, j, k) how much a tube the surroundings of each voxel are, the most of all scales (m)."""
+    """(i, j, k) how much a tube the surroundings of each voxel are, the most of all scales (m).
+
+    A. Frangi and others, "Multiscale vessel enhancement filtering", MICCAI 1998, as ITK's
+    ObjectnessMeasure has it (L. Antiga, Insight Journal 2007): by the Hessian of grey values.
+    """
     most = np.zeros(image.GetSize(), np.float32)
     for done, scale in enumerate(scales):
         sigma = float(scale * 1e3)
         progress(done / len(scales), f"tubes {sigma * np.sqrt(8.0):.1f} mm wide")
         smooth = sitk.SmoothingRecursiveGaussian(sitk.Cast(image, sitk.sitkFloat32), sigma)
-        # What is smooth is as well known on a coarser grid, on which it takes a fraction.
-        steps = [max(1, int(sigma / side / _STEP)) for side in image.GetSpacing()]
+        # A smooth image is as well known on a grid of its standard deviation, in less time.
+        steps = [max(1, int(sigma / side)) for side in image.GetSpacing()]
         found = sitk.ObjectnessMeasure(
             sitk.Shrink(smooth, steps),
             alpha=0.5,
@@ -258,7 +237,7 @@ class Covered(Settings):
 
     error = VolumeError
 
-    lower: float = setting(Quantity("number", 0.0, 255.0), "least grey value of data", default=1.0)
+    lower: float = setting(_GREY, "least grey value of data", default=1.0)
     gap: float = setting(
         Quantity("length", 0.0, 0.02), "gaps up to twice as wide are closed", default=2e-3
     )

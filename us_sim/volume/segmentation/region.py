@@ -1,7 +1,4 @@
-"""The part of a volume that is looked at for one structure, as SimpleITK takes it.
-
-Masks opened, closed and parted, in metres.
-"""
+"""The part of a volume in which one structure is looked for, and its masks, in metres."""
 
 from __future__ import annotations
 
@@ -17,6 +14,7 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 
 Index = tuple[int, int, int]
+_TOUCHING = np.ones((3, 3, 3), bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +27,7 @@ class Region:
     outside: tuple[Index, ...]  # known not to be in it
     name: str  # of the structure, for sentences
     progress: Callable[[float, str], None] = lambda *_: None
-    """Is told the fraction done, and what is being done, by what takes long."""
+    """Is told the fraction done and the work in progress, where it takes long."""
 
     @cached_property
     def image(self) -> sitk.Image:
@@ -60,50 +58,40 @@ def array_of(image: sitk.Image) -> NDArray[np.generic]:
     return np.asarray(sitk.GetArrayFromImage(image).transpose(2, 1, 0))
 
 
-_TOUCHING = np.ones((3, 3, 3), bool)
-
-
 def ball_closed(
     mask: NDArray[np.bool_], radius: float, spacing: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """The mask with all places filled that a ball of that radius (m) outside it cannot reach."""
-    reach = _reach(radius, spacing)
-    if not any(reach) or not mask.any():
-        return mask
-    return _back(sitk.BinaryMorphologicalClosing(_image(mask), reach, sitk.sitkBall, 1.0, True))
+    return _by_ball(sitk.BinaryMorphologicalClosing, mask, radius, spacing, 1.0, True)
 
 
 def ball_opened(
     mask: NDArray[np.bool_], radius: float, spacing: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """The places of the mask that a ball of that radius (m) inside it can reach."""
-    reach = _reach(radius, spacing)
-    if not any(reach) or not mask.any():
-        return mask
-    return _back(sitk.BinaryMorphologicalOpening(_image(mask), reach, sitk.sitkBall))
+    return _by_ball(sitk.BinaryMorphologicalOpening, mask, radius, spacing)
 
 
 def ball_eroded(
     mask: NDArray[np.bool_], radius: float, spacing: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """The mask without what is within that radius (m) of its border, or of the array's."""
-    reach = _reach(radius, spacing)
+    """The mask without its parts within that radius (m) of its border, or of the array's."""
+    return _by_ball(sitk.BinaryErode, mask, radius, spacing, 0.0, 1.0, False)
+
+
+def _by_ball(
+    operation: Callable[..., sitk.Image],
+    mask: NDArray[np.bool_],
+    radius: float,
+    spacing: NDArray[np.float64],
+    *more: float,
+) -> NDArray[np.bool_]:
+    reach = [int(count) for count in np.rint(radius / spacing)]
     if not any(reach) or not mask.any():
         return mask
-    return _back(sitk.BinaryErode(_image(mask), reach, sitk.sitkBall, 0.0, 1.0, False))
-
-
-def _reach(radius: float, spacing: NDArray[np.float64]) -> list[int]:
-    """A radius in voxels along each axis."""
-    return [int(count) for count in np.rint(radius / spacing)]
-
-
-def _image(mask: NDArray[np.bool_]) -> sitk.Image:
-    return sitk.GetImageFromArray(np.ascontiguousarray(mask.transpose(2, 1, 0)).view(np.uint8))
-
-
-def _back(image: sitk.Image) -> NDArray[np.bool_]:
-    return np.asarray(sitk.GetArrayFromImage(image).view(np.bool_).transpose(2, 1, 0))
+    image = sitk.GetImageFromArray(np.ascontiguousarray(mask.transpose(2, 1, 0)).view(np.uint8))
+    made = sitk.GetArrayFromImage(operation(image, reach, sitk.sitkBall, *more))
+    return np.asarray(made.view(np.bool_).transpose(2, 1, 0))
 
 
 def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -116,14 +104,13 @@ def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(parts == sizes.argmax())
 
 
-def parts_with(mask: NDArray[np.bool_], seeds: Iterable[tuple[int, int, int]]) -> NDArray[np.bool_]:
+def parts_with(mask: NDArray[np.bool_], seeds: Iterable[Index]) -> NDArray[np.bool_]:
     """The parts that hold one of some voxels, which may lie beside the mask."""
     parts, _ = ndimage.label(mask, _TOUCHING)
     inside = [
         seed for seed in seeds if all(0 <= n < m for n, m in zip(seed, mask.shape, strict=True))
     ]
-    held = {int(parts[seed]) for seed in inside} - {0}
-    return np.isin(parts, sorted(held))
+    return np.isin(parts, sorted({int(parts[seed]) for seed in inside} - {0}))
 
 
 def parts_at_least(mask: NDArray[np.bool_], voxels: float) -> NDArray[np.bool_]:

@@ -1,7 +1,4 @@
-"""What a file of seeds says: the structures of a volume, where each is, and how it is found.
-
-What is asked of `us-sim segment`: each field is an option of it.
-"""
+"""Settings of a segmentation: the options of `us-sim segment`, and the files of seeds."""
 
 from __future__ import annotations
 

@@ -1,25 +1,18 @@
-"""How ultrasound images lie in a file: Plus' orientation codes, and turning images to ``MF``.
-
-A code's first letter says where columns go as they are counted up, its second where rows go: to
-the probe's marked (M) or unmarked side (U), far from it (F) or near (N). A third letter says how
-slices follow in a volume (A ascending, D descending) and means nothing for a flat image. The
-transforms of a sequence hold for images in ``MF``, to which Plus turns them as it reads them
-(plustoolkit.org, "Ultrasound image orientation").
-
-What the file of a tracked sequence says of its frames: MetaImage and NRRD alike.
-
-The images of a sequence where they are: in its file, raw or packed, one after another.
-
-Tracked sequences of Plus and 3D Slicer: frames with times and transforms, and maybe images.
+"""Tracked sequences of Plus and 3D Slicer: frames with times and transforms, and maybe images.
 
 ``.igs.mha``, ``.mha``, ``.igs.nrrd`` and ``.seq.nrrd``: an image file whose last axis is time, and
 whose header gives every frame its transforms (4×4, millimetres, row by row), their status and a
 time stamp (plustoolkit.org, "Sequence file"). Images stay in the file until they are asked for.
+
+An orientation's first letter says where columns go as they are counted up, its second where rows
+go: to the probe's marked (M) or unmarked side (U), far from it (F) or near (N). A third letter says
+how slices follow in a volume (A ascending, D descending) and means nothing for a flat image. The
+transforms of a sequence hold for images in ``MF``, to which Plus turns them as it reads them
+(plustoolkit.org, "Ultrasound image orientation").
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections import Counter
@@ -44,40 +37,21 @@ from us_sim.volume.sequences.transforms import (
     read_transforms,
 )
 
-_CODE = re.compile(r"([UM][FN]|[FN][UM])[AD]?")
-
-
-def is_orientation(code: str) -> bool:
-    """Whether a code says how flat images lie."""
-    return _CODE.fullmatch(code) is not None
-
-
-def is_transposed(code: str) -> bool:
-    """Whether the image's columns go along the depth."""
-    return code[0] in "FN"
-
-
-def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
-    """A view of an image (rows, columns) that was stored in an orientation, as it is in ``MF``."""
-    across, down = code[0], code[1]
-    if is_transposed(code):
-        image, across, down = image.T, down, across
-    if across == "U":
-        image = image[:, ::-1]
-    return image[::-1] if down == "N" else image
-
-
 SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 
 _GIVE = "give a sequence of Plus or 3D Slicer (.igs.mha, .igs.nrrd, .seq.nrrd)"
 _MOST_FRAMES = 1 << 20  # four hours at 60 Hz
-_NUMBER = re.compile(r"-?[0-9]{1,18}")
-_COLOURS = {"vector", "rgb-color", "3-color", "list"}
+_LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
+
+NO_TIME = "no Timestamp"
+NO_IMAGE = "ImageStatus is not OK"
+NO_FIELDS = "no field in the header"
+"""Why frames cannot be used."""
 
 
 @dataclass(frozen=True)
 class SequenceFile:
-    """A header; the images are as they are stored."""
+    """The header of a sequence; the images are as they are stored."""
 
     path: Path
     columns: int  # along the file's first axis of an image; 0 where there are no images
@@ -87,123 +61,6 @@ class SequenceFile:
     orientation: str
     frames: Mapping[int, Mapping[str, str]]  # fields by the frame's number
     voxels: Callable[[], StoredVoxels]  # where the images are; raises VolumeError
-
-
-def read_sequence_file(path: Path) -> SequenceFile:
-    """The header of a sequence.
-
-    Raises:
-        VolumeError: the file is missing, is of another format, a volume, or cut within its
-            header, or says no usable size.
-    """
-    if not os.path.isfile(path):
-        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
-    with path.open("rb") as file:
-        start = file.read(256)
-    # The first bytes tell, so that a vast file of another kind is not read as a header.
-    if start.startswith(b"NRRD"):
-        return _nrrd(path)
-    if b"=" not in start:
-        raise VolumeError(f"{path}: is neither MetaImage nor NRRD; {_GIVE}")
-    return _metaimage(path)
-
-
-def _metaimage(path: Path) -> SequenceFile:
-    header, header_bytes = metaimage_header(path)
-    if "ElementDataFile" not in header:
-        raise VolumeError(
-            f"{path}: ends within its header, so it is cut; copy it again, or {_GIVE}"
-        )
-    said = header.get("DimSize", "")
-    sizes = _whole_numbers(path, "DimSize", said)
-    # Newer versions of Plus write a depth of 1 before the number of frames.
-    if len(sizes) not in (3, 4):
-        raise _no_size(path, "DimSize", said)
-    columns, rows, *between, count = sizes
-    (channels,) = _whole_numbers(path, "channels", header.get("ElementNumberOfChannels", "1"))
-    return SequenceFile(
-        path,
-        *_size(path, columns, rows, between, channels, count),
-        _orientation(header),
-        _frames(path, header.get("Kinds", ""), header),
-        lambda: metaimage_voxels(path, header, header_bytes),
-    )
-
-
-def _nrrd(path: Path) -> SequenceFile:
-    fields, pairs, _ = nrrd_header(path)
-    kinds = fields.get("kinds", "").lower().split()
-    if frame_fields(pairs) and {"list", "time"} & set(kinds[:-1]) and kinds[-1] == "domain":
-        raise VolumeError(
-            f"{path}: stores its frames along another axis than the last ({' '.join(kinds)[:80]}); "
-            f"export it as Plus does: domain domain domain list"
-        )
-    frames = _frames(path, " ".join(kinds), pairs)
-    said = fields.get("sizes", "")
-    sizes = _whole_numbers(path, "sizes", said)
-    if not kinds:
-        kinds = ["domain"] * (len(sizes) - 1) + ["list"]
-    channels = 1
-    if kinds[0] in _COLOURS:
-        channels, kinds, sizes = sizes[0], kinds[1:], sizes[1:]
-    if len(sizes) != len(kinds) or len(sizes) not in (3, 4):
-        raise _no_size(path, "sizes", said)
-    columns, rows, *between, count = sizes
-    return SequenceFile(
-        path,
-        *_size(path, columns, rows, between, channels, count),
-        _orientation(pairs),
-        frames,
-        lambda: nrrd_voxels(path),
-    )
-
-
-def _orientation(keys: Mapping[str, str]) -> str:
-    """How images lie; older versions of Plus write the key in small letters with blanks."""
-    return keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
-
-
-def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[str, str]]:
-    """The fields of the frames, of what is a sequence."""
-    frames = frame_fields(keys)
-    if kinds and not is_sequence(kinds, keys):
-        raise VolumeError(
-            f"{path}: is a volume, as its axes are {kinds}, and holds no tracked frames; {_GIVE}"
-        )
-    if not frames:
-        raise VolumeError(f"{path}: holds no tracked frames (Seq_Frame0000_...); {_GIVE}")
-    return frames
-
-
-def _size(
-    path: Path, columns: int, rows: int, between: Sequence[int], channels: int, count: int
-) -> tuple[int, int, int, int]:
-    """Columns, rows, channels and frames that can be."""
-    if any(depth > 1 for depth in between):
-        raise VolumeError(f"{path}: is a sequence of volumes; give one of flat images")
-    if not 1 <= count <= _MOST_FRAMES:
-        raise VolumeError(
-            f"{path}: says it holds {count} frames; 1 to {_MOST_FRAMES} can be read: export it "
-            f"again, or a part of it"
-        )
-    if min(columns, rows) < 1 or not all(between):
-        columns = rows = 0  # poses alone
-    return columns, rows, channels, count
-
-
-def _whole_numbers(path: Path, key: str, said: str) -> list[int]:
-    words = said.split()
-    # int() would also take 1_000 and the digits of other scripts.
-    if not words or not all(map(_NUMBER.fullmatch, words)):
-        raise _no_size(path, key, said)
-    return list(map(int, words))
-
-
-def _no_size(path: Path, key: str, said: str) -> VolumeError:
-    return VolumeError(
-        f"{path}: its {key} is {said[:80]!r} where a sequence has columns, rows and frames; export "
-        f"it again"
-    )
 
 
 @dataclass(frozen=True)
@@ -245,16 +102,9 @@ class StoredImages:
         return GreyLevels.over(self.voxels.header, self.voxels.pieces(self._size))
 
 
-_LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
-NO_TIME = "no Timestamp"
-NO_IMAGE = "ImageStatus is not OK"
-NO_FIELDS = "no field in the header"
-"""Why frames cannot be used."""
-
-
 @dataclass(frozen=True, eq=False)
 class TrackedSequence:
-    """The frames that the header describes; what is not valid is nan, and it is said why."""
+    """The frames that the header describes; invalid entries are nan, with the reason."""
 
     path: Path
     columns: int  # of the images, turned to MF; 0 where there are none
@@ -276,7 +126,7 @@ class TrackedSequence:
         return self.columns > 0
 
     def require_images(self) -> StoredImages:
-        """Where the images are.
+        """The images in the file.
 
         Raises:
             VolumeError: there are none, or none that can be read.
@@ -337,7 +187,7 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         )
     frames = [file.frames[number] for number in numbers]
     columns, rows = file.columns, file.rows
-    if is_orientation(file.orientation) and is_transposed(file.orientation):
+    if _is_orientation(file.orientation) and file.orientation[0] in "FN":
         columns, rows = rows, columns
     return TrackedSequence(
         file.path,
@@ -345,7 +195,7 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         rows,
         file.count,
         np.array(numbers, dtype=np.int64),
-        np.array([_time(fields) for fields in frames]),
+        np.array([frame_time(fields) for fields in frames]),
         np.array([fields.get("ImageStatus", "OK").upper() == "OK" for fields in frames]),
         read_transforms(file.path, frames),
         file.channels > 1,
@@ -353,30 +203,23 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     )
 
 
-def _time(fields: Mapping[str, str]) -> float:
-    try:
-        return frame_time(fields)
-    except ValueError:
-        return math.nan
-
-
 def _stored_images(file: SequenceFile) -> StoredImages | VolumeError:
-    """Where the images are, or why they cannot be read, which matters to who wants them only."""
-    path, size = file.path, f"{file.columns} × {file.rows} pixels"
+    """The images, or why they cannot be read, which matters to who wants them only."""
+    path = file.path
     if not file.columns:
         return VolumeError(
             f"{path}: holds poses without images ({file.count} frames); record the images too"
         )
     if file.columns * file.rows > _LARGEST_IMAGE:
         return VolumeError(
-            f"{path}: says it holds {file.count} images of {size}; {_LARGEST_IMAGE} pixels are "
-            f"read at most: export a part of it"
+            f"{path}: says it holds {file.count} images of {file.columns} × {file.rows} pixels; "
+            f"{_LARGEST_IMAGE} pixels are read at most: export a part of it"
         )
     if file.channels not in (1, 3):
         return VolumeError(
             f"{path}: holds {file.channels} numbers per pixel; save it as grey values or colours"
         )
-    if not is_orientation(file.orientation):
+    if not _is_orientation(file.orientation):
         return VolumeError(
             f"{path}: its images are stored in the orientation {file.orientation[:20]!r}; save it "
             f"with UltrasoundImageOrientation MF, UF, MN, UN, FM, FU, NM or NU"
@@ -388,3 +231,129 @@ def _stored_images(file: SequenceFile) -> StoredImages | VolumeError:
     except VolumeError as error:
         return error
     return StoredImages(voxels, file.columns, file.rows, file.channels, file.orientation)
+
+
+def _is_orientation(code: str) -> bool:
+    return re.fullmatch(r"([UM][FN]|[FN][UM])[AD]?", code) is not None
+
+
+def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
+    """A view of an image (rows, columns) that was stored in an orientation, as it is in ``MF``.
+
+    >>> turned(np.array([[1, 2], [3, 4], [5, 6]]), "FM")
+    array([[1, 3, 5],
+           [2, 4, 6]])
+    """
+    across, down = code[0], code[1]
+    if across in "FN":
+        image, across, down = image.T, down, across
+    if across == "U":
+        image = image[:, ::-1]
+    return image[::-1] if down == "N" else image
+
+
+def read_sequence_file(path: Path) -> SequenceFile:
+    """The header of a sequence.
+
+    Raises:
+        VolumeError: the file is missing, is of another format, a volume, or cut within its
+            header, or says no usable size.
+    """
+    if not os.path.isfile(path):
+        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
+    with path.open("rb") as file:
+        start = file.read(256)
+    # The first bytes tell, so that a vast file of another kind is not read as a header.
+    if start.startswith(b"NRRD"):
+        return _nrrd(path)
+    if b"=" not in start:
+        raise VolumeError(f"{path}: is neither MetaImage nor NRRD; {_GIVE}")
+    return _metaimage(path)
+
+
+def _metaimage(path: Path) -> SequenceFile:
+    header, header_bytes = metaimage_header(path)
+    if "ElementDataFile" not in header:
+        raise VolumeError(
+            f"{path}: ends within its header, so it is cut; copy it again, or {_GIVE}"
+        )
+    sizes = _whole_numbers(path, "DimSize", header.get("DimSize", ""))
+    (channels,) = _whole_numbers(path, "channels", header.get("ElementNumberOfChannels", "1"))
+    return SequenceFile(
+        path,
+        *_size(path, "DimSize", sizes, channels),
+        _orientation(header),
+        _frames(path, header.get("Kinds", ""), header),
+        lambda: metaimage_voxels(path, header, header_bytes),
+    )
+
+
+def _nrrd(path: Path) -> SequenceFile:
+    fields, pairs, _ = nrrd_header(path)
+    kinds = fields.get("kinds", "").lower().split()
+    if frame_fields(pairs) and {"list", "time"} & set(kinds[:-1]) and kinds[-1] == "domain":
+        raise VolumeError(
+            f"{path}: stores its frames along another axis than the last ({' '.join(kinds)[:80]}); "
+            f"export it as Plus does: domain domain domain list"
+        )
+    frames = _frames(path, " ".join(kinds), pairs)
+    sizes = _whole_numbers(path, "sizes", fields.get("sizes", ""))
+    channels, count = 1, len(kinds) or len(sizes)
+    if kinds and kinds[0] in ("vector", "rgb-color", "3-color", "list"):
+        channels, sizes, count = sizes[0], sizes[1:], count - 1
+    return SequenceFile(
+        path,
+        *_size(path, "sizes", sizes if len(sizes) == count else [], channels),
+        _orientation(pairs),
+        frames,
+        lambda: nrrd_voxels(path),
+    )
+
+
+def _orientation(keys: Mapping[str, str]) -> str:
+    """The images' orientation; older versions of Plus write the key with blanks."""
+    return keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
+
+
+def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[str, str]]:
+    frames = frame_fields(keys)
+    if kinds and not is_sequence(kinds, keys):
+        raise VolumeError(
+            f"{path}: is a volume, as its axes are {kinds}, and holds no tracked frames; {_GIVE}"
+        )
+    if not frames:
+        raise VolumeError(f"{path}: holds no tracked frames (Seq_Frame0000_...); {_GIVE}")
+    return frames
+
+
+def _size(path: Path, key: str, sizes: Sequence[int], channels: int) -> tuple[int, int, int, int]:
+    """Columns, rows, channels and frames that can be."""
+    # Newer versions of Plus write a depth of 1 before the number of frames.
+    if len(sizes) not in (3, 4):
+        raise _no_size(path, key, " ".join(map(str, sizes)))
+    columns, rows, *between, count = sizes
+    if any(depth > 1 for depth in between):
+        raise VolumeError(f"{path}: is a sequence of volumes; give one of flat images")
+    if not 1 <= count <= _MOST_FRAMES:
+        raise VolumeError(
+            f"{path}: says it holds {count} frames; 1 to {_MOST_FRAMES} can be read: export it "
+            f"again, or a part of it"
+        )
+    if min(columns, rows) < 1 or not all(between):
+        columns = rows = 0  # poses alone
+    return columns, rows, channels, count
+
+
+def _whole_numbers(path: Path, key: str, said: str) -> list[int]:
+    words = said.split()
+    # int() would also take 1_000 and the digits of other scripts.
+    if not words or not all(re.fullmatch(r"-?[0-9]{1,18}", word) for word in words):
+        raise _no_size(path, key, said)
+    return list(map(int, words))
+
+
+def _no_size(path: Path, key: str, said: str) -> VolumeError:
+    return VolumeError(
+        f"{path}: its {key} is {said[:80]!r} where a sequence has columns, rows and frames; export "
+        f"it again"
+    )

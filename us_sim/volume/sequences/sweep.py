@@ -1,7 +1,4 @@
-"""Tracked freehand sweeps: images of a moving probe, and where each of them is.
-
-Poses of a sweep for images that were stamped early or late.
-"""
+"""Tracked freehand sweeps: images of a moving probe, and where each of them is."""
 
 from __future__ import annotations
 
@@ -27,6 +24,7 @@ from us_sim.volume.sequences.transforms import (
 )
 
 IMAGE, REFERENCE = "Image", "Reference"
+_LONGEST_GAP = 0.3  # s, between poses that are interpolated; three frames of a slow scanner
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +70,7 @@ def read_sweep(path: str | os.PathLike[str], *, tracked: bool = True) -> Sweep:
             frame of it can be used.
     """
     sequence = read_sequence(path)
-    if tracked:
-        return sweep_of(sequence)
-    return _sweep(sequence, None, TransformChain("", ()))
+    return sweep_of(sequence) if tracked else _sweep(sequence, None, TransformChain("", ()))
 
 
 def sweep_of(
@@ -109,10 +105,10 @@ def sweep_of(
         known[name] = FrameTransforms(np.broadcast_to(matrix, (count, 4, 4)), ("",) * count)
     chain = shortest_chain(known, image, reference)
     if chain is None:
-        recorded = ", ".join(sorted(known)) or "none"
         raise VolumeError(
             f"{sequence.path}: no transform leads from {image} to {reference}; the known ones are "
-            f"{recorded}: name others, or give the probe's calibration (such as ImageToProbe)"
+            f"{', '.join(sorted(known))}: name others, or give the probe's calibration (such as "
+            f"ImageToProbe)"
         )
     return _sweep(sequence, along(known, chain), chain)
 
@@ -120,7 +116,6 @@ def sweep_of(
 def _sweep(
     sequence: TrackedSequence, placed: FrameTransforms | None, chain: TransformChain
 ) -> Sweep:
-    """The frames that can be used."""
     sequence.require_images()
     faults = sequence.faults(placed, images=True)
     left_out = sequence.left_out(faults)
@@ -131,22 +126,18 @@ def _sweep(
             f"{sequence.path}: none of its {sequence.count} frames can be used ({why}); record the "
             f"sweep again with the probe in the tracker's view"
         )
-    nowhere = np.full((len(sequence), 4, 4), math.nan)
+    matrices = np.full((len(sequence), 4, 4), math.nan) if placed is None else placed.matrices
     return Sweep(
         sequence.path,
         sequence.columns,
         sequence.rows,
         sequence.numbers[used],
         sequence.times[used],
-        (nowhere if placed is None else placed.matrices)[used],
+        matrices[used],
         left_out,
         chain,
         sequence,
     )
-
-
-_LONGEST_GAP = 0.3  # s, between poses that are interpolated; three frames of a slow scanner
-_NO_POSE = "no pose at its time"
 
 
 def shifted(sweep: Sweep, offset: float) -> Sweep:
@@ -169,7 +160,7 @@ def shifted(sweep: Sweep, offset: float) -> Sweep:
         )
     left_out = dict(sweep.left_out)
     if not used.all():
-        left_out[_NO_POSE] = int((~used).sum())
+        left_out["no pose at its time"] = int((~used).sum())
     return dataclasses.replace(
         sweep,
         numbers=sweep.numbers[used],
@@ -215,8 +206,9 @@ def _between(
     centre: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     start, end = (matrix[:3, :3] @ centre + matrix[:3, 3] for matrix in (first, second))
+    left, _, right = np.linalg.svd(second[:3, :3] @ np.linalg.inv(first[:3, :3]))
     turn = np.eye(4)
-    turn[:3, :3] = _nearest_rotation(second[:3, :3] @ np.linalg.inv(first[:3, :3]))
+    turn[:3, :3] = left @ right  # the nearest rotation
     turn[:3, 3] = end - start
     moved = interpolate(Pose(), Pose.from_matrix(turn), fraction)
     placed = first.copy()
@@ -224,8 +216,3 @@ def _between(
     placed = moved.matrix @ placed
     placed[:3, 3] += start
     return np.asarray(placed, dtype=np.float64)
-
-
-def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right, dtype=np.float64)

@@ -1,15 +1,4 @@
-"""Names of transforms as Plus reads them: the frame whose points are taken, ``To``, the frame they
-are given in.
-
-Plus (IGSIO, igsioTransformName::SetTransformName) splits a name at the one ``To`` whose next
-character is no lower-case letter, so that a body may be called ``Tool`` or ``Torso``.
-
-Chains of transforms from one frame to another, each forwards or inverted.
-
-The fields of each frame in the header of a sequence file of Plus: transforms, status, time.
-
-One transform of every frame of a sequence, and chains of them.
-"""
+"""Named transforms between frames, as tracked sequences of Plus hold them, and chains of them."""
 
 from __future__ import annotations
 
@@ -27,15 +16,22 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.files.readers import FRAME_KEY
 
-_TO = re.compile(r"To(?=[^a-z])")
+_LARGEST = 1e7  # mm, of any transform's numbers, so that products of them stay finite
+_MOST_NUMBERS = 1 << 27  # 1 GiB; eight transforms a frame for four hours at 60 Hz
+UNSEEN = "an identity among poses that are none"
 
 
 def split_transform_name(name: str) -> tuple[str, str] | None:
-    """The frames that a transform leads from and to; None for what names no transform.
+    """The frames that a transform leads from and to; None for a name of no transform.
 
-    Frames begin with a capital letter, as Plus makes them.
+    Plus (IGSIO, igsioTransformName::SetTransformName) splits a name at the one ``To`` whose next
+    character is no lower-case letter, so that a body may be called ``Tool`` or ``Torso``. Frames
+    begin with a capital letter, as Plus makes them.
+
+    >>> split_transform_name("TestToolToTracker"), split_transform_name("ToolTip")
+    (('TestTool', 'Tracker'), None)
     """
-    found = list(_TO.finditer(name))
+    found = list(re.finditer(r"To(?=[^a-z])", name))
     if len(found) != 1 or not found[0].start():
         return None
     start, end = name[: found[0].start()], name[found[0].end() :]
@@ -75,7 +71,7 @@ def _chains(names: Iterable[str], start: str) -> dict[str, TransformChain]:
     chains = {start: TransformChain(start, ())}
     waiting = deque([start])
     while waiting:
-        frame = waiting.popleft()
+        frame = waiting.popleft()  # breadth first, so that the first chain is a shortest one
         for end, name, forward in steps.get(frame, []):
             if end not in chains:
                 chains[end] = TransformChain(end, (*chains[frame].steps, (name, forward)))
@@ -84,8 +80,17 @@ def _chains(names: Iterable[str], start: str) -> dict[str, TransformChain]:
     return chains
 
 
-_LARGEST = 1e7
-"""mm, of any transform's numbers, so that products of them stay finite."""
+@dataclass(frozen=True, eq=False)
+class FrameTransforms:
+    """A transform over the frames; ``AToB`` takes points of A, m (pixels of an image), to B, m."""
+
+    matrices: NDArray[np.float64]  # (K, 4, 4); nan where not valid
+    faults: tuple[str, ...]  # (K,) why it is not valid; empty where it is
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """(K,) whether the frame's transform can be used."""
+        return np.array([not fault for fault in self.faults], dtype=bool)
 
 
 def frame_fields(header: Mapping[str, str]) -> dict[int, dict[str, str]]:
@@ -109,8 +114,7 @@ def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
     if key not in fields:
         raise ValueError(f"no {key}")
     try:
-        numbers = [float(number) for number in fields[key].split()]
-        matrix = np.array(numbers).reshape(4, 4)
+        matrix = np.array([float(number) for number in fields[key].split()]).reshape(4, 4)
     except ValueError:
         raise ValueError("a transform that is not 16 numbers") from None
     with np.errstate(all="ignore"):
@@ -123,37 +127,12 @@ def frame_matrix(fields: Mapping[str, str], key: str) -> NDArray[np.float64]:
 
 
 def frame_time(fields: Mapping[str, str]) -> float:
-    """When the frame was recorded, s of the recorder's clock.
-
-    Raises:
-        ValueError: the time is missing or no finite number.
-    """
+    """When the frame was recorded, s of the recorder's clock; nan where it does not say it."""
     try:
         time = float(fields["Timestamp"])
     except (KeyError, ValueError):
-        time = math.nan
-    if not math.isfinite(time):
-        raise ValueError("no Timestamp")
-    return time
-
-
-_METRES = 1e-3  # the format holds millimetres
-_SUFFIX = "Transform"
-_MOST_NUMBERS = 1 << 27  # 1 GiB; eight transforms a frame for four hours at 60 Hz
-UNSEEN = "an identity among poses that are none"
-
-
-@dataclass(frozen=True, eq=False)
-class FrameTransforms:
-    """A transform over the frames; ``AToB`` takes points of A, m (pixels of an image), to B, m."""
-
-    matrices: NDArray[np.float64]  # (K, 4, 4); nan where not valid
-    faults: tuple[str, ...]  # (K,) why it is not valid; empty where it is
-
-    @cached_property
-    def valid(self) -> NDArray[np.bool_]:
-        """(K,) whether the frame's transform can be used."""
-        return np.array([not fault for fault in self.faults], dtype=bool)
+        return math.nan
+    return time if math.isfinite(time) else math.nan
 
 
 def read_transforms(path: Path, frames: Sequence[Mapping[str, str]]) -> dict[str, FrameTransforms]:
@@ -166,15 +145,32 @@ def read_transforms(path: Path, frames: Sequence[Mapping[str, str]]) -> dict[str
     Raises:
         VolumeError: the header names more transforms than any recording has.
     """
-    keys = sorted({key for fields in frames for key in fields if key.endswith(_SUFFIX)})
-    names = [key.removesuffix(_SUFFIX) for key in keys]
+    keys = sorted({key for fields in frames for key in fields if key.endswith("Transform")})
+    names = [key.removesuffix("Transform") for key in keys]
     names = [name for name in names if split_transform_name(name)]
     if 16 * len(names) * len(frames) > _MOST_NUMBERS:
         raise VolumeError(
             f"{path}: names {len(names)} transforms for {len(frames)} frames, more than can be "
             f"read; export a part of it"
         )
-    return {name: _read(frames, name) for name in names}
+    return {name: _over_frames(frames, name) for name in names}
+
+
+def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransforms:
+    matrices = np.full((len(frames), 4, 4), np.nan)
+    faults = [""] * len(frames)
+    for k, fields in enumerate(frames):
+        try:
+            matrices[k] = frame_matrix(fields, f"{name}Transform")
+        except ValueError as reason:
+            faults[k] = str(reason)
+    identity = (matrices == np.eye(4)).all(axis=(1, 2))
+    if identity.any() and (np.isfinite(matrices[:, 0, 0]) & ~identity).any():
+        # No measurement is exactly that: Plus fills it in for a body it has not seen.
+        matrices[identity] = np.nan
+        for k in np.flatnonzero(identity).tolist():
+            faults[k] = UNSEEN
+    return FrameTransforms(in_metres(name, matrices), tuple(faults))
 
 
 def in_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -183,8 +179,8 @@ def in_metres(name: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     Coordinates of images stay pixels.
     """
     start, end = split_transform_name(name) or ("", "")
-    from_unit = 1.0 if is_image_frame(start) else _METRES
-    to_unit = 1.0 if is_image_frame(end) else _METRES
+    from_unit = 1.0 if is_image_frame(start) else 1e-3
+    to_unit = 1.0 if is_image_frame(end) else 1e-3
     matrix = matrix.copy()
     matrix[..., :3, :3] *= to_unit / from_unit
     matrix[..., :3, 3] *= to_unit
@@ -198,29 +194,10 @@ def along(transforms: Mapping[str, FrameTransforms], chain: TransformChain) -> F
     for name, forward in chain.steps:
         step = transforms[name]
         faults = [fault or other for fault, other in zip(faults, step.faults, strict=True)]
-        matrices = (step.matrices if forward else _inverse(step)) @ matrices
+        matrix = step.matrices
+        if not forward:
+            matrix = np.full_like(step.matrices, np.nan)
+            matrix[step.valid] = np.linalg.inv(step.matrices[step.valid])
+            matrix[step.valid, 3] = (0.0, 0.0, 0.0, 1.0)
+        matrices = matrix @ matrices
     return FrameTransforms(matrices, tuple(faults))
-
-
-def _inverse(step: FrameTransforms) -> NDArray[np.float64]:
-    inverse = np.full_like(step.matrices, np.nan)
-    inverse[step.valid] = np.linalg.inv(step.matrices[step.valid])
-    inverse[step.valid, 3] = (0.0, 0.0, 0.0, 1.0)
-    return inverse
-
-
-def _read(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransforms:
-    matrices = np.full((len(frames), 4, 4), np.nan)
-    faults = [""] * len(frames)
-    for k, fields in enumerate(frames):
-        try:
-            matrices[k] = frame_matrix(fields, f"{name}{_SUFFIX}")
-        except ValueError as reason:
-            faults[k] = str(reason)
-    identity = (matrices == np.eye(4)).all(axis=(1, 2))
-    if identity.any() and (np.isfinite(matrices[:, 0, 0]) & ~identity).any():
-        # No measurement is exactly that: Plus fills it in for a body it has not seen.
-        matrices[identity] = np.nan
-        for k in np.flatnonzero(identity).tolist():
-            faults[k] = UNSEEN
-    return FrameTransforms(in_metres(name, matrices), tuple(faults))

@@ -7,18 +7,16 @@ Each says in its header that its axes are left, posterior and superior (``SPACE=
 from __future__ import annotations
 
 import base64
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.partial_file import partial_file
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 
-_MILLIMETRES = 1e3
 _SAID = "us_sim; millimetres; SPACE=LPS"
 
 
@@ -31,27 +29,8 @@ def write_surface(path: Path, surface: ClosedSurface) -> None:
     written = _WRITERS.get(path.suffix.lower())
     if written is None:
         raise VolumeError(f"{path}: a surface file ends in .{', .'.join(SURFACE_FORMATS)}")
-    points = surface.vertices * _MILLIMETRES
-    try:
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f".{path.name}.", delete=False
-        ) as file:
-            try:
-                file.write(written(points, surface.triangles))
-                file.close()
-                os.chmod(file.name, 0o666 & ~_umask())
-                os.replace(file.name, path)
-            except BaseException:
-                os.unlink(file.name)
-                raise
-    except OSError as error:
-        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with partial_file(path) as partial:
+        partial.write_bytes(written(surface.vertices * 1e3, surface.triangles))
 
 
 def _stl(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:

@@ -139,7 +139,7 @@ def test_a_real_series_lies_where_simpleitk_says():
     reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(files[0].parent)))
     image = reader.Execute()
     placed = placed_images(files)
-    assert placed.shape == image.GetSize()
+    assert placed.voxels().shape == image.GetSize()
     matrix = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     np.testing.assert_allclose(placed.placement[:3, :3], matrix * 1e-3, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(placed.placement[:3, 3], np.array(image.GetOrigin()) * 1e-3)

@@ -1,9 +1,9 @@
 """The process that decodes compressed images, and may end of one.
 
-It is run as a script, imports nothing of this package, reads what to decode as JSON from stdin,
-and writes the images one after another to stdout; what is wrong is a line of JSON on stderr.
-Decoders are large programs in C and C++ that are handed a stranger's bytes: here one that fails
-ends nothing else, and memory and time are bounded.
+It is run as a script, imports nothing of this package, reads its task as JSON from stdin, and
+writes the images one after another to stdout; a failure is a line of JSON on stderr. Decoders are
+large programs in C and C++ that are handed a stranger's bytes: here one that fails ends nothing
+else, and memory and time are bounded.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-MISSING, WRONG = "missing", "wrong"
+MISSING, UNKNOWN, WRONG = "missing", "unknown", "wrong"
+"""Kinds of failures: a library is not installed, the syntax is not read, the images are damaged."""
 
 _EXTENDED = "1.2.840.10008.1.2.4.51"  # JPEG of up to 12 bits
 DECODER_DEPENDENCIES = {_EXTENDED: ("python-gdcm",)}
@@ -24,7 +25,7 @@ DECODER_DEPENDENCIES = {_EXTENDED: ("python-gdcm",)}
 
 
 def is_available(syntax: str) -> bool:
-    """Whether what `decode_twelve_bits` needs is installed."""
+    """Whether `decode_twelve_bits` can decode a syntax."""
     try:
         import gdcm  # noqa: F401
     except ImportError:
@@ -69,33 +70,31 @@ def main() -> int:
     try:
         decoder = get_decoder(task["syntax"])
     except NotImplementedError:
-        return _end(WRONG, "no decoder")
+        return _fail(UNKNOWN)
     if task["syntax"] == _EXTENDED and task["bytes"] > 1:
         decoder.add_plugin("twelve bits", (__name__, "decode_twelve_bits"))
-        missing = [] if is_available(_EXTENDED) else list(DECODER_DEPENDENCIES[_EXTENDED])
+        available = is_available(_EXTENDED)
     else:
-        missing = [] if decoder.is_available else decoder.missing_dependencies
-    if missing:
-        return _end(MISSING, "; ".join(missing))
-    _bound(task["memory"], task["seconds"])
+        available = decoder.is_available
+    if not available:
+        return _fail(MISSING)
+    _limit(task["memory"], task["seconds"])
     shape, size = tuple(task["shape"]), task["bytes"]
     for job in task["files"]:
         try:
             for frame in iter_pixels(job["path"], indices=job["frames"], raw=False):
                 if frame.shape != shape or frame.dtype.itemsize != size:
-                    return _end(WRONG, f"{frame.shape} {frame.dtype}")
+                    return _fail(WRONG)
                 out.write(frame.astype(frame.dtype.newbyteorder("<"), copy=False).tobytes())
-        except MemoryError:
-            return _end(WRONG, "memory")
         except BrokenPipeError:
             return 1
-        except Exception as error:  # whatever the bytes of a damaged image lead to
-            return _end(WRONG, type(error).__name__)
+        except Exception:  # whatever the bytes of a damaged image lead to, MemoryError too
+            return _fail(WRONG)
     out.flush()
     return 0
 
 
-def _bound(memory: int, seconds: int) -> None:
+def _limit(memory: int, seconds: int) -> None:
     """Allow so many more bytes of memory and seconds of processor time, and no file to be left."""
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if sys.platform == "linux" else 0
     if pages:
@@ -106,8 +105,8 @@ def _bound(memory: int, seconds: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
 
-def _end(kind: str, why: str) -> int:
-    print(json.dumps({"kind": kind, "why": why}), file=sys.stderr)
+def _fail(kind: str) -> int:
+    print(json.dumps({"kind": kind}), file=sys.stderr)
     return 3
 
 

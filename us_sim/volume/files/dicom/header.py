@@ -1,12 +1,7 @@
-"""Values of a DICOM header that nobody has checked.
-
-pydicom makes a value when it is first asked for, and raises whatever the value's bytes lead to; a
-value that cannot be made is one that is not there.
-
-Opening a DICOM file: everything but its images, and where in the file those are.
+"""DICOM headers: everything of a file but its images, and where in the file those are.
 
 Nothing large is read: of the images and of private data only the place is kept. A deflated file is
-inflated step by step, and not further than its own header says that it goes.
+inflated step by step, and no further than its own header says that it goes.
 """
 
 from __future__ import annotations
@@ -26,6 +21,13 @@ from typing import Any, BinaryIO, cast
 from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_image import check_claim
 
+EXTRA = "pip install 'us_sim[dicom]'"
+
+_DEFER = 1 << 20  # bytes of a value that is not read; a palette has 128 KiB a colour
+_DEFLATED = "1.2.840.10008.1.2.1.99"
+_NATIVE = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2", _DEFLATED, "")
+_MOST_HEADER = 1 << 26  # bytes of an inflated file beside its images
+
 
 @contextmanager
 def quiet() -> Iterator[None]:
@@ -43,7 +45,10 @@ def quiet() -> Iterator[None]:
 
 
 def value(header: Any, key: str | int) -> Any:
-    """The value of an element by its keyword or tag; None where there is none that can be read."""
+    """The value of an element by its keyword or tag; None where there is none that can be read.
+
+    pydicom makes a value when it is first asked for, and raises whatever its bytes lead to.
+    """
     try:
         if header is None or key not in header:
             return None
@@ -64,20 +69,18 @@ def text(header: Any, key: str | int) -> str:
 
 
 def numbers(header: Any, key: str | int, count: int | None = None) -> tuple[float, ...] | None:
-    """Finite numbers, ``count`` of them where it is given."""
+    """Finite numbers, ``count`` of them where it is given; None where there are none such."""
     found = value(header, key)
     if found is None or isinstance(found, bytes):
         return None
     if isinstance(found, str):
         found = found.split("\\")
-    listed = found if isinstance(found, Sequence) else [found]
     try:
-        made = tuple(float(each) for each in listed)
+        made = tuple(float(each) for each in (found if isinstance(found, Sequence) else [found]))
     except (TypeError, ValueError, OverflowError):
         return None
-    if not made or len(made) != (count or len(made)) or not all(map(math.isfinite, made)):
-        return None
-    return made
+    fits = made and len(made) == (count or len(made)) and all(map(math.isfinite, made))
+    return made if fits else None
 
 
 def number(header: Any, key: str | int) -> float | None:
@@ -110,24 +113,11 @@ def private(header: Any, group: int, creator: str, element: int) -> int | None:
     return None
 
 
-EXTRA = "pip install 'us_sim[dicom]'"
-
-_DEFER = 1 << 20  # bytes of a value that is not read; a palette has 128 KiB a colour
-_STEP = 1 << 20
-_DEFLATED = "1.2.840.10008.1.2.1.99"
-_NATIVE = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2", _DEFLATED, "")
-_UNDEFINED = 0xFFFFFFFF
-_LONG = (b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV")
-"""Value representations whose length takes four bytes (PS3.5, 7.1.2)."""
-_MOST_HEADER = 1 << 26  # bytes of an inflated file beside its images
-_NAMES = (".dcm", ".dicom", ".ima")
-
-
 @dataclass(frozen=True)
 class PixelPlace:
     """Where the images are."""
 
-    start: int  # byte of the file, or of what was inflated
+    start: int  # byte of the file, or of the inflated bytes
     length: int | None  # bytes; None where they are in fragments, up to a delimiter
     element: int  # the tag: whole numbers, or numbers in single or double precision
 
@@ -137,7 +127,7 @@ class DicomFile:
     """A DICOM file that was opened."""
 
     path: Path
-    header: Any  # pydicom.Dataset, of which values are read by `values`
+    header: Any  # pydicom.Dataset, whose values are read by the functions above
     syntax: str  # UID of the transfer syntax; empty where the file does not say
     little_endian: bool
     pixels: PixelPlace | None
@@ -165,7 +155,7 @@ def is_dicom(path: Path) -> bool:
             start = file.read(132)
     except OSError:
         return False
-    named = path.suffix.lower() in _NAMES
+    named = path.suffix.lower() in (".dcm", ".dicom", ".ima")
     return start[128:] == b"DICM" or _has_no_preamble(start) or named
 
 
@@ -211,16 +201,23 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
     except ImportError as error:
         raise VolumeError(f"{path}: reading DICOM needs an extra package: {EXTRA}") from error
     try:
-        with quiet():
-            return _opened(path)
+        with quiet(), path.open("rb") as file:
+            start = file.read(144)
+            if start[128:132] != b"DICM" and not _has_no_preamble(start):
+                raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
+            file.seek(0)
+            try:
+                return _read(path, file, path.stat().st_size)
+            except _DeflatedError:
+                inflated = _inflated(path, start)
+                return _read(path, io.BytesIO(inflated), len(inflated), inflated)
     except (VolumeError, MemoryError):
         raise
     except Exception as error:  # pydicom raises what the bytes of a damaged file lead to
         if isinstance(error, OSError) and error.errno is not None:
             raise  # the file cannot be read at all
         raise VolumeError(
-            f"{path}: cannot be read as DICOM: its header is damaged or cut short; copy or export "
-            f"it again"
+            f"{path}: cannot be read as DICOM: its header is damaged or cut short; export it again"
         ) from error
 
 
@@ -249,29 +246,14 @@ class _Bounded(io.BufferedIOBase):
         return self._file.tell()
 
 
-def _opened(path: Path) -> DicomFile:
-    with path.open("rb") as file:
-        start = file.read(144)
-        if start[128:132] != b"DICM" and not _has_no_preamble(start):
-            raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
-        file.seek(0)
-        try:
-            return _read(path, file, path.stat().st_size)
-        except _DeflatedError:
-            inflated = _inflated(path, start)
-    return _read(path, io.BytesIO(inflated), len(inflated), inflated)
-
-
-def _read(path: Path, whole: BinaryIO, size: int, inflated: bytes | None = None) -> DicomFile:
-    """The header before and after the images."""
+def _read(path: Path, data: BinaryIO, size: int, inflated: bytes | None = None) -> DicomFile:
     from pydicom import dcmread
     from pydicom.filereader import read_dataset
 
-    file = _Bounded(whole, size)
+    file = _Bounded(data, size)
     header = dcmread(file, defer_size=_DEFER, stop_before_pixels=True, force=True)
     syntax = _DEFLATED if inflated else text(header.file_meta, "TransferSyntaxUID")
-    implicit, little = header.original_encoding
-    implicit, little = implicit is not False, little is not False
+    implicit, little = (each is not False for each in header.original_encoding)
     pixels = _pixel_place(file, implicit, "<" if little else ">")
     if pixels is not None:
         try:
@@ -291,14 +273,14 @@ def _read(path: Path, whole: BinaryIO, size: int, inflated: bytes | None = None)
 
 
 def _pixel_place(file: _Bounded, implicit: bool, order: str) -> PixelPlace | None:
-    """Where the images are, in a file that stands at their element."""
+    """Where the images are, in a file that stands at their element (PS3.5, 7.1.2)."""
     start = file.read(8)
     if len(start) < 8:
         return None
     group, element = struct.unpack(f"{order}2H", start[:4])
     if implicit:
         (length,) = struct.unpack(f"{order}I", start[4:])
-    elif start[4:6] in _LONG:
+    elif start[4:6] in b"OB OD OF OL OV OW SQ SV UC UN UR UT UV".split():
         more = file.read(4)
         if len(more) < 4:
             return None
@@ -308,7 +290,7 @@ def _pixel_place(file: _Bounded, implicit: bool, order: str) -> PixelPlace | Non
     tag = (group << 16) | element
     if tag not in (0x7FE00008, 0x7FE00009, 0x7FE00010):
         return None
-    return PixelPlace(file.tell(), None if length == _UNDEFINED else length, tag)
+    return PixelPlace(file.tell(), None if length == 0xFFFFFFFF else length, tag)
 
 
 def _end(file: _Bounded) -> int:
@@ -324,33 +306,31 @@ def _end(file: _Bounded) -> int:
 
 
 def _inflated(path: Path, start: bytes) -> bytes:
-    """The file as if it had not been deflated (PS3.5, A.5), with the same syntax in its meta."""
+    """The file as if it had not been deflated (PS3.5, A.5), with a syntax that says so."""
     if len(start) < 144 or start[132:138] != b"\x02\0\0\0UL":
         raise VolumeError(f"{path}: is deflated, and does not say where that begins: export again")
     (meta,) = struct.unpack("<I", start[140:144])
     if 144 + meta > path.stat().st_size:
         raise VolumeError(f"{path}: breaks off in its header; copy or export it again")
-    # Explicit little endian, which is what it is once it is inflated.
-    plain = b"\x02\0\x10\0UI\x14\0" + b"1.2.840.10008.1.2.1\0"
+    plain = b"\x02\0\x10\0UI\x14\0" + b"1.2.840.10008.1.2.1\0"  # explicit little endian
     made = bytearray(128) + b"DICM\x02\0\0\0UL\x04\0" + struct.pack("<I", len(plain)) + plain
     first = len(made)
-    inflate, most = zlib.decompressobj(-zlib.MAX_WBITS), _MOST_HEADER
-    told = False
+    inflate, most, claimed = zlib.decompressobj(-zlib.MAX_WBITS), _MOST_HEADER, False
     with path.open("rb") as file:
         file.seek(144 + meta)
         try:
             while not inflate.eof:
-                packed = inflate.unconsumed_tail or file.read(_STEP)
+                packed = inflate.unconsumed_tail or file.read(1 << 20)
                 if not packed:
                     raise VolumeError(f"{path}: its compression is cut short; copy it again")
-                made += inflate.decompress(packed, _STEP)
+                made += inflate.decompress(packed, 1 << 20)
                 if len(made) - first > most:
-                    if told:
+                    if claimed:
                         raise VolumeError(
                             f"{path}: inflates to more than the {most} bytes that its header says; "
                             f"export it again"
                         )
-                    most, told = _MOST_HEADER + _claim(path, bytes(made)), True
+                    most, claimed = _MOST_HEADER + _claim(path, bytes(made)), True
         except zlib.error as error:
             raise VolumeError(f"{path}: its compression is damaged; copy it again") from error
     return bytes(made)
@@ -366,11 +346,8 @@ def _claim(path: Path, begun: bytes) -> int:
 
     file = _Bounded(io.BytesIO(begun), len(begun))
     header = dcmread(file, defer_size=_DEFER, stop_before_pixels=True, force=True)
-    size = [max(whole(header, key) or 1, 1) for key in ("NumberOfFrames", "Rows", "Columns")]
-    size.append(max(whole(header, "SamplesPerPixel") or 1, 1))
-    value = -(-max(whole(header, "BitsAllocated") or 8, 8) // 8)
-    check_claim(path, tuple(size), value)
-    claimed = value
-    for count in size:
-        claimed *= count
-    return claimed
+    keys = ("NumberOfFrames", "Rows", "Columns", "SamplesPerPixel")
+    size = tuple(max(whole(header, key) or 1, 1) for key in keys)
+    sample = -(-max(whole(header, "BitsAllocated") or 8, 8) // 8)
+    check_claim(path, size, sample)
+    return sample * math.prod(size)

@@ -1,16 +1,12 @@
-"""How the images of a DICOM file are stored: size, number, type and colour.
-
-Colour tables of DICOM as tables of grey values (PS3.3, C.7.6.3.1.5 and C.7.9.2).
-
-Compressed images, decoded in a process of their own.
-
-The process starts in about half a second, decodes the images of any number of files, and hands
-them over one by one.
-
-The images of DICOM files as grey values, a few in memory at a time.
+"""The images of DICOM files as grey values, a few in memory at a time.
 
 8-bit values are taken as they are; all others are spread so that the least becomes 0 and the
 greatest 255, as `us_sim.volume.files.readers` does. Colour becomes grey by its brightness.
+
+pydicom decodes compressed images, in a process of its own (`decoder`). Its `pixels.processing` was
+tried for palettes and rescaling and is not used: 1.8 kB of a segmented palette expand to 20 million
+entries, without a bound (ours stops at the entries that the header claims), it knows no rescaling
+of single frames (functional groups), and makes 64-bit numbers of all frames at once.
 """
 
 from __future__ import annotations
@@ -24,7 +20,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +43,13 @@ _GREY = ("MONOCHROME1", "MONOCHROME2", "PALETTE COLOR")
 _MOST_FRAMES = 1 << 20
 _DIRECT = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99", "")
 
+_WEIGHTS = {"Red": 77, "Green": 150, "Blue": 29}
+"""Of colours in a grey value, in 256ths (ITU-R BT.601, 2.5.1); a grey pixel stays as it is."""
+
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """What a header says of its images."""
+    """Size, number, type and colour of a file's images."""
 
     frames: int
     rows: int
@@ -72,14 +71,9 @@ class ImageFormat:
         """Bits that an image which is not compressed has in the file, where masks are packed."""
         return self.frame_bytes if self.type == np.bool_ else 8 * self.frame_bytes
 
-    @property
-    def colour(self) -> bool:
-        """Whether grey values have to be made of colours."""
-        return self.samples == 3 or self.photometric == "PALETTE COLOR"
-
 
 def image_format(file: DicomFile) -> ImageFormat:
-    """What a header says of its images, compared with the bytes that there are.
+    """The format that a header states, compared with the bytes that there are.
 
     Raises:
         VolumeError: there are no images, their number, size or type is missing or cannot be, or
@@ -88,45 +82,36 @@ def image_format(file: DicomFile) -> ImageFormat:
     header, path = file.header, file.path
     if file.pixels is None:
         raise VolumeError(
-            f"{path}: holds no image ({_kind(file)}); give the DICOM file of an image or a volume"
+            f"{path}: holds no image ({_class_name(file)}); give the DICOM file of an image or a "
+            f"volume"
         )
-    size = {key: whole(header, key) for key in ("Rows", "Columns")}
     frames = whole(header, "NumberOfFrames") if "NumberOfFrames" in header else 1
     samples = whole(header, "SamplesPerPixel") or 1
-    rows, columns = size["Rows"] or 0, size["Columns"] or 0
+    rows, columns = whole(header, "Rows") or 0, whole(header, "Columns") or 0
     if frames is None or not 1 <= frames <= _MOST_FRAMES or min(rows, columns) < 1:
         raise VolumeError(
             f"{path}: says that it holds {frames} images of {columns} × {rows} pixels; export it "
             f"again"
         )
-    bits, stored = _bits(file)
+    bits, stored = _number_type(file, file.pixels.element)
     photometric = text(header, "PhotometricInterpretation") or "MONOCHROME2"
     if samples not in (1, 3) or (samples == 1) != (photometric in _GREY):
         raise VolumeError(
             f"{path}: its pixels have {samples} numbers as {photometric[:20]!r}; save it as grey "
             f"values or RGB"
         )
-    form = ImageFormat(
-        frames=frames,
-        rows=rows,
-        columns=columns,
-        samples=samples,
-        photometric=photometric,
-        type=stored,
-        bits=bits,
-        planar=samples == 3 and whole(header, "PlanarConfiguration") == 1,
-        direct=file.syntax in _DIRECT and photometric in (*_GREY, "RGB") and file.little_endian,
-    )
+    planar = samples == 3 and whole(header, "PlanarConfiguration") == 1
+    direct = file.syntax in _DIRECT and photometric in (*_GREY, "RGB") and file.little_endian
+    form = ImageFormat(frames, rows, columns, samples, photometric, stored, bits, planar, direct)
     check_claim(path, (frames, rows, columns, samples), stored.itemsize)
     _check_bytes(file, form)
     return form
 
 
-def _bits(file: DicomFile) -> tuple[int, np.dtype[np.generic]]:
+def _number_type(file: DicomFile, element: int) -> tuple[int, np.dtype[np.generic]]:
     """Bits of a number that count, and how it is stored."""
-    assert file.pixels is not None
-    if file.pixels.element != 0x7FE00010:
-        bits = 32 if file.pixels.element == 0x7FE00008 else 64
+    if element != 0x7FE00010:
+        bits = 32 if element == 0x7FE00008 else 64
         return bits, np.dtype(f"<f{bits // 8}")
     allocated = whole(file.header, "BitsAllocated")
     stored = whole(file.header, "BitsStored") or allocated
@@ -141,16 +126,15 @@ def _bits(file: DicomFile) -> tuple[int, np.dtype[np.generic]]:
 
 
 def _check_bytes(file: DicomFile, form: ImageFormat) -> None:
-    """Compare what the header says with the bytes or fragments that there are."""
     assert file.pixels is not None
-    if file.compressed != (file.pixels.length is None):
+    length = file.pixels.length
+    if file.compressed != (length is None):
         raise VolumeError(
             f"{file.path}: its images are {'not ' if file.compressed else ''}in fragments, against "
             f"its transfer syntax; export it again"
         )
-    if file.pixels.length is None:
-        there = _fragments(file)
-        if there < form.frames:
+    if length is None:
+        if (there := _fragments(file, file.pixels.start)) < form.frames:
             raise VolumeError(
                 f"{file.path}: holds {there} compressed images where its header says "
                 f"{form.frames}; copy or export it again"
@@ -159,19 +143,18 @@ def _check_bytes(file: DicomFile, form: ImageFormat) -> None:
     expected = -(-form.frames * form.native_bits // 8)
     if form.photometric == "YBR_FULL_422":
         expected = form.frames * form.rows * math.ceil(form.columns / 2) * 4 * form.type.itemsize
-    if file.pixels.length not in (expected, expected + expected % 2):
+    if length not in (expected, expected + expected % 2):
         raise VolumeError(
-            f"{file.path}: holds {file.pixels.length} bytes of images where its header says "
-            f"{expected}; copy or export it again"
+            f"{file.path}: holds {length} bytes of images where its header says {expected}; copy "
+            f"or export it again"
         )
 
 
-def _fragments(file: DicomFile) -> int:
+def _fragments(file: DicomFile, start: int) -> int:
     """How many fragments there are behind the table of their offsets."""
-    assert file.pixels is not None
     count, size = -1, file.size
     with file.open() as data:
-        data.seek(file.pixels.start)
+        data.seek(start)
         while (head := data.read(8))[:4] == b"\xfe\xff\x00\xe0" and len(head) == 8:
             data.seek(int.from_bytes(head[4:], "little"), 1)
             if data.tell() > size:
@@ -180,22 +163,16 @@ def _fragments(file: DicomFile) -> int:
     return count
 
 
-def _kind(file: DicomFile) -> str:
-    """What a file is, in the standard's words."""
+def _class_name(file: DicomFile) -> str:
     from pydicom.uid import UID
 
     kind = UID(text(file.header, "SOPClassUID"))
     return kind.name if kind.name != kind else "of no kind that is known"
 
 
-WEIGHTS = {"Red": 77, "Green": 150, "Blue": 29}
-"""Of colours in a grey value, in 256ths (ITU-R BT.601, 2.5.1); a grey pixel stays as it is."""
-
-_MOST = 1 << 16
-
-
-def grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
-    """The stored value that the table begins with, and the grey value of each that follows.
+def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
+    """The stored value that the colour table begins with, and the grey value of each that follows
+    (PS3.3, C.7.6.3.1.5 and C.7.9.2).
 
     Raises:
         VolumeError: a table is missing or damaged.
@@ -203,33 +180,30 @@ def grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
     order = "<" if file.little_endian else ">"
     total = np.zeros(1, np.float64)
     first = 0
-    for colour, weight in WEIGHTS.items():
+    for colour, weight in _WEIGHTS.items():
         described = numbers(file.header, f"{colour}PaletteColorLookupTableDescriptor", 3)
-        if described is None:
-            raise _refused(file, colour)
-        count, first, bits = (int(each) for each in described)
-        count = count % (_MOST + 1) or _MOST
+        count, first, bits = (int(each) for each in described or (1, 0, 0))
+        count = count % ((1 << 16) + 1) or 1 << 16
         data = value(file.header, f"{colour}PaletteColorLookupTableData")
         if isinstance(data, bytes):
             table = _plain(data, count, order)
         else:
             data = value(file.header, f"Segmented{colour}PaletteColorLookupTableData")
             table = _expanded(data, count, order) if isinstance(data, bytes) else None
-        if table is None or len(table) != count or bits not in (8, 16):
-            raise _refused(file, colour)
+        if (
+            table is None
+            or len(table) != count
+            or bits not in (8, 16)
+            or len(total) not in (1, count)
+        ):
+            raise VolumeError(
+                f"{file.path}: its table of {colour.lower()} values is missing or damaged; export "
+                f"it in grey values or RGB"
+            )
         # Some writers give numbers of 8 bits in entries that say 16.
         top = 65535.0 if bits == 16 and table.max() > 255 else 255.0
-        if len(total) not in (1, count):
-            raise _refused(file, colour)
         total = total + weight / 256 * 255 * np.minimum(table / top, 1.0)
     return first, np.floor(total + 0.5).astype(np.uint8)
-
-
-def _refused(file: DicomFile, colour: str) -> VolumeError:
-    return VolumeError(
-        f"{file.path}: its table of {colour.lower()} values is missing or damaged; export it in "
-        f"grey values or RGB"
-    )
 
 
 def _plain(data: bytes, count: int, order: str) -> NDArray[np.int64] | None:
@@ -263,21 +237,17 @@ def _expanded(data: bytes, count: int, order: str) -> NDArray[np.int64] | None:
     return np.concatenate(pieces) if pieces and made == count else None
 
 
-_MEMORY = 1 << 30
-"""Bytes that decoders may take beside several copies of an image."""
-_SECONDS = 60
-_PIXELS_PER_SECOND = 1e6
-"""The slowest decoder, of run lengths, is thirty times as fast on a slow machine."""
-
-
 def decoded_frames(
     jobs: Sequence[tuple[DicomFile, Sequence[int]]], form: ImageFormat
 ) -> Iterator[NDArray[np.generic]]:
-    """The images of files, by their numbers, as (rows, columns) or (rows, columns, RGB).
+    """Compressed images of files, decoded in a process of its own, which starts in half a second.
 
     Args:
-        jobs: files of one transfer syntax, and which images of each.
+        jobs: files of one transfer syntax, and the numbers of the images wanted of each.
         form: how their images are stored.
+
+    Yields:
+        (rows, columns) or (rows, columns, RGB).
 
     Raises:
         VolumeError: a decoder is missing, or an image cannot be decoded or is not of that form.
@@ -288,8 +258,8 @@ def decoded_frames(
         "syntax": jobs[0][0].syntax,
         "shape": shape,
         "bytes": form.type.itemsize,
-        "memory": _MEMORY + 16 * form.frame_bytes,
-        "seconds": int(_SECONDS + total / _PIXELS_PER_SECOND),
+        "memory": (1 << 30) + 16 * form.frame_bytes,  # bytes, beside several copies of an image
+        "seconds": int(60 + total / 1e6),  # run lengths decode at 30 million pixels a second
         "files": [
             {"path": str(file.path.resolve()), "frames": [int(frame) for frame in which]}
             for file, which in jobs
@@ -303,7 +273,11 @@ def decoded_frames(
         assert process.stdin
         assert process.stdout
         try:
-            _tell(process.stdin, task)
+            try:
+                process.stdin.write(json.dumps(task).encode() + b"\n")
+                process.stdin.close()
+            except BrokenPipeError:  # it ended at once; the first missing image shows that
+                pass
             for file, which in jobs:
                 for _ in which:
                     data = process.stdout.read(form.frame_bytes)
@@ -314,42 +288,31 @@ def decoded_frames(
             process.kill()
 
 
-def _tell(stdin: IO[bytes], task: dict[str, object]) -> None:
-    try:
-        stdin.write(json.dumps(task).encode() + b"\n")
-        stdin.close()
-    except BrokenPipeError:  # it ended at once, which the first image that is missing tells
-        pass
-
-
 def _failure(file: DicomFile, process: subprocess.Popen[bytes]) -> VolumeError:
-    """Why an image is missing."""
     from pydicom.uid import UID
 
     assert process.stderr
-    words = process.stderr.read(1 << 16).decode(errors="replace").strip().splitlines()
+    lines = process.stderr.read(1 << 16).decode(errors="replace").strip().splitlines()
     process.wait()
     try:
-        said = json.loads(words[-1])
-        kind, why = str(said["kind"]), str(said["why"])
+        kind = json.loads(lines[-1])["kind"]
     except (ValueError, IndexError, TypeError, KeyError):
-        kind, why = decoder.WRONG, ""
+        kind = decoder.WRONG
     name = UID(file.syntax).name
     name = name if name != file.syntax else "a way that is not known"
     if kind == decoder.MISSING:
-        return VolumeError(
-            f"{file.path}: its images are compressed as {name}, for which no decoder is "
-            f"installed: {EXTRA}"
+        why = f"images are compressed as {name}, for which no decoder is installed: {EXTRA}"
+    elif kind == decoder.UNKNOWN:
+        why = (
+            f"images are compressed as {name}, which is not read; export them uncompressed, or as "
+            f"JPEG, JPEG 2000 or RLE"
         )
-    if why == "no decoder":
-        return VolumeError(
-            f"{file.path}: its images are compressed as {name}, which is not read; export them "
-            f"uncompressed, or as JPEG, JPEG 2000 or RLE"
+    else:
+        why = (
+            "compressed images are damaged, or not of the size and type that its header says; copy "
+            "or export it again"
         )
-    return VolumeError(
-        f"{file.path}: its compressed images are damaged, or not of the size and type that its "
-        f"header says; copy or export it again"
-    )
+    return VolumeError(f"{file.path}: its {why}")
 
 
 class GreyImages:
@@ -366,17 +329,18 @@ class GreyImages:
         self.files = list(files)
         self.formats = [image_format(file) for file in self.files]
         self.form = self.formats[0]
-        first = self.files[0]
-        for file, form in zip(self.files, self.formats, strict=True):
-            same = (form.rows, form.columns, form.samples, form.photometric, form.type)
-            one = self.form
-            if same != (one.rows, one.columns, one.samples, one.photometric, one.type) or (
-                file.syntax != first.syntax
-            ):
+        kinds = [
+            (form.rows, form.columns, form.samples, form.photometric, form.type, file.syntax)
+            for file, form in zip(self.files, self.formats, strict=True)
+        ]
+        for file, kind in zip(self.files, kinds, strict=True):
+            if kind != kinds[0]:
                 raise VolumeError(
                     f"{file.path}: its images are of another size or type than those of "
-                    f"{first.path}; import them one by one"
+                    f"{self.files[0].path}; import them one by one"
                 )
+        self._inverted = self.form.photometric == "MONOCHROME1"
+        self._is_palette = self.form.photometric == "PALETTE COLOR"
 
     @property
     def all(self) -> list[tuple[int, int]]:
@@ -385,16 +349,16 @@ class GreyImages:
 
     @cached_property
     def conversions(self) -> tuple[str, ...]:
-        """What is made of the stored values, for a person."""
-        form, said = self.form, []
-        if form.photometric == "PALETTE COLOR":
+        """Changes of the stored values, for a person."""
+        said = []
+        if self._is_palette:
             said.append("palette colour converted to grey")
-        elif form.colour:
+        elif self.form.samples == 3:
             said.append("colour converted to grey")
         if self._inverted:
             said.append("values turned, since 0 means white")
         if not self._plain:
-            said.append(f"{form.bits}-bit values spread over 0 to 255")
+            said.append(f"{self.form.bits}-bit values spread over 0 to 255")
         return tuple(said)
 
     def images(
@@ -404,7 +368,7 @@ class GreyImages:
 
         Args:
             which: of which file, and which of its images; all without it.
-            keep: (rows, columns) what of each is kept; the rest becomes 0.
+            keep: (rows, columns) the pixels of each that are kept; the rest becomes 0.
 
         Raises:
             VolumeError: an image is damaged, or its decoder is missing.
@@ -423,19 +387,11 @@ class GreyImages:
                 grey[blank] = 0
             yield grey
 
-    @property
-    def _inverted(self) -> bool:
-        return self.form.photometric == "MONOCHROME1"
-
     @cached_property
     def _plain(self) -> bool:
-        """Whether what is stored is a grey value already."""
-        form = self.form
-        if form.photometric == "PALETTE COLOR":
-            return True
-        scaled = any(_rescale(file) != (1.0, 0.0) for file in self.files)
-        scaled = scaled or any(self._groups[n] for n in range(len(self.files)))
-        return form.type == np.uint8 and not scaled
+        """Whether the stored numbers are grey values already."""
+        scaled = any(map(_rescale, self.files)) or any(self._groups)
+        return self._is_palette or (self.form.type == np.uint8 and not scaled)
 
     @cached_property
     def _groups(self) -> list[list[Any]]:
@@ -448,9 +404,7 @@ class GreyImages:
 
     def _brightness(self, which: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:
         """One number a pixel: a grey value where `_plain`, else the rescaled value."""
-        palette = None
-        if self.form.photometric == "PALETTE COLOR":
-            palette = grey_palette(self.files[0])
+        palette = _grey_palette(self.files[0]) if self._is_palette else None
         for (n, k), image in zip(which, self._stored(which), strict=True):
             if palette is not None:
                 first, greys = palette
@@ -459,14 +413,10 @@ class GreyImages:
             if self.form.samples == 3:
                 image = _luma(image)
             image = _masked(image, self.form)
-            if self._plain:
-                yield image
-                continue
-            group = self._groups[n]
-            slope, offset = _rescale(self.files[n])
-            if k < len(group):
-                slope, offset = _transformation(group[k], (slope, offset))
-            yield image if (slope, offset) == (1.0, 0.0) else image * slope + offset
+            scale = None if self._plain else _rescale(self.files[n])
+            if not self._plain and k < len(self._groups[n]):
+                scale = _transformation(self._groups[n][k], scale)
+            yield image if scale is None else image * scale[0] + scale[1]
 
     def _stored(self, which: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:
         """The images as they are stored, colours last."""
@@ -493,7 +443,6 @@ def stored_frames(
 
 
 def _read(file: DicomFile, form: ImageFormat, frames: Sequence[int]) -> Iterator[NDArray[Any]]:
-    """Images that are stored as they are."""
     assert file.pixels is not None
     with file.open() as data:
         for frame in frames:
@@ -517,7 +466,7 @@ def _read(file: DicomFile, form: ImageFormat, frames: Sequence[int]) -> Iterator
 def _luma(image: NDArray[Any]) -> NDArray[Any]:
     """The brightness of (rows, columns, RGB), of the same type."""
     wide: NDArray[Any] = image.astype(np.uint16 if image.dtype == np.uint8 else np.int64)
-    weighted: NDArray[Any] = wide @ np.array(list(WEIGHTS.values()), wide.dtype)
+    weighted: NDArray[Any] = wide @ np.array(list(_WEIGHTS.values()), wide.dtype)
     return ((weighted + 128) >> 8).astype(image.dtype)
 
 
@@ -531,19 +480,18 @@ def _masked(image: NDArray[Any], form: ImageFormat) -> NDArray[Any]:
     return (image << spare) >> spare  # moved up and down again, the sign is that of its last bit
 
 
-def _rescale(file: DicomFile) -> tuple[float, float]:
-    """Slope and offset of all values of a file (PS3.3, C.11.1)."""
+def _rescale(file: DicomFile) -> tuple[float, float] | None:
+    """Slope and offset of all values of a file (PS3.3, C.11.1); None where they change nothing."""
+    own = _slope_and_offset(file.header)
     shared = items(file.header, "SharedFunctionalGroupsSequence")
-    own = (_one(number(file.header, "RescaleSlope")), number(file.header, "RescaleIntercept") or 0)
     return _transformation(shared[0], own) if shared else own
 
 
-def _transformation(group: Any, without: tuple[float, float]) -> tuple[float, float]:
+def _transformation(group: Any, without: tuple[float, float] | None) -> tuple[float, float] | None:
     found = items(group, "PixelValueTransformationSequence")
-    if not found:
-        return without
-    return _one(number(found[0], "RescaleSlope")), number(found[0], "RescaleIntercept") or 0.0
+    return _slope_and_offset(found[0]) if found else without
 
 
-def _one(slope: float | None) -> float:
-    return 1.0 if slope is None or slope == 0.0 else slope
+def _slope_and_offset(header: Any) -> tuple[float, float] | None:
+    scale = number(header, "RescaleSlope") or 1.0, number(header, "RescaleIntercept") or 0.0
+    return None if scale == (1.0, 0.0) else scale

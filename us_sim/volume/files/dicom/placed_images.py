@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import DicomFile, number, open_dicom, text
+from us_sim.volume.files.dicom.header import number, open_dicom, text
 from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.dicom.planes import (
     Plane,
@@ -30,7 +30,6 @@ from us_sim.volume.files.stored_image import volume_of_slices
 SEGMENTATIONS = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 """Classes of files that hold labels: masks of segments, and label maps."""
 
-_TISSUE = "TISSUE_INTENSITY"
 _MOST_FILES = 1 << 14
 
 
@@ -43,11 +42,6 @@ class PlacedImages:
     placement: NDArray[np.float64]  # (4, 4) m, from (column, row, image)
     volumes: int  # how many there are in time
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Voxels along each axis."""
-        return self.images.form.columns, self.images.form.rows, len(self.which)
-
     def voxels(
         self,
         keep: NDArray[np.bool_] | None = None,
@@ -56,7 +50,7 @@ class PlacedImages:
         """The grey values (i, j, k), read a few images at a time.
 
         Args:
-            keep: (rows, columns) what of each image is kept; the rest becomes 0.
+            keep: (rows, columns) the pixels of each image that are kept; the rest becomes 0.
             progress: told the fraction that is read.
 
         Raises:
@@ -104,32 +98,35 @@ def placed_images(
             belong together.
     """
     images = paths if isinstance(paths, GreyImages) else opened_images(paths)
-    _check_series(images.files)
+    path = images.files[0].path
+    for key in ("SeriesInstanceUID", "FrameOfReferenceUID"):
+        if len({text(file.header, key) for file in images.files}) > 1:
+            raise VolumeError(
+                f"{path}: and the other files are of several series; give the files of one"
+            )
     planes, times = _planes(images)
     if planes is None or len({plane.position for plane in planes}) < 2:
-        raise VolumeError(f"{images.files[0].path}: {_why_flat(images, planes)}")
-    wanted = images.all
+        raise VolumeError(f"{path}: {_why_flat(images, planes)}")
     kinds: list[str] = []
     for file, form in zip(images.files, images.formats, strict=True):
         kinds += image_kinds(file, form.frames)
-    kind = _TISSUE if _TISSUE in kinds else kinds[0]
+    kind = "TISSUE_INTENSITY" if "TISSUE_INTENSITY" in kinds else kinds[0]
+    wanted = images.all
     here = [n for n in range(len(wanted)) if kinds[n] == kind]
-    groups = _in_time(images.files[0].path, here, planes, times)
+    groups = _in_time(path, here, planes, times)
     if not 1 <= volume <= len(groups):
         raise VolumeError(
-            f"{images.files[0].path}: holds {len(groups)} volumes in time; number {volume} is none "
-            f"of them"
+            f"{path}: holds {len(groups)} volumes in time; number {volume} is none of them"
         )
     chosen = groups[volume - 1]
-    order, placement = grid_of(images.files[0].path, [planes[n] for n in chosen])
-    which = [wanted[chosen[n]] for n in order]
-    placed = PlacedImages(images, which, placement, len(groups))
-    if min(placed.shape) < 2:
+    order, placement = grid_of(path, [planes[n] for n in chosen])
+    shape = images.form.columns, images.form.rows, len(chosen)
+    if min(shape) < 2:
         raise VolumeError(
-            f"{images.files[0].path}: has {' × '.join(map(str, placed.shape))} voxels; a volume "
-            f"needs two or more along each axis"
+            f"{path}: has {' × '.join(map(str, shape))} voxels; a volume needs two or more along "
+            f"each axis"
         )
-    return placed
+    return PlacedImages(images, [wanted[chosen[n]] for n in order], placement, len(groups))
 
 
 def _planes(images: GreyImages) -> tuple[list[Plane] | None, list[float]]:
@@ -146,23 +143,12 @@ def _planes(images: GreyImages) -> tuple[list[Plane] | None, list[float]]:
     return planes, times
 
 
-def _check_series(files: Sequence[DicomFile]) -> None:
-    for key in ("SeriesInstanceUID", "FrameOfReferenceUID"):
-        if len({text(file.header, key) for file in files}) > 1:
-            raise VolumeError(
-                f"{files[0].path}: and the other files are of several series; give the files of one"
-            )
-
-
 def _in_time(
     path: Path, here: Sequence[int], planes: Sequence[Plane], times: Sequence[float]
 ) -> list[list[int]]:
     """The images of each volume, by their times, or where these are alike as they follow."""
     if len({times[n] for n in here}) > 1:
-        groups: dict[float, list[int]] = {}
-        for n in here:
-            groups.setdefault(times[n], []).append(n)
-        return [groups[time] for time in sorted(groups)]
+        return [[n for n in here if times[n] == time] for time in sorted({times[n] for n in here})]
     places = Counter(planes[n].position for n in here)
     count = max(places.values())
     if set(places.values()) != {count}:
@@ -179,7 +165,7 @@ def _in_time(
 
 
 def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
-    """What the files are in place of a volume, and what to do."""
+    """The kind of files that hold no volume, and what to do."""
     count = len(images.all)
     as_images = f"`us-sim import {images.files[0].path.name} --out images.igs.mha`"
     if planes and count == 1:
@@ -191,14 +177,13 @@ def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
             f"holds {count} images at one place, one after another in time, and no volume; as 2D "
             f"images it is imported with {as_images}"
         )
-    what = "a 2D image" if count == 1 else f"a 2D cine of {count} images"
+    kind = "a 2D image" if count == 1 else f"a 2D cine of {count} images"
     if len(images.files) > 1:
-        what = f"one of {len(images.files)} files with 2D images"
+        kind = f"one of {len(images.files)} files with 2D images"
     timed = number(images.files[0].header, "FrameTime")
-    what += ", one after another in time" if timed and count > 1 else ""
-    hidden = next(filter(None, map(hidden_volume, images.files)), "")
-    remedy = hidden or (
+    kind += ", one after another in time" if timed and count > 1 else ""
+    remedy = next(filter(None, map(hidden_volume, images.files)), "") or (
         f"export the 3D data as an Enhanced US Volume, or record a tracked sweep and reconstruct "
         f"it; as 2D images it is imported with {as_images}"
     )
-    return f"is {what}, not a volume: nothing in it says where its images lie in space; {remedy}"
+    return f"is {kind}, not a volume: nothing in it says where its images lie in space; {remedy}"

@@ -1,31 +1,14 @@
-"""Parallel images in space as one grid of voxels.
+"""The place and time of DICOM's images, as their header states them, and the grid that they make.
 
 DICOM says of every image where its first pixel is, which way its rows and columns go, and how far
 apart pixels are (PS3.3, C.7.6.2). A volume is a set of such images at even distances along their
-common normal, in any order.
+common normal, in any order. pydicom leaves this to others; highdicom's `get_volume_from_series` and
+its kin refuse the ultrasound objects that state no patient's coordinates (Enhanced US Volume) and
+the private ones, so it would not replace what is here.
 
-Where the images of a DICOM file are, as far as its header states it.
-
-- Enhanced US Volume and other enhanced objects: groups of values for each image or shared by all
-  (PS3.3, C.7.6.16; C.8.24.6 for ultrasound, in the volume's own frame of reference).
-- One image a file, with its position in the patient.
-- Several images with one position, and the distance of each (`GridFrameOffsetVector`) or of all
-  (`SpacingBetweenSlices`).
-
-Volumes that makers of scanners keep in ways of their own, and how to get at those.
-
-Three are read, as 3D Slicer's SlicerHeart and ITK-SNAP read them:
-
-- Philips' Cartesian export from QLAB (a storage class of its own): the number of slices and their
-  distance in the private elements (3001,1001) and (3001,1003), the other distances in cm in the
-  standard's;
-- Philips Affiniti: the distances in mm in a private element of "Philips US Imaging DD 036";
-- Eigen Artemis: voxels whose edge in mm is a thousandth of the pixels' aspect ratio.
-
-All others are refused with what a person can do. None of the three says where the patient is: the
-axes are those of the grid.
-
-When the images of a cine were made, from its first one on.
+Three makers' volumes are read as 3D Slicer's SlicerHeart and ITK-SNAP read them: Philips' Cartesian
+export from QLAB, Philips Affiniti, and Eigen Artemis. None of them says where the patient is: the
+axes are those of the grid. All others are refused with a way out.
 """
 
 from __future__ import annotations
@@ -35,7 +18,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -45,45 +28,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import (
-    DicomFile,
-    items,
-    number,
-    numbers,
-    private,
-    text,
-    value,
-    whole,
-)
+from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, private, text, whole
+from us_sim.volume.files.dicom.header import value as value_of
 from us_sim.volume.files.placement import checked_placement
 
 _PARALLEL = 1e-4  # difference of the components of directions that are the same
 _EVEN = 0.02  # of the distance between images, by which one may be off
 _PLACES = 0.01  # mm, to which some scanners round positions
+_ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+_CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
+
+_SAVE = "and save the volume as .nrrd"
+_QLAB = "export it as Cartesian DICOM (3DDCM) from QLAB or Ultrasound Workspace"
+_IMAGE3D = f"export an Enhanced US Volume, or open it in 3D Slicer with the maker's loader {_SAVE}"
+_HIDDEN = (
+    (0x7FE1, "KRETZ_US", "GE (Kretz)", f"open it in 3D Slicer with SlicerHeart {_SAVE}"),
+    (0x7FE1, "GEMS_Ultrasound_MovieGroup_001", "GE (movie group)", _IMAGE3D),
+    (0x200D, "Philips US Imaging DD", "Philips", _QLAB),
+    (0x200D, "Philips US Private 3D", "Philips", _QLAB),
+    (0x0039, "SIEMENS MED SMS USG ANTARES 3D VOLUME", "Siemens", _IMAGE3D),
+    (0x0139, "SIEMENS MED SMS USG S2000 3D VOLUME", "Siemens", _IMAGE3D),
+)
+"""Group, beginning of the creator's name as in DCMTK's dictionary, maker, advice."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Where an image is."""
+    """The place of an image."""
 
     position: tuple[float, ...]  # (3,) mm, centre of the first pixel
     orientation: tuple[float, ...]  # (6,) along a row, then along a column; unit vectors
     spacing: tuple[float, ...]  # (2,) mm, between rows, then between columns
-
-
-def image_axes(path: Path | str, orientation: Sequence[float]) -> NDArray[np.float64]:
-    """(3, 3) with columns along a row of the image, along a column, and along the normal.
-
-    Raises:
-        VolumeError: the first two are no unit vectors at right angles.
-    """
-    along = np.array(orientation, np.float64).reshape(2, 3).T
-    if np.abs(along.T @ along - np.eye(2)).max() > 1e-3:
-        raise VolumeError(
-            f"{path}: the directions of its rows and columns are not at right angles; export it "
-            f"again"
-        )
-    return np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
 
 
 def grid_of(path: Path | str, planes: Sequence[Plane]) -> tuple[list[int], NDArray[np.float64]]:
@@ -97,20 +72,26 @@ def grid_of(path: Path | str, planes: Sequence[Plane]) -> tuple[list[int], NDArr
         raise VolumeError(
             f"{path}: is one image; a volume needs two or more: give all files of the series"
         )
-    _check_parallel(path, planes)
-    axes = image_axes(path, planes[0].orientation)
-    positions = np.array([plane.position for plane in planes])
-    depth = positions @ axes[:, 2]
+    axes, positions, depth = _along_normal(path, planes)
     order = [int(n) for n in np.argsort(depth, kind="stable")]
     positions = positions[order]
-    step = (positions[-1] - positions[0]) / (len(planes) - 1)
-    distance = float(step @ axes[:, 2])
-    _check_even(path, np.diff(depth[order]), distance)
-    even = positions[0] + np.outer(np.arange(len(planes)), distance * axes[:, 2])
-    if np.abs(positions - even).max() > max(_EVEN * distance, _PLACES):
+    distance = float((positions[-1] - positions[0]) / (len(planes) - 1) @ axes[:, 2])
+    gaps = np.diff(depth[order])
+    if not np.isfinite(gaps).all() or gaps.min() < 1e-4:
         raise VolumeError(
-            f"{path}: its images are shifted against each other ({np.abs(positions - even).max():g}"
-            f" mm), so the grid is sheared; resample it on one with right angles"
+            f"{path}: several of its images are at the same place, and not one volume after "
+            f"another; give the files of one volume"
+        )
+    if np.abs(gaps - distance).max() > max(_EVEN * distance, _PLACES):
+        raise VolumeError(
+            f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart, which is not even: "
+            f"one may be missing"
+        )
+    even = positions[0] + np.outer(np.arange(len(planes)), distance * axes[:, 2])
+    if (off := np.abs(positions - even).max()) > max(_EVEN * distance, _PLACES):
+        raise VolumeError(
+            f"{path}: its images are shifted against each other ({off:g} mm), so the grid is "
+            f"sheared; resample it on one with right angles"
         )
     rows, columns = planes[0].spacing
     return order, checked_placement(path, (columns, rows, distance), axes, positions[0])
@@ -131,10 +112,7 @@ def sparse_grid_of(
         VolumeError: they are not parallel, are shifted against each other, lie between the slices,
             or where no body does.
     """
-    _check_parallel(path, planes)
-    axes = image_axes(path, planes[0].orientation)
-    positions = np.array([plane.position for plane in planes])
-    depth = positions @ axes[:, 2]
+    axes, positions, depth = _along_normal(path, planes)
     gaps = np.diff(np.unique(np.round(depth / _PLACES) * _PLACES))
     step = step or (float(gaps.min()) if len(gaps) else 1.0)
     slices = np.rint((depth - depth.min()) / step)
@@ -148,7 +126,10 @@ def sparse_grid_of(
     return slices.astype(int).tolist(), checked_placement(path, (columns, rows, step), axes, first)
 
 
-def _check_parallel(path: Path | str, planes: Sequence[Plane]) -> None:
+def _along_normal(
+    path: Path | str, planes: Sequence[Plane]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Axes (3, 3) of parallel images, their positions (N, 3) mm and depths (N,) along it."""
     orientation = np.array([plane.orientation for plane in planes])
     spacing = np.array([plane.spacing for plane in planes])
     if (
@@ -159,45 +140,43 @@ def _check_parallel(path: Path | str, planes: Sequence[Plane]) -> None:
             f"{path}: its images are not parallel, or their pixels differ in size, so they are no "
             f"grid; export a volume with even slices"
         )
+    axes = _image_axes(path, planes[0].orientation)
+    positions = np.array([plane.position for plane in planes])
+    return axes, positions, positions @ axes[:, 2]
 
 
-def _check_even(path: Path | str, gaps: NDArray[np.float64], distance: float) -> None:
-    if not np.isfinite(gaps).all() or gaps.min() < 1e-4:
+def _image_axes(path: Path | str, orientation: Sequence[float]) -> NDArray[np.float64]:
+    """(3, 3) with columns along a row of the image, along a column, and along the normal."""
+    along = np.array(orientation, np.float64).reshape(2, 3).T
+    if np.abs(along.T @ along - np.eye(2)).max() > 1e-3:
         raise VolumeError(
-            f"{path}: several of its images are at the same place, and not one volume after "
-            f"another; give the files of one volume"
+            f"{path}: the directions of its rows and columns are not at right angles; export it "
+            f"again"
         )
-    if np.abs(gaps - distance).max() > max(_EVEN * distance, _PLACES):
-        raise VolumeError(
-            f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart, which is not even: "
-            f"one may be missing"
-        )
-
-
-_ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-_CINE = (0x00181063, 0x00181065)  # FrameTime, FrameTimeVector
-_POSITIONS = (
-    ("PlanePositionVolumeSequence", "ImagePositionVolume"),
-    ("PlanePositionSequence", "ImagePositionPatient"),
-)
-_DIRECTIONS = (
-    ("PlaneOrientationVolumeSequence", "ImageOrientationVolume"),
-    ("PlaneOrientationSequence", "ImageOrientationPatient"),
-)
-_SIZES = (("PixelMeasuresSequence", "PixelSpacing"),)
+    return np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
 
 
 def stated_planes(file: DicomFile, frames: int) -> list[Plane] | None:
-    """The place of each of the images; None where the header does not state it."""
+    """The place of each of the images; None where the header does not state it.
+
+    - Enhanced objects: groups of values for each image or shared by all (PS3.3, C.7.6.16; C.8.24.6
+      for ultrasound, in the volume's own frame of reference).
+    - One image a file, with its position in the patient.
+    - Several images with one position, and the distance of each (`GridFrameOffsetVector`) or of
+      all (`SpacingBetweenSlices`).
+    """
     header = file.header
     if groups := _groups(header, frames):
-        return _of_groups(groups)
+        return _planes_of_groups(groups)
     position = numbers(header, "ImagePositionPatient", 3)
     orientation = numbers(header, "ImageOrientationPatient", 6)
     spacing = numbers(header, "PixelSpacing", 2)
     if position and orientation and spacing and frames == 1:
         return [Plane(position, orientation, spacing)]
-    if not spacing or frames == 1 or is_cine(header):
+    pointer = value_of(header, "FrameIncrementPointer")
+    listed = [pointer] if isinstance(pointer, int) else list(pointer or ())
+    is_cine = any(each in (0x00181063, 0x00181065) for each in listed)  # FrameTime, FrameTimeVector
+    if not spacing or frames == 1 or is_cine:
         return None
     offsets = numbers(header, "GridFrameOffsetVector", frames)
     between = number(header, "SpacingBetweenSlices")
@@ -206,34 +185,22 @@ def stated_planes(file: DicomFile, frames: int) -> list[Plane] | None:
     if offsets is None:
         return None
     orientation = orientation or _ALONG_AXES
-    normal = image_axes(file.path, orientation)[:, 2]
-    first = position or (0.0, 0.0, 0.0)
-    return [
-        Plane(
-            tuple(a + offset * b for a, b in zip(first, normal, strict=True)), orientation, spacing
-        )
-        for offset in offsets
-    ]
-
-
-def is_cine(header: Any) -> bool:
-    """Whether a file says that its images follow each other in time."""
-    pointer = value(header, "FrameIncrementPointer")
-    listed = [pointer] if isinstance(pointer, int) else list(pointer or ())
-    return any(each in _CINE for each in listed)
+    normal = _image_axes(file.path, orientation)[:, 2]
+    first = np.array(position or (0.0, 0.0, 0.0))
+    return [Plane(tuple(first + offset * normal), orientation, spacing) for offset in offsets]
 
 
 def image_times(file: DicomFile, frames: int) -> list[float]:
     """For each image the time of its volume, s, where there are several; else 0."""
     times = []
     for group in _groups(file.header, frames) or [()] * frames:
-        found = _found(group, (("TemporalPositionSequence", "TemporalPositionTimeOffset"),), 1)
+        found = _found(group, ("TemporalPositionSequence TemporalPositionTimeOffset",), 1)
         times.append(found[0] if found else 0.0)
     return times
 
 
 def image_kinds(file: DicomFile, frames: int) -> list[str]:
-    """For each image what its values are, such as TISSUE_INTENSITY; empty where nothing says it."""
+    """For each image the kind of its values, such as TISSUE_INTENSITY; empty where none is said."""
     kinds = []
     for group in _groups(file.header, frames) or [()] * frames:
         described = [each for part in group for each in items(part, "ImageDataTypeSequence")]
@@ -248,12 +215,20 @@ def _groups(header: Any, frames: int) -> list[tuple[Any, ...]]:
     return [(group, *shared) for group in own] if len(own) == frames else []
 
 
-def _of_groups(groups: list[tuple[Any, ...]]) -> list[Plane] | None:
+def _planes_of_groups(groups: list[tuple[Any, ...]]) -> list[Plane] | None:
     planes = []
     for group in groups:
-        position = _found(group, _POSITIONS, 3)
-        orientation = _found(group, _DIRECTIONS, 6)
-        spacing = _found(group, _SIZES, 2)
+        position = _found(
+            group,
+            ("PlanePositionVolumeSequence ImagePositionVolume",
+             "PlanePositionSequence ImagePositionPatient"), 3,
+        )  # fmt: skip
+        orientation = _found(
+            group,
+            ("PlaneOrientationVolumeSequence ImageOrientationVolume",
+             "PlaneOrientationSequence ImageOrientationPatient"), 6,
+        )  # fmt: skip
+        spacing = _found(group, ("PixelMeasuresSequence PixelSpacing",), 2)
         if not (position and orientation and spacing):
             return None
         planes.append(Plane(position, orientation, spacing))
@@ -261,34 +236,15 @@ def _of_groups(groups: list[tuple[Any, ...]]) -> list[Plane] | None:
 
 
 def _found(
-    groups: tuple[Any, ...], where: tuple[tuple[str, str], ...], count: int
+    groups: tuple[Any, ...], places: tuple[str, ...], count: int
 ) -> tuple[float, ...] | None:
-    """The numbers of the first group that has them."""
+    """The numbers at the first of some places, each a sequence and an element of its first item."""
     for group in groups:
-        for sequence, key in where:
+        for sequence, key in map(str.split, places):
             for item in items(group, sequence)[:1]:
-                found = numbers(item, key, count)
-                if found is not None:
+                if (found := numbers(item, key, count)) is not None:
                     return found
     return None
-
-
-_CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
-_CENTIMETRES = 10.0  # mm
-
-_SAVE = "and save the volume as .nrrd"
-_QLAB = "export it as Cartesian DICOM (3DDCM) from QLAB or Ultrasound Workspace"
-_IMAGE3D = f"export an Enhanced US Volume, or open it in 3D Slicer with the maker's loader {_SAVE}"
-_HIDDEN = (
-    (0x7FE1, "KRETZ_US", "GE (Kretz)", f"open it in 3D Slicer with SlicerHeart {_SAVE}"),
-    (0x7FE1, "GEMS_Ultrasound_MovieGroup_001", "GE (movie group)", _IMAGE3D),
-    (0x200D, "Philips US Imaging DD", "Philips", _QLAB),
-    (0x200D, "Philips US Private 3D", "Philips", _QLAB),
-    (0x0039, "SIEMENS MED SMS USG ANTARES 3D VOLUME", "Siemens", _IMAGE3D),
-    (0x0139, "SIEMENS MED SMS USG S2000 3D VOLUME", "Siemens", _IMAGE3D),
-)
-"""Group, beginning of the creator's name as in DCMTK's and pydicom's dictionaries, whose it is,
-and what to do."""
 
 
 def is_cartesian(file: DicomFile) -> bool:
@@ -304,7 +260,8 @@ def one_image_after_another(file: DicomFile) -> DicomFile:
     """
     if not is_cartesian(file):
         return file
-    slices, volumes = _private_number(file.header, 0x30011001), _volumes(file)
+    slices = _private_number(file.header, 0x30011001)
+    volumes = max(whole(file.header, "NumberOfFrames") or 1, 1)
     if slices is None or slices != int(slices) or slices < 2:
         raise VolumeError(
             f"{file.path}: is a Cartesian export of Philips that does not say how many slices it "
@@ -312,11 +269,16 @@ def one_image_after_another(file: DicomFile) -> DicomFile:
         )
     header = copy.copy(file.header)
     header.NumberOfFrames = int(min(volumes * slices, 1 << 30))
-    return DicomFile(file.path, header, file.syntax, file.little_endian, file.pixels, file.inflated)
+    return replace(file, header=header)
 
 
 def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float]] | None:
     """The places of images that a maker states in a way of its own, and their times in s.
+
+    - Philips' Cartesian export: the number of slices and their distance in the private elements
+      (3001,1001) and (3001,1003), the other distances in the standard's; all in cm.
+    - Philips Affiniti: the distances in mm in an element of "Philips US Imaging DD 036".
+    - Eigen Artemis: voxels whose edge in mm is a thousandth of the pixels' aspect ratio.
 
     Args:
         file: as `one_image_after_another` returns it.
@@ -326,29 +288,52 @@ def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float
     if is_cartesian(file):
         x, y = number(header, "PhysicalDeltaX"), number(header, "PhysicalDeltaY")
         z = _private_number(header, 0x30011003)
-        slices = _private_number(header, 0x30011001)
+        slices = int(_private_number(header, 0x30011001) or 0)
         if not (x and y and z and slices):
             return None
         step = (number(header, "FrameTime") or 1000.0) * 1e-3  # s
-        grid = _stack(
-            (x * _CENTIMETRES, y * _CENTIMETRES, z * _CENTIMETRES), int(slices), centred=0
-        )
-        return grid * (frames // int(slices)), [step * (n // int(slices)) for n in range(frames)]
+        grid = _stack((x * 10.0, y * 10.0, z * 10.0), slices)
+        return grid * (frames // slices), [step * (n // slices) for n in range(frames)]
     tag = private(header, 0x200D, "Philips US Imaging DD 036", 0x03)
     spacing = numbers(header, tag, 3) if tag is not None else None
     if spacing and frames > 1:
-        return _stack(spacing, frames, centred=0), [0.0] * frames
-    if text(header, "Manufacturer") == "Eigen" and (
-        text(header, "ManufacturerModelName") == "Artemis" and frames > 1
-    ):
+        return _stack(spacing, frames), [0.0] * frames
+    maker = text(header, "Manufacturer"), text(header, "ManufacturerModelName")
+    if maker == ("Eigen", "Artemis") and frames > 1:
         edge = (number(header, "PixelAspectRatio") or 0.0) / 1000
         size = (whole(header, "Columns") or 0, whole(header, "Rows") or 0)
-        return _stack((edge, edge, edge), frames, centred=1, size=size), [0.0] * frames
+        return _stack((edge, edge, edge), frames, about=size), [0.0] * frames
     return None
 
 
+def _stack(
+    spacing: Sequence[float], count: int, about: tuple[int, int] | None = None
+) -> list[Plane]:
+    """Images one behind the other along the grid's axes, from 0 or about it; spacing x y z."""
+    x, y, z = spacing
+    corner = [0.0, 0.0, 0.0]
+    if about is not None:
+        corner = [-(n - 1) / 2 * s for n, s in zip((*about, count), spacing, strict=True)]
+    return [
+        Plane((corner[0], corner[1], corner[2] + n * z), _ALONG_AXES, (y, x)) for n in range(count)
+    ]
+
+
+def _private_number(header: Any, tag: int) -> float | None:
+    """A number whose type the file does not say: as text, whole, or in double precision."""
+    found = value_of(header, tag)
+    if not isinstance(found, bytes):
+        return number(header, tag)
+    try:
+        form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found))
+        made = float(struct.unpack(form, found)[0] if form else found.decode("ascii"))
+    except (ValueError, struct.error):
+        return None
+    return made if math.isfinite(made) else None
+
+
 def hidden_volume(file: DicomFile) -> str:
-    """What to do about a volume that is there, but in a form only its maker knows; or nothing."""
+    """Advice about a volume that is there, but in a form only its maker knows; or nothing."""
     for group, creator, maker, remedy in _HIDDEN:
         for block in range(0x10, 0x100):
             if text(file.header, (group << 16) | block).startswith(creator):
@@ -356,56 +341,24 @@ def hidden_volume(file: DicomFile) -> str:
     return ""
 
 
-def _stack(
-    spacing: Sequence[float], count: int, *, centred: int, size: tuple[int, int] = (1, 1)
-) -> list[Plane]:
-    """Images one behind the other along the grid's own axes, from 0 or about it; spacing x y z."""
-    x, y, z = spacing
-    corner = [-centred * (n - 1) / 2 * s for n, s in zip((*size, count), spacing, strict=True)]
-    return [
-        Plane((corner[0], corner[1], corner[2] + n * z), _ALONG_AXES, (y, x)) for n in range(count)
-    ]
-
-
-def _volumes(file: DicomFile) -> int:
-    return max(whole(file.header, "NumberOfFrames") or 1, 1)
-
-
-def _private_number(header: Any, tag: int) -> float | None:
-    """A number whose type the file does not say: as text, whole, or in double precision."""
-    found = value(header, tag)
-    if isinstance(found, bytes):
-        try:
-            form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found))
-            made = float(struct.unpack(form, found)[0] if form else found.decode("ascii"))
-        except (ValueError, struct.error):
-            return None
-        return made if math.isfinite(made) else None
-    return number(header, tag)
-
-
-_MILLISECONDS = 1e-3
-_STAMP = re.compile(r"(\d{14})(\.\d{1,6})?([+-]\d{4})?")  # value representation DT, PS3.5, 6.2
-
-
 def frame_times(file: DicomFile, frames: int) -> list[float] | None:
-    """Times in s from the first image on; None where the header does not state them.
+    """Times of a cine's images in s, from the first on; None where the header does not state them.
 
     `FrameTimeVector` says how long after the one before it each image came, `FrameTime` and the
     rates say it of all (PS3.3, C.7.6.5). Without these, images of enhanced objects state their own
     times (PS3.3, C.7.6.16.2).
     """
     header = file.header
-    steps = numbers(header, "FrameTimeVector", frames)
+    steps = numbers(header, "FrameTimeVector", frames)  # ms
     if steps and all(0.0 <= step < 1e7 for step in steps[1:]):
-        return list(accumulate((step * _MILLISECONDS for step in steps[1:]), initial=0.0))
+        return list(accumulate((step * 1e-3 for step in steps[1:]), initial=0.0))
     step = number(header, "FrameTime")
     if not step or not 0.0 < step < 1e7:
         rate = number(header, "CineRate") or number(header, "RecommendedDisplayFrameRate")
-        step = 1.0 / rate / _MILLISECONDS if rate and rate > 1e-3 else math.nan
-    if math.isnan(step):
+        step = 1.0 / rate / 1e-3 if rate and rate > 1e-3 else None
+    if step is None:
         return [0.0] if frames == 1 else _own_times(file, frames)
-    return [frame * step * _MILLISECONDS for frame in range(frames)]
+    return [frame * step * 1e-3 for frame in range(frames)]
 
 
 def _own_times(file: DicomFile, frames: int) -> list[float] | None:
@@ -413,21 +366,18 @@ def _own_times(file: DicomFile, frames: int) -> list[float] | None:
     groups = items(file.header, "PerFrameFunctionalGroupsSequence")
     contents = [item for group in groups for item in items(group, "FrameContentSequence")[:1]]
     keys = ("FrameReferenceDateTime", "FrameAcquisitionDateTime")
-    for times in (image_times(file, frames), *(_since_first(contents, key) for key in keys)):
+    stamps = [list(_stamps(contents, key)) for key in keys]
+    since = [[(stamp - each[0]).total_seconds() for stamp in each] for each in stamps]
+    for times in (image_times(file, frames), *since):
         if len(times) == frames and all(a < b for a, b in pairwise(times)):
             return [time - times[0] for time in times]
     return None
 
 
-def _since_first(contents: list[Any], key: str) -> list[float]:
-    """Times in s of the items that state them."""
-    stamps = list(_stamps(contents, key))
-    return [(stamp - stamps[0]).total_seconds() for stamp in stamps]
-
-
 def _stamps(contents: list[Any], key: str) -> Iterator[datetime]:
+    """Dates and times of value representation DT (PS3.5, 6.2) of the items that state them."""
     for item in contents:
-        if found := _STAMP.fullmatch(text(item, key)):
+        if found := re.fullmatch(r"(\d{14})(\.\d{1,6})?([+-]\d{4})?", text(item, key)):
             day, part, zone = found.groups("")
             try:
                 stated = f"{day}{part or '.0'}{zone or '+0000'}"

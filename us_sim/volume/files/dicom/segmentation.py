@@ -66,10 +66,11 @@ def read_segmentation(file: DicomFile) -> DicomSegmentation:
         raise VolumeError(f"{path}: does not state where its images lie; export it again")
     shared = items(header, "SharedFunctionalGroupsSequence")[:1]
     own = items(header, "PerFrameFunctionalGroupsSequence")
-    measures = [
-        each for group in (*shared, *own[:1]) for each in items(group, "PixelMeasuresSequence")
+    steps = [
+        number(each, "SpacingBetweenSlices")
+        for group in (*shared, *own[:1])
+        for each in items(group, "PixelMeasuresSequence")
     ]
-    steps = [number(each, "SpacingBetweenSlices") for each in measures]
     slices, placement = sparse_grid_of(
         path, planes, next((s for s in steps if s and s > 0.0), None)
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
@@ -21,7 +22,6 @@ from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
-from us_sim.volume.reconstruction.picture import draw_slices
 from us_sim.volume.reconstruction.reconstruction import (
     APART,
     Plan,
@@ -34,12 +34,9 @@ from us_sim.volume.reconstruction.reconstruction import (
     reconstruct,
 )
 from us_sim.volume.reconstruction.scanning_probe import ScanningProbe, scanning_probe
-from us_sim.volume.reconstruction.settings import Compounding, ImagePart
+from us_sim.volume.reconstruction.settings import VOLUME_ENDINGS, Compounding, ImagePart
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import Sweep, shifted, sweep_of
-
-_VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
-_FRAME = "frame"
 
 
 @dataclass(frozen=True)
@@ -82,8 +79,8 @@ class SweepSettings(Settings):
         if not self.is_volume and 1 < len(self.out.suffix) <= 5:
             raise self.refused(
                 "out",
-                f"{self.out}: its name ends as no volume's does; write {', '.join(_VOLUMES)}, or a "
-                f"folder's name without an ending for a case",
+                f"{self.out}: its name ends as no volume's does; write "
+                f"{', '.join(VOLUME_ENDINGS)}, or a folder's name without an ending for a case",
             )
         if self.is_volume and not self.out.absolute().parent.is_dir():
             raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
@@ -93,13 +90,14 @@ class SweepSettings(Settings):
     @property
     def is_volume(self) -> bool:
         """Whether a volume's file is written, and not a case."""
-        return self.out.name.lower().endswith(_VOLUMES)
+        return self.out.name.lower().endswith(VOLUME_ENDINGS)
 
     @property
     def picture(self) -> Path:
         """The picture beside the file."""
-        stem = next((end for end in _VOLUMES[::-1] if self.out.name.lower().endswith(end)), "")
-        return self.out.with_name(self.out.name[: len(self.out.name) - len(stem)] + ".png")
+        name = self.out.name
+        ending = next((end for end in VOLUME_ENDINGS[::-1] if name.lower().endswith(end)), "")
+        return self.out.with_name(name[: len(name) - len(ending)] + ".png")
 
 
 def reconstruct_sweep(
@@ -110,13 +108,13 @@ def reconstruct_sweep(
     rest_of: Callable[[Sweep, ImagePart], Rest] | None = None,
     progress: Progress | None = None,
 ) -> str:
-    """Reconstruct a sweep and write what came of it; returns a sentence with the result.
+    """Reconstruct a sweep and write the result; returns a sentence about it.
 
     Args:
         settings: which sweep.
         compounding: how.
         part: of each image; where it says nothing, the calibration's.
-        rest_of: makes what undoes the tissue's deformation, of the placed sweep.
+        rest_of: makes the function that undoes the tissue's deformation, of the placed sweep.
         progress: is told how far it is.
 
     Raises:
@@ -141,48 +139,52 @@ def reconstruct_sweep(
     prediction = None
     if settings.leave_one_out:
         prediction = leave_one_out(planned, settings.leave_one_out, progress)
-    case = _case(settings, planned, scanner)
-    picture = _write(settings, planned, made, prediction, case)
-    return _said(settings, planned, made, prediction, picture, case)
+    size = (
+        f"{' × '.join(map(str, made.volume.shape))} voxels of {1e3 * planned.grid.spacing:.4g} mm"
+    )
+    if scanner is None:
+        picture = settings.picture
+        write_volume(settings.out, made.volume)
+        draw_slices(picture, made.volume, made.covered, size)
+    else:
+        picture = settings.out / "volume.png"
+        with new_case(settings.out) as folder:
+            write_volume(folder / "volume.nrrd", made.volume)
+            write_case_settings(folder, _case(settings, planned, scanner))
+            add_step(folder, _step(settings, planned, made, prediction))
+            draw_slices(folder / picture.name, made.volume, made.covered, size)
+    sentences = [
+        f"{settings.out}: {size} ({100.0 * made.covered.mean():.0f} % covered, {made.filled} of "
+        f"them filled holes) from {made.frames} frames by {compounding.method} insertion and "
+        f"{compounding.compounding} compounding"
+    ]
+    if left_out := sweep.left_out:
+        why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
+        sentences.append(f"left out are {why}")
+    if sweep.sequence.are_colours:
+        sentences.append("its colour images were made grey")
+    if prediction is not None:
+        sentences.append(_prediction_said(prediction, settings.leave_one_out))
+    if scanner is not None and scanner.probe is not None:
+        sentences.append(f"its images are those of {_array_said(scanner.probe)}")
+    elif scanner is not None:
+        sentences.append("nothing shows the probe's shape, which is guessed")
+    return "; ".join([*sentences, f"slices in {picture}"])
 
 
-def _case(settings: SweepSettings, planned: Plan, scanner: ScanningProbe | None) -> CaseSettings:
-    """What the sweep tells of the case: its probe, and where this was.
+def _case(settings: SweepSettings, planned: Plan, scanner: ScanningProbe) -> CaseSettings:
+    """The case's probe and its poses, as the sweep shows them.
 
     The poses are those of a probe that pressed, so they are not said where that has been undone.
     """
-    case = CaseSettings(name=settings.out.name)
-    if scanner is None:
-        return case
-    case = dataclasses.replace(case, probe=scanner.probe)
-    return case if planned.rest else dataclasses.replace(case, scanned=scanner.poses)
-
-
-def _write(
-    settings: SweepSettings,
-    planned: Plan,
-    made: Reconstruction,
-    prediction: Prediction | None,
-    case: CaseSettings,
-) -> Path:
-    """Write the volume or case; the picture's path."""
-    title = f"{' × '.join(map(str, made.volume.shape))} voxels of {_spacing(planned)} mm"
-    if settings.is_volume:
-        write_volume(settings.out, made.volume)
-        draw_slices(settings.picture, made.volume, made.covered, title)
-        return settings.picture
-    with new_case(settings.out) as folder:
-        write_volume(folder / "volume.nrrd", made.volume)
-        write_case_settings(folder, case)
-        add_step(folder, _step(settings, planned, made, prediction))
-        draw_slices(folder / "volume.png", made.volume, made.covered, title)
-    return settings.out / "volume.png"
+    scanned = () if planned.rest else scanner.poses
+    return CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
 
 
 def _step(
     settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
 ) -> Step:
-    """What was done, without names of files."""
+    """The entry in the provenance, without names of files."""
     sources = [Source.of(settings.sweep, "tracked sequence")]
     if settings.calibration is not None:
         sources.append(Source.of(settings.calibration, "probe calibration"))
@@ -208,44 +210,15 @@ def _step(
     return Step("reconstructed", {**said, **more}, counts, tuple(sources))
 
 
-def _said(
-    settings: SweepSettings,
-    planned: Plan,
-    made: Reconstruction,
-    prediction: Prediction | None,
-    picture: Path,
-    case: CaseSettings,
-) -> str:
-    share = 100.0 * made.covered.mean()
-    compounding = planned.compounding
-    sentences = [
-        f"{settings.out}: {' × '.join(map(str, made.volume.shape))} voxels of "
-        f"{_spacing(planned)} mm ({share:.0f} % covered, {made.filled} of them filled holes) from "
-        f"{made.frames} frames by {compounding.method} insertion and {compounding.compounding} "
-        f"compounding"
-    ]
-    left_out = planned.sweep.left_out
-    if left_out:
-        why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
-        sentences.append(f"left out are {why}")
-    if planned.sweep.sequence.are_colours:
-        sentences.append("its colour images were made grey")
-    if prediction is not None:
-        worst = int(prediction.frames[int(np.nanargmin(prediction.correlations))])
-        few = len(prediction.frames) < settings.leave_one_out
-        between = f"{APART - 1} others or more stay between two of them"
-        why = f" (not {settings.leave_one_out}: {between})" if few else ""
-        sentences.append(
-            f"{counted(len(prediction.frames), 'frame')}{why} predicted from the others correlate "
-            f"with what was seen by {prediction.median:.3f} in the median and "
-            f"{prediction.worst:.3f} at worst "
-            f"({_FRAME} {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
-        )
-    if case.probe is not None:
-        sentences.append(f"its images are those of {_array_said(case.probe)}")
-    elif not settings.is_volume:
-        sentences.append("nothing shows the probe's shape, which is guessed")
-    return "; ".join([*sentences, f"slices in {picture}"])
+def _prediction_said(prediction: Prediction, asked: int) -> str:
+    worst = int(prediction.frames[int(np.nanargmin(prediction.correlations))])
+    between = f"{APART - 1} others or more stay between two of them"
+    why = f" (not {asked}: {between})" if len(prediction.frames) < asked else ""
+    return (
+        f"{counted(len(prediction.frames), 'frame')}{why} predicted from the others correlate with "
+        f"what was seen by {prediction.median:.3f} in the median and {prediction.worst:.3f} at "
+        f"worst (frame {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
+    )
 
 
 def _array_said(probe: ProbeSettings) -> str:
@@ -258,7 +231,3 @@ def _array_said(probe: ProbeSettings) -> str:
     if probe.geometry == "sector":
         return f"a phased array, {opening}"
     return f"a curved array of radius {1e3 * array.radius:.1f} mm, {opening}"
-
-
-def _spacing(planned: Plan) -> str:
-    return f"{1e3 * planned.grid.spacing:.4g}"

@@ -1,4 +1,4 @@
-"""A picture of a segmentation: slices with outlines, and the surfaces."""
+"""Pictures of volumes and segmentations: slices in millimetres, outlines and surfaces."""
 
 from __future__ import annotations
 
@@ -13,24 +13,60 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
+from us_sim.errors import VolumeError
 from us_sim.volume.surfaces.closed_surface import ClosedSurface
 from us_sim.volume.surfaces.label_surface import voxel_surface
 from us_sim.volume.volume import LabelMap, Volume
 
 _AXES = ("i", "j", "k")
+_BARS = (1, 2, 5, 10, 20, 50, 100, 200)  # mm
 _SLICES = 3  # along each axis
 _MOST_TRIANGLES = 20_000  # of all surfaces; matplotlib draws them in a second or two
-_MARGIN = 20.0  # mm that slices show around what is labelled
 _LINES: tuple[Any, ...] = ("solid", "dashed", "dotted", "dashdot")
 """In turn, since several structures may have one colour."""
-_LIGHT = np.array([0.4, -0.5, 0.77])
+
+
+def draw_slices(path: Path, volume: Volume, covered: NDArray[np.bool_], title: str) -> None:
+    """Write a PNG of three slices at right angles, with a scale bar.
+
+    Args:
+        path: of the new file.
+        volume: its slices through the middle of the covered part are drawn.
+        covered: (i, j, k) where it holds something.
+        title: above the slices.
+
+    Raises:
+        VolumeError: the file cannot be written.
+    """
+    at = [int(np.median(np.flatnonzero(covered.any(axis=_others(axis))))) for axis in range(3)]
+    spacing = 1e3 * np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)  # mm
+    figure = Figure(figsize=(12, 4.6), layout="constrained")
+    figure.suptitle(title, fontsize=10)
+    for axis, plot in enumerate(figure.subplots(1, 3)):
+        across, down = _others(axis)
+        grey = np.take(volume.intensities, at[axis], axis=axis)
+        size = spacing[[across, down]] * grey.shape
+        plot.imshow(
+            grey.T, cmap="gray", vmin=0, vmax=255, extent=(0, size[0], size[1], 0), aspect="equal"
+        )
+        bar = max(mm for mm in _BARS if mm <= max(0.4 * size[0], _BARS[0]))
+        left, low = 0.05 * size[0], 0.95 * size[1]
+        plot.plot([left, left + bar], [low, low], color="w", linewidth=3)
+        plot.text(left, low - 0.02 * size[1], f"{bar} mm", color="w", va="bottom", fontsize=9)
+        plot.set_title(f"{_AXES[axis]} = {at[axis]}", fontsize=9)
+        plot.set(xlabel=f"{_AXES[across]} (mm)", ylabel=f"{_AXES[down]} (mm)")
+    try:
+        with path.open("xb") as file:
+            FigureCanvasAgg(figure).print_png(file)
+    except OSError as error:
+        raise VolumeError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
-    """Write the picture as PNG.
+    """Write a PNG of slices with the structures' outlines, and of their surfaces.
 
     Each row has slices through the middle and both sides of the structures along one axis of the
-    grid, in millimetres from the grid's first voxel, with what is near the structures.
+    grid, in millimetres from the grid's first voxel, with their surroundings.
     """
     figure = Figure(figsize=(17, 11))
     FigureCanvasAgg(figure)
@@ -39,8 +75,11 @@ def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
         3, 2 + _SLICES, left=0.04, right=0.97, bottom=0.05, top=0.96, wspace=0.24, hspace=0.22
     )
     for axis in range(3):
-        for column, index in enumerate(_indices(found.labels, axis)):
-            _slice(figure.add_subplot(grid[axis, column]), volume, found, axis, index)
+        # Slices at a sixth, a half and five sixths of the labelled voxels.
+        held = np.cumsum(np.count_nonzero(found.labels, axis=_others(axis)))
+        parts = (np.arange(_SLICES) + 0.5) / _SLICES * held[-1]
+        for column, index in enumerate(np.searchsorted(held, parts)):
+            _slice(figure.add_subplot(grid[axis, column]), volume, found, axis, int(index))
     _surfaces(figure.add_subplot(grid[:2, _SLICES:], projection="3d"), volume, found)
     voxel = abs(float(np.linalg.det(volume.index_to_patient[:3, :3])))
     keys = [
@@ -59,21 +98,8 @@ def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
     figure.savefig(file, dpi=80)
 
 
-def _indices(labels: NDArray[np.uint8], axis: int) -> list[int]:
-    """Slices along an axis: at parts of a quarter, half and three quarters of what is labelled."""
-    others = tuple(other for other in range(3) if other != axis)
-    covered = np.cumsum(np.count_nonzero(labels, axis=others))
-    parts = (np.arange(_SLICES) + 0.5) / _SLICES * covered[-1]
-    return [int(index) for index in np.searchsorted(covered, parts)]
-
-
-def _shown_part(labels: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """(2, 3) first and last index of what is labelled along each axis."""
-    ends = []
-    for axis in range(3):
-        there = np.flatnonzero(labels.any(axis=tuple(other for other in range(3) if other != axis)))
-        ends.append((there[0], there[-1]))
-    return np.array(ends).T
+def _others(axis: int) -> tuple[int, ...]:
+    return tuple(other for other in range(3) if other != axis)
 
 
 def _slice(panel: Any, volume: Volume, found: LabelMap, axis: int, index: int) -> None:
@@ -85,19 +111,21 @@ def _slice(panel: Any, volume: Volume, found: LabelMap, axis: int, index: int) -
     panel.imshow(np.sqrt(grey / 255.0), cmap="gray", vmin=0.0, vmax=1.0, extent=extent)
     shown = np.take(found.labels, index, axis=axis).T
     x, y = np.arange(columns) * sides[0], np.arange(rows) * sides[1]
-    for label in found.names:
+    for number, label in enumerate(found.names):
         if (shown == label).any():
-            line = _LINES[list(found.names).index(label) % len(_LINES)]
-            colour = [found.colours[label]]
+            line, colour = _LINES[number % len(_LINES)], [found.colours[label]]
             panel.contour(x, y, shown == label, [0.5], colors=colour, linestyles=line)
-    names = [name for other, name in enumerate(_AXES) if other != axis]
-    lower, upper = np.delete(_shown_part(found.labels), axis, axis=1) * sides
-    panel.set_xlim(lower[0] - _MARGIN, upper[0] + _MARGIN)
-    panel.set_ylim(upper[1] + _MARGIN, lower[1] - _MARGIN)
+    across, down = _others(axis)
+    ends = []
+    for along, side in zip((across, down), sides, strict=True):
+        held = np.flatnonzero(found.labels.any(axis=_others(along)))
+        ends.append((held[0] * side - 20.0, held[-1] * side + 20.0))  # mm around the labels
+    panel.set_xlim(*ends[0])
+    panel.set_ylim(*ends[1][::-1])
     panel.set_facecolor("black")
     panel.set_title(f"{_AXES[axis]} = {index}", fontsize=10)
-    panel.set_xlabel(f"{names[0]}, mm", fontsize=8)
-    panel.set_ylabel(f"{names[1]}, mm", fontsize=8)
+    panel.set_xlabel(f"{_AXES[across]}, mm", fontsize=8)
+    panel.set_ylabel(f"{_AXES[down]}, mm", fontsize=8)
     panel.tick_params(labelsize=7)
 
 
@@ -107,7 +135,8 @@ def _surfaces(panel: Any, volume: Volume, found: LabelMap) -> None:
     for label, surface in shown:
         normals = surface.crosses
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        shade = (0.45 + 0.55 * np.clip(normals @ _LIGHT, 0.0, 1.0))[:, None]
+        light = normals @ np.array([0.4, -0.5, 0.77])
+        shade = (0.45 + 0.55 * np.clip(light, 0.0, 1.0))[:, None]
         corners = 1e3 * surface.vertices[surface.triangles]
         panel.add_collection3d(Poly3DCollection(corners, facecolors=shade * found.colours[label]))
     points = 1e3 * np.concatenate([surface.vertices for _, surface in shown])
@@ -118,24 +147,24 @@ def _surfaces(panel: Any, volume: Volume, found: LabelMap) -> None:
     panel.set_ylim(middle[1] + reach, middle[1] - reach)
     panel.set_zlim(middle[2] - reach, middle[2] + reach)
     panel.set_box_aspect((1, 1, 1))
-    for name, set_label in zip(
-        "LPS", (panel.set_xlabel, panel.set_ylabel, panel.set_zlabel), strict=True
-    ):
+    labels = panel.set_xlabel, panel.set_ylabel, panel.set_zlabel
+    for name, set_label in zip("LPS", labels, strict=True):
         set_label(f"{name}, mm", fontsize=8)
     panel.tick_params(labelsize=7)
 
 
 def _coarse_surfaces(volume: Volume, found: LabelMap) -> Sequence[tuple[int, ClosedSurface]]:
+    shown: Sequence[tuple[int, ClosedSurface]] = ()
     for step in range(1, 64):
         placement = volume.index_to_patient.copy()
         placement[:3, :3] *= step
         labels = np.ascontiguousarray(found.labels[::step, ::step, ::step])
         coarse = Volume(labels, placement, labels, found.names)
-        there = [label for label in found.names if (labels == label).any()]
         # Six faces a voxel at most; a quick look before surfaces are made.
         if np.count_nonzero(labels) ** (2 / 3) * 12 > 8 * _MOST_TRIANGLES:
             continue
+        there = [label for label in found.names if (labels == label).any()]
         shown = [(label, voxel_surface(coarse, label)[0]) for label in there]
         if sum(len(surface.triangles) for _, surface in shown) <= _MOST_TRIANGLES:
-            return shown
+            break
     return shown
