@@ -1,10 +1,15 @@
-"""Numbers with units."""
+"""Numbers with units.
+
+Numbers for a person: in a handy unit, and read back as the number they are.
+"""
 
 import math
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from us_sim.settings.quantity import Quantity
+from us_sim.settings.quantity import Quantity, amount, span
 
 
 @pytest.mark.parametrize(
@@ -35,3 +40,38 @@ def test_what_is_no_length(text):
 def test_what_is_not_finite(number):
     with pytest.raises(ValueError, match="is not finite"):
         Quantity("length").parse(number)
+
+
+@given(
+    st.sampled_from(["length", "pressure", "time", "angle", "stiffness", "number", "density"]),
+    st.floats(-1e13, 1e13, allow_subnormal=False),
+)
+def test_what_is_written_is_read_back(dimension, value):
+    back = Quantity(dimension).parse(amount(value, dimension))
+    assert math.isclose(back, value, rel_tol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "dimension", "text"),
+    [
+        (0.04, "length", "40 mm"),
+        (0.0, "length", "0 mm"),
+        (1e-9, "length", "0.001 um"),
+        (0.4e3, "pressure", "0.4 kPa"),
+        (1e7, "pressure", "10 MPa"),
+        (math.radians(75), "angle", "75 deg"),
+        (0.3, "angle", "0.3 rad"),
+        (0.02, "time", "20 ms"),
+        (6.0, "level", "6 dB"),
+        (0.999999, "number", "0.999999"),
+        (2**31, "number", "2147483648"),
+    ],
+)
+def test_the_unit_is_the_one_that_people_use(value, dimension, text):
+    assert amount(value, dimension) == text
+
+
+def test_a_range_has_its_unit_once_where_it_is_one():
+    assert span(Quantity("length", 0.0, 0.01)) == "0 to 10 mm"
+    assert span(Quantity("time", 1e-3, 60.0)) == "1 ms to 60 s"
+    assert span(Quantity("number", 0.0, 1.0)) == "0 to 1"

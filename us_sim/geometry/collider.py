@@ -19,54 +19,50 @@ _ROUNDING = Quantity("length", 1e-5, 0.25)
 
 
 @dataclass(frozen=True)
-class Sphere(Settings):
-    """The paper's spherical collision volume; touches z = 0 of the probe at the origin.
+class _Shape(Settings):
+    """A box grown by a rounding.
 
     Raises:
-        ProbeError: the radius is out of its range.
+        ProbeError: a dimension is out of its range, or they do not go together.
     """
 
     section = "probe.collider"
     error = ProbeError
+
+    @property
+    def offset_box(self) -> NDArray[np.float64]:
+        """(4,) m: half extents x, y, z of the core box, and the rounding around it; (5,) where the
+        core's front is curved, with its curvature, 1/m.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Sphere(_Shape):
+    """The paper's spherical collision volume; touches z = 0 of the probe at the origin."""
 
     radius: float = setting(_SIZE, "of the sphere")
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
-        """(4,) m: half extents x, y, z of the core box, and the rounding around it."""
         return np.array([0.0, 0.0, 0.0, self.radius])
 
 
 @dataclass(frozen=True)
-class Capsule(Settings):
-    """A cylinder along the probe's x with hemispherical ends, as a linear array has.
-
-    Raises:
-        ProbeError: a dimension is out of its range.
-    """
-
-    section = "probe.collider"
-    error = ProbeError
+class Capsule(_Shape):
+    """A cylinder along the probe's x with hemispherical ends, as a linear array has."""
 
     radius: float = setting(_SIZE, "of the cylinder and of its ends")
     length: float = setting(_SIZE, "between the centres of the two end caps")
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
-        """(4,) m: half extents x, y, z of the core box, and the rounding around it."""
         return np.array([self.length / 2, 0.0, 0.0, self.radius])
 
 
 @dataclass(frozen=True)
-class RoundedBox(Settings):
-    """A flat transducer face with rounded edges.
-
-    Raises:
-        ProbeError: a dimension is out of its range, or the rounding is more than half of one.
-    """
-
-    section = "probe.collider"
-    error = ProbeError
+class RoundedBox(_Shape):
+    """A flat transducer face with rounded edges."""
 
     length: float = setting(_SIZE, "along the probe's x, over everything")
     width: float = setting(_SIZE, "along the probe's y, over everything")
@@ -85,21 +81,13 @@ class RoundedBox(Settings):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
-        """(4,) m: half extents x, y, z of the core box, and the rounding around it."""
         sides = np.array([self.length, self.width, self.height])
         return np.append(sides / 2 - self.rounding, self.rounding)
 
 
 @dataclass(frozen=True)
-class Convex(Settings):
-    """A curved array: a rounded box whose face is part of a cylinder about a line along y.
-
-    Raises:
-        ProbeError: a dimension is out of its range, or they do not go together.
-    """
-
-    section = "probe.collider"
-    error = ProbeError
+class Convex(_Shape):
+    """A curved array: a rounded box whose face is part of a cylinder about a line along y."""
 
     radius: float = setting(_SIZE, "of the face's curvature")
     length: float = setting(_SIZE, "along the probe's x, over everything")
@@ -134,8 +122,6 @@ class Convex(Settings):
 
     @property
     def offset_box(self) -> NDArray[np.float64]:
-        """(5,) m: half extents x, y, z of the core box, the rounding around it, and 1/m, the
-        curvature of the core's front."""
         sides = np.array([self.length, self.width, self.height])
         core = self.radius - self.rounding
         return np.append(sides / 2 - self.rounding, [self.rounding, 1 / core])

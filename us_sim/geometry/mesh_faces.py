@@ -45,7 +45,6 @@ def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.
     """(``count``,) the part of each vertex, from 0 in the order of their first vertices.
 
     Args:
-        count: of vertices.
         one, other: (E,) the vertices that each edge joins.
     """
     ends = np.concatenate([np.asarray(one, np.int64), np.asarray(other, np.int64)])

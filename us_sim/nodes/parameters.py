@@ -185,7 +185,7 @@ def _default(settings: Settings, name: str) -> Any:
 
 
 def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
-    """What `ros2 param describe` shows of a setting.
+    """The description of a setting that `ros2 param describe` shows.
 
     What ROS has no field for is a JSON object in ``additional_constraints``: ``unit`` (SI),
     ``shown_in`` (the unit on a dial), ``choices`` (their meanings by name, as far as told),

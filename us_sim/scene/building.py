@@ -1,33 +1,12 @@
 """The objects a scene names, each made (and its module imported) only when it is asked for.
 
->>> from us_sim.scene.building import probe_of
->>> from us_sim.scene.reading import parse_scene
->>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
-...                      "probe": {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}})
->>> probe_of(scene).columns
-400
-
-What a scene says of its tracker, made into objects, each only when it is asked for.
-
+>>> from us_sim.scene.building import colour_of, probe_of, tracking_of
 >>> from us_sim.scene.reading import load_scene
->>> from us_sim.scene.building import tracking_of
->>> tracking_of(load_scene("upper_arm")).filter.lag
-0.0
-
-The vessels, nerves and bones that a scene names, as surfaces that its tissue carries.
-
->>> from us_sim.scene.reading import parse_scene
->>> from us_sim.scene.building import colour_of
->>> scene = parse_scene({
-...     "name": "arm", "volume": {"phantom": "upper_arm"}, "structures": ["vein"],
-...     "probe": {"aperture": "4 cm", "depth": "4 cm",
-...               "collider": {"shape": "sphere", "radius": "2 cm"}},
-...     "tissue": {"mesh": {"lower": [-0.03, -0.03, 0], "upper": [0.03, 0.03, 0.05]},
-...                "materials": {"vein": {"young_modulus": "1 kPa"}}}})
+>>> scene = load_scene("upper_arm")
+>>> probe_of(scene).columns, tracking_of(scene).filter.lag
+(512, 0.0)
 >>> colour_of(scene, "vein")  # blue
 (0.25, 0.4, 0.85)
-
-The blood in the vessels of a scene: each structure that has a flow, made from its label.
 """
 
 from __future__ import annotations
@@ -239,7 +218,6 @@ def materials_of(
 
 
 def _label_fractions(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
-    """None where the volume has no labels."""
     from us_sim.tissue.elasticity.materials import label_fractions
 
     if volume.labels is None:
@@ -309,7 +287,7 @@ def membrane_of(scene: Scene, settings: MembraneSettings | None = None) -> SkinM
 def _mesh(
     scene: Scene, section: TissueSettings, volume: Volume
 ) -> tuple[TetrahedralMesh, tuple[str, ...], LabelFractions | None]:
-    """The mesh, what there is to say about it, and how much of each label is in it."""
+    """The mesh, remarks about it, and how much of each label is in it."""
     given = section.mesh
     if given.file:
         from us_sim.tissue.mesh.file import read_mesh
@@ -369,7 +347,7 @@ def _fixed_nodes(
 
 
 def tracking_of(scene: Scene, filter: PoseFilter | None = None) -> ProbeTracking:
-    """What turns the measurements of the scene's tracker into the probe's poses.
+    """The tracking of the probe by the measurements of the scene's tracker.
 
     Args:
         scene: with the tracker.
@@ -421,7 +399,7 @@ def tracker_poses_of(scene: Scene) -> tuple[Pose, Pose]:
 
 
 def haptic_rendering_of(scene: Scene) -> HapticRendering:
-    """What tells the wrench on the handle of the scene's haptic arm.
+    """The rendering of the wrench on the handle of the scene's haptic arm.
 
     Raises:
         CalibrationError: a file of a registration or calibration cannot be used.
@@ -539,7 +517,6 @@ def structures_of(
 
 
 def _surface_of(scene: Scene, name: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices in ``patient`` and triangles of a structure's file."""
     from us_sim.skin.surface import read_surface
 
     given = scene.structures[name]

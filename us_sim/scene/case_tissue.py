@@ -1,27 +1,12 @@
-"""From a case to a scene: what a scene file would say to scan it and press on it.
+"""Scenes made from cases: their keys, and their box of tissue, which is kept in the case.
 
 Frame ``patient`` is the probe's where it touches the skin at the case's start: its origin is the
 middle of the probe's face, and +z goes into the body.
-
->>> import numpy as np
->>> from us_sim.geometry.pose import Placement
->>> from us_sim.scene.case_tissue import patient_from_volume
->>> start = Placement((0.0, 0.1, 0.0), (1.0, 0.0, 0.0, 0.0))  # on the volume's face, looking back
->>> pose = patient_from_volume(start).pose
->>> bool(np.allclose(pose.apply(np.array([[0.0, 0.1, -0.03]])), [[0.0, 0.0, 0.03]]))
-True
-
-The box of tetrahedra of a scene's tissue, with its planes where they count.
 
 >>> from us_sim.geometry.collider import RoundedBox
 >>> from us_sim.scene.case_tissue import footprint
 >>> footprint(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
 (0.023, 0.007)
-
-The tissue of a scene that is made from a case: kept in the case, so that it is made once.
-
-Only what the mesh and its labels follow from counts: the box, the probe's shape, where the volume
-is, and the labels. Materials may change without it.
 """
 
 from __future__ import annotations
@@ -52,13 +37,9 @@ from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
 from us_sim.volume.volume import Volume, grid_extent
 
 _BESIDE = 0.013  # m, of tissue beside the probe
-_LEAST_ASIDE = 0.03  # m, along the probe's y: for its slide, and for tissue to give way
-_ASIDE_OVER_DEPTH = 0.25
 _BELOW = 1.05
 """Depth of the tissue over that of the image: tissue that moves against the volume beside it would
 leave a seam in the image."""
-_PRESS_OVER_DEPTH = 1 / 3
-_DEEPEST_PRESS = 0.022  # m, of a firm press on an abdomen
 _THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
 
 
@@ -102,12 +83,11 @@ def case_document(folder: Path) -> dict[str, Any]:
 
 
 def _path(settings: CaseSettings) -> str:
-    """The path of a press as deep as the case proposes."""
     assert settings.probe is not None
     press = settings.press
     if press is None:
         depth = settings.probe.array.settings(PROBES).depth
-        press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
+        press = min(1 / 3 * depth, 0.022)  # m, of a firm press on an abdomen
     from us_sim.recording.press_and_slide import pressing_path
 
     return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
@@ -126,7 +106,8 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
     array = probe.array.settings(PROBES)
     length, width = footprint(probe.collider.settings(COLLIDERS)) if probe.collider else (0.0, 0.0)
     aside = max(array.width / 2, length + _BESIDE)
-    across = max(_LEAST_ASIDE, _ASIDE_OVER_DEPTH * array.depth, 2 * width)
+    # m, along the probe's y: for its slide, and for tissue to give way
+    across = max(0.03, 0.25 * array.depth, 2 * width)
     box = np.array([[-aside, -across, 0.0], [aside, across, _BELOW * array.depth]])
     cut = np.stack([np.maximum(box[0], volume[0]), np.minimum(box[1], volume[1])])
     cut[0, 2] = 0.0
@@ -139,12 +120,11 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
 
 
 def _rounded(corner: NDArray[np.float64]) -> list[float]:
-    """To a tenth of a millimetre, for a person who reads the scene."""
     return [round(float(value), 4) for value in corner]
 
 
 _STEPS = 160
-"""Places along the longest side of the box at which structures are looked for."""
+"""Places along the longest side of the box at which labels are read."""
 
 _IN_REACH = 0.015
 """m: how far from the image's plane at rest structures count; the probe slides and tilts."""
@@ -261,7 +241,7 @@ def _is_fitted(scene: Scene) -> bool:
 
 
 def _made_from(scene: Scene) -> dict[str, Any]:
-    """What the tissue follows from, as JSON gives it back."""
+    """All that the tissue follows from, as JSON gives it back."""
     assert scene.tissue is not None
     assert scene.probe.collider is not None
     assert scene.volume.case is not None

@@ -133,7 +133,6 @@ def _no_longer(below: dict[Any, Any], above: dict[Any, Any], choice: Choice) -> 
 
 
 def _settings_in(kind: Any) -> type[Settings] | None:
-    """The settings class that a type is, or may be."""
     options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     for option in options:
         if isinstance(option, type) and issubclass(option, Settings):
@@ -142,7 +141,6 @@ def _settings_in(kind: Any) -> type[Settings] | None:
 
 
 def _kind_of_each(kind: Any) -> Any:
-    """The type of the values of a mapping by name; None where a type is no such mapping."""
     return get_args(kind)[1] if get_origin(kind) in (dict, Mapping) else None
 
 

@@ -1,7 +1,4 @@
-"""What there is to load: installed scenes, and cases, with what a person chooses them by.
-
-A small picture of what the probe sees in a scene before it presses, kept once it was made.
-"""
+"""Scenes and cases that can be loaded, each described for a person, and a thumbnail."""
 
 from __future__ import annotations
 
@@ -67,7 +64,7 @@ def listed_scenes() -> Iterator[ListedScene]:
 
 
 def listed_scene(name: str) -> ListedScene:
-    """What there is to say of a scene, or of ``case:`` and a case."""
+    """The entry of a scene, or of ``case:`` and a case."""
     if name.startswith(CASE_PREFIX):
         return _listed_case(Path(name.removeprefix(CASE_PREFIX)))
     try:
@@ -136,7 +133,7 @@ def thumbnail_file(scene: Scene) -> Path:
 
 
 def _key(scene: Scene) -> str:
-    """Tells apart what looks different: the volume, the probe and how grey values are made."""
+    """A name for all that the thumbnail depends on: volume, probe and grey values."""
     source = scene.volume.case or scene.volume.file
     changed = 0
     if source:

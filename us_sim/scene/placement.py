@@ -1,22 +1,4 @@
-"""Where the tissue in an image lies while nothing presses it, by a scene's tissue model.
-
-A probe that scans presses, and what it presses aside is seen where it was pressed to. The scene's
-solver says how each pose of a sweep deforms the tissue; each point of the image is then taken
-back, within its deformed tetrahedron, to where the same piece of tissue lies at rest.
-
-Whether a path's images meet the volume, found out before hundreds of black ones are made.
-
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.scene.placement import part_inside
->>> from us_sim.scene.building import probe_of
->>> from us_sim.scene.reading import parse_scene
->>> import numpy as np
->>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
-...                      "probe": {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}})
->>> to_index = np.diag([1e3, 1e3, 1e3, 1.0])  # 1 mm voxels from the origin on
->>> part_inside(probe_of(scene), [Pose(), Pose([0.0, -0.05, 0.0])], to_index, (50, 50, 50)).tolist()
-[0.5, 0.0]
-"""
+"""Images in the volume: where they show tissue at rest, and whether they show any of it."""
 
 from __future__ import annotations
 
@@ -124,7 +106,7 @@ class RestPlacement:
         return np.asarray(deformation.nodes, dtype=np.float64)
 
 
-_POSES = 60  # of a path that are looked at
+_POSES = 60  # of a path that are tried
 _POINTS = 32  # along each side of an image
 
 _LITTLE = 0.002
@@ -191,7 +173,6 @@ def check_path_in_volume(
 
 
 def _sampled(scene: Scene, path: ProbePath) -> list[Pose]:
-    """Poses of the probe in ``patient`` along a path."""
     registration, calibration = tracker_poses_of(scene)
     if path.frame_id == PATIENT:  # the probe's own, or of a tracker whose frame that is
         of_tracker = scene.tracker.frame == PATIENT

@@ -1,19 +1,12 @@
-"""Whether the files that a scene names can be read, found out without running it.
+"""Reading a scene file: YAML to :class:`us_sim.scene.scene.Scene`, every key and value checked.
 
->>> from us_sim.scene.reading import parse_scene
->>> from us_sim.scene.reading import check_files
->>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
-...                      "probe": {"aperture": "40 mm", "depth": "30 mm", "image": [400, 300]}})
->>> check_files(scene)
-[]
-
-Reading a scene file: YAML to :class:`us_sim.scene.scene.Scene`, every key and value checked.
-
->>> from us_sim.scene.reading import parse_scene
+>>> from us_sim.scene.reading import check_files, parse_scene
 >>> scene = parse_scene({"name": "bare", "volume": {"phantom": "upper_arm"},
 ...                      "probe": {"aperture": "40 mm", "depth": "40 mm"}})
 >>> [part.node for part in scene.parts() if part.needed]
 ['probe_tracker', 'slice_interpolator']
+>>> check_files(scene)
+[]
 """
 
 from __future__ import annotations
@@ -85,7 +78,7 @@ def check_files(scene: Scene) -> list[str]:
 
 
 def _mesh_remarks(tissue: TissueSettings) -> list[str]:
-    """What there is to say about the mesh of a file, as far as it says so without the volume."""
+    """Remarks about the mesh of a file that can be told without the volume."""
     from us_sim.tissue.mesh.file import read_mesh
     from us_sim.tissue.model import FACES, face_nodes, held_remark
 
@@ -138,7 +131,7 @@ def load_scene(name: str | Path, *, volume: str | Path | None = None) -> Scene:
 
 
 def scene_document(name: str | Path) -> tuple[Any, list[Path], str]:
-    """What a scene file, or ``case:`` and a case, says; folders of its files; where it is from.
+    """The document of a scene or ``case:`` and a case, the folders of its files, its origin.
 
     Raises:
         SceneError: it cannot be found or read.
@@ -234,7 +227,6 @@ def _find_case(name: str, folders: Sequence[Path] = ()) -> Path:
 
 
 def _existing(name: str, origin: str, folders: Sequence[Path], key: str) -> str:
-    """The absolute path of a file named in a scene."""
     if key in ("case", "volume.case"):
         try:
             return str(_find_case(name, folders))

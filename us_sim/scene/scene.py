@@ -1,4 +1,4 @@
-"""What a scene may hold: sections of settings, most of them the domain's own.
+"""Scene: sections of settings, most of them the domain's own.
 
 `reading` makes a scene from YAML; `building` makes the objects that it names.
 """
@@ -280,7 +280,6 @@ class Scene(Settings):
         return topics + (["skin/nodes"] if self.skin else [])
 
     def _felt(self) -> list[Part]:
-        """What a haptic arm needs."""
         if self.tracker.source.name != "haptic":
             return []
         return [_part("haptic_renderer", self.tissue, "tissue", "nothing can be felt")]
@@ -299,7 +298,7 @@ class Scene(Settings):
         return f"{self.probe.geometry} images are cut by `{self.slice.name}`, {formed}{blood}"
 
     def solver_settings(self, name: str) -> Any:
-        """What the scene says of a solver, or None."""
+        """The scene's settings of a solver, or None."""
         return self.tissue.settings.get(name) if self.tissue else None
 
     def named(self, origin: str) -> Scene:

@@ -1,1 +1,1 @@
-"""What can be set: once said, in its unit and range, beside what it sets."""
+"""Settings: their units, ranges, choices, and one reader for all of them."""

@@ -126,12 +126,12 @@ class Choice:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What can be chosen."""
+        """The options' names."""
         return tuple(self.options)
 
     @property
     def importable(self) -> tuple[str, ...]:
-        """What can be chosen and imported; what another package adds and breaks is told once."""
+        """The options that can be imported; a broken one of another package is reported once."""
         for name, option in self.options.items():
             if option.package is not None and option not in self._broken:
                 try:
@@ -169,7 +169,7 @@ class Choice:
 
     @property
     def in_short(self) -> dict[str, str]:
-        """What options that can be imported say of themselves, by name; imports all of them."""
+        """Descriptions of the options that can be imported, by name; imports all of them."""
         if not self._described:
             return {}
         said = {name: getattr(self.load(name), "in_short", "") for name in self.importable}

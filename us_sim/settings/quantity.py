@@ -1,13 +1,8 @@
-"""Numbers with units, as a person writes them in a scene: ``0.04``, ``40 mm``, ``12 kPa``.
+"""Numbers with units: read as a person writes them in a scene, and shown in handy units.
 
->>> from us_sim.settings.quantity import Quantity
+>>> from us_sim.settings.quantity import Quantity, amount, dial_unit, span
 >>> Quantity("length", minimum=0.0, maximum=1.0).parse("40 mm")
 0.04
-
-Numbers as a person reads them: in a handy unit, and still exactly the number.
-
->>> from us_sim.settings.quantity import amount, span
->>> from us_sim.settings.quantity import Quantity
 >>> amount(0.0003, "length"), amount(12e3, "pressure"), amount(2.0, "number")
 ('0.3 mm', '12 kPa', '2')
 >>> span(Quantity("length", 0.003, 0.2)), span(Quantity("level", -60.0, 0.0))
@@ -155,10 +150,6 @@ _HANDY = {
 
 _ON_A_DIAL = {"rate": "/min", "angular speed": "deg/s"}
 """Units of other dimensions, where a number is turned up and down."""
-_SLOW = 5.0
-"""m/s; speeds up to here, those of blood, are told in cm/s."""
-_OF_SOUND = 1e5
-"""Hz; frequencies from here on are told in MHz."""
 
 _EXACT = 1e-12
 """How far, relatively, a number in another unit may be from the number: only by rounding."""
@@ -186,9 +177,9 @@ def span(quantity: Quantity) -> str:
 def dial_unit(quantity: Quantity) -> str:
     """The one unit in which all of a quantity's range is shown where a person turns it."""
     dimension = quantity.dimension
-    if dimension == "frequency" and quantity.minimum >= _OF_SOUND:
+    if dimension == "frequency" and quantity.minimum >= 1e5:  # of sound
         return "MHz"
-    if dimension == "speed" and quantity.maximum <= _SLOW:
+    if dimension == "speed" and quantity.maximum <= 5.0:  # of blood
         return "cm/s"
     handy = _HANDY.get(dimension, (quantity.unit,))[0]
     return _ON_A_DIAL.get(dimension, handy)
@@ -231,6 +222,5 @@ def _plain(value: float) -> str:
 
 
 def _tidy(text: str) -> str:
-    """Without the zeros and the plus sign of an exponent."""
     mantissa, e, exponent = text.partition("e")
     return f"{mantissa}e{int(exponent)}" if e else mantissa

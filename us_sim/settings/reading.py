@@ -1,22 +1,14 @@
-"""From a mapping of keys, as a file holds it, to settings: every key and value checked.
+"""Settings from a mapping of keys, as a file holds it, every key and value checked; and back.
 
->>> from us_sim.settings.reading import Reader
->>> from us_sim.slicing.settings import Imaging
->>> Reader("my.yaml").read(Imaging, {"gain": "6 dB"}, "imaging").gain
-6.0
->>> Reader("my.yaml").read(Imaging, {"gian": 6}, "imaging")
-Traceback (most recent call last):
-...
-us_sim.errors.SettingsError: my.yaml: imaging.gian: unknown key; did you mean `gain`?
-
-From settings to a mapping of keys as a file holds it: what `us_sim.settings.reading` reads.
-
->>> from us_sim.settings.reading import Reader
->>> from us_sim.settings.reading import document_of
+>>> from us_sim.settings.reading import Reader, document_of
 >>> from us_sim.skin.settings import SkinSettings
 >>> skin = Reader("my.yaml").read(SkinSettings, {"spacing": "5 mm", "size": ["12 cm", "10 cm"]})
 >>> document_of(skin)
 {'size': [0.12, 0.1], 'spacing': 0.005}
+>>> Reader("my.yaml").read(SkinSettings, {"spacign": "5 mm"}, "skin")
+Traceback (most recent call last):
+...
+us_sim.errors.SettingsError: my.yaml: skin.spacign: unknown key; did you mean `spacing`?
 """
 
 from __future__ import annotations
@@ -93,16 +85,10 @@ class Reader:
             if not error.problem:
                 raise self._error(f"{self._origin}: {error}") from error
             raise self._refused(joined(path, error.key), error.problem) from error
-        for name, rule in rules_of(settings).items():
-            if rule.applies and name in given:  # also where it is the default
-                other, values_of_other = rule.applies
-                chosen = getattr(made, other)
-                chosen = getattr(chosen, "name", chosen)
-                if chosen not in values_of_other:
-                    raise self._refused(
-                        joined(path, name),
-                        f"is for {other} {' or '.join(values_of_other)} only, not {chosen}",
-                    )
+        for name in rules_of(settings):
+            problem = made.inapplicable(name)
+            if problem and name in given:  # also where it is the default
+                raise self._refused(joined(path, name), problem)
         return made
 
     def _value(self, kind: Any, value: object, rule: Rule, path: str) -> Any:
@@ -141,7 +127,7 @@ class Reader:
         return value
 
     def _chosen(self, choice: Choice, document: object, path: str) -> Chosen:
-        """What a mapping with the choice's key names, with the other keys as its settings."""
+        """The option named under the choice's key, with the other keys as its settings."""
         mapping = self._mapping(document, path)
         if choice.key not in mapping:
             for key in mapping:
@@ -163,7 +149,7 @@ class Reader:
         path: str,
         beside: set[str],
     ) -> tuple[set[str], Chosen]:
-        """What is chosen among the keys of other settings; the keys that are about it."""
+        """The option chosen among the keys of other settings, and the keys that are about it."""
         choice = rule.choice
         assert choice is not None
         default = settings.__dataclass_fields__[field].default  # type: ignore[attr-defined]
@@ -251,7 +237,6 @@ class Reader:
 
 
 def _texts(value: object) -> Iterator[tuple[str, str]]:
-    """The texts in a value, each with the rest of the path of keys to it."""
     if isinstance(value, str):
         yield "", value
     elif isinstance(value, tuple):
@@ -269,7 +254,7 @@ def _is_required(settings: type, name: str) -> bool:
 
 
 def document_of(settings: Settings) -> dict[str, Any]:
-    """The settings that are not what they would be without being said, in SI units."""
+    """The settings that differ from their defaults, in SI units."""
     document: dict[str, Any] = {}
     fields = {field.name: field for field in dataclasses.fields(settings)}
     for name, rule in rules_of(type(settings)).items():
@@ -297,7 +282,6 @@ def _chosen(name: str, chosen: Chosen, rule: Rule) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value in the types that YAML has."""
     if isinstance(value, Settings):
         return document_of(value)
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""What there is to choose from, by the names that scenes, parameters and reports use.
+"""Choices of solvers, slicers, probes and more, by the names that users write.
 
 One line an option: its name and where its class is. A class is imported when it is chosen, not
 before. Packages of others add solvers and trackers under the entry point groups named here.

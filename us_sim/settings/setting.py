@@ -36,7 +36,7 @@ NUMBER = Quantity("number")
 
 @dataclass(frozen=True)
 class Rule:
-    """What is said of a setting beside its name, type and default."""
+    """Properties of a setting beside its name, type and default."""
 
     quantity: Quantity | None = None  # unit and range of a number, or of each number of a list
     description: str = ""  # for a person, without the unit
@@ -98,13 +98,13 @@ class Settings:
     """
 
     section: ClassVar[str] = ""
-    """What these settings are of, for sentences: ``probe.collider``."""
+    """The keys that lead to these settings, for sentences: ``probe.collider``."""
     error: ClassVar[type[UsSimError]] = SettingsError
-    """What is raised for a value that will not do."""
+    """The class of errors."""
     live: ClassVar[bool] = False
     """Whether all of these settings may change while what they set is running."""
     alternatives: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Settings of which one takes the place of the others, each with those that belong to it."""
+    """Mutually exclusive settings and their dependants."""
 
     def __post_init__(self) -> None:
         kinds = kinds_of(type(self))
@@ -116,16 +116,22 @@ class Settings:
                 except Refusal as refusal:
                     raise self.refused(f"{name}{refusal.key}", refusal.problem) from refusal
                 object.__setattr__(self, name, value)
-        for name, rule in rules_of(type(self)).items():
-            if rule.applies and getattr(self, name) != _default(type(self), name):
-                other, values = rule.applies
-                chosen = getattr(self, other)
-                chosen = getattr(chosen, "name", chosen)
-                if chosen not in values:
-                    raise self.refused(
-                        name, f"is for {other} {' or '.join(values)} only, not {chosen}"
-                    )
+        for name in rules_of(type(self)):
+            problem = self.inapplicable(name)
+            if problem and getattr(self, name) != _default(type(self), name):
+                raise self.refused(name, problem)
         self.check()
+
+    def inapplicable(self, name: str) -> str:
+        """The reason why a setting has no meaning beside another one; "" if it has."""
+        applies = rules_of(type(self))[name].applies
+        if applies is None:
+            return ""
+        other, values = applies
+        chosen = getattr(self, other)
+        chosen = getattr(chosen, "name", chosen)
+        wanted = " or ".join(values)
+        return "" if chosen in values else f"is for {other} {wanted} only, not {chosen}"
 
     def check(self) -> None:
         """Refuse values that do not go together."""

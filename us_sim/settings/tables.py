@@ -89,7 +89,7 @@ def table(
 
 
 def values(kind: Any, rule: Rule) -> str:
-    """What a setting of a type and rule may be, in words."""
+    """The values of a setting of a type and rule, in words."""
     if get_origin(kind) in (Union, UnionType):
         options = [option for option in get_args(kind) if option is not type(None)]
         return ", or ".join(values(option, rule) for option in options)
@@ -127,14 +127,14 @@ def first_sentence(documented: Any) -> str:
 
 
 def anchor(title: str) -> str:
-    """What GitHub names the heading of that title in links."""
+    """The name of a heading in GitHub's links."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def _option_sections(
     options: _Options, path: str, shared: Mapping[type[Settings], str]
 ) -> Iterator[Section]:
-    """What there is to choose from, then the settings of each that has some."""
+    """The options of a choice, then the settings of each that has some."""
     choice = options.choice
     rows = []
     for name in choice.importable:
@@ -152,8 +152,6 @@ def _option_sections(
 
 @dataclass(frozen=True)
 class _Options:
-    """The options of a setting that is chosen, and where their own settings stand."""
-
     choice: Choice
     place: str
     by_name: bool  # the names of the options are keys, of a mapping under this setting
@@ -218,7 +216,6 @@ def _meaning(rule: Rule) -> str:
 
 
 def _settings_in(kind: Any) -> type[Settings] | None:
-    """The settings class that a type is, may be, or has as its values."""
     options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     for option in options:
         by_name = get_origin(option) in (dict, Mapping)

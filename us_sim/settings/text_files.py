@@ -1,22 +1,15 @@
-"""Reading the text files that a person names.
+"""Text files and YAML that a person or a stranger wrote, of limited size, each key once.
 
->>> from us_sim.settings.text_files import read_text
+>>> from us_sim.settings.text_files import load_yaml, read_text
 >>> read_text("/dev/zero")
 Traceback (most recent call last):
     ...
 OSError: [Errno 27] more than 64 MiB, and no text is so long: '/dev/zero'
-
-YAML that a person or a stranger wrote: as much as a file of ours can need, each key once.
-
->>> from us_sim.settings.text_files import load_yaml
 >>> load_yaml("probe: {depth: 4 cm}")
 {'probe': {'depth': '4 cm'}}
 >>> load_yaml("depth: 4 cm\\ndepth: 5 cm")
 Traceback (most recent call last):
 us_sim.settings.text_files.YamlError: line 2: key `depth` is there twice, first in line 1: keep one
->>> load_yaml("a: &a [1, *a]")
-Traceback (most recent call last):
-us_sim.settings.text_files.YamlError: line 1: is not YAML that can be read: `*a` is within itself
 """
 
 from __future__ import annotations
@@ -69,7 +62,7 @@ class YamlError(UsSimError):
 
 
 def load_yaml(text: str) -> Any:
-    """What a YAML text says, in Python's own types.
+    """The content of a YAML text, in Python's own types.
 
     Raises:
         YamlError: it is not YAML, has a key twice, is larger than `LARGEST_YAML` or holds more

@@ -1,4 +1,4 @@
-"""What can be set of the viewer.
+"""Settings of the viewer, which the command line reads without ROS.
 
 >>> from us_sim.settings.viewer import ViewerSettings
 >>> ViewerSettings().host

@@ -354,14 +354,8 @@ class SkinMembrane:
         """J, of the springs, the anchors and the motion; 0 at rest."""
         return float(
             spring_energy(
-                self._vertices,
-                self._velocity,
-                self.surface.vertices,
-                self._edges,
-                self._natural_length,
-                self._rest_tension,
-                self._stiffness,
-                self._anchor,
+                *(self._vertices, self._velocity, self.surface.vertices, self._edges),
+                *(self._natural_length, self._rest_tension, self._stiffness, self._anchor),
                 self.mass,
             )
         )
@@ -376,23 +370,10 @@ class SkinMembrane:
         start, steps, note = self._approach(pose)
         vertices, velocity = self._vertices.copy(), self._velocity.copy()
         residual, moved, contacts = _relax(
-            vertices,
-            velocity,
-            self.surface.vertices,
-            self._edges,
-            self._natural_length,
-            self._rest_tension,
-            self._stiffness,
-            self._anchor,
-            self.mass,
-            self._decay,
-            self._time_step,
-            steps,
-            self._parts,
-            self._collider.offset_box,
-            _placement(start),
-            _placement(pose),
-            pose is not None,
+            *(vertices, velocity, self.surface.vertices, self._edges, self._natural_length),
+            *(self._rest_tension, self._stiffness, self._anchor, self.mass, self._decay),
+            *(self._time_step, steps, self._parts, self._collider.offset_box),
+            *(_placement(start), _placement(pose), pose is not None),
         )
         finite = np.isfinite(vertices).all() and np.isfinite(velocity).all()
         if not (finite and math.isfinite(residual)):

@@ -73,17 +73,14 @@ class Imaging(Settings):
     error = ProbeError
     live = True
 
-    gain: float = setting(_GAIN, default=0.0, description="added to every echo")
+    gain: float = setting(_GAIN, "added to every echo", default=0.0)
     time_gain: tuple[float, ...] = setting(
         _GAIN,
+        "added at evenly spaced depths from the face to the end of the beams, linear in between",
         default=(),
-        description="added at evenly spaced depths from the face to the end of the beams, "
-        "linear in between",
     )
     dynamic_range: float = setting(
-        Quantity("level", 10.0, 120.0),
-        default=ECHO_RANGE,
-        description="level shown from black to white",
+        Quantity("level", 10.0, 120.0), "level shown from black to white", default=ECHO_RANGE
     )
     grey_map: str = setting(
         default="linear",
@@ -92,24 +89,23 @@ class Imaging(Settings):
     )
     elevation_planes: int = setting(
         Quantity("number", 1, 15),
+        "slices averaged across the thickness of the beam; 1 is ideally thin",
         default=1,
-        description="slices averaged across the thickness of the beam; 1 is ideally thin",
     )
     elevation_width: float = setting(
         Quantity("length", 1e-4, 0.02),
+        "thickness of the beam at its focus, full width at half maximum",
         default=2e-3,
-        description="thickness of the beam at its focus, full width at half maximum",
     )
     lateral_resolution: float = setting(
         _RESOLUTION,
+        "width of a point along the array at the focus, 6 dB below its peak; 0 is ideal",
         default=0.0,
-        description="width of a point along the array at the focus, 6 dB below its peak; "
-        "0 is ideal",
     )
     axial_resolution: float = setting(
         _RESOLUTION,
+        "length of a point along the beam at the face, 6 dB below its peak; 0 is ideal",
         default=0.0,
-        description="length of a point along the beam at the face, 6 dB below its peak; 0 is ideal",
     )
     contact: bool = setting(
         default=False,
@@ -117,8 +113,8 @@ class Imaging(Settings):
     )
     reverberation: float = setting(
         Quantity("level", -ECHO_RANGE, 0.0),
+        "the face's first echo in air, where the strongest echo is 0",
         default=-10.0,
-        description="the face's first echo in air, where the strongest echo is 0",
     )
 
     @property
@@ -391,6 +387,6 @@ class SpectrumSettings(DopplerSettings):
         default=0.0,
     )
     dynamic_range: float = setting(
-        Quantity("level", 10.0, 80.0), default=30.0, description="level from black to white"
+        Quantity("level", 10.0, 80.0), "level from black to white", default=30.0
     )
     sweep: float = setting(Quantity("time", 0.5, 20.0), "that the picture shows", default=4.0)

@@ -82,12 +82,15 @@ def main_labels(
     index = nodes @ to_index[:3, :3].T + to_index[:3, 3]
     last = np.array(volume.shape) - 1
     corners = index[tetrahedra]
+    counts = itertools.product(range(_PARTS + 1), repeat=3)
+    inner = [(*each, _PARTS - sum(each)) for each in counts if sum(each) <= _PARTS]
+    weights = [(np.array(each) + 0.25) / (_PARTS + 1.0) for each in inner]  # none on a face
     most = np.zeros(len(tetrahedra), dtype=np.int16)
     found = np.zeros(len(tetrahedra), dtype=np.uint8)
     seen = np.stack(
         [
             volume.labels[tuple(np.clip(np.rint(place), 0, last).astype(np.intp).T)]
-            for place in (np.einsum("k,ekj->ej", weight, corners) for weight in _weights())
+            for place in (np.einsum("k,ekj->ej", weight, corners) for weight in weights)
         ],
         axis=1,
     )
@@ -96,13 +99,6 @@ def main_labels(
         more = count > most
         most[more], found[more] = count[more], label
     return found
-
-
-def _weights() -> list[NDArray[np.float64]]:
-    """Barycentric coordinates (4,) of evenly spaced points, none of them on a face."""
-    counts = itertools.product(range(_PARTS + 1), repeat=3)
-    inner = [(*each, _PARTS - sum(each)) for each in counts if sum(each) <= _PARTS]
-    return [(np.array(each) + 0.25) / (_PARTS + 1.0) for each in inner]
 
 
 class Corners(NamedTuple):

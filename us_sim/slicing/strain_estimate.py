@@ -304,16 +304,7 @@ def _line_spacing(probe: Probe) -> float:
 
 
 def _along_beams(image: NDArray[np.uint8], probe: Probe) -> NDArray[np.float32]:
-    columns, rows = probe.beam_pixels
-    return np.asarray(
-        cv2.remap(
-            image.astype(np.float32),
-            columns,
-            rows,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-    )
+    return _remapped(image.astype(np.float32), *probe.beam_pixels)
 
 
 def _to_pixels(values: NDArray[np.float32], probe: Probe) -> NDArray[np.float32]:
@@ -321,15 +312,14 @@ def _to_pixels(values: NDArray[np.float32], probe: Probe) -> NDArray[np.float32]
     lines, distances = probe.pixel_beams
     samples = distances * np.float32(probe.samples / probe.depth) - np.float32(0.5)
     beside = np.isnan(lines)
-    image = cv2.remap(
-        values,
-        np.where(beside, np.float32(0.0), lines),
-        np.where(beside, np.float32(0.0), samples),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    image = _remapped(values, *(np.where(beside, np.float32(0.0), at) for at in (lines, samples)))
     image[beside] = np.nan
-    return np.asarray(image, dtype=np.float32)
+    return image
+
+
+def _remapped(image: Field, columns: Field, rows: Field) -> Field:
+    edge = cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=edge))
 
 
 class Earlier:

@@ -100,7 +100,6 @@ class Access:
         return ""
 
     def _given(self, scope: Any) -> bool:
-        """Whether the token is in the address."""
         given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
         return hmac.compare_digest(given.encode(), self._token.encode())
 
@@ -134,10 +133,7 @@ def _name(host: str) -> str:
 
 
 def _safely(scope: Any, send: Any) -> Any:
-    """What sends an answer with the headers that keep it from misuse.
-
-    Of a page, which comes whole, the scripts get the number that lets them run.
-    """
+    """A sender that adds headers against misuse, and to a page's scripts the number to run."""
     number = secrets.token_urlsafe(16)
     host = dict(scope["headers"]).get(b"host", b"").decode("latin-1")
     # Older browsers do not take websockets for part of 'self'.

@@ -77,7 +77,6 @@ def exported(kind: str, frames: Sequence[Sent]) -> bytes:
 
 
 def _mp4(frames: Sequence[Sent]) -> bytes:
-    """MPEG-4, which every OpenCV can write."""
     pictures = _evenly(frames, MP4_RATE)
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     width, height = width + width % 2, height + height % 2  # as the format wants it
@@ -96,7 +95,6 @@ def _mp4(frames: Sequence[Sent]) -> bytes:
 
 
 def _gif(frames: Sequence[Sent]) -> bytes:
-    """Played again and again by whatever shows pictures."""
     from PIL import Image  # what draws this package's figures brings it
 
     height, width = (
@@ -236,4 +234,4 @@ def _region(header: Mapping[str, Any], region: Any) -> Any:
 
 
 KINDS: dict[str, Callable[[Sequence[Sent]], bytes]] = {"mp4": _mp4, "gif": _gif, "dcm": _dicom}
-"""What is made, by the name's ending."""
+"""Makers of files, by the name's ending."""

@@ -165,7 +165,6 @@ class ViewerSurface:
         self._changed()
 
     def _make_tissue(self) -> None:
-        """The tissue's upper side, of the mesh that is there now."""
         if self._rest.mesh is not None:
             self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
             self._changed()
@@ -176,18 +175,11 @@ MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 images than that."""
 RESTING = 5.0
 """Poses a second; images are called stale after half a second."""
-TICKS = 2.0
-"""Timer ticks from pose to pose."""
 STREAMING, LATEST = 3.0, 1.45
 """From pose to pose: how long after a command the next is expected, and then waited for. A timer's
 pose just before it would hold up the command's own."""
-STATE_RATE = 10.0
-"""Hz at which pages are told at most how the probe is held: to a person's eye sliders follow, and
-more often to lay them out would take time from the image."""
 LONGEST_STEP = 0.05
 """s of movement at most between two poses: were the node held up, the probe would leap."""
-NEAR = 0.02
-"""m from the old place to a new surface: it is another one of the same patient."""
 KEPT = 512
 """Poses whose press is remembered until their image is made."""
 UNANSWERED = 3.0
@@ -215,7 +207,8 @@ class ViewerHand:
         self, node: GuardedNode, post: Posted, simulator: Simulator, rest: RestMesh
     ) -> None:
         self._node, self._post, self._rest = node, post, rest
-        self.feed = Feed("hand", self._watched, STATE_RATE)
+        # To a person's eye sliders follow at 10 Hz, and more would take time from the image.
+        self.feed = Feed("hand", self._watched, 10.0)
         self._simulator = simulator
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
@@ -236,7 +229,7 @@ class ViewerHand:
         self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
         self._warning = ""
         self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
-        self._moving_timer = node.create_timer(1.0 / (TICKS * MOVING), self._tick)
+        self._moving_timer = node.create_timer(0.5 / MOVING, self._tick)
         self._resting_timer = node.create_timer(1.0 / RESTING, self._update)
         self._moving_timer.cancel()
         self._resting_timer.cancel()
@@ -265,7 +258,6 @@ class ViewerHand:
         return None
 
     def _watched(self, _: bool) -> None:
-        """Called in a page's thread."""
         self._post(self._watch)
 
     def _watch(self) -> None:
@@ -298,7 +290,7 @@ class ViewerHand:
             return
         stance = self._motion.stance
         foot = surface.closest(stance.point)
-        if float(np.linalg.norm(foot.point - stance.point)) < NEAR:
+        if float(np.linalg.norm(foot.point - stance.point)) < 0.02:  # of the same patient
             self._motion.rest_at(replace(stance, point=foot.point))
         else:
             self._motion.rest_at(Stance.home(surface, HOME_PRESS))
@@ -345,7 +337,6 @@ class ViewerHand:
         self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:
-        """Publish no more."""
         self._moving_timer.cancel()
         self._warning = ""
         if self._publisher is not None:
@@ -372,7 +363,6 @@ class ViewerHand:
         self._update()
 
     def _be_elsewhere(self) -> None:
-        """Poses come, or came a moment ago: of this hand, if it has had the probe."""
         self._is_found |= self._motion is not None
 
     def _follow(self, pose: Pose) -> None:
@@ -407,7 +397,6 @@ class ViewerHand:
             self._advance(1.0 / MOVING if rested else LONGEST_STEP)
 
     def _tick(self) -> None:
-        """The next pose of a movement, if it is due."""
         now = time.monotonic()
         is_streaming = now - self.asked.at < STREAMING / MOVING
         if now - self._sent_at > (LATEST if is_streaming else 0.9) / MOVING:
@@ -428,7 +417,6 @@ class ViewerHand:
             self._tell()
 
     def _publish(self) -> None:
-        """Where the probe is held."""
         assert self._motion is not None
         assert self._standing is not None
         stamp = self._node.get_clock().now()
@@ -452,7 +440,7 @@ class ViewerHand:
         return f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
 
     def _tell(self) -> None:
-        """The pages how the probe is held, and by whom."""
+        """Tell the pages how the probe is held, and by whom."""
         motion, surface = self._motion, self._standing
         stance = motion.stance if motion is not None else None
         goal = motion.goal if motion is not None else None

@@ -6,15 +6,6 @@
 ... )
 >>> depth.value, depth.low, depth.high, depth.raw_of(45)
 (40.0, 5.0, 400.0, 0.045)
-
-The parameters of all nodes that pages look at; pages and the graph meet here.
-
->>> from us_sim.viewer.parameters import ParameterBoard
->>> board = ParameterBoard(on_watch=lambda: print("somebody looks, or nobody does any more"))
->>> board.watch("tissue_deformer")
-somebody looks, or nobody does any more
->>> board.of("tissue_deformer").state.value
-'is not running'
 """
 
 from __future__ import annotations
@@ -61,7 +52,7 @@ class Kind(Enum):
 
 
 class State(Enum):
-    """What is known of a node's parameters."""
+    """Progress of asking a node for its parameters."""
 
     ABSENT = "is not running"
     ASKED = "is being asked for its parameters"
@@ -109,7 +100,7 @@ class Parameter:
 
     @property
     def group(self) -> str:
-        """What comes before the last dot of its name."""
+        """Its name up to the last dot."""
         return self.name.rpartition(".")[0]
 
     @property
@@ -118,7 +109,7 @@ class Parameter:
         return in_words(self.name.rpartition(".")[2])
 
     def raw_of(self, value: Any) -> Any:
-        """What the node is sent for a value that a person has set, in ``unit``.
+        """The value in SI units of one that a person has set, in ``unit``.
 
         Raises:
             SettingsError: it is no value of this kind, or outside the range.
@@ -153,7 +144,6 @@ class Parameter:
         return nothing.get(self.kind)
 
     def _item(self, value: Any) -> Any:
-        """One of a list."""
         if self.kind is Kind.TEXTS:
             return str(value)
         return self._whole(value) if self.kind is Kind.WHOLES else self._number(value)
@@ -198,7 +188,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class NodeParameters:
-    """What is known of the parameters of one node, at one moment."""
+    """The parameters of one node, as far as they are known."""
 
     node: str
     state: State = State.ABSENT
@@ -226,10 +216,10 @@ Send = Callable[[Parameter, Any], "Future[str]"]
 
 
 class ParameterBoard:
-    """The newest that is known of each node's parameters, and who looks at them; for any thread.
+    """The newest parameters of each node, and the nodes that pages show; for any thread.
 
     Args:
-        on_watch: called when a node begins to be looked at, or no longer is.
+        on_watch: called when pages begin to show a node, or no longer do.
         send: asks a node to set a parameter.
     """
 
@@ -241,12 +231,12 @@ class ParameterBoard:
 
     @property
     def watched(self) -> set[str]:
-        """The names of the nodes that are looked at."""
+        """The names of the nodes that pages show."""
         with self._lock:
             return set(self._watched)
 
     def watch(self, node: str) -> None:
-        """Look at a node's parameters, until `unwatch`."""
+        """Follow a node's parameters, until `unwatch`."""
         with self._lock:
             self._watched[node] += 1
             first = self._watched[node] == 1
@@ -254,7 +244,7 @@ class ParameterBoard:
             self._on_watch()
 
     def unwatch(self, node: str) -> None:
-        """Look at them no longer."""
+        """Follow them no longer."""
         with self._lock:
             self._watched[node] -= 1
             last = self._watched[node] <= 0
@@ -264,7 +254,7 @@ class ParameterBoard:
             self._on_watch()
 
     def of(self, node: str) -> NodeParameters:
-        """What is known; it is another object whenever it has changed."""
+        """The parameters of a node; another object whenever they have changed."""
         with self._lock:
             return self._known.get(node) or NodeParameters(node)
 

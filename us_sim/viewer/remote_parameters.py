@@ -47,7 +47,6 @@ _KINDS = {number: (kind, field) for kind, (number, field) in _TYPES.items()}
 def _parameter(
     node: str, name: str, descriptor: ParameterDescriptor, value: ParameterValue
 ) -> Parameter:
-    """A node's parameter as pages show it."""
     kind, raw = _raw(value)
     told = _extras(descriptor)
     unit, reads = str(told.get("unit", "")), str(told.get("shown_in", ""))
@@ -82,7 +81,6 @@ def _extras(descriptor: ParameterDescriptor) -> dict[str, Any]:
 
 
 def _raw(value: ParameterValue) -> tuple[Kind, Any]:
-    """The kind and the value in SI units; lists are tuples."""
     if value.type not in _KINDS:
         return Kind.OTHER, None
     kind, field = _KINDS[value.type]
@@ -91,7 +89,6 @@ def _raw(value: ParameterValue) -> tuple[Kind, Any]:
 
 
 def _message(parameter: Parameter, raw: Any) -> ParameterMessage:
-    """The message that sets a parameter to a value in SI units."""
     number, field = _TYPES[parameter.kind]
     if parameter.kind.is_list:
         raw = array("d", raw) if parameter.kind is Kind.NUMBERS else list(raw)
@@ -354,5 +351,4 @@ class _RemoteNode:
 
 
 def _answer(future: Any) -> Any:
-    """The response, or None where there is none."""
     return None if future.cancelled() or future.exception() is not None else future.result()

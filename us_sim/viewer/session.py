@@ -44,7 +44,7 @@ class LoadableScene:
 
 @dataclass(frozen=True)
 class SessionState:
-    """What the simulation does."""
+    """State of the simulation: its scene, recording and replay."""
 
     is_there: bool = False  # whether somebody answers for it
     state: str = ""  # for a person
@@ -188,7 +188,6 @@ class ViewerSession(SessionBoard):
                 told.set_result("the viewer ends")
 
     def _listen(self) -> None:
-        """Subscribe, or not, as pages want it now."""
         if self.is_watched and not self._subscriptions:
             if self._client is None:
                 self._client = AsyncParameterClient(self._node, CONTROL)

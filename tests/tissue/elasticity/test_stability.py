@@ -14,6 +14,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.elasticity.springs import SpringNetwork, fitted_springs, springs_of, volume_term
 from us_sim.tissue.elasticity.stability import (
+    ElasticResidual,
     highest_frequency,
     node_stiffness,
     stabilise,
@@ -192,3 +193,14 @@ def test_where_nothing_is_free_any_step_is_stable():
     solver = Msds(model)
     assert solver.step_limit == math.inf
     np.testing.assert_array_equal(solver.deform(None).nodes, model.mesh.nodes)
+
+
+def test_the_residual_is_unbalanced_over_contact_force_or_the_largest_since_rest():
+    residual, down = ElasticResidual(rounding=1e-12), np.array([[0.0, 0.0, 1.0]])
+    elastic = np.array([[0.0, 0.1, 4.0], [0.1, 0.0, 0.0]])  # N; the probe bears 4 N on node 0
+    found = residual.residual(elastic, np.array([0]), down)
+    assert found == pytest.approx(math.hypot(0.1, 0.1) / 4.0)
+    released = residual.residual(elastic / 40, np.array([], int), down[:0])
+    assert released == pytest.approx(np.linalg.norm(elastic) / 40 / 4.0)
+    residual.reset()
+    assert residual.residual(elastic / 40, np.array([], int), down[:0]) == 1.0

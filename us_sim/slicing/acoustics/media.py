@@ -81,10 +81,9 @@ def media_of(
         if is_used and tissue.fibres is not None and tissue.fibres not in directions:
             directions.append(tissue.fibres)
     count = 1 + len(constants)
-    loss, shadow, scattering = np.zeros(count), np.zeros(count), np.zeros(count)
-    crossing = np.zeros((count, count))
+    loss, shadow, scattering, anisotropy = np.zeros((4, count), np.float32)
+    crossing, half_sine = np.zeros((count, count), np.float32), np.ones(count, np.float32)
     fibres = np.full(count, -1, dtype=np.int32)
-    anisotropy, half_sine = np.zeros(count), np.ones(count)
     blocks = np.zeros(count, dtype=np.bool_)
     for number, tissue in enumerate(constants, 1):
         assert tissue.attenuation is not None
@@ -106,15 +105,7 @@ def media_of(
             anisotropy[number] = tissue.anisotropy
             half_sine[number] = np.sin(tissue.half_angle) ** 2
     media = Media(
-        of_label,
-        loss.astype(np.float32),
-        shadow.astype(np.float32),
-        crossing.astype(np.float32),
-        blocks,
-        scattering.astype(np.float32),
-        fibres,
-        anisotropy.astype(np.float32),
-        half_sine.astype(np.float32),
+        of_label, loss, shadow, crossing, blocks, scattering, fibres, anisotropy, half_sine
     )
     unit = np.array(directions).reshape(-1, 3)
     return media, constants, unit / np.linalg.norm(unit, axis=1, keepdims=True)
@@ -184,7 +175,7 @@ class BeamGrid:
         self.columns = (x - left) / lateral  # (samples, beams), fractional
         self.rows = (z - top) / axial
         self.aperture = aperture(probe, self.distance)  # (samples,) m
-        self.places = self._places(probe, None if is_linear else _nearest_shown(probe))
+        self.places = self._places(probe)
         self._shape = probe.rows, probe.columns
         self._maps = None if is_linear else self._pixel_places(probe)
 
@@ -196,9 +187,7 @@ class BeamGrid:
             np.concatenate([first, np.stack([self.columns[1], self.rows[1]]) - first]).T
         )
 
-    def _places(
-        self, probe: Probe, nearest: tuple[NDArray[np.int32], NDArray[np.int32]] | None
-    ) -> NDArray[np.int32]:
+    def _places(self, probe: Probe) -> NDArray[np.int32]:
         """(beams, samples): which of the located pixels, flat, is nearest to each sample.
 
         Of those that beams reach, since the nearest of all may lie beside a fan.
@@ -207,8 +196,8 @@ class BeamGrid:
         many = -(-probe.columns // step)
         row = np.clip(np.rint(self.rows / row_step), 0, (probe.rows - 1) // row_step).astype(int)
         column = np.clip(np.rint(self.columns / step), 0, many - 1).astype(int)
-        if nearest is not None:
-            row, column = nearest[0][row, column], nearest[1][row, column]
+        if not self.is_linear:
+            row, column = _nearest(~np.isnan(probe.pixel_beams[0, ::2, ::2]))[:, row, column]
         return np.ascontiguousarray((row * many + column).T, dtype=np.int32)
 
     def _pixel_places(self, probe: Probe) -> tuple[NDArray, NDArray]:
@@ -235,11 +224,6 @@ class BeamGrid:
             return np.asarray(resized)[:rows, :columns]
         remapped = cv2.remap(values, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(remapped)
-
-
-def _nearest_shown(probe: Probe) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    row, column = _nearest(~np.isnan(probe.pixel_beams[0, ::2, ::2]))
-    return row, column
 
 
 def _nearest(marked: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -65,14 +65,10 @@ class Crossings(NamedTuple):
 def room_for_crossings(count: int) -> Crossings:
     """Room for so many."""
     return Crossings(
-        np.empty(count, np.int32),
-        np.empty(count, np.float32),
-        np.empty((count, 2), np.uint8),
-        np.empty(count, np.int32),
-        np.empty((count, 3), np.float32),
-        np.empty((count, 3), np.float32),
-        np.empty(count, np.float32),
-    )
+        np.empty(count, np.int32), np.empty(count, np.float32), np.empty((count, 2), np.uint8),
+        np.empty(count, np.int32), np.empty((count, 3), np.float32),
+        np.empty((count, 3), np.float32), np.empty(count, np.float32),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -345,11 +341,8 @@ _EDGE_HALVINGS = 4  # of the distance between two beams
 _FINER = 4  # steps a sample, of beams that look for an edge
 
 
-def _amplitudes() -> np.ndarray:
-    return (10.0 ** (-np.arange(100 * _FINE + 2) / (20.0 * _FINE))).astype(np.float32)
-
-
-AMPLITUDES = _amplitudes()
+AMPLITUDES = (10.0 ** (-np.arange(100 * _FINE + 2) / (20.0 * _FINE))).astype(np.float32)
+"""Amplitude at each sixteenth of a dB of loss, to 100 dB."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -41,11 +41,6 @@ def angle_loss(cosine: Any) -> Any:
     return -20.0 * np.log10(np.maximum(facets, floor))
 
 
-def _angle_table() -> np.ndarray:
-    """(257,) float32 `angle_loss` at evenly spaced cosines from 0 to 1."""
-    return np.asarray(angle_loss(np.arange(257) / 256.0), dtype=np.float32)
-
-
 def _grain() -> np.ndarray:
     """(16, 16, 16) float32 dB: borders are patchy, as the tissue at them is."""
     random = np.random.Generator(np.random.PCG64(11))
@@ -61,7 +56,7 @@ def _grain() -> np.ndarray:
     return np.asarray(level - level.mean(), dtype=np.float32)
 
 
-ANGLES = _angle_table()
+ANGLES = np.asarray(angle_loss(np.arange(257) / 256.0), np.float32)  # at even cosines from 0 to 1
 GRAIN = _grain()
 
 

@@ -333,14 +333,9 @@ class RestSurface:
     def cut(self, plane: SlicePlane) -> Outline:
         """The cut by the plane of an image; overwritten by the next."""
         count = _cut(
-            self._nodes,
-            self._triangles,
-            plane.to_pixel,
-            plane.columns,
-            plane.rows,
-            self._places,
+            self._nodes, self._triangles, plane.to_pixel, plane.columns, plane.rows, self._places,
             *self._outline[:3],
-        )
+        )  # fmt: skip
         return self._outline._replace(number=count)
 
 

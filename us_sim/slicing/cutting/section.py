@@ -125,19 +125,11 @@ class RestMesh:
         Raises:
             MeshError: another number of nodes, or nodes that are not finite.
         """
-        nodes = finite_nodes(nodes, len(self.nodes))
-        return Section(
-            *_cut(
-                nodes,
-                self.tetrahedra,
-                self.rest_index,
-                self.determinants,
-                plane.to_pixel,
-                float(np.linalg.det(plane.basis)),
-                plane.columns,
-                plane.rows,
-            )
-        )
+        return Section(*_cut(
+            finite_nodes(nodes, len(self.nodes)), self.tetrahedra, self.rest_index,
+            self.determinants, plane.to_pixel, float(np.linalg.det(plane.basis)), plane.columns,
+            plane.rows,
+        ))  # fmt: skip
 
 
 def finite_nodes(nodes: ArrayLike, count: int | None) -> NDArray[np.float64]:

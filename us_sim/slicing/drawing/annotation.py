@@ -63,10 +63,9 @@ class Annotation:
         self._text = int(np.clip(round(min(self._rows, self._columns) / 40), 8, 48))
         self._line = max(1, round(self._text / 12))
         self._frame = max(2, self._text // 3)
-        red_green_blue = {
+        self._structures = {
             label: (name, _bright(colour)) for label, (name, colour) in structures.items()
         }
-        self._structures = red_green_blue
         self._ticks: list[NDArray[np.int32]] = []
         self._labels: list[tuple[Label, int, int]] = []
         self._occupied: list[Box] = []

@@ -299,7 +299,8 @@ def centreline(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) 
         index_to_patient = index_to_patient @ np.diag([2.0, 2.0, 2.0, 1.0])
     voxels = np.argwhere(lumen)
     graph = _graph(lumen, voxels, index_to_patient[:3, :3])
-    start = _farthest(dijkstra(graph, directed=False, indices=0))
+    distance = dijkstra(graph, directed=False, indices=0)
+    start = int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
     walked = dijkstra(graph, directed=False, indices=start)
     walked[~np.isfinite(walked)] = 0.0  # a crumb that thinning cut off
     length = float(walked.max())
@@ -373,10 +374,6 @@ def _graph(
         lengths.append(np.full(len(met), np.linalg.norm(step @ half)))
     pairs = np.concatenate(ones), np.concatenate(others)
     return coo_matrix((np.concatenate(lengths), pairs), shape=(len(voxels), len(voxels))).tocsr()
-
-
-def _farthest(distance: NDArray[np.float64]) -> int:
-    return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
 
 
 def _require_no_branch(

@@ -130,16 +130,9 @@ class ContactSurface:
             )
         gap, press = np.empty(probe.lines), np.empty(probe.lines)
         _meet(
-            now,
-            self.rest_nodes,
-            self._triangles,
-            np.ascontiguousarray(pose.rotation),
-            np.array(pose.position),
-            probe.beam_starts,
-            probe.beam_directions,
-            gap,
-            press,
-        )
+            now, self.rest_nodes, self._triangles, np.ascontiguousarray(pose.rotation),
+            np.array(pose.position), probe.beam_starts, probe.beam_directions, gap, press,
+        )  # fmt: skip
         return gap, press
 
 

@@ -18,10 +18,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 _SAMPLES = 1024
 
 
-def _none() -> NDArray[np.float64]:
-    return np.zeros(0)
-
-
 @dataclass(frozen=True, eq=False)
 class TissueMaterials:
     """Constants of each tetrahedron of a mesh.
@@ -33,8 +29,12 @@ class TissueMaterials:
     young_modulus: NDArray[np.float64]  # (M,), Pa
     poisson_ratio: NDArray[np.float64]  # (M,)
     density: NDArray[np.float64]  # (M,), kg/m3
-    lumen_fraction: NDArray[np.float64] = field(default_factory=_none)  # (M,), of the volume
-    lumen_pressure: NDArray[np.float64] = field(default_factory=_none)  # (M,), Pa, 0 without lumen
+    lumen_fraction: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (M,), of the volume
+    lumen_pressure: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (M,), Pa, 0 without lumen
 
     def __post_init__(self) -> None:
         for name in vars(self):
@@ -141,7 +141,6 @@ def average_over_labels(
     """Constants of each tetrahedron: the average of its labels' constants by volume fraction.
 
     Args:
-        fractions: of the tetrahedra.
         materials: of each label that occurs in them.
 
     Raises:

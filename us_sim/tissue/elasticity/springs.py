@@ -93,7 +93,6 @@ def springs_of(
     """The paper's Algorithm 1: all edges of all tetrahedra become springs, duplicates merge.
 
     Args:
-        mesh, materials: of the tissue.
         stiffness_factor: m, spring constant over Young's modulus, for one tetrahedron's edge. The
             paper gives it as a bare number, but it is a length: the right one grows with the mesh's
             spacing, as `fitted_springs` shows.
@@ -120,7 +119,6 @@ def fitted_springs(
     that Algorithm 1 hides in its constant is 15 V / (2 (1 + nu) sum(L**2)).
 
     Args:
-        mesh, materials: of the tissue.
         damping_factor: s, damping constant over spring constant.
         with_volume: match mu, since a volume term will add the missing part of lambda. Otherwise,
             and below Poisson's ratio 1/4, match Young's modulus, at the springs' own ratio of 1/4.
@@ -312,8 +310,6 @@ def volume_term(
     make the tissue collapse.
 
     Args:
-        mesh, materials: of the tissue.
-        springs: on the mesh's edges.
         damping_time: s, viscosity over stiffness.
         yielding: whether a tetrahedron whose faces have grown beyond `_YIELD` resists no more than
             it does there. Its stiffness grows with the square of its faces, and so, without this,

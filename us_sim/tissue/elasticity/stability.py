@@ -104,7 +104,6 @@ def stabilise(
         time_step: s, as set.
         damping_factor: s, damping constant over stiffness.
         stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only adds the remark.
-        maximum_substeps: of one step.
 
     Raises:
         SolverError: more sub-steps than allowed.

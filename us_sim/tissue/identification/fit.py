@@ -259,28 +259,22 @@ class Identifiability:
 
 
 def assess_identifiability(
-    slopes: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    noise: NDArray[np.float64],
+    fitted: FitResult,
     nuisance: NDArray[np.float64],
     times: NDArray[np.float64],
     depths: NDArray[np.float64],
-    *,
-    widest: float = 3.0,
-    confidence: float = 0.95,
+    widest: float,
+    confidence: float,
 ) -> Identifiability:
     """Tell moduli that are determined from those that are not.
 
     Args:
-        slopes: (n, P) of the measurements by the logarithms of moduli.
-        residual: (n,) that the fit left.
-        noise: (n,) deviation of each measurement.
         nuisance: (n, Q) slopes by other unknowns.
         times: (n,) s.
         depths: (n,) m, of the probe, zero without contact.
         widest: factor by which a modulus may be off either way and still counts as determined.
-        confidence: of the intervals.
     """
+    slopes, residual, noise = fitted.jacobian, fitted.residual, fitted.noise
     _, clear = without_nuisance(residual, slopes, nuisance, noise)
     limit, times_deviation = np.log(widest), quantile(confidence)
     count = slopes.shape[1]

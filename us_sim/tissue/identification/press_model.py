@@ -168,7 +168,6 @@ def slopes(
         tissue: whose forces balance.
         varied: the same with the logarithm of one modulus larger by ``step``, for each modulus.
         step: small, since these slopes of the forces are differences.
-        pose: of the probe.
         displacement: (3, N) m, at which the forces balance.
     """
     tissue.set_state(pose, displacement)

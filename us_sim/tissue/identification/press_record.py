@@ -276,7 +276,6 @@ def choose_poses(
     """Poses that press the tissue, and as many that do not touch it, where there are some.
 
     Args:
-        record: the press.
         clearance: m, of a pose from the undeformed tissue.
         count: of poses that press, at most.
 

@@ -97,9 +97,6 @@ def observations_of(
     """The measurements at chosen poses.
 
     Args:
-        record: the press.
-        chosen: its poses.
-        seen: landmarks.
         late: whether the wrenches' stamps may be late by a little more.
     """
     channels = np.flatnonzero(record.channels)
@@ -251,15 +248,7 @@ def undetermined(
     fitted: FitResult,
     settings: StiffnessSettings,
 ) -> str:
-    """Reasons why a press does not determine moduli, and remedies, in a sentence.
-
-    Args:
-        names: of P structures.
-        known: which of them are determined.
-        observed: the measurements.
-        fitted: to these.
-        settings: of the fit.
-    """
+    """Reasons why a press does not determine moduli, and remedies, in a sentence."""
     reasons, unknown = [], [p for p in range(len(names)) if not known.determined[p]]
     for p in unknown:
         if not known.felt[p]:
@@ -356,9 +345,6 @@ def fit_stiffness(
     """The moduli that explain a press best.
 
     Args:
-        tissue: pressed.
-        record: the press.
-        settings: see `StiffnessSettings`.
         landmarks: points that were seen meanwhile.
         chosen: poses; by default `choose_poses` does.
         progress: told how far a step of the fit is, and which it is.
@@ -440,14 +426,12 @@ def _result(
     settings: StiffnessSettings,
 ) -> StiffnessFit:
     known = assess_identifiability(
-        fitted.jacobian,
-        fitted.residual,
-        fitted.noise,
+        fitted,
         observed.nuisance,
         observed.times,
         observed.depths,
-        widest=settings.widest,
-        confidence=settings.confidence,
+        settings.widest,
+        settings.confidence,
     )
     if not known.determined.all():
         raise StiffnessError(undetermined(names, known, observed, fitted, settings))

@@ -50,8 +50,6 @@ class DenseFields:
         """The fields at ``nodes`` (F,) of forces on S nodes.
 
         Args:
-            nodes: of the fields.
-            forces: S.
             solve: the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
             precision: of the numbers to keep.
         """
@@ -148,7 +146,6 @@ def surface_compliance(
     fixed and contact nodes.
 
     Args:
-        model: the tissue.
         progress: called with the fraction done and a label, if it takes a second or more.
 
     Raises:

@@ -84,21 +84,9 @@ def _precondition(preconditioner, residual, scaled):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def conjugate_gradients(
-    start,
-    columns,
-    blocks,
-    preconditioner,
-    touched,
-    normal,
-    displacement,
-    residual,
-    direction,
-    product,
-    slope,
-    norm,
-    iterations,
-    target,
-):
+    start, columns, blocks, preconditioner, touched, normal, displacement, residual, direction,
+    product, slope, norm, iterations, target,
+):  # fmt: skip
     """Improve displacement (N, 3) by at most ``iterations``, until |residual| <= target.
 
     Goes on with residual and direction when ``slope`` is positive, begins anew when it is negative,

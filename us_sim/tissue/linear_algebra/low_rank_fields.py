@@ -77,7 +77,6 @@ class LowRankFields:
 
         Args:
             points: (N, 3) m, by which nodes are put into blocks.
-            nodes: of the fields.
             surface: (S, 3) m, where the forces are.
             solve: the (N, 3, 3K) m/N fields of unit forces on K of the S nodes.
             tolerance: singular values that are left out, over the largest displacement that a force
@@ -94,17 +93,8 @@ class LowRankFields:
         ordered = forces.reshape(-1, 3)[self.order].astype(np.float32)
         weights, loaded = _weights(self.patches, self.columns, self.rows, self.right, ordered)
         _add_products(
-            self.nodes,
-            self.blocks,
-            self.products,
-            self.patch,
-            self.weights,
-            self.place,
-            self.minor,
-            self.major,
-            weights,
-            loaded,
-            displacement,
+            *(self.nodes, self.blocks, self.products, self.patch, self.weights, self.place),
+            *(self.minor, self.major, weights, loaded, displacement),
         )
 
 

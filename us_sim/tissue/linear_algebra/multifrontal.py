@@ -95,9 +95,8 @@ def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
 
 
 _LARGE = 100_000  # Numbers in a matrix from which on it may be kept in a file
-_Update = tuple[
-    NDArray[np.int64], NDArray[np.float64]
-]  # unknowns, and the Schur complement on them
+# Unknowns, and the Schur complement on them.
+_Update = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +180,6 @@ def eliminate(
     """Eliminate all nodes.
 
     Args:
-        mesh: of the system.
-        system: its equations.
         fixed: (N,), nodes that stay; enough to make the stiffness positive definite.
         loaded: (K,) nodes that are not fixed, on which there will be forces.
         precision: of the numbers that say how parts follow.

@@ -39,7 +39,6 @@ class CoarseGrid:
     Woodbury, Inverting modified matrices, 1950).
 
     Args:
-        mesh: of any shape.
         fixed: (N,), nodes that do not move.
         product: K times a field (3, N), with the fixed nodes' rows left in.
         dtype: in which it is applied.
@@ -91,34 +90,16 @@ class CoarseGrid:
         self._response = np.empty((len(nodes), self.size), self._dtype)
         self._factor = np.zeros((len(nodes), len(nodes)))
         _respond(
-            self._inverse,
-            self._touched_corner,
-            self._touched_weight,
-            self._normal,
-            1.0 / (_YIELD * stiffness),
-            self._response,
-            self._factor,
+            *(self._inverse, self._touched_corner, self._touched_weight, self._normal),
+            *(1.0 / (_YIELD * stiffness), self._response, self._factor),
         )
 
     def add_correction(self, force: NDArray[np.floating], correction: NDArray[np.floating]) -> None:
         """Add the smooth displacement that balances ``force`` to ``correction``, both (3, N)."""
         _correct(
-            self._inverse,
-            self._node,
-            self._start,
-            self._corner,
-            self._weight,
-            self._across,
-            self._room,
-            self._touched_corner,
-            self._touched_weight,
-            self._normal,
-            self._response,
-            self._factor,
-            self._coarse[0],
-            self._coarse[1],
-            force,
-            correction,
+            *(self._inverse, self._node, self._start, self._corner, self._weight, self._across),
+            *(self._room, self._touched_corner, self._touched_weight, self._normal),
+            *(self._response, self._factor, *self._coarse, force, correction),
         )
 
     def _invert(self, count: int, product: Callable[[NDArray], NDArray]) -> NDArray:
@@ -265,23 +246,9 @@ def _respond(inverse, corner, weight, normal, softness, response, factor):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _correct(
-    inverse,
-    node,
-    start,
-    corner,
-    weight,
-    across,
-    room,
-    touched_corner,
-    touched_weight,
-    normal,
-    response,
-    factor,
-    right,
-    solution,
-    force,
-    correction,
-):
+    inverse, node, start, corner, weight, across, room, touched_corner, touched_weight, normal,
+    response, factor, right, solution, force, correction,
+):  # fmt: skip
     """correction (3, N) += the constrained grid's answer to force (3, N)."""
     _restrict(force, node, start, corner, weight, right)
     solution[:] = 0
@@ -420,7 +387,6 @@ def conjugate_gradients(
 
     Args:
         product: writes the stiffness, without springs, times its first argument into the second.
-        preconditioner: prepared.
         residual: (3, N), zero at fixed nodes; overwritten with the remaining one.
         iterations: the most products.
         tolerance: norm of the residual at which to end.

@@ -37,7 +37,6 @@ def fitted_planes(
     """Mesh planes (m, ascending) of x, y and z, from the first edge to the last of each.
 
     Args:
-        wanted: of the three axes.
         nodes: that the box has at most.
 
     Raises:
@@ -68,7 +67,6 @@ def spacing_under_probe(
     and beside the probe.
 
     Args:
-        wanted: of x, y and z.
         half_length, half_width: m, of the probe's footprint, along x and y.
     """
     least = _UNDER_PROBE * half_width

@@ -100,14 +100,14 @@ def chosen_first(choosing: str) -> Arrange:
 
 
 def given_at_the_start(parameters: Mapping[str, Parameter], names: Iterable[str]) -> list[Section]:
-    """What cannot be changed any more, if there is any."""
+    """A section of those that cannot be changed any more, if there are any."""
     fixed = tuple(name for name in names if not parameters[name].is_live)
     labels = {name: in_words(name) for name in fixed}
     return [Section("fixed", "Given at the start", fixed, labels)] if fixed else []
 
 
 def title_of(group: str) -> str:
-    """What comes before parameters' names, in words."""
+    """The title of a group of parameters."""
     words = in_words(group)
     return words[:1].upper() + words[1:]
 
@@ -140,11 +140,11 @@ class ParameterSections:
         self._body = ui.element("div").classes("us-sections")
 
     def watch(self) -> None:
-        """Somebody begins to look."""
+        """Follow the node's parameters."""
         self._board.watch(self._node)
 
     def unwatch(self) -> None:
-        """Nobody looks any more."""
+        """Follow them no longer."""
         self._board.unwatch(self._node)
 
     def refresh(self) -> None:
@@ -174,8 +174,6 @@ class ParameterSections:
 
 
 class _ShownSection:
-    """One section on the page."""
-
     def __init__(
         self, board: ParameterBoard, section: Section, special: Mapping[str, MakeControl]
     ) -> None:
