@@ -25,7 +25,7 @@ from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_services
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, news
+from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, losses_between
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
@@ -187,7 +187,7 @@ class SessionRecorder(GuardedNode):
         self._topics[topic] = RecordedTopic(self, topic, cls, offered, self._take, self._lost)
 
     def _offered(self, topic: str, type_name: str) -> list[QoSProfile]:
-        """What the publishers of that type offer."""
+        """Quality of service of the topic's publishers of that type."""
         publishers = self.get_publishers_info_by_topic(topic)
         return [each.qos_profile for each in publishers if each.topic_type == type_name]
 
@@ -231,7 +231,7 @@ class SessionRecorder(GuardedNode):
 
     def _tell_losses(self, bag: WriteBehind) -> None:
         lost = bag.losses.by_topic()
-        new = news(lost, self._told)
+        new = losses_between(lost, self._told)
         self._told = lost
         self.health.dropped = bag.losses.total
         while bag.untold:

@@ -22,7 +22,7 @@ import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
@@ -262,8 +262,11 @@ class McapFile:
                 self._take_record(record)
             position = record.end
             ended = record.opcode in AFTER_THE_DATA
-        if ended:
-            self._learn_types(stream, position, size)
+        if ended:  # a summary whose checksum does not hold may have types that are lost elsewhere
+            end = position
+            while (record := record_at(stream, end, size)) is not None:
+                self._learn(record.opcode, record.content, anew=False)
+                end = record.end
         elif (chunk := cut_chunk_at(stream, position, size)) is not None:
             self._take_chunk(stream, chunk)
         self._runs.sort()
@@ -329,23 +332,17 @@ class McapFile:
         self.end = time if self.end is None else max(self.end, time)
         return channel, time
 
-    def _learn(self, opcode: int, content: memoryview) -> None:
-        """Keep a schema or a channel."""
-        if opcode == Opcode.SCHEMA:
-            schema = parsed(Schema, content)
-            self._schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = parsed(Channel, content)
-            self._channels[channel.id] = channel
-
-    def _learn_types(self, stream: BinaryIO, position: int, size: int) -> None:
-        """Keep schemas and channels of a summary, though its checksum does not hold."""
-        while (record := record_at(stream, position, size)) is not None:
-            if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind = parsed(Schema if record.opcode == Opcode.SCHEMA else Channel, record.content)
-                known = self._schemas if record.opcode == Opcode.SCHEMA else self._channels
-                known.setdefault(kind.id, kind)
-            position = record.end
+    def _learn(self, opcode: int, content: memoryview, *, anew: bool = True) -> None:
+        """Keep a schema or a channel; if not ``anew``, only where its number is not known."""
+        kinds: dict[int, Any] = {
+            Opcode.SCHEMA: (Schema, self._schemas),
+            Opcode.CHANNEL: (Channel, self._channels),
+        }
+        if opcode in kinds:
+            kind, known = kinds[opcode]
+            record = parsed(kind, content)
+            if anew or record.id not in known:
+                known[record.id] = record
 
     def _topics(self) -> tuple[BagTopic, ...]:
         topics: dict[str, BagTopic] = {}

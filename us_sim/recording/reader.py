@@ -83,10 +83,10 @@ class Bag:
     @property
     def note(self) -> str:
         """The faults that were found when the bag was opened; empty when there are none."""
-        return "; ".join(fault.text for fault in self.found_at_once)
+        return "; ".join(fault.text for fault in self.opening_faults)
 
     @property
-    def found_at_once(self) -> list[Fault]:
+    def opening_faults(self) -> list[Fault]:
         """The faults that were found when the bag was opened."""
         found = [fault for storage in self._storages for fault in storage.faults]
         if self.metadata is not None:
@@ -99,7 +99,7 @@ class Bag:
 
     def faults(self) -> list[Fault]:
         """Everything that is wrong with the bag, for which all of it is read."""
-        found = [*self.found_at_once]
+        found = [*self.opening_faults]
         self.attachments(found)
         self.notes(found)
         try:

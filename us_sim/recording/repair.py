@@ -86,7 +86,7 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
             cannot be written.
     """
     bag = read_bag(path)
-    damage = [*bag.found_at_once]
+    damage = [*bag.opening_faults]
     with BagWriter(out) as writer:
         for attached in bag.attachments(damage).values():
             writer.attach(attached.name, attached.media_type, attached.data, attached.time)

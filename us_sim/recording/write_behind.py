@@ -49,7 +49,7 @@ class Losses:
             return {t: Loss(self._in_transport[t], self._in_recorder[t]) for t in topics}
 
 
-def news(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
+def losses_between(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[str, Loss]:
     """Losses between two results of `Losses.by_topic`, of topics that lost something."""
     none = Loss(0, 0)
     return {
@@ -247,7 +247,7 @@ class WriteBehind:
         """Note the losses since the last note."""
         lost = self.losses.by_topic()
         if lost != self._noted and not self.problem:
-            new = news(lost, self._noted)
+            new = losses_between(lost, self._noted)
             self._bag.note(LOST, {topic: str(sum(loss)) for topic, loss in new.items()})
             self._noted = lost
 
