@@ -86,7 +86,7 @@ def test_nodes_that_end_are_back_and_the_rest_goes_on(played_scene, tmp_path):
     assert summary["lost"]["files"] == ["session.mcap", "session_1.mcap"]
     assert summary["images_out"] == summary["lost"]["images_recorded"]
     assert summary["images_out"] == images_in(out / "session.mcap") + images_in(further)
-    assert "the recording is in session.mcap and session_1.mcap" in told
+    assert "session.mcap, session_1.mcap" in told
     # The recording says it by itself, too.
     assert "slice_interpolator was ended by SIGKILL" in str(summary["nodes"]["session_monitor"])
 

@@ -1,4 +1,8 @@
-"""The haptic node: what a wall gives back, zero at any doubt, and the whole way from the tissue."""
+"""The haptic node: walls, zero force at any doubt, the whole way from the tissue, steady ticks."""
+
+import itertools
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +14,7 @@ from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.haptic_renderer import HapticRenderer
+from us_sim.nodes.haptic_renderer import HapticRenderer, PeriodicThread
 from us_sim.nodes.messages import (
     contact_model_from,
     contact_model_message,
@@ -244,3 +248,37 @@ def test_a_scene_without_tissue_is_refused(bench, tmp_path):
     )
     with pytest.raises(SceneError, match="nothing can be felt"):
         bench.make(HapticRenderer, scene=str(file))
+
+
+def run(thread, done):
+    thread.start()
+    assert done.wait(20.0)
+    thread.stop()
+
+
+def test_a_hold_up_is_skipped_and_not_made_up_for():
+    period, ticks, done = 0.005, [], threading.Event()
+
+    def work(now):
+        ticks.append(now)
+        if len(ticks) == 20:
+            time.sleep(20.5 * period)
+        if len(ticks) == 60:
+            done.set()
+
+    thread = PeriodicThread(1 / period, work)
+    run(thread, done)
+    assert thread.skipped >= 19
+    count, ways = len(ticks), [b - a for a, b in itertools.pairwise(ticks)]
+    # On the whole as many periods passed as there were ticks and skipped ones: nothing drifts.
+    assert abs((ticks[59] - ticks[0]) * 1e-9 / period - (59 + thread.skipped)) < 3
+    assert sum(way < 0.2e9 * period for way in ways) <= 3
+    assert 0.0 < thread.jitter < 25 * period
+    time.sleep(4 * period)
+    assert len(ticks) == count
+
+
+def test_it_ends_even_if_it_never_began():
+    thread = PeriodicThread(100.0, lambda _: None)
+    thread.stop()
+    assert thread.jitter == 0.0

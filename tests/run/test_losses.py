@@ -31,7 +31,7 @@ def test_what_became_of_a_node_is_said(files):
         "tissue_deformer was ended by SIGKILL at 12.3 s and was back after 2.5 s; "
         "session_recorder was stopped (SIGSTOP) at 20.0 s and is not started again; "
         "550 images were recorded of 600 poses; "
-        "the recording is in session.mcap and session_1.mcap"
+        "the recording is in session.mcap, session_1.mcap"
     )
 
 

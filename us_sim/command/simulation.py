@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from us_sim.command.options import (
     add_network_option,
@@ -25,6 +26,9 @@ from us_sim.errors import UsSimError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
+
+if TYPE_CHECKING:
+    from us_sim.run.plan import Request
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
@@ -112,28 +116,39 @@ def _run(args: argparse.Namespace) -> int:
     parameters = node_parameters(args.param)
     with ForkServer() as forks:  # which imports what the nodes need while this process does
         from us_sim.run.live import run
-        from us_sim.scene.reading import load_scene
 
         return run(
-            load_scene(scene_name(args), volume=args.volume),
-            parameters,
-            record=asked.record,
-            path=args.path,
-            topic=args.topic,
-            duration=asked.duration,
+            _request(args, asked, parameters),
             network=args.network,
             supervision=supervision(args),
-            view=viewed(args),
             forks=forks,
         )
+
+
+def _request(
+    args: argparse.Namespace, asked: RunSettings, parameters: dict[str, dict[str, str]]
+) -> Request:
+    from us_sim.run.plan import Request
+    from us_sim.scene.reading import load_scene
+
+    return Request(
+        load_scene(scene_name(args), volume=args.volume),
+        parameters,
+        record=asked.record,
+        path=args.path,
+        topic=args.topic,
+        duration=asked.duration,
+        view=viewed(args),
+    )
 
 
 def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
     """Print the nodes that would run, having checked the files of the scene."""
     from us_sim.run.live import dry_run
-    from us_sim.scene.reading import check_files, load_scene
+    from us_sim.scene.reading import check_files
 
-    scene = load_scene(scene_name(args), volume=args.volume)
+    request = _request(args, asked, node_parameters(args.param))
+    scene = request.scene
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
     if path is not None and not scene.volume.phantom:
@@ -141,9 +156,7 @@ def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
         from us_sim.scene.placement import check_path_in_volume
 
         check_path_in_volume(scene, path, volume_of(scene), args.topic if args.path else None)
-    parameters = node_parameters(args.param)
-    asked_of = {"record": asked.record, "path": args.path, "topic": args.topic}
-    print(dry_run(scene, parameters, **asked_of, view=viewed(args)))
+    print(dry_run(request))
     if checked:
         print(f"readable  {', '.join(checked)}")
     return 0
@@ -216,22 +229,20 @@ def _view(args: argparse.Namespace) -> int:
         raise UsSimError("--loop plays a path again and again: name one with --path")
     with ForkServer() as forks:  # which imports what the nodes need while this process does
         from us_sim.run.live import run
+        from us_sim.run.plan import Request
         from us_sim.scene.reading import load_scene
 
-        return run(
+        request = Request(
             load_scene(scene_name(args, "upper_arm"), volume=args.volume),
             parameters,
             record=read_settings(args, RunSettings, ("record",)).record,
             path=args.path,
             topic=args.topic,
-            duration=None,
-            network=args.network,
-            supervision=supervision(args),
             view=viewer(args),
             by_hand=not args.tracker,
-            playing={"stay": True, "loop": args.loop} if args.path is not None else None,
-            forks=forks,
+            playing={"stay": True, "loop": args.loop} if args.path is not None else {},
         )
+        return run(request, network=args.network, supervision=supervision(args), forks=forks)
 
 
 _OF_THE_PLAYER = ("rate", "loop")

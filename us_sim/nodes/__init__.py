@@ -37,10 +37,11 @@ def is_node(command: list[str]) -> bool:
     """
     for option, value in itertools.pairwise(command):
         if option == "-m":
-            return value.startswith(f"{__name__}.")
+            return value.startswith((f"{__name__}.", "us_sim.viewer.viewer"))
         if not value.startswith("-") and option not in ("-X", "-W"):  # which a value follows
             name = Path(value).name
-            return name.isidentifier() and (Path(__file__).parent / f"{name}.py").is_file()
+            of_package = name.isidentifier() and (Path(__file__).parent / f"{name}.py").is_file()
+            return of_package or name == "viewer"
     return False
 
 

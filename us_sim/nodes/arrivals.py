@@ -47,7 +47,7 @@ class Arrivals(GuardedNode):
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """What is noted, in the order in which it is made."""
+        """Topics whose arrivals are noted, in the order in which they are made."""
         return tuple(self._heard)
 
     def heard(self, topic: str) -> Sequence[tuple[int, int]]:

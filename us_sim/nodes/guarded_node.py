@@ -1,4 +1,4 @@
-"""A node that goes on whatever comes in, says what it could not use, and reports its health.
+"""A node that goes on whatever comes in, refuses bad input, and reports its health.
 
 What a node reports about itself once a second: rate, latency, drops, state.
 """
@@ -205,7 +205,7 @@ class GuardedNode(Node):
 
 
 def decoded(message_type: Any, work: Callable[[Any], None]) -> Callable[[bytes], None]:
-    """What takes a message's bytes and hands ``work`` the message.
+    """A callback that takes a message's bytes and hands ``work`` the message.
 
     It raises MessageError for bytes that are none, and StampError where its stamp is no time. That
     is not left to subscriptions: of a message that is cut off, rmw_fastrtps says nothing, and
@@ -230,7 +230,7 @@ def decoded(message_type: Any, work: Callable[[Any], None]) -> Callable[[bytes],
 
 
 def kind_of(error: UsSimError) -> str:
-    """What an error is counted as: ``pose`` of a PoseError."""
+    """The kind that an error is counted as: ``pose`` of a PoseError."""
     return type(error).__name__.removesuffix("Error").lower()
 
 
@@ -348,6 +348,7 @@ class Health:
         total = max(self._published.values(), default=0)
         rate = (total - self._last_total) / elapsed
         self._last_time, self._last_total = now.nanoseconds, total
+        failures: Counter[str] = Counter(getattr(self._node, "failures", ()))
         values = {
             "state": self.state,
             "pid": str(os.getpid()),
@@ -359,31 +360,24 @@ class Health:
             **({"scheduling": self.scheduling} if self.scheduling else {}),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
-            **{f"failed {where}": str(n) for where, n in self._failures().items()},
+            **{f"failed {where}": str(n) for where, n in failures.items()},
             **self.values,
         }
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])
             values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
-        self._publisher.publish(self._message(now.to_msg(), values))
-        self._last_problem = ""
-
-    def _failures(self) -> Counter[str]:
-        return Counter(getattr(self._node, "failures", ()))
-
-    def _message(self, stamp: TimeMessage, values: dict[str, str]) -> DiagnosticArray:
-        status = DiagnosticStatus()
         wrong = self._last_problem or self.warning
-        status.level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
-        failures = self._failures().total()
-        if failures > self._failures_told:
-            self._failures_told, wrong = failures, self._node.last_failure
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK,
+            name=self._node.get_fully_qualified_name(),
+            hardware_id=self._hardware_id,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        if failures.total() > self._failures_told:
+            self._failures_told, wrong = failures.total(), self._node.last_failure
             status.level = DiagnosticStatus.ERROR
-        status.name = self._node.get_fully_qualified_name()
         status.message = wrong or self.state
-        status.hardware_id = self._hardware_id
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray()
-        message.header.stamp = stamp
-        message.status = [status]
-        return message
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = now.to_msg()
+        self._publisher.publish(message)
+        self._last_problem = ""

@@ -127,9 +127,7 @@ def pose_from(message: PoseStamped, frame: str | None = None) -> Pose:
 
 def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
     """``pose`` of the probe in ``frame``."""
-    message = PoseStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    message = PoseStamped(header=Header(stamp=stamp, frame_id=frame))
     p, q = message.pose.position, message.pose.orientation
     p.x, p.y, p.z = map(float, pose.position)
     q.x, q.y, q.z, q.w = map(float, pose.orientation)
@@ -142,7 +140,7 @@ def pose_text(pose: Pose) -> str:
 
 
 def pose_from_text(text: str) -> Pose:
-    """What `pose_text` has written.
+    """The pose in a text of `pose_text`.
 
     Raises:
         PoseError: it is no pose.
@@ -177,9 +175,7 @@ def _pose(p: Any, q: Any) -> Pose:
 
 def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> TransformStamped:
     """The same transform for tf."""
-    message = TransformStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    message = TransformStamped(header=Header(stamp=stamp, frame_id=frame))
     message.child_frame_id = child
     t, q = message.transform.translation, message.transform.rotation
     t.x, t.y, t.z = map(float, pose.position)
@@ -191,9 +187,7 @@ def wrench_message(
     force: NDArray[np.float64], torque: NDArray[np.float64], stamp: Time, frame: str
 ) -> WrenchStamped:
     """Force (3,) N and torque (3,) N m about the origin of ``frame``."""
-    message = WrenchStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    message = WrenchStamped(header=Header(stamp=stamp, frame_id=frame))
     f, t = message.wrench.force, message.wrench.torque
     f.x, f.y, f.z = map(float, force)
     t.x, t.y, t.z = map(float, torque)
@@ -271,9 +265,7 @@ _FARTHEST = 1e6
 def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: str) -> PointCloud2:
     """A float32 cloud whose fields are the ``columns``, each (N,), in their order."""
     table = np.column_stack(list(columns.values())).astype("<f4")
-    message = PointCloud2()
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    message = PointCloud2(header=Header(stamp=stamp, frame_id=frame))
     message.height, message.width = 1, len(table)
     message.fields = [
         PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
@@ -419,9 +411,7 @@ def field_message(values: NDArray[np.float32], stamp: Time, frame: str) -> Image
 
 
 def _image(pixels: NDArray[Any], encoding: str, size: int, stamp: Time, frame: str) -> Image:
-    message = Image()
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    message = Image(header=Header(stamp=stamp, frame_id=frame))
     message.height, message.width = pixels.shape[:2]
     message.encoding = encoding
     message.is_bigendian = 0

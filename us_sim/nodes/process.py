@@ -208,7 +208,7 @@ class _Executor(SingleThreadedExecutor):
         return self._taken(super()._take_client, entity)
 
     def _taken(self, take: Callable[[Any], Any], entity: Any) -> Any:
-        """What is to be done with what came, as rclpy has it; a failure is raised only then."""
+        """The work that rclpy makes of an entity; a failure to take it is raised by that work."""
         try:
             return take(entity)
         except Exception as error:

@@ -24,7 +24,7 @@ _FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_ro
 
 
 class Controlled(Protocol):
-    """What does as the parameters say."""
+    """The simulation that follows the parameters."""
 
     def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         """Raise UsSimError when this cannot be; ``named`` are the parameters that were set."""
@@ -81,7 +81,7 @@ class SessionControl(GuardedNode):
 
     @property
     def values(self) -> SessionControlSettings:
-        """What the parameters say."""
+        """The present values of the parameters."""
         return self._values
 
     def tell(self, state: str, values: Mapping[str, str], warning: str = "") -> None:

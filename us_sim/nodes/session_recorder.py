@@ -187,7 +187,7 @@ class SessionRecorder(GuardedNode):
         self._topics[topic] = RecordedTopic(self, topic, cls, offered, self._take, self._lost)
 
     def _offered(self, topic: str, type_name: str) -> list[QoSProfile]:
-        """What the publishers of that type offer."""
+        """Quality of service of the topic's publishers of that type."""
         publishers = self.get_publishers_info_by_topic(topic)
         return [each.qos_profile for each in publishers if each.topic_type == type_name]
 

@@ -77,8 +77,7 @@ class LiveTissue:
         self._live = LiveSettings(node, groups, use=self._use)
         values = self._live.values
         self._volume = volume_of(scene)
-        given_materials = _materials(values)
-        self._scene = replace(scene, tissue=replace(tissue, materials=given_materials))
+        self._scene = replace(scene, tissue=replace(tissue, materials=self._materials(values)))
         model = tissue_model_of(self._scene, self._volume, node.get_logger().info)
         node.get_logger().info(
             f"preparing {values[OWN].solver} for {len(model.mesh.nodes)} nodes, "
@@ -118,29 +117,26 @@ class LiveTissue:
         if values == self._asked:
             return
         self._asked = dict(values)
+        log = self._node.get_logger()
         if values == self._current:
             self._preparation.drop()
-            self._tell_preparing()
-            self._node.get_logger().info(
+            log.info(
                 f"set back: {self.tissue.name} goes on as it is, and what was being prepared is "
                 f"dropped"
             )
-            return
-        plan = self._plan(values)
-        if self._node.lockstep:
-            self._conclude(self._made(plan))
-            return
-        self._node.get_logger().info(
-            f"{plan.reason}: being prepared; {self.tissue.name} goes on until it is ready"
-        )
-        self._preparation.want(plan)
-        self._tell_preparing()
+        else:
+            plan = self._plan(values)
+            if self._node.lockstep:
+                self._adopt(self._made(plan))
+                return
+            log.info(f"{plan.reason}: being prepared; {self.tissue.name} goes on until it is ready")
+            self._preparation.want(plan)
+        self._tell(self._preparation.state)
 
     def _plan(self, values: Mapping[str, Any]) -> Plan:
         own = values[OWN]
         changed = [key for key in values if values[key] != self._current[key]]
-        other = any(key.startswith("materials.") for key in changed)
-        materials, model = _materials(values), self.tissue.model
+        materials, model = self._materials(values), self.tissue.model
 
         def with_materials() -> TissueModel:
             made = materials_of(self._scene, materials, model.mesh, self._volume)
@@ -152,9 +148,15 @@ class LiveTissue:
             own.solver,
             own.compare_with or "",
             _settings(values),
-            with_materials if other else None,
+            with_materials if materials != self._materials(self._current) else None,
             ", ".join(reasons),
         )
+
+    def _materials(self, values: Mapping[str, Any]) -> dict[str, Material]:
+        tissue = self._node.scene.tissue
+        return {
+            label: values[f"materials.{label}"] for label in (tissue.materials if tissue else ())
+        }
 
     def _made(self, plan: Plan) -> Prepared | Failed:
         try:
@@ -163,58 +165,42 @@ class LiveTissue:
             return Failed(plan, str(error))
 
     def _tick(self) -> None:
-        """Look, and tell diagnostics how far it is, also while no pose comes."""
-        if self._preparation.state:
-            self._node.health.state, self._node.health.preparing = (
-                self.state,
-                self._preparation.state,
-            )
+        """Adopt what is ready, and tell diagnostics how far it is, also while no pose comes."""
+        if preparing := self._preparation.state:
+            self._node.health.state, self._node.health.preparing = self.state, preparing
         self._take_prepared()
 
-    def _tell_preparing(self) -> None:
-        self._node.health.state, self._node.health.preparing = self.state, self._preparation.state
+    def _tell(self, preparing: str) -> None:
+        self._node.health.state = self.state if preparing else self.tissue.name
+        self._node.health.preparing = preparing
         self._node.health.report()
 
     def _take_prepared(self) -> None:
         outcome = self._preparation.take()
         if outcome is not None:
-            self._conclude(outcome)
+            self._adopt(outcome)
 
-    def _conclude(self, outcome: Prepared | Failed) -> None:
-        self._take(outcome)
-        self._node.health.state = self.tissue.name  # also while no pose comes
-        self._node.health.preparing = ""
-        self._node.health.report()
-
-    def _take(self, outcome: Prepared | Failed) -> None:
+    def _adopt(self, outcome: Prepared | Failed) -> None:
+        reason = outcome.plan.reason
         if isinstance(outcome, Failed):
-            self._node.health.problem(
-                "setting", f"{outcome.plan.reason}: {outcome.problem}; it is set back"
-            )
+            self._node.health.problem("setting", f"{reason}: {outcome.problem}; it is set back")
             self._asked = dict(self._current)
             self._live.restore(self._current)
-            return
-        before, compared = self.tissue.name, self.tissue.compared
-        self.tissue.adopt(outcome)
-        self._current = dict(self._asked)
-        log = self._node.get_logger()
-        if self.tissue.name != before:
-            log.info(f"switched to {self.tissue.name}")
-        if self.tissue.compared != compared and self.tissue.compared:
-            log.info(f"comparing with {self.tissue.compared}")
-        log.info(f"{outcome.plan.reason}: in use from now on")
+        else:
+            before, compared = self.tissue.name, self.tissue.compared
+            self.tissue.adopt(outcome)
+            self._current = dict(self._asked)
+            log = self._node.get_logger()
+            if self.tissue.name != before:
+                log.info(f"switched to {self.tissue.name}")
+            if self.tissue.compared != compared and self.tissue.compared:
+                log.info(f"comparing with {self.tissue.compared}")
+            log.info(f"{reason}: in use from now on")
+        self._tell("")
 
 
 def _settings(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: values[name] for name in SOLVERS.importable}
-
-
-def _materials(values: Mapping[str, Any]) -> dict[str, Material]:
-    return {
-        key.removeprefix("materials."): value
-        for key, value in values.items()
-        if key.startswith("materials.")
-    }
 
 
 class ContactModelPublisher:
@@ -357,11 +343,8 @@ class TissueDeformer(SceneNode):
         mesh = self._live.tissue.model.mesh
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
-        self._contact: ContactModelPublisher | None = None
-        if self.scene.tracker.source.name == "haptic":
-            from us_sim.nodes.tissue_deformer import ContactModelPublisher
-
-            self._contact = ContactModelPublisher(self)
+        is_felt = self.scene.tracker.source.name == "haptic"
+        self._contact = ContactModelPublisher(self) if is_felt else None
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
@@ -372,11 +355,7 @@ class TissueDeformer(SceneNode):
             self.get_logger().info(f"a frame may take {1e3 * limit:.1f} ms")
             self.create_timer(GO_ON_S, self._go_on)
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
-        self._structures: StructureMarkers | None = None
-        if self.scene.structures:
-            from us_sim.nodes.tissue_deformer import StructureMarkers
-
-            self._structures = StructureMarkers(self, mesh)
+        self._structures = StructureMarkers(self, mesh) if self.scene.structures else None
         self._last: PoseStamped | None = None
         self._sent = mesh.nodes  # (N, 3) m
         self._is_balanced = True  # the last frame

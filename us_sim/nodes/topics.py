@@ -45,7 +45,7 @@ def _topic(entry: str) -> Topic:
         () if publishers == "drivers" else tuple(publishers.split(", ")),
         tuple(filter(None, subscribers.split(", "))),
         latched="[latched]" in flags,
-        on_demand="[on demand]" in flags,
+        on_demand="[on_demand]" in flags,
     )
 
 
@@ -98,7 +98,7 @@ tissue/rest: sensor_msgs/PointCloud2 [latched]
     tissue_deformer -> slice_interpolator, viewer | where they are at rest
 tissue/tetrahedra: std_msgs/Int32MultiArray [latched]
     tissue_deformer -> slice_interpolator, viewer | four nodes of each tetrahedron, N × 4
-tissue/structures: visualization_msgs/MarkerArray [on demand]
+tissue/structures: visualization_msgs/MarkerArray [on_demand]
     tissue_deformer -> viewer | vessels, nerves and bones as deformed, where the scene names
     `structures`
 tissue/contact_model: std_msgs/Float64MultiArray
@@ -113,43 +113,43 @@ skin/marker: visualization_msgs/Marker
 ultrasound/image: sensor_msgs/Image
     slice_interpolator -> openigtlink_bridge, image_writer, path_player, volume_reconstructor,
     viewer | `mono8`, in frame `probe`: columns along the array, rows along the depth
-ultrasound/image_annotated: sensor_msgs/Image [on demand]
+ultrasound/image_annotated: sensor_msgs/Image [on_demand]
     slice_interpolator | `rgb8`, for the eye: with a depth scale, outlines of structures, and its
     age
-ultrasound/labels: sensor_msgs/Image [on demand]
+ultrasound/labels: sensor_msgs/Image [on_demand]
     slice_interpolator -> image_writer | `mono8`: the number of the volume's label at each pixel of
     the image, 0 for nothing
-ultrasound/displacement: sensor_msgs/Image [on demand]
+ultrasound/displacement: sensor_msgs/Image [on_demand]
     slice_interpolator -> image_writer | `32FC2`: how far each pixel's tissue has moved since rest
     along +x and +z of `probe`, m; NaN where there is no tissue
-ultrasound/strain: sensor_msgs/Image [on demand]
+ultrasound/strain: sensor_msgs/Image [on_demand]
     slice_interpolator | `32FC1`: the tissue's strain along each pixel's beam, negative where it got
     shorter; NaN where there is no tissue
-ultrasound/strain_estimate: sensor_msgs/Image [on demand]
+ultrasound/strain_estimate: sensor_msgs/Image [on_demand]
     slice_interpolator | `32FC1`: the same between two images, estimated from these alone; NaN where
     nothing was found again
-ultrasound/velocity: sensor_msgs/Image [on demand]
+ultrasound/velocity: sensor_msgs/Image [on_demand]
     slice_interpolator | `32FC1`: velocity of blood along the beams of colour Doppler, m/s, towards
     the probe positive, exact; NaN where none flows; where the scene names a `flow`
-ultrasound/velocity_estimate: sensor_msgs/Image [on demand]
+ultrasound/velocity_estimate: sensor_msgs/Image [on_demand]
     slice_interpolator | `32FC1`: the same in the colour box as a scanner estimates it, aliased and
     noisy; NaN where no colour is shown
-ultrasound/spectrum: sensor_msgs/Image [on demand]
+ultrasound/spectrum: sensor_msgs/Image [on_demand]
     slice_interpolator | `rgb8`, for the eye: velocities at the gate of pulsed-wave Doppler over
     time, in cm/s; where the scene names a `flow`
-ultrasound/m_mode: sensor_msgs/Image [on demand]
+ultrasound/m_mode: sensor_msgs/Image [on_demand]
     slice_interpolator | `rgb8`, for the eye: the image's echoes along a line over time
 ultrasound/image_to_probe: std_msgs/Float64MultiArray [latched]
     slice_interpolator -> openigtlink_bridge, volume_reconstructor, viewer | 4 × 4, from (column,
     row, 0, 1) of a pixel to metres in frame `probe`
 session/marker: std_msgs/String
     drivers | a text that marks a moment of the recording
-session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on demand]
+session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
     session_control | scenes and cases that can be loaded: name, description, what loads it, and
     more
-session/thumbnails: sensor_msgs/CompressedImage [latched] [on demand]
+session/thumbnails: sensor_msgs/CompressedImage [latched] [on_demand]
     session_control | JPEG of what the probe sees in each of them; the frame is what loads it
-session/bags: diagnostic_msgs/DiagnosticArray [latched] [on demand]
+session/bags: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
     session_control | bags that can be played: those of the folder `us-sim` runs in, and installed
     ones
 events/write_split: rosbag2_interfaces/WriteSplitEvent

@@ -34,7 +34,7 @@ def compile_kernels() -> int:
 
 
 def parts() -> Iterator[Part]:
-    """What a simulation may be made of, what takes longest first."""
+    """Parts that a simulation may be made of, those that take longest first."""
     for solver in sorted(SOLVERS.importable, key=lambda name: name != "fem_nonlinear"):
         yield solver, partial(_use_solver, solver, box=True)
     for solver in SOLVERS.importable:

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.nodes.settings import checked_parameters
+from us_sim.nodes.topics import published_counts
 from us_sim.progress import Progress, late_progress
 from us_sim.run.fork_server import ForkServer
 from us_sim.run.losses import Outcome
-from us_sim.run.monitored import Monitored, alone_on_domain
-from us_sim.run.plan import VIEWER, NodeProcess, Parameters, Plan, Request, plan_of, viewer_process
+from us_sim.run.monitored import Monitored, alone_on_domain, domain
+from us_sim.run.plan import (
+    RECORDER,
+    VIEWER,
+    NodeProcess,
+    Parameters,
+    Plan,
+    Request,
+    plan_of,
+    viewer_process,
+)
 from us_sim.run.processes import ProcessGroup, keep_on_this_host
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import IMAGER, IMAGES, Supervisor, say
@@ -32,10 +40,8 @@ if TYPE_CHECKING:
     from us_sim.demo.camera_video import PathVideo
 
 
-SETTLE_S = 1.2
-"""After the path's end: the last images, and each node's last report, which comes every second."""
-RIVALRY_S = 5.0
-"""After all nodes are ready: to see a simulation elsewhere that began at the same moment."""
+SETTLE_S = 1.2  # after the path's end: for the last images and each node's last report
+RIVALRY_S = 5.0  # after all nodes are ready: to see a simulation elsewhere that began just before
 
 
 def follow(
@@ -119,7 +125,9 @@ def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored
                 plan, now = supervisor.plan, time.monotonic()
                 if now - began < RIVALRY_S:
                     monitor.refuse_earlier_run()
-                done = now - began if plan.poses is None else _played(plan, monitor)
+                played = monitor.node.reports.get(plan.player, {}).get("played", "")
+                is_known = played.isdecimal() and len(played) < 12
+                done = now - began if plan.poses is None else float(played) if is_known else 0.0
                 bar.update(min(done, total or done), _status(plan, monitor))
                 ended = ended or now if supervisor.finished else None
                 if plan.duration is not None and now - began > plan.duration:
@@ -129,15 +137,10 @@ def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored
 
 
 def _shown(plan: Plan) -> tuple[float | None, str]:
-    """What a bar shows the run's progress in: its end, and the unit."""
+    """The end of a progress bar, and its unit."""
     if plan.poses is None:
         return plan.duration, "s"
     return None if plan.loops else plan.poses, "poses" if plan.player == "path_player" else "images"
-
-
-def _played(plan: Plan, monitor: Monitored) -> float:
-    text = monitor.node.reports.get(plan.player, {}).get("played", "")
-    return float(text) if text.isdecimal() and len(text) < 12 else 0.0
 
 
 def _status(plan: Plan, monitor: Monitored) -> str:
@@ -159,84 +162,58 @@ def _status(plan: Plan, monitor: Monitored) -> str:
     )
 
 
-def dry_run(
-    scene: Scene,
-    parameters: Parameters,
-    *,
-    record: Path | None,
-    path: Path | None,
-    topic: str | None = None,
-    view: ViewerSettings | None = None,
-) -> str:
-    """What :func:`run` would start and what it would leave out, and why, one line each."""
-    plan_of(Request(scene, parameters, record, path, topic, view=view))
+def dry_run(request: Request) -> str:
+    """The processes that :func:`run` would start or leave out, and why, one line each."""
+    plan_of(request)
+    scene, view = request.scene, request.view
     rows = [
         ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
     ]
-    optional = {
-        "path_player": (
-            path and f"plays {path}",
+    port = (view and view.port) or "any"
+    for node, reason, without in (
+        (
+            "path_player",
+            request.path and f"plays {request.path}",
             f"no --path: poses come from `{scene.tracker.source.name}`",
         ),
-        "session_recorder": (record and f"records to {record}", "no --record"),
-        "viewer": (
-            view and f"serves a page at {view.host}, port {view.port or 'any'}",
-            "no --view",
-        ),
-    }
-    for node, (what, without) in optional.items():
-        rows.append(("runs", node, what) if what else ("left out", node, without))
-    lines = [f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}"]
-    lines += [f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows]
-    lines.append(
-        "on demand wrench, tf, markers, annotated image, what is known of images: nothing is "
-        "computed for a topic nobody subscribes"
+        (RECORDER, request.record and f"records to {request.record}", "no --record"),
+        (VIEWER, view and f"serves a page at {view.host}, port {port}", "no --view"),
+    ):
+        rows.append(("runs", node, reason) if reason else ("left out", node, without))
+    return "\n".join(
+        [
+            f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}",
+            *(f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows),
+            "on demand wrench, tf, markers, annotated image, what is known of images: nothing is "
+            "computed for a topic nobody subscribes",
+        ]
     )
-    return "\n".join(lines)
 
 
 def run(
-    scene: Scene,
-    parameters: Parameters,
+    request: Request,
     *,
-    record: Path | None,
-    path: Path | None,
-    duration: float | None,
     network: bool,
     supervision: SupervisionSettings,
-    topic: str | None = None,
-    view: ViewerSettings | None = None,
-    by_hand: bool = False,
-    playing: Mapping[str, object] | None = None,
     forks: ForkServer | None = None,
 ) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
 
     Args:
-        scene: what is run.
-        parameters: given by a person, by node.
-        record: MCAP file to record to.
-        path: bag to play to the tracker.
-        duration: s, after which all ends.
+        request: the scene, and what is recorded, played and shown.
         network: talk beyond this host.
         supervision: when a node hangs, and how often it is started again.
-        topic: of the body in the bag whose poses are played.
-        view: address of the page that shows the simulation; None is no page.
-        by_hand: poses come on ``tracker/pose``, whatever the scene's tracker is.
-        playing: parameters of what plays the path.
         forks: that the nodes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
             recorded.
     """
-    if topic and path is None:
-        raise UsSimError(f"--topic {topic}: is of a path: name its file with --path")
+    if request.topic and request.path is None:
+        raise UsSimError(f"--topic {request.topic}: is of a path: name its file with --path")
     keep_on_this_host(network=network)
-    request = Request(scene, parameters, record, path, topic, duration=duration, view=view)
-    request = replace(request, by_hand=by_hand, playing=playing or {})
     plan = plan_of(request).with_free_port()
-    prepare_volume(scene, path, plan.topic)
+    prepare_volume(request.scene, request.path, plan.topic)
     outcome = follow(plan, None, supervision, request, forks)
     for file in outcome.files:
         print(f"recorded to {file}")
@@ -381,11 +358,11 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
                 for how in watch.hung(group.pids, monitor.node.heard).values():
                     raise UsSimError(f"{process.node} {how}, and what it plays is not at its end")
                 report = monitor.node.reports.get(process.node, {})
-                done = sum(int(v) for k, v in report.items() if k.startswith("published "))
+                done = sum(published_counts(report).values())
                 state = report.get("state", "starting")
-                domain = os.environ.get("ROS_DOMAIN_ID", "0")
-                where = f" on ROS domain {domain}" if state.startswith("waiting") else ""
-                bar.update(min(done, count), state + where)
+                if state == "waiting":
+                    state = f"waiting for the simulation on ROS domain {domain()}"
+                bar.update(min(done, count), state)
             group.check()
             bar.update(count)
     finally:
@@ -468,8 +445,7 @@ def _require_a_cache() -> None:
 
 
 def _require_nothing_lost(outcome: Outcome) -> None:
-    lost = outcome.sentence()
-    if lost:
+    if lost := outcome.sentence():
         raise UsSimError(lost)
 
 
@@ -503,18 +479,15 @@ def _report(
     if tracked is not None:
         print(tracked)
     for vessel in areas.area if areas is not None else ():
-        pressed, released = (
-            summary["areas"][f"{vessel}_change_{moment}"]
-            for moment in ("at_full_press", "after_release")
-        )
+        changes = {
+            moment: "not in the image" if change is None else format(change, form)
+            for moment, form in (("at_full_press", "+.0%"), ("after_release", "+.1%"))
+            for change in [summary["areas"][f"{vessel}_change_{moment}"]]
+        }
         print(
-            f"{vessel}: {_change(pressed, '+.0%')} at full press, "
-            f"{_change(released, '+.1%')} after release"
+            f"{vessel}: {changes['at_full_press']} at full press, "
+            f"{changes['after_release']} after release"
         )
     recordings = (file.name for file in outcome.files)
     for name in (*recordings, "contact_sheet.png", "summary.json", "nodes.log"):
         print(out / name)
-
-
-def _change(change: float | None, form: str) -> str:
-    return "not in the image" if change is None else format(change, form)

@@ -65,7 +65,7 @@ class Outcome:
     awaited: str = ""  # why nothing was played
 
     def sentence(self) -> str:
-        """What was lost, for a person; empty when nothing was."""
+        """The losses, for a person; empty when there are none."""
         told = [str(loss) for loss in self.losses[:TOLD]]
         if self.awaited:
             told.append(f"nothing was played: it waited for {self.awaited}")
@@ -77,12 +77,9 @@ class Outcome:
                 of = f" of {self.made} that were made"
             told.append(f"{self.recorded} images were recorded{of}")
         if self.files:
-            told.append(f"the recording is in {_listed([file.name for file in self.files])}")
-        return "; ".join(told) if self.losses or self.awaited or self._lacks_images else ""
-
-    @property
-    def _lacks_images(self) -> bool:
-        return bool(self.files) and self.recorded < self.made
+            told.append(f"the recording is in {', '.join(file.name for file in self.files)}")
+        lacks_images = bool(self.files) and self.recorded < self.made
+        return "; ".join(told) if self.losses or self.awaited or lacks_images else ""
 
     def summary(self) -> dict[str, Any]:
         """As one JSON-like mapping."""
@@ -116,10 +113,6 @@ def images_in(files: Sequence[Path]) -> int:
     return count
 
 
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
 class Recordings:
     """Finds the files of each recorder that was started, without those that were there before."""
 
@@ -134,7 +127,7 @@ class Recordings:
         self._begun.setdefault(file, time.monotonic())
 
     def progress(self, file: Path) -> dict[str, str]:
-        """What diagnostics say of a recording: its age, its size, and the room that is left."""
+        """Age and size of a recording and the room that is left, as values of diagnostics."""
         if file not in self._begun:
             return {}
         try:
@@ -151,7 +144,7 @@ class Recordings:
         }
 
     def files(self) -> list[Path]:
-        """What is there by now, in the order in which it was begun."""
+        """The files that are there by now, in the order in which they were begun."""
         return [
             found
             for file, older in self._older.items()

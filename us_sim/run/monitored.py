@@ -105,7 +105,6 @@ class Monitored:
 
         from us_sim.nodes.session_monitor import SessionMonitor
 
-        self.names = nodes
         self._context = Context()
         try:
             rclpy.init(
@@ -136,7 +135,6 @@ class Monitored:
 
     def follow(self, nodes: Sequence[str]) -> None:
         """Follow these nodes from now on."""
-        self.names = list(nodes)
         self.node.follow(nodes)
 
     def spin(self, seconds: float = 0.1) -> None:
@@ -148,8 +146,7 @@ class Monitored:
         until = time.monotonic() + DISCOVERY_S
         while time.monotonic() < until:
             self.spin()
-        taken = sorted(set(names) & set(self.node.get_node_names()))
-        if taken:
+        if taken := sorted(set(names) & set(self.node.get_node_names())):
             raise UsSimError(
                 f"{taken[0]} runs already on ROS domain {domain()}: "
                 f"end that simulation, or set ROS_DOMAIN_ID to another number for this one"

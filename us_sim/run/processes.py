@@ -139,11 +139,6 @@ class RunningNode:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(max(seconds, 0.0))
 
-    def wait_after_sigterm(self, seconds: float) -> None:
-        """Tell it to end, and wait at most so long."""
-        self.tell_to_end()
-        self.wait(seconds)
-
     def kill(self) -> bool:
         """End it for certain; whether it had not ended by itself."""
         if self.process.poll() is not None:
@@ -264,7 +259,8 @@ class ProcessGroup:
     def end(self, node: str) -> None:
         """End one that hangs: it may do so by itself for a moment, also if it was stopped."""
         running = self._running[node]
-        running.wait_after_sigterm(HUNG_STOP_S)
+        running.tell_to_end()
+        running.wait(HUNG_STOP_S)
         running.kill()
         running.told = True
 
@@ -307,7 +303,8 @@ class ProcessGroup:
         for running in others:
             running.wait(deadline - time.monotonic())
         if RECORDER in self._running:
-            self._running[RECORDER].wait_after_sigterm(RECORDER_STOP_S)
+            self._running[RECORDER].tell_to_end()
+            self._running[RECORDER].wait(RECORDER_STOP_S)
         for _, running, until in self._leaving:
             running.wait(until - time.monotonic())
         every = [*self._running.items(), *((node, running) for node, running, _ in self._leaving)]
@@ -323,7 +320,7 @@ class ProcessGroup:
 
 
 def ending(status: int) -> str:
-    """What an exit status says, for a person: negative ones are signals."""
+    """An exit status in words; negative ones are signals."""
     if status == INTERRUPTED:
         return "was told to end by a signal"
     if status >= 0:

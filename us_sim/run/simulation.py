@@ -164,7 +164,7 @@ class Simulation:
 
     @property
     def _kept_here(self) -> Kept:
-        """What was set of the nodes of this scene: they get it back whenever they start again."""
+        """Parameters set of the nodes of this scene, which get them back when they start again."""
         return self._kept.setdefault(_identity(self._request.scene), {})
 
     def _take_what_was_set(self) -> None:
@@ -278,7 +278,8 @@ class Simulation:
         state, fraction = "running", 1.0
         if self._making is not None:
             fraction, what = self._made
-            state = f"loading {_short(self._asked[0])}: {what}"
+            name = Path(self._asked[0].rpartition(":")[2]).stem  # of a file, or `case:NAME`
+            state = f"loading {name}: {what}"
         elif waiting:
             fraction = (count - len(waiting)) / max(count, 1)
             state = f"starting: {count - len(waiting)} of {count} nodes"
@@ -351,7 +352,3 @@ def _volume_of(scene: Scene) -> str | None:
     except SceneError:  # it has none of its own
         own = None
     return scene.volume.file if scene.volume.file != own else None
-
-
-def _short(name: str) -> str:
-    return Path(name.rpartition(":")[2]).stem

@@ -84,7 +84,7 @@ class Supervisor:
 
     @property
     def plan(self) -> Plan:
-        """What runs, or is about to."""
+        """The plan that runs, or is about to."""
         return self._plan
 
     @property
@@ -113,7 +113,7 @@ class Supervisor:
             self._processes[node] = replace(process, kept=process.kept | dict(values))
 
     def take_set(self) -> tuple[Kept, Kept]:
-        """What was set and is kept, and what is kept no longer: it was why a node ended."""
+        """Parameters that were set, and those kept no longer because a node ended of them."""
         taken = self._set, self._dropped
         self._set, self._dropped = {}, {}
         return taken

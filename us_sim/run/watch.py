@@ -23,7 +23,7 @@ from us_sim.settings.setting import Settings, setting
 
 @dataclass(frozen=True)
 class SupervisionSettings(Settings):
-    """What is done for a node that has ended or hangs."""
+    """Settings of restarts of nodes that have ended or hang."""
 
     restarts: int = setting(
         Quantity("number", 0, 1_000_000),

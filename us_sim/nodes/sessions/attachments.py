@@ -1,4 +1,4 @@
-"""What a session was recorded with: its scene, the files that the scene names, and versions."""
+"""Attachments of a recording: its scene, the files that the scene names, and versions."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class RecordedTopic:
 
     @property
     def offered(self) -> list[QosProfile]:
-        """What its publishers have offered so far."""
+        """Qualities of service that its publishers have offered so far."""
         return [*self._offered]
 
     @property
@@ -68,7 +68,7 @@ class RecordedTopic:
         return self._adopted.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     def follow(self, offered: Iterable[QoSProfile]) -> list[QosProfile]:
-        """Look at what publishers offer now; what none has offered before."""
+        """Follow the qualities that publishers offer now; those that none has offered before."""
         now = [QosProfile.of(profile) for profile in offered]
         if len(now) != self._publishers:
             self._publishers, self._sequence = len(now), None
@@ -120,7 +120,7 @@ class RecordedTopic:
 
 
 def _adopted(offered: Iterable[QosProfile]) -> QoSProfile:
-    """What every one of the publishers can serve, as rosbag2 chooses it."""
+    """The quality of service that every publisher can serve, as rosbag2 chooses it."""
     offered = list(offered)
     reliable = all(q.reliability == "reliable" for q in offered)
     latched = all(q.durability == "transient_local" for q in offered)

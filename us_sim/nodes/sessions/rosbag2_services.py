@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from us_sim.nodes.settings import LOST, PathPlayerSettings, SessionPlayerSettings
 from us_sim.recording.write_behind import Loss
+
+if TYPE_CHECKING:
+    from us_sim.nodes.session_recorder import SessionRecorder
 
 
 def offer_service(node: Node, service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
@@ -63,9 +67,7 @@ def offer_player_services(
     def set_rate(request: Any, response: Any) -> None:
         response.success = set_to("rate", request.rate)
 
-    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> None:
-        offer_service(node, service, name, act)
-
+    offer = partial(offer_service, node)
     offer("Pause", "pause", lambda *_: set_to("paused", True))
     offer("Resume", "resume", lambda *_: set_to("paused", False))
     offer("TogglePaused", "toggle_paused", lambda *_: set_to("paused", not settings().paused))
@@ -75,41 +77,10 @@ def offer_player_services(
     offer("Seek", "seek", seek)
 
 
-class Controlled(Protocol):
-    """A recorder."""
-
-    paused: bool
-
-    def pause(self) -> None:
-        """Record nothing until `resume`."""
-        ...
-
-    def resume(self) -> None:
-        """Go on."""
-        ...
-
-    def split(self) -> None:
-        """Go on in a further file."""
-        ...
-
-    def stop(self) -> None:
-        """End the recording."""
-        ...
-
-    def record(self, file: str) -> str:
-        """Begin a further recording; why that cannot be, or nothing."""
-        ...
-
-    def snapshot(self) -> bool:
-        """Write what was kept in memory; False where nothing is kept."""
-        ...
-
-
-def offer_services(node: Node, recorder: Controlled) -> bool:
+def offer_services(node: Node, recorder: SessionRecorder) -> bool:
     """Offer rosbag2's services; False where ``rosbag2_interfaces`` is not installed."""
 
-    def offer(service: str, name: str, act: Callable[[Any, Any], Any]) -> bool:
-        return offer_service(node, service, name, act)
+    offer = partial(offer_service, node)
 
     def toggle(_: Any, __: Any) -> None:
         (recorder.resume if recorder.paused else recorder.pause)()

@@ -6,7 +6,13 @@ Only those are there that a scene and its volume can provide.
 from __future__ import annotations
 
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.streams.stream import BModeStream, FrameStream, MModeStream
+from us_sim.nodes.streams.stream import (
+    BModeStream,
+    DisplacementStream,
+    FrameStream,
+    LabelStream,
+    MModeStream,
+)
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.volume import Volume
 
@@ -19,12 +25,9 @@ def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameSt
     """
     further: list[FrameStream] = []
     if volume.labels is not None:
-        from us_sim.nodes.streams.stream import LabelStream
-
         further.append(LabelStream(node))
     if node.scene.tissue is not None:
         from us_sim.nodes.streams.strain import strain_streams
-        from us_sim.nodes.streams.stream import DisplacementStream
 
         further += [DisplacementStream(node), *strain_streams(node)]
     if node.scene.flows:

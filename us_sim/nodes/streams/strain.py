@@ -41,7 +41,7 @@ def strain_streams(node: SceneNode) -> list[FrameStream]:
 
 
 class _StrainImages(FrameStream):
-    """What both have in common: values as a message, or as colours with a note."""
+    """Base of both: values as a message, or as colours with a note."""
 
     def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
         super().__init__(node)

@@ -61,7 +61,7 @@ class FrameStream(ABC):
 
     @abstractmethod
     def _message(self, frame: Frame, stamp: Time) -> Image | None:
-        """What is sent of a frame; None where it has nothing to send."""
+        """The message of a frame; None where there is none."""
 
     @property
     def lines(self) -> Sequence[NDArray[np.float64]]:
@@ -107,14 +107,14 @@ class SettableStream(FrameStream, Generic[M]):
 
     @abstractmethod
     def _make(self, probe: Probe, settings: Any) -> M:
-        """What makes the topic.
+        """The object that makes the topic.
 
         Raises:
             ProbeError: what is set lies outside the images of this probe.
         """
 
     def for_frame(self, frame: Frame) -> M:
-        """What makes the topic of this frame."""
+        """The object that makes the topic of this frame."""
         if self._made is None or self._is_outdated or frame.probe is not self._probe:
             made, before = self._make(frame.probe, self._settings.values["set"]), self._made
             if before is not None:

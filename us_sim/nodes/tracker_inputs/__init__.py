@@ -1,1 +1,1 @@
-"""What the probe tracker listens to: one file for each source that a scene may name."""
+"""Sources of poses that a scene may name, for the probe tracker."""

@@ -1,6 +1,7 @@
-"""Nodes go before ordinary programs where they may, and what they start does not."""
+"""A node's process: its imports, its scheduling, and Ctrl-C while it starts."""
 
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -10,6 +11,21 @@ import pytest
 from us_sim.nodes import process
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.process import go_first, scheduling_of
+
+
+def test_ctrl_c_among_imports_is_silent():
+    command = [sys.executable, "-X", "importtime", "-m", "us_sim.nodes.path_player"]
+    node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    said = []
+    for line in node.stderr:
+        said.append(line)
+        if "us_sim.standalone" in line:  # comes after it
+            node.send_signal(signal.SIGINT)
+            break
+    said += node.communicate(timeout=60)[1].splitlines()
+    assert node.returncode == 130
+    assert [line for line in said if not line.startswith("import time:")] == []
+
 
 WITH_A_THREAD = """
 import os, threading
@@ -79,3 +95,24 @@ def test_a_node_asks_for_it_and_says_what_it_got(
     monkeypatch.setattr(process.gc, "freeze", lambda: None)
     assert process.run_node(lambda: node) == 0
     assert (len(times), node.health.scheduling) == ((1, "realtime") if asked else (0, ""))
+
+
+UNUSED = [
+    ("us_sim.viewer.viewer, us_sim.viewer.page", {"numba", "scipy"}),
+    ("us_sim.nodes.probe_tracker", {"numba", "scipy", "cv2"}),
+    ("us_sim.nodes.session_recorder", {"numba", "scipy", "cv2"}),
+    ("us_sim.nodes.path_player", {"numba", "scipy", "cv2"}),
+    ("us_sim.nodes.tissue_deformer", {"scipy.ndimage", "scipy.spatial", "cv2"}),
+    (
+        "us_sim.nodes.slice_interpolator, us_sim.slicing.acoustics.beam_acoustics, "
+        "us_sim.nodes.streams.doppler, us_sim.slicing.flow.doppler",
+        {"scipy.ndimage", "scipy.spatial"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("modules", "unused"), UNUSED)
+def test_what_a_node_does_not_use_it_does_not_import(modules, unused):
+    program = f"import sys, {modules}\nprint(*({unused!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, []), done.stderr

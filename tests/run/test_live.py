@@ -1,0 +1,98 @@
+"""Live runs: refused before anything is made, and their status on the terminal."""
+
+import socket
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from us_sim.errors import SceneError, UsSimError
+from us_sim.run import live
+from us_sim.run.live import _status, demo
+from us_sim.run.plan import Plan, Request
+from us_sim.run.watch import SupervisionSettings
+from us_sim.scene.reading import load_scene
+from us_sim.settings.viewer import ViewerSettings
+from us_sim.share import find_bag
+from us_sim.volume.files.writing import write_volume
+from us_sim.volume.volume import Volume
+
+
+@pytest.mark.parametrize(
+    ("plan", "said"),
+    [
+        (Plan([], 40), "waiting for poses"),
+        (Plan([], loops=True), "begins again at its end; waiting for poses"),
+        (Plan([], 40, loops=True), "begins again every 40 poses; waiting for poses"),
+        (
+            Plan([], 40, player="camera_driver", loops=True),
+            "begins again every 40 images; waiting for poses",
+        ),
+    ],
+)
+def test_a_run_says_when_what_it_plays_begins_again(plan: Plan, said: str) -> None:
+    node: Any = SimpleNamespace(reports={}, count=lambda *_: 0)
+    monitor: Any = SimpleNamespace(node=node)
+    assert _status(plan, monitor) == said
+
+
+SCENE = """
+name: elsewhere
+volume: {file: block.nrrd, pose: {position: [2 m, 0, 0]}}
+probe: {aperture: 40 mm, depth: 30 mm, image: [100, 80]}
+"""
+
+
+@pytest.mark.parametrize("mine", [False, True])
+def test_an_empty_folder_is_not_left(tmp_path, mine):
+    block = Volume(np.ones((9, 9, 9), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
+    write_volume(tmp_path / "block.nrrd", block)
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    out = tmp_path / "some" / "press"
+    if mine:
+        out.mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SceneError, match="lies beside all images"):
+        demo(
+            str(tmp_path / "scene.yaml"),
+            None,
+            out,
+            {},
+            network=False,
+            supervision=SupervisionSettings(),
+            path=find_bag("press_and_slide.mcap"),
+        )
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.fixture
+def taken():
+    """A port that is listened at."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        yield other.getsockname()[1]
+
+
+def fail(*_):
+    raise AssertionError("it has begun")
+
+
+def test_a_taken_port_is_said_before_the_volume_is_made(small_scene, taken, monkeypatch):
+    monkeypatch.setattr(live, "prepare_volume", fail)
+    scene, view = load_scene(small_scene), ViewerSettings(port=taken)
+    request = Request(scene, view=view)
+    with pytest.raises(UsSimError, match=f"port {taken} of 127.0.0.1 is taken: choose another"):
+        live.run(request, network=False, supervision=SupervisionSettings())
+
+
+@pytest.mark.parametrize("view", [ViewerSettings(), None])
+def test_a_taken_port_is_said_before_the_viewer_starts(taken, monkeypatch, view):
+    monkeypatch.setattr(live, "follow", fail)
+    given = {} if view is None else {"viewer": {"port": str(taken)}}
+    with pytest.raises(UsSimError, match="is taken: choose another with --port"):
+        live.view_running(
+            view or ViewerSettings(port=taken),
+            given,
+            network=False,
+            supervision=SupervisionSettings(),
+        )
