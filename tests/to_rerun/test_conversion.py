@@ -74,7 +74,7 @@ def session(tmp_path):
 
 @pytest.fixture
 def converted(session, tmp_path):
-    """Rows that rerun reads: ((stamp, recorded) in ns after EPOCH, value) by entity and component."""
+    """Rows of rerun: ((stamp, recorded) in ns after EPOCH, value) by entity and component."""
     pytest.importorskip("rerun", reason=MISSING)
     from rerun.chunk import RrdReader
 
