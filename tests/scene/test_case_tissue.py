@@ -184,7 +184,7 @@ def test_a_case_that_cannot_be_written_is_used_all_the_same(cases, tmp_path, mon
 
     shutil.copytree(cases / "block", tmp_path / "block")
     scene = load_scene(f"case:{tmp_path / 'block'}")
-    monkeypatch.setattr("us_sim.volume.cases.tissue.tempfile.mkstemp", refuse)
+    monkeypatch.setattr("tempfile.mkdtemp", refuse)
     keep_tissue(scene, volume_of(scene))
     assert "made in every run" in caplog.text
 

@@ -241,13 +241,13 @@ def test_directions_of_pixels_are_those_of_the_beams_through_them(probe):
 
 def test_what_has_no_strain_is_said():
     frame = framed(PROBES[0], Pose(), None)
-    with pytest.raises(MeshError, match="no tissue carries the volume, so there is no strain"):
+    with pytest.raises(MeshError, match="no tissue"):
         AxialStrain.of(frame)
     frame = framed(PROBES[0], Pose(), MESH.nodes)
-    with pytest.raises(MeshError, match=r"a mesh of 125 nodes, but \(7, 3\) came"):
+    with pytest.raises(MeshError, match=r"125 nodes.*\(7, 3\)"):
         AxialStrain.of(frame).image(frame, MESH.nodes[:7])
     other = AxialStrain(block(6).nodes, block(6).tetrahedra)
-    with pytest.raises(MeshError, match=r"a mesh of 216 nodes, but \(125, 3\) came"):
+    with pytest.raises(MeshError, match=r"216 nodes.*\(125, 3\)"):
         other.image(frame)
     warm_up()
 

@@ -333,7 +333,7 @@ def test_nothing_is_overwritten_and_nothing_half_is_left(session, tmp_path):
 def test_a_bag_without_anything_to_show_is_refused(session, tmp_path):
     pytest.importorskip("rerun", reason=MISSING)
     bag = session(("/probe/speed", "std_msgs/msg/Float64", bytes.fromhex("00010000") + bytes(8), 0))
-    with pytest.raises(BagError, match="no messages on topics that could be shown"):
+    with pytest.raises(BagError, match="no messages"):
         to_rerun(bag, tmp_path / "a.rrd", quietly)
 
 

@@ -1,8 +1,8 @@
 """Error against run time: each subject writes tables, pictures and a report.
 
-Each subject has a function that is called with the folder to write to, which is made if it is not
-there, and with whether a part of it, in a few minutes, will do. It prints a table, and returns 0,
-or 1 where something failed: that has a row that says how, and the rest is measured all the same.
-It raises UsSimError where the folder cannot be written or holds a report, before anything is
-measured.
+A subject is a folder with cases, measure, report and templates. Its function takes the folder to
+write to, made if it is not there, and whether it is a quick run of a few minutes. It prints a table
+and returns 0, or 1 where something failed: its row says how, and the rest is measured all the same.
+It raises UsSimError, before anything is measured, where the folder cannot be written or holds a
+report.
 """

@@ -1,10 +1,7 @@
-"""The forces that hold tissue where it is, by the equations of each method, written a second time.
+"""Forces that hold tissue at its displacements, by the equations of each method, in NumPy.
 
-Everything here is NumPy in double precision, for meshes of some hundred nodes; it shares no kernel
-with a solver.
+They are written down a second time, in double precision, and share no kernel with a solver.
 
->>> import numpy as np
->>> from us_sim.evaluation.independent_forces import hooke_forces
 >>> from us_sim.tissue.elasticity.material import Material
 >>> from us_sim.tissue.model import TissueModel
 >>> block = TissueModel.block(nodes=(2, 2, 2), material=Material(10e3, 0.25))
@@ -12,13 +9,6 @@ with a solver.
 >>> forces = hooke_forces(block.mesh, block.materials, pulled)
 >>> f"{forces[block.mesh.nodes[:, 2] > 0.05, 2].sum():.3f} N"  # 1.2 E of strain on 0.01 m2
 '1.200 N'
-
-Pressures of tetrahedra that are crushed, and of lumens that empty, written down again.
-
-As `independent_residual`, this is NumPy on formulas, and shares nothing with the solvers.
-
->>> import numpy as np
->>> from us_sim.evaluation.independent_forces import lumen_pressure
 >>> one = np.ones(3)
 >>> pressures = lumen_pressure(np.array([0.0, -0.1, -0.5]), one, 1000 * one, one, one)
 >>> pressures.round().tolist()
@@ -36,7 +26,7 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 Array = NDArray[np.float64]
 
 _ELEMENT_BULK = 5.0
-"""(lambda + mu) / mu that tetrahedra keep themselves; what is above is of nodal averages."""
+"""(lambda + mu) / mu that tetrahedra keep themselves; the rest is of nodal averages."""
 
 _YIELD = 1.5
 """Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""

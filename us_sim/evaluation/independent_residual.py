@@ -1,21 +1,13 @@
-"""How far a tissue is from balance, computed from what a solver returned and not by the solver.
+"""The residual of a tissue, from the nodes that a solver returned and by other code.
 
-Forces are those of `independent_forces`, derivatives of a method's energy at the returned nodes, so
-that what a solver rounds, or leaves out, shows.
+Forces are those of `independent_forces`, derivatives of a method's energy, so that rounding and
+omissions of a solver show; directions of the probe's contact forces are written down a second time.
 
 >>> from us_sim.evaluation.independent_forces import hooke_forces
->>> from us_sim.evaluation.independent_residual import SpringSettings, solid_residual
->>> from us_sim.tissue.model import TissueModel
+>>> from us_sim.geometry.collider import RoundedBox, Sphere
 >>> solid_residual(hooke_forces)(TissueModel.block(), SpringSettings()).is_least
 False
-
-In which directions a probe pushes, written down a second time.
-
->>> import numpy as np
->>> from us_sim.evaluation.independent_residual import flared_distance, push_directions
->>> from us_sim.geometry.collider import RoundedBox, Sphere
->>> from us_sim.geometry.pose import Pose
->>> push_directions(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.0]]), 0.005)
+>>> contact_directions(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.0]]), 0.005)
 array([[0., 0., 1.]])
 >>> box = RoundedBox(0.04, 0.014, 0.03, 0.004)
 >>> distance, normal = flared_distance(box, Pose(), np.array([[0.022, 0.0, -0.005]]), 0.006)
@@ -47,23 +39,12 @@ from us_sim.tissue.solvers.solver import same_pose
 Array = NDArray[np.float64]
 
 _PARTS = 12
-"""Parts of a triangle's sides, between which it is looked where a surface is pushed."""
-
-_ALIKE = 7  # decimals in which directions of pushes differ that are not the same
-
-_WAY = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
-"""Parts of a probe's way from pose to pose at which it is looked how deep it was."""
-
-_DEEP = 0.35
-"""Depth, over half the probe's smallest width, from which it may push in other directions than its
-own. A solver may take it to be so from half of that, with tissue that has moved on the way."""
-
-_SETTLED = 1e-5  # residual
+"""Parts of a triangle's sides, between which places of contact are sampled."""
 
 
 @dataclass(frozen=True)
 class SpringSettings:
-    """How a method that has springs is set; the fields are named as its settings are."""
+    """Settings of methods with springs, by their names."""
 
     stiffness: str = "algorithm_1"
     volume: bool = False  # whether tetrahedra keep their volumes
@@ -76,9 +57,9 @@ class IndependentResidual:
         model: of the solver.
         forces: (N, 3) N that hold the nodes at displacements (N, 3) m, by the method's equations.
         rounding: N, norm of the forces that the last digit of the nodes' coordinates makes.
-        surface: whether the probe pushes places on triangles, out of the shape of
-            `flared_distance`, and not the nodes, as `push_directions` says. By how much it pushes
-            is left open, so what is found is the least that the residual can be.
+        surface: whether contact forces act at places on triangles, square to the shape of
+            `flared_distance`, and not at nodes along `contact_directions`. Their sizes are open, so
+            the least residual is found.
     """
 
     def __init__(
@@ -89,34 +70,32 @@ class IndependentResidual:
         *,
         surface: bool = False,
     ) -> None:
-        self._model = model
-        self._forces = forces
-        self._rounding = rounding
-        #: Whether a true residual may also be greater than what is found.
+        self._model, self._forces, self._rounding = model, forces, rounding
+        #: Whether a true residual may also be greater than the returned one.
         self.is_least = surface
         self._surface = _touchable(model) if surface else np.zeros((0, 3), np.int32)
         self._spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
-        self._last: tuple[Array, Pose | None] = model.mesh.nodes, None  # nodes that were returned
-        self._swept = False  # whether the probe, where it is, came down deep in tissue
+        self._last: tuple[Array, Pose | None] = model.mesh.nodes, None
+        self._deep = False  # whether the probe came down deep in tissue that has not settled since
         self._settled = False  # as was reported last
         self._heaviest = 0.0
-        self._scale = math.inf  # N, what the last residual referred to
+        self._scale = math.inf  # N, to which the last residual referred
 
     def forget(self) -> None:
-        """The solver went back to an earlier state: loads before count no more."""
+        """Forget earlier loads: the solver went back to an earlier state."""
         self._heaviest = 0.0
 
     def check(self, deformation: Deformation, pose: Pose | None) -> tuple[float, float]:
         """Residual of the returned nodes, and the part of it that may be rounding of the nodes.
 
-        As defined for `Deformation`: unbalanced over contact forces, where of what acts on touched
-        nodes the part is balanced that is a sum of pushes by the probe. Without contact it refers
-        to the heaviest contact before. Where a probe has come down deep in tissue, it is not known
-        in which directions it pushes until the tissue has settled: the second is infinite then.
+        As defined for `Deformation`: unbalanced over contact forces; of the forces on touched nodes
+        the part is balanced that is a sum of contact forces. Without contact it refers to the
+        heaviest contact before. Where a probe has come down deep in tissue, the directions of its
+        forces are unknown until the tissue has settled: the second number is infinite then.
         """
         model = self._model
         if self.is_least:
-            self._look_back(deformation, pose)
+            self._update_depth(deformation, pose)
         with np.errstate(all="ignore"):
             holding = self._forces(deformation.nodes - model.mesh.nodes)
             unbalanced = np.where(model.fixed[:, None], 0.0, holding)
@@ -125,59 +104,60 @@ class IndependentResidual:
             load = 0.0
             if pose is not None and len(touched):
                 if self.is_least:
-                    push = self._on_triangles(pose, deformation.nodes, touched, holding)
+                    contact = self._on_triangles(pose, deformation.nodes, touched, holding)
                     # If the reported residual is true, contact forces are at most so great.
                     held, left = float(np.linalg.norm(holding[touched])), 1 - deformation.residual
                     load = held / left if left > 0.0 else math.inf
                 else:
-                    push = self._at_nodes(pose, deformation.nodes, touched, holding)
-                    load = float(np.linalg.norm(push))
-                unbalanced[touched] -= push
-            imbalance = float(np.linalg.norm(unbalanced))
-        if load == 0.0 and imbalance <= self._rounding:
+                    contact = self._at_nodes(pose, deformation.nodes, touched, holding)
+                    load = float(np.linalg.norm(contact))
+                unbalanced[touched] -= contact
+            residual_norm = float(np.linalg.norm(unbalanced))
+        if load == 0.0 and residual_norm <= self._rounding:
             self._heaviest = 0.0  # at rest, or as good as
             return 0.0, self._rounding / self._scale
-        self._heaviest = max(self._heaviest, load) or imbalance
+        self._heaviest = max(self._heaviest, load) or residual_norm
         self._scale = load or self._heaviest
-        rounding = math.inf if self._swept else self._rounding / self._scale
-        return imbalance / self._scale, rounding
+        rounding = math.inf if self._deep else self._rounding / self._scale
+        return residual_norm / self._scale, rounding
 
-    def _look_back(self, deformation: Deformation, pose: Pose | None) -> None:
-        """Find out whether the probe came down deep in tissue where it is, and that has not settled
-        since.
+    def _update_depth(self, deformation: Deformation, pose: Pose | None) -> None:
+        """From 0.35 of half its smallest width the probe may push in other directions than its own.
+
+        A solver may take it to be so from half of that, with tissue that has moved on the way.
         """
         (nodes, before), self._last = self._last, (deformation.nodes, pose)
         if pose is None:
-            self._swept = False
+            self._deep = False
         elif not same_pose(pose, before):
             box = self._model.collider.offset_box
-            deep = _DEEP * float(box[:2].min() + box[3])
+            deep = 0.35 * float(box[:2].min() + box[3])
             places = _places(nodes, self._surface).reshape(-1, 3)
             # A solver may have gone a long way in strides, and come down on one of them.
-            way = [interpolate(before, pose, part) for part in _WAY] if before else []
+            way = [interpolate(before, pose, k / 8) for k in range(1, 8)] if before else []
             for there in [*way, pose]:
                 gap, _ = flared_distance(self._model.collider, there, places, self._spacing)
-                self._swept = bool(gap.min(initial=np.inf) < -deep)
-                if self._swept:
+                self._deep = bool(gap.min(initial=np.inf) < -deep)
+                if self._deep:
                     break
         elif self._settled:
-            self._swept = False
-        self._settled = deformation.residual <= _SETTLED
+            self._deep = False
+        self._settled = deformation.residual <= 1e-5
 
     def _at_nodes(
         self, pose: Pose, nodes: Array, touched: NDArray[np.integer], holding: Array
     ) -> Array:
-        """(K, 3) N, of the forces that hold the touched nodes, what pushes these nodes."""
+        """(K, 3) N, the part of the touched nodes' forces that the probe balances."""
         model = self._model
-        normal = push_directions(model.collider, pose, nodes[touched], model.contact_spacing)
-        push = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
-        return np.asarray(push[:, None] * normal)
+        normal = contact_directions(model.collider, pose, nodes[touched], model.contact_spacing)
+        size = np.maximum(np.einsum("ij,ij->i", holding[touched], normal), 0.0)
+        return np.asarray(size[:, None] * normal)
 
     def _on_triangles(
         self, pose: Pose, nodes: Array, touched: NDArray[np.integer], holding: Array
     ) -> Array:
-        """(K, 3) N, of the forces that hold the touched nodes, the greatest part that is a sum of
-        pushes square to the probe at places in it, on triangles of these nodes.
+        """(K, 3) N, the greatest part of the touched nodes' forces that is a sum of forces square
+        to the probe at places in it, on triangles of these nodes.
         """
         triangles = self._surface[np.isin(self._surface, touched).any(axis=1)]
         corners, places = nodes[triangles], _places(nodes, triangles)
@@ -185,22 +165,22 @@ class IndependentResidual:
         gap, normal = flared_distance(
             self._model.collider, pose, places.reshape(-1, 3), self._spacing
         )
-        # Within a part that is pushed at all, no corner is farther out than the part is long.
+        # Within a part in contact, no corner is farther out than the part is long.
         near = gap.reshape(places.shape[:2]) <= sides.max(axis=1)[:, None] / _PARTS
         normal = normal.reshape(places.shape)
-        push = np.zeros((len(touched), 3))
+        contact = np.zeros((len(touched), 3))
         for number, node in enumerate(touched):
             own = (triangles == node).any(axis=1)
             along = normal[own][near[own]]
             size = float(np.linalg.norm(holding[node]))
             if len(along) and size > 0.0:
-                along = along[np.unique(along.round(_ALIKE), axis=0, return_index=True)[1]]
-                push[number] = size * nnls(along.T, holding[node] / size)[0] @ along
-        return push
+                along = along[np.unique(along.round(7), axis=0, return_index=True)[1]]
+                contact[number] = size * nnls(along.T, holding[node] / size)[0] @ along
+        return contact
 
 
 Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
-"""Makes what checks the residuals of one method on a model."""
+"""Makes the independent residual of one method on a model."""
 
 
 def solid_residual(
@@ -252,7 +232,7 @@ def spring_residual(*, yielding: bool) -> Residual:
 
 
 def _touchable(model: TissueModel) -> NDArray[np.integer]:
-    """(T, 3) triangles that the probe can push; what is touched alone is one with no extent."""
+    """(T, 3) triangles that the probe can touch; a node that is touched alone is a point."""
     reached = np.zeros(len(model.mesh.nodes), dtype=bool)
     reached[model.contact_nodes] = True
     triangles = model.mesh.boundary
@@ -282,7 +262,7 @@ _LEAN, _FLARE = math.radians(60), 0.6
 _ON = 1e-12  # m; what is as near to an outline lies on it
 
 
-def push_directions(collider: Collider, pose: Pose, points: Array, spacing: float) -> Array:
+def contact_directions(collider: Collider, pose: Pose, points: Array, spacing: float) -> Array:
     """(K, 3) unit directions in which the probe pushes points (K, 3) m on or in it.
 
     The rule of `us_sim.tissue.contact.probe_gap.push_out`, written down again.

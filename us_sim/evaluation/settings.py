@@ -1,7 +1,4 @@
-"""What of the evaluation may be chosen: each field is an option of the command.
-
-A recorded sweep that images are compared with: each field is an option of the command.
-"""
+"""Options of `us-sim evaluate hand` and `us-sim evaluate slice`."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ class HandSettings(Settings):
 
 @dataclass(frozen=True)
 class RecordedSweep(Settings):
-    """Both files, or none of them."""
+    """A recorded sweep that images are compared with: both files, or none."""
 
     volume: Path | None = setting(description="volume compounded from --sweep", default=None)
     sweep: Path | None = setting(description="tracked sweep to compare images with", default=None)

@@ -1,6 +1,4 @@
-"""What the evaluation knows of each tissue solver: all of it stands here, one entry a solver.
-
-Only these are evaluated, and not what other packages add.
+"""The evaluated tissue solvers, one entry each; those of other packages are not evaluated.
 
 >>> from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 >>> TISSUE_METHODS["msds"].has_springs, TISSUE_METHODS["fem"].equations({"threads": 2})
@@ -41,19 +39,19 @@ class TissueMethod:
     patient: Setting | None  # settings with which it converges; None where it solves directly
     tried: tuple[Setting, ...] = ()  # besides the defaults
     has_springs: bool = False
-    is_quasi_static: bool = True  # without masses: what nothing holds has no position of rest
+    is_quasi_static: bool = True  # without masses: a free tissue has no position of rest
     is_explicit: bool = False  # only time steps up to a limit are stable
     is_judged_at_rest: bool = False  # under a held probe it must come to balance, nothing inverted
     families: Mapping[str, str] = field(default_factory=dict)
-    """What a plot calls settings that change the equations."""
+    """Names in plots of settings that change the equations."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """All that is tried, the defaults first."""
+        """All that are tried, the defaults first."""
         return ({}, *self.tried)
 
     def equations(self, setting: Setting) -> tuple[Any, ...]:
-        """What two settings have in common when they approach the same solution."""
+        """Key of the equations: alike for settings that approach the same solution."""
         return (self.name, *sorted(self.without_effort(setting).items()))
 
     @staticmethod
@@ -62,7 +60,7 @@ class TissueMethod:
         return {name: value for name, value in setting.items() if name not in _EFFORT}
 
     def family(self, setting: str) -> str:
-        """What tells the equations of a setting, written ``a=1, b=2``, from the default's."""
+        """Difference of a setting's equations, written ``a=1, b=2``, from the default's."""
         parts = (self.families.get(part) for part in setting.split(", "))
         return ", ".join(part for part in parts if part)
 

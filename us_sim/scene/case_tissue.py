@@ -37,13 +37,9 @@ from us_sim.volume.cases.tissue import CaseTissue, read_tissue, write_tissue
 from us_sim.volume.volume import Volume, grid_extent
 
 _BESIDE = 0.013  # m, of tissue beside the probe
-_LEAST_ASIDE = 0.03  # m, along the probe's y: for its slide, and for tissue to give way
-_ASIDE_OVER_DEPTH = 0.25
 _BELOW = 1.05
 """Depth of the tissue over that of the image: tissue that moves against the volume beside it would
 leave a seam in the image."""
-_PRESS_OVER_DEPTH = 1 / 3
-_DEEPEST_PRESS = 0.022  # m, of a firm press on an abdomen
 _THINNEST = 0.02  # m, to which the tissue is cut where the volume ends
 
 
@@ -91,7 +87,7 @@ def _path(settings: CaseSettings) -> str:
     press = settings.press
     if press is None:
         depth = settings.probe.array.settings(PROBES).depth
-        press = min(_PRESS_OVER_DEPTH * depth, _DEEPEST_PRESS)
+        press = min(1 / 3 * depth, 0.022)  # m, of a firm press on an abdomen
     from us_sim.recording.press_and_slide import pressing_path
 
     return str(pressing_path(press, SLIDE if settings.slide is None else settings.slide))
@@ -110,7 +106,8 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
     array = probe.array.settings(PROBES)
     length, width = footprint(probe.collider.settings(COLLIDERS)) if probe.collider else (0.0, 0.0)
     aside = max(array.width / 2, length + _BESIDE)
-    across = max(_LEAST_ASIDE, _ASIDE_OVER_DEPTH * array.depth, 2 * width)
+    # m, along the probe's y: for its slide, and for tissue to give way
+    across = max(0.03, 0.25 * array.depth, 2 * width)
     box = np.array([[-aside, -across, 0.0], [aside, across, _BELOW * array.depth]])
     cut = np.stack([np.maximum(box[0], volume[0]), np.minimum(box[1], volume[1])])
     cut[0, 2] = 0.0
@@ -127,7 +124,7 @@ def _rounded(corner: NDArray[np.float64]) -> list[float]:
 
 
 _STEPS = 160
-"""Places along the longest side of the box at which structures are looked for."""
+"""Places along the longest side of the box at which labels are read."""
 
 _IN_REACH = 0.015
 """m: how far from the image's plane at rest structures count; the probe slides and tilts."""

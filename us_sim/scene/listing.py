@@ -133,7 +133,7 @@ def thumbnail_file(scene: Scene) -> Path:
 
 
 def _key(scene: Scene) -> str:
-    """Tells apart what looks different: the volume, the probe and how grey values are made."""
+    """A name for all that the thumbnail depends on: volume, probe and grey values."""
     source = scene.volume.case or scene.volume.file
     changed = 0
     if source:

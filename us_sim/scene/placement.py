@@ -106,7 +106,7 @@ class RestPlacement:
         return np.asarray(deformation.nodes, dtype=np.float64)
 
 
-_POSES = 60  # of a path that are looked at
+_POSES = 60  # of a path that are tried
 _POINTS = 32  # along each side of an image
 
 _LITTLE = 0.002

@@ -150,10 +150,6 @@ _HANDY = {
 
 _ON_A_DIAL = {"rate": "/min", "angular speed": "deg/s"}
 """Units of other dimensions, where a number is turned up and down."""
-_SLOW = 5.0
-"""m/s; speeds up to here, those of blood, are told in cm/s."""
-_OF_SOUND = 1e5
-"""Hz; frequencies from here on are told in MHz."""
 
 _EXACT = 1e-12
 """How far, relatively, a number in another unit may be from the number: only by rounding."""
@@ -181,9 +177,9 @@ def span(quantity: Quantity) -> str:
 def dial_unit(quantity: Quantity) -> str:
     """The one unit in which all of a quantity's range is shown where a person turns it."""
     dimension = quantity.dimension
-    if dimension == "frequency" and quantity.minimum >= _OF_SOUND:
+    if dimension == "frequency" and quantity.minimum >= 1e5:  # of sound
         return "MHz"
-    if dimension == "speed" and quantity.maximum <= _SLOW:
+    if dimension == "speed" and quantity.maximum <= 5.0:  # of blood
         return "cm/s"
     handy = _HANDY.get(dimension, (quantity.unit,))[0]
     return _ON_A_DIAL.get(dimension, handy)

@@ -85,16 +85,10 @@ class Reader:
             if not error.problem:
                 raise self._error(f"{self._origin}: {error}") from error
             raise self._refused(joined(path, error.key), error.problem) from error
-        for name, rule in rules_of(settings).items():
-            if rule.applies and name in given:  # also where it is the default
-                other, values_of_other = rule.applies
-                chosen = getattr(made, other)
-                chosen = getattr(chosen, "name", chosen)
-                if chosen not in values_of_other:
-                    raise self._refused(
-                        joined(path, name),
-                        f"is for {other} {' or '.join(values_of_other)} only, not {chosen}",
-                    )
+        for name in rules_of(settings):
+            problem = made.inapplicable(name)
+            if problem and name in given:  # also where it is the default
+                raise self._refused(joined(path, name), problem)
         return made
 
     def _value(self, kind: Any, value: object, rule: Rule, path: str) -> Any:

@@ -116,16 +116,22 @@ class Settings:
                 except Refusal as refusal:
                     raise self.refused(f"{name}{refusal.key}", refusal.problem) from refusal
                 object.__setattr__(self, name, value)
-        for name, rule in rules_of(type(self)).items():
-            if rule.applies and getattr(self, name) != _default(type(self), name):
-                other, values = rule.applies
-                chosen = getattr(self, other)
-                chosen = getattr(chosen, "name", chosen)
-                if chosen not in values:
-                    raise self.refused(
-                        name, f"is for {other} {' or '.join(values)} only, not {chosen}"
-                    )
+        for name in rules_of(type(self)):
+            problem = self.inapplicable(name)
+            if problem and getattr(self, name) != _default(type(self), name):
+                raise self.refused(name, problem)
         self.check()
+
+    def inapplicable(self, name: str) -> str:
+        """The reason why a setting has no meaning beside another one; "" if it has."""
+        applies = rules_of(type(self))[name].applies
+        if applies is None:
+            return ""
+        other, values = applies
+        chosen = getattr(self, other)
+        chosen = getattr(chosen, "name", chosen)
+        wanted = " or ".join(values)
+        return "" if chosen in values else f"is for {other} {wanted} only, not {chosen}"
 
     def check(self) -> None:
         """Refuse values that do not go together."""

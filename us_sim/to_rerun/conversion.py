@@ -145,30 +145,22 @@ def to_rerun(session: Path, file: Path, progress: Callable[[float, str], None]) 
 
 class _Conversion:
     def __init__(self, bag: Bag, tell: Callable[[float, str], None]) -> None:
-        from us_sim.to_rerun.converters import (
-            Clouds,
-            Diagnostics,
-            Images,
-            Markers,
-            Skin,
-            Texts,
-            Transforms,
-            Wrenches,
-        )
+        from us_sim.to_rerun import converters  # which need rerun
 
+        self._converters = converters
         self._bag, self._tell = bag, tell
         self.left_out: list[str] = []
         there = {topic.name: topic for topic in bag.topics if topic.message_count}
-        skin, images, markers = Skin(), Images(), Markers()
+        skin, images, markers = converters.Skin(), converters.Images(), converters.Markers()
         by_type: dict[str, Shown] = {
-            "tf2_msgs/msg/TFMessage": Transforms(),
-            "sensor_msgs/msg/PointCloud2": Clouds(),
+            "tf2_msgs/msg/TFMessage": converters.Transforms(),
+            "sensor_msgs/msg/PointCloud2": converters.Clouds(),
             "sensor_msgs/msg/Image": images,
             "visualization_msgs/msg/Marker": markers,
             "visualization_msgs/msg/MarkerArray": markers,
-            "geometry_msgs/msg/WrenchStamped": Wrenches(),
-            "diagnostic_msgs/msg/DiagnosticArray": Diagnostics(),
-            "std_msgs/msg/String": Texts(),
+            "geometry_msgs/msg/WrenchStamped": converters.Wrenches(),
+            "diagnostic_msgs/msg/DiagnosticArray": converters.Diagnostics(),
+            "std_msgs/msg/String": converters.Texts(),
         }
         self.shown: dict[str, list[Shown]] = {
             name: [by_type[topic.type_name]]
@@ -185,21 +177,19 @@ class _Conversion:
         self._there = there
 
     def _carry_structures(self, there: dict[str, BagTopic]) -> None:
-        from us_sim.to_rerun.converters import REST, TETRAHEDRA, Structures
-
-        if "/tissue/structures" in there or not {REST, TETRAHEDRA} <= there.keys():
+        mesh = {"/tissue/rest", "/tissue/tetrahedra"}
+        if "/tissue/structures" in there or not mesh <= there.keys():
             return
         if "/tissue/nodes" not in self.shown:
             return
         try:
-            self.shown["/tissue/nodes"].append(Structures(self._bag, self._tell))
+            structures = self._converters.Structures(self._bag, self._tell)
+            self.shown["/tissue/nodes"].append(structures)
         except UsSimError as error:
             self.left_out.append(f"the structures of the scene are left out: {error}")
 
     def write(self, file: RerunFile) -> None:
         """Log all messages, and what the viewer opens."""
-        from us_sim.to_rerun.converters import blueprint_of
-
         total = sum(self._there[name].message_count for name in self.shown)
         refused: dict[str, tuple[int, str]] = {}
         stamps: list[int] = []  # of poses
@@ -229,7 +219,7 @@ class _Conversion:
             if self._there[name].type_name == "sensor_msgs/msg/Image"
         ]
         span = (min(stamps), max(stamps)) if stamps else None
-        file.show(blueprint_of(entities, images, "patient", span))
+        file.show(self._converters.blueprint_of(entities, images, "patient", span))
 
 
 def _stamp_of(message: Any) -> int | None:

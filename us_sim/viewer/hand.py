@@ -175,18 +175,11 @@ MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 images than that."""
 RESTING = 5.0
 """Poses a second; images are called stale after half a second."""
-TICKS = 2.0
-"""Timer ticks from pose to pose."""
 STREAMING, LATEST = 3.0, 1.45
 """From pose to pose: how long after a command the next is expected, and then waited for. A timer's
 pose just before it would hold up the command's own."""
-STATE_RATE = 10.0
-"""Hz at which pages are told at most how the probe is held: to a person's eye sliders follow, and
-more often to lay them out would take time from the image."""
 LONGEST_STEP = 0.05
 """s of movement at most between two poses: were the node held up, the probe would leap."""
-NEAR = 0.02
-"""m from the old place to a new surface: it is another one of the same patient."""
 KEPT = 512
 """Poses whose press is remembered until their image is made."""
 UNANSWERED = 3.0
@@ -214,7 +207,8 @@ class ViewerHand:
         self, node: GuardedNode, post: Posted, simulator: Simulator, rest: RestMesh
     ) -> None:
         self._node, self._post, self._rest = node, post, rest
-        self.feed = Feed("hand", self._watched, STATE_RATE)
+        # To a person's eye sliders follow at 10 Hz, and more would take time from the image.
+        self.feed = Feed("hand", self._watched, 10.0)
         self._simulator = simulator
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
@@ -235,7 +229,7 @@ class ViewerHand:
         self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
         self._warning = ""
         self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
-        self._moving_timer = node.create_timer(1.0 / (TICKS * MOVING), self._tick)
+        self._moving_timer = node.create_timer(0.5 / MOVING, self._tick)
         self._resting_timer = node.create_timer(1.0 / RESTING, self._update)
         self._moving_timer.cancel()
         self._resting_timer.cancel()
@@ -296,7 +290,7 @@ class ViewerHand:
             return
         stance = self._motion.stance
         foot = surface.closest(stance.point)
-        if float(np.linalg.norm(foot.point - stance.point)) < NEAR:
+        if float(np.linalg.norm(foot.point - stance.point)) < 0.02:  # of the same patient
             self._motion.rest_at(replace(stance, point=foot.point))
         else:
             self._motion.rest_at(Stance.home(surface, HOME_PRESS))

@@ -25,6 +25,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from us_sim.errors import MessageError
+from us_sim.settings.spelling import shown
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, RestSurface, Stance
 
 HOME_PRESS = 1e-3
@@ -59,20 +60,20 @@ class HandCommand:
             MessageError: it is none, with what is wrong.
         """
         if not isinstance(value, dict):
-            raise MessageError(f"a command to the hand is an object, not {_shown(value)}")
+            raise MessageError(f"a command to the hand is an object, not {shown(value)}")
         unknown = value.keys() - {"source", "sequence", "to", "by", "go"}
         if unknown:
-            raise MessageError(f"a command to the hand has no {_shown(min(unknown))}")
+            raise MessageError(f"a command to the hand has no {shown(min(unknown))}")
         source, sequence, go = value.get("source"), value.get("sequence"), value.get("go")
         if not is_source(source):
             raise MessageError(
                 f"the hand's source is a text of 1 to {_LONGEST_SOURCE} characters, not "
-                f"{_shown(source)}"
+                f"{shown(source)}"
             )
         if type(sequence) is not int or not 0 <= sequence <= _LAST:
-            raise MessageError(f"the hand's sequence is a count, not {_shown(sequence)}")
+            raise MessageError(f"the hand's sequence is a count, not {shown(sequence)}")
         if go is not None and go not in _PLACES:
-            raise MessageError(f"the hand goes to {', '.join(_PLACES)}, not to {_shown(go)}")
+            raise MessageError(f"the hand goes to {', '.join(_PLACES)}, not to {shown(go)}")
         to, by = _numbers(value, "to", _TO), _numbers(value, "by", _BY)
         return cls(source, sequence, to, by, go)
 
@@ -116,17 +117,17 @@ def _numbers(
     """The numbers of one part of a command, each as many as there must be."""
     given = value.get(key, {})
     if not isinstance(given, dict):
-        raise MessageError(f"the hand's {key} is an object, not {_shown(given)}")
+        raise MessageError(f"the hand's {key} is an object, not {shown(given)}")
     numbers = {}
     for name, listed in given.items():
         if name not in sizes:
-            raise MessageError(f"the hand cannot move {_shown(name)}: {', '.join(sizes)}")
+            raise MessageError(f"the hand cannot move {shown(name)}: {', '.join(sizes)}")
         values = listed if isinstance(listed, list) else [listed]
         proper = all(type(n) in (int, float) and abs(n) <= sys.float_info.max for n in values)
         if not proper or len(values) != sizes[name]:
             raise MessageError(
                 f"the hand's {name} is {sizes[name]} finite number{'s' * (sizes[name] > 1)}, not "
-                f"{_shown(listed)}"
+                f"{shown(listed)}"
             )
         limit = _FULL if name in _ANGLES else _FARTHEST
         if max(map(abs, values)) > limit:
@@ -139,12 +140,6 @@ def _numbers(
             )
         numbers[name] = tuple(map(float, values))
     return numbers
-
-
-def _shown(value: Any) -> str:
-    """A value in a sentence, not too long."""
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:60]} …"
 
 
 def hand_state(

@@ -1,4 +1,4 @@
-"""The bar above the image: what it shows, and what runs over time below it."""
+"""The bar above the image: modes, strips over time below it, and switches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ MODES = {
     **{name: mode[:2] for name, mode in OVERLAYS.items()},
 }
 """Label and title by value of the parameter ``overlay``, and the plain image before them."""
-_TOO_MUCH = 20.0  # N; sonographers press with some 5 to 10
 SWITCHES = {
     BESIDE: ("Beside", "The B-mode image beside the one with outlines or colours, on all pages"),
     FLIP: (
@@ -43,7 +42,6 @@ _ABSENT = {
 }
 TISSUE = "tissue_deformer"
 _UNMOVED = 1e-5  # m, or of the face: by how much a place that was dragged may be as it was
-_LOOK_S = 0.3
 
 
 class _Modes:
@@ -69,7 +67,7 @@ class _Modes:
         ui.context.client.on_delete(lambda: board.unwatch(NODE))
         status.watch(pages=1)
         ui.context.client.on_delete(lambda: status.watch(pages=-1))
-        ui.timer(_LOOK_S, self._look)
+        ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
         if mode == "b-mode" or await self._set(OVERLAY, mode):
@@ -107,14 +105,14 @@ class _Modes:
         )
         self._mark()
 
-    def _look(self) -> None:
-        """Follow a change that was made elsewhere, and what the node says of its images."""
-        remarks = self._said()
+    def _refresh(self) -> None:
+        """Show changes that were made elsewhere, and the node's remarks on its images."""
+        remarks = self._wanted_remarks()
         if remarks != self._remarks:
             self._remarks = remarks
             told = f"m.setRemarks({json.dumps(remarks)})"
             ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {told})")
-        places = [] if self._probe_depth is None else list(self._looked_at())
+        places = [] if self._probe_depth is None else list(self._dragged())
         if places != self._places:
             self._places = places
             told = f"m.setPlaces({json.dumps(places)})"
@@ -125,14 +123,14 @@ class _Modes:
             self._show(known)
         self._mark()
 
-    def _said(self) -> list[str]:
-        """Why the images that are shown show little, for a person."""
+    def _wanted_remarks(self) -> list[str]:
+        """Reasons why the images show little, for a person."""
         status = self._simulator.status.node(NODE, time.monotonic())
         values = status.values if status else {}
         remarks = [_CONTACT.get(values.get("contact", ""), "")]
         tissue = self._simulator.status.node(TISSUE, time.monotonic())
         force = (tissue.number("force") if tissue else None) or 0.0
-        if force > _TOO_MUCH:
+        if force > 20.0:  # N; sonographers press with some 5 to 10
             remarks.append(f"Too much force: {force:.0f} N")
         if self._mode == "velocity":
             remarks.append(_absent("No colour", values.get("no_colour", ""), values))
@@ -141,7 +139,7 @@ class _Modes:
         return [remark for remark in remarks if remark]
 
     def _value(self, name: str) -> float | None:
-        """Of a parameter that is a number, in SI units; None where there is none, or nothing."""
+        """A number of the node in SI units; None where there is none."""
         parameter = self._simulator.nodes.of(NODE).parameters.get(name)
         if parameter is None or parameter.kind is not Kind.NUMBER or parameter.value is None:
             return None
@@ -151,8 +149,8 @@ class _Modes:
     def _probe_depth(self) -> float | None:
         return self._value("depth")
 
-    def _looked_at(self) -> Iterator[dict[str, Any]]:
-        """The colour box, the gate and the line that are shown, as parameters have them, m, rad."""
+    def _dragged(self) -> Iterator[dict[str, Any]]:
+        """The colour box, the gate and the line, which a person can drag; m and rad."""
         deepest = self._probe_depth or 0.0
         shown = {"colour": self._mode == "velocity", **self._strips}
         for kind in (kind for kind, on in shown.items() if on):
@@ -199,7 +197,7 @@ def _button(label: str, title: str, on_click: Any) -> ui.button:
 
 
 def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
-    """Why there is no flow; nothing where that is said of the whole image already."""
+    """The reason why there is no flow, unless it is said of the whole image already."""
     if why not in _ABSENT or (why == "no_contact" and values.get("contact") != "good"):
         return ""
     return f"{what}: {_ABSENT[why]}"

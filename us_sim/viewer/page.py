@@ -7,8 +7,6 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -25,8 +23,6 @@ from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, b
 from us_sim.viewer.panels.session import build_cases, build_session
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import PageStream, Simulator
-
-_LOOK_S = 0.5
 
 
 def words_of(state: SessionState) -> tuple[str, str]:
@@ -56,7 +52,7 @@ def build_headline(simulator: Simulator) -> None:
     words = ui.label().classes("us-headline").props('role="status"')
     problem = ui.label().classes("us-headline us-wrong").props('role="alert"')
 
-    def look() -> None:
+    def refresh() -> None:
         scene, told = words_of(board.state)
         name.set_text(scene)
         if name.props.get("data-scene") != board.state.scene:
@@ -70,23 +66,12 @@ def build_headline(simulator: Simulator) -> None:
     nodes.watch(pages=1)
     ui.context.client.on_delete(board.unwatch)
     ui.context.client.on_delete(lambda: nodes.watch(pages=-1))
-    ui.timer(_LOOK_S, look)
+    ui.timer(0.5, refresh)
 
 
 _HEAD = """<link rel="stylesheet" href="/us_sim/assets/viewer.css">
 <link rel="stylesheet" href="/us_sim/assets/panels.css">
 <link rel="stylesheet" href="/us_sim/assets/session.css">"""
-_BODY = '<script type="module" src="/us_sim/assets/main.js"></script>'
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One tab of the panels."""
-
-    name: str
-    icon: str  # of Material's icons, which NiceGUI brings
-    title: str
-    build: Callable[[Simulator], None]  # called inside the tab
 
 
 def _status(simulator: Simulator) -> None:
@@ -95,18 +80,19 @@ def _status(simulator: Simulator) -> None:
 
 
 PANELS = [
-    Panel("Image", "contrast", "The scanner's console: depth, gain, focus and more", build_image),
-    Panel("Tissue", "layers", "Method, materials, skin and tracker", build_tissue),
-    Panel("Cases", "collections", "Scenes and cases to load", build_cases),
-    Panel("Session", "radio_button_checked", "Record, and replay recordings", build_session),
-    Panel("Status", "monitor_heart", "How every node is, and plots of the last minute", _status),
+    ("Image", "contrast", "The scanner's console: depth, gain, focus and more", build_image),
+    ("Tissue", "layers", "Method, materials, skin and tracker", build_tissue),
+    ("Cases", "collections", "Scenes and cases to load", build_cases),
+    ("Session", "radio_button_checked", "Record, and replay recordings", build_session),
+    ("Status", "monitor_heart", "How every node is, and plots of the last minute", _status),
 ]
+"""Name, icon of Material's, title, and the function that fills the tab."""
 
 
 def build_page(simulator: Simulator) -> None:
     """Make the page for one browser."""
     ui.add_head_html(_HEAD)
-    ui.add_body_html(_BODY)
+    ui.add_body_html('<script type="module" src="/us_sim/assets/main.js"></script>')
     ui.colors(primary="#4fb3bf", dark="#171b1f", dark_page="#0e1113", negative="#e5735c")
     ui.query(".nicegui-content").classes("us-content")
     with ui.header(wrap=False).classes("us-header"):
@@ -152,12 +138,12 @@ def _section(name: str, label: str) -> ui.element:
 
 def _panels(simulator: Simulator) -> None:
     with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
-        for panel in PANELS:
-            ui.tab(panel.name, icon=panel.icon).props["title"] = panel.title
-    with ui.tab_panels(tabs, value=PANELS[0].name).classes("us-panels"):
-        for panel in PANELS:
-            with ui.tab_panel(panel.name):
-                panel.build(simulator)
+        for name, icon, title, _ in PANELS:
+            ui.tab(name, icon=icon).props["title"] = title
+    with ui.tab_panels(tabs, value=PANELS[0][0]).classes("us-panels"):
+        for name, _, _, build in PANELS:
+            with ui.tab_panel(name):
+                build(simulator)
 
 
 ASSETS = Path(__file__).parent / "assets"

@@ -216,10 +216,10 @@ Send = Callable[[Parameter, Any], "Future[str]"]
 
 
 class ParameterBoard:
-    """The newest that is known of each node's parameters, and who looks at them; for any thread.
+    """The newest parameters of each node, and the nodes that pages show; for any thread.
 
     Args:
-        on_watch: called when a node begins to be looked at, or no longer is.
+        on_watch: called when pages begin to show a node, or no longer do.
         send: asks a node to set a parameter.
     """
 
@@ -231,12 +231,12 @@ class ParameterBoard:
 
     @property
     def watched(self) -> set[str]:
-        """The names of the nodes that are looked at."""
+        """The names of the nodes that pages show."""
         with self._lock:
             return set(self._watched)
 
     def watch(self, node: str) -> None:
-        """Look at a node's parameters, until `unwatch`."""
+        """Follow a node's parameters, until `unwatch`."""
         with self._lock:
             self._watched[node] += 1
             first = self._watched[node] == 1
@@ -244,7 +244,7 @@ class ParameterBoard:
             self._on_watch()
 
     def unwatch(self, node: str) -> None:
-        """Look at them no longer."""
+        """Follow them no longer."""
         with self._lock:
             self._watched[node] -= 1
             last = self._watched[node] <= 0

@@ -9,14 +9,13 @@ import re
 import secrets
 import socket
 import threading
+import time
 from typing import Any
 
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
 from us_sim.viewer.access import Access, is_loopback
 from us_sim.viewer.stream import Simulator
-
-_QUEUE = 64
 
 
 def require_free(host: str, port: int) -> None:
@@ -42,7 +41,7 @@ def listening(host: str, port: int) -> socket.socket:
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         opened.bind(where)
-        opened.listen(_QUEUE)
+        opened.listen(64)
     except OSError as error:
         with contextlib.suppress(OSError):
             opened.close()
@@ -56,10 +55,6 @@ def listening(host: str, port: int) -> socket.socket:
             f"--port"
         ) from error
     return opened
-
-
-_STARTED_S = 30.0
-_STOPPED_S = 3.0
 
 
 class WebServer:
@@ -117,20 +112,18 @@ class WebServer:
     def close(self) -> None:
         """Serve no longer."""
         self._server.should_exit = True
-        self._thread.join(_STOPPED_S)
+        self._thread.join(3.0)
         self._socket.close()
 
     def _run(self) -> None:
         self._server.run(sockets=[self._socket])
 
     def _await_start(self) -> None:
-        deadline = threading.Event()
-        for _ in range(int(_STARTED_S / 0.02)):
+        until = time.monotonic() + 30.0
+        while self._thread.is_alive() and time.monotonic() < until:
             if self._server.started:
                 return
-            if not self._thread.is_alive():
-                break
-            deadline.wait(0.02)
+            time.sleep(0.02)
         raise UsSimError(f"the web server at {self.host}:{self.port} did not start")
 
 

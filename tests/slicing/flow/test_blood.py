@@ -193,5 +193,5 @@ def test_a_flow_across_its_vessel_is_refused(vein):
     import dataclasses
 
     across = dataclasses.replace(VEIN, direction=(1.0, 0.1, 0.0))
-    with pytest.raises(SceneError, match=r"structures.vessel.flow.direction: .* is across the"):
+    with pytest.raises(SceneError, match=r"structures\.vessel\.flow\.direction"):
         vein.require(across)

@@ -220,31 +220,31 @@ def test_steered_beams_see_a_vessel_in_the_image_by_the_angle(scanner):
 
 
 @pytest.mark.parametrize(
-    ("probe", "settings", "sentence"),
+    ("probe", "settings", "key"),
     [
-        (PROBE, {"depth": 0.025}, "colour.depth: the middle of the box at 25 mm lies outside the"),
+        (PROBE, {"depth": 0.025}, "colour.depth: .* 25 mm"),
         (
             ConvexProbe(radius=0.03, opening_angle=1.0, depth=0.05, columns=80, rows=80),
             {"steering": 0.1},
-            "colour.steering: is for linear probes only",
+            "colour.steering",
         ),
         (
             LinearProbe(aperture=0.02, depth=0.02, columns=4, rows=4),
             {"width": 0.02, "lateral": 0.1, "height": 1e-3},
-            "colour.width: no pixel of the image lies in the box",
+            "colour.width",
         ),
     ],
 )
-def test_a_box_outside_the_image_is_refused(probe, settings, sentence):
-    with pytest.raises(ProbeError, match=sentence):
+def test_a_box_outside_the_image_is_refused(probe, settings, key):
+    with pytest.raises(ProbeError, match=key):
         ColourDoppler(probe, ColourSettings(**settings))
 
 
 @pytest.mark.parametrize("kind", [ColourSettings, SpectrumSettings])
 def test_a_nyquist_velocity_of_zero_and_a_filter_of_everything_are_refused(kind):
-    with pytest.raises(ProbeError, match=r"\.nyquist_velocity: 0 m/s is outside 0.01 to 5"):
+    with pytest.raises(ProbeError, match=r"\.nyquist_velocity: 0 m/s"):
         kind(nyquist_velocity=0.0)
-    with pytest.raises(ProbeError, match=r"\.wall_filter: 0.1 m/s is not below nyquist_velocity"):
+    with pytest.raises(ProbeError, match=r"\.wall_filter: 0.1 m/s"):
         kind(nyquist_velocity=0.1, wall_filter=0.1)
 
 
@@ -364,25 +364,25 @@ def test_a_vein_under_a_full_press_shows_none(gate_scanner):
 
 
 @pytest.mark.parametrize(
-    ("probe", "settings", "sentence"),
+    ("probe", "settings", "key"),
     [
         (
             GATE_PROBE,
             {"depth": 0.03},
-            "spectrum.depth: the gate at 30 mm lies outside the image, which",
+            "spectrum.depth: .* 30 mm",
         ),
         (
             GATE_PROBE,
             {"lateral": 0.5, "steering": 0.4},
-            "spectrum.steering: the gate lies beside the",
+            "spectrum.steering: .* beside",
         ),
         (
             SectorProbe(aperture=0.02, opening_angle=1.0, depth=0.05, columns=80, rows=80),
             {"steering": 0.1},
-            "spectrum.steering: is for linear probes only",
+            "spectrum.steering: .* linear",
         ),
     ],
 )
-def test_a_gate_outside_the_image_is_refused(probe, settings, sentence):
-    with pytest.raises(ProbeError, match=sentence):
+def test_a_gate_outside_the_image_is_refused(probe, settings, key):
+    with pytest.raises(ProbeError, match=key):
         Spectrum(probe, SpectrumSettings(**settings))

@@ -60,7 +60,7 @@ def test_places_are_along_the_tube_and_radial_coordinates_as_in_a_cylinder():
 def test_a_vessel_at_the_edge_of_the_volume_is_not_closed():
     places, to_patient = grid()
     lumen = around(places, (0.0, 0.0, 0.5e-3), (0, 1, 0))
-    with pytest.raises(VolumeError, match=r"is no tube: its section at \(.* mm is not closed"):
+    with pytest.raises(VolumeError, match="not closed"):
         lumen_of(lumen, to_patient)
 
 

@@ -443,7 +443,7 @@ def test_a_plane_that_cannot_be_is_refused(change, words):
 )
 def test_spans_beyond_the_image_are_refused(spans):
     steps = {"origin": np.zeros(3), "column_step": np.eye(3)[0], "row_step": np.eye(3)[2]}
-    with pytest.raises(ProbeError, match="two runs of columns, 0 to 5, of each of the 4 rows"):
+    with pytest.raises(ProbeError, match=r"0 to 5, .* 4 rows"):
         SlicePlane(**steps, columns=5, rows=4, spans=spans)
     runs = np.zeros((4, 2, 2), dtype=np.int64)
     runs[:, 0] = [1, 4]
@@ -515,5 +515,5 @@ def test_one_line_is_everywhere_the_same():
 
 def test_a_depth_outside_the_image_is_refused_and_none_is_its_middle():
     assert require_depth(STEERED[0], "gate.depth", None, "the gate") == 0.025
-    with pytest.raises(ProbeError, match=r"gate.depth: the gate at 50 mm lies outside the image"):
+    with pytest.raises(ProbeError, match=r"gate.depth: .* 50 mm"):
         require_depth(STEERED[0], "gate.depth", 0.05, "the gate")

@@ -1,7 +1,4 @@
-"""Cases that are read as they were written, and those of which no good can come.
-
-Cases by name, in several folders.
-"""
+"""Cases as they were written, by name in several folders, and broken ones."""
 
 import os
 import shutil
@@ -132,7 +129,7 @@ def test_labels_must_be_on_the_volumes_grid(make_case, block):
     shifted = block.index_to_patient.copy()
     shifted[0, 3] += 1e-4
     write_labels(folder / "labels.nrrd", Volume(block.intensities, shifted, block.labels))
-    with pytest.raises(CaseError, match=r"is on another grid than volume.nrrd .* 0.1 mm apart"):
+    with pytest.raises(CaseError, match=r"another grid.* 0\.1 mm"):
         read_case(folder).volume()
     fewer = block.labels[:, :, :-1]
     write_labels(folder / "labels.nrrd", Volume(fewer, block.index_to_patient, fewer))
@@ -194,7 +191,7 @@ def test_a_path_is_a_case_too_and_goes_first(roots, tmp_path):
 
 @pytest.mark.usefixtures("roots")
 def test_an_unknown_name_is_told_those_that_are_known():
-    with pytest.raises(CaseError, match=r"no case livr; cases are arm, liver in .*mean liver\?"):
+    with pytest.raises(CaseError, match=r"livr.* arm, liver .*mean liver\?"):
         find_case("livr")
     with pytest.raises(CaseError, match="there is no case"):
         find_case("../one/nothing")

@@ -1,9 +1,4 @@
-"""A case is made whole or not at all.
-
-Moduli in a case: only they change, and the case says how they were found.
-
-What was done to a case, as its file says it.
-"""
+"""A case is made whole or not at all, moduli alone change, and its history has a form."""
 
 import os
 import signal
@@ -42,7 +37,7 @@ def test_nothing_is_left_of_a_case_that_was_broken_off(tmp_path, block, interrup
 
 def test_nothing_is_left_of_a_case_that_is_none(tmp_path, block):
     with (
-        pytest.raises(CaseError, match=rf"^{tmp_path}/arm: is no case, as it has no case.yaml"),
+        pytest.raises(CaseError, match=rf"^{tmp_path}/arm: .*no case.yaml"),
         new_case(tmp_path / "arm") as folder,
     ):
         write_volume(folder / "volume.nrrd", block)

@@ -1,7 +1,4 @@
-"""What an import makes, what it refuses, and what it leaves where it ends.
-
-Text in real images is found where a person sees it, and none is seen where there is none.
-"""
+"""Imports: their results, their refusals, their ends, and text that is burned in."""
 
 import os
 import subprocess
@@ -269,7 +266,7 @@ def test_wrong_options_are_refused(cine, tmp_path, more, message, capsys):
 
 @pytest.mark.parametrize("name", ["case", "a.nrrd", "a.nii.gz"])
 def test_a_cine_is_no_volume(cine, tmp_path, name):
-    with pytest.raises(VolumeError, match=r"2D cine of 4 images.* not a volume"):
+    with pytest.raises(VolumeError, match="cine of 4 images"):
         import_files([cine], tmp_path / name, ImportSettings(keep_whole_image=True))
     assert list(tmp_path.iterdir()) == [cine]
 

@@ -205,9 +205,9 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
 @pytest.mark.parametrize(
     ("fields", "data", "message"),
     [
-        ({}, b"\0" * 60, "holds 60 bytes of image data where its header says 120"),
-        ({}, b"\0" * 121, "holds 121 bytes of image data where its header says 120"),
-        ({"DimSize": "4 5 7"}, None, "holds 120 bytes of image data where its header says 140"),
+        ({}, b"\0" * 60, "holds 60 bytes .* 120"),
+        ({}, b"\0" * 121, "holds 121 bytes .* 120"),
+        ({"DimSize": "4 5 7"}, None, "holds 120 bytes .* 140"),
         ({"ElementType": "MET_SHORT"}, None, "header says 240"),
         ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
         ({"ElementSpacing": "1 -2 1"}, None, "spacing 1 × -2 × 1 mm"),
@@ -216,14 +216,14 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
         ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular direction matrix"),
         ({"DimSize": "4 5 1"}, b"\0" * 20, "two or more along each axis"),
         ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers per voxel"),
-        ({"DimSize": ":4 5 6"}, None, "its DimSize is ':4 5 6' where whole numbers above zero"),
+        ({"DimSize": ":4 5 6"}, None, "DimSize is ':4 5 6'"),
         ({"DimSize": "-4 5 6"}, None, "whole numbers above zero"),
         ({"DimSize": "4 5_0 6"}, None, "whole numbers above zero"),
         ({"NDims": "2"}, None, "NDims says 2 numbers"),
         ({"DimSize": "1024 1024 1024"}, None, "536870912 are read at most"),
         ({"DimSize": "4000000000 4000000000 4000000000"}, None, "are read at most"),
         ({"ElementSpacing": "1e-30 1 1"}, None, "spacing 1e-30 × 1 × 1 mm; that of a body is"),
-        ({"Offset": "nan 0 0"}, None, "its Offset is 'nan 0 0' where 3 finite numbers belong"),
+        ({"Offset": "nan 0 0"}, None, "Offset is 'nan 0 0'"),
         ({"Offset": "0 0"}, None, "where 3 finite numbers belong"),
         ({"Offset": "0 0 1e9"}, None, "lies 1e\\+06 m from its origin"),
         ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "axes that are sheared or scaled"),
@@ -256,12 +256,12 @@ def test_a_compressed_metaimage_holds_what_its_header_says(tmp_path):
         read_volume(_compressed(tmp_path / "a.mha", data)).intensities, GREY
     )
     for wrong, held in ((data[:60], "60"), (b"", "0"), (data + b"\0", "121 or more")):
-        with pytest.raises(VolumeError, match=f"holds {held} bytes .* where its header says 120"):
+        with pytest.raises(VolumeError, match=f"holds {held} bytes .* 120"):
             read_volume(_compressed(tmp_path / "a.mha", wrong))
 
 
 def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
-    with pytest.raises(VolumeError, match="or more bytes of image data where its header says 120"):
+    with pytest.raises(VolumeError, match=r"or more bytes .* 120"):
         read_volume(_compressed(tmp_path / "a.mha", bytes(100 << 20)))
     with pytest.raises(VolumeError, match="536870912 are read at most"):
         read_volume(_compressed(tmp_path / "a.mha", bytes(100), DimSize="1024 1024 1024"))
@@ -269,14 +269,14 @@ def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
 
 def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(stored_image, "free_memory", lambda: 200.0)
-    with pytest.raises(VolumeError, match=r"take 0\.0 GB of memory where 0\.0 GB are free"):
+    with pytest.raises(VolumeError, match="GB of memory"):
         read_volume(_metaimage(tmp_path / "a.mha"))
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("sizes: 4 5 6", "sizes: 4 5 7", "holds 120 bytes .* where its header says 140"),
+        ("sizes: 4 5 6", "sizes: 4 5 7", "holds 120 bytes .* 140"),
         ("sizes: 4 5 6", "sizes: 4 5 6 1", "its dimension '3'"),
         ("sizes: 4 5 6", "sizes: 4 5 -6", "whole numbers above zero"),
         # ITK writes beyond its memory for these.
@@ -313,7 +313,7 @@ def test_an_nrrd_header_may_say_much_in_its_own_words(tmp_path):
     [
         (40, "<2h", (3, -4), "axes of -4, 5, 6"),
         (40, "<h", (8,), "says 8 axes"),
-        (70, "<h", (4,), "holds 120 bytes .* where its header says 240"),
+        (70, "<h", (4,), "holds 120 bytes .* 240"),
         (70, "<h", (77,), "data type 77"),
         (108, "<f", (np.nan,), "from byte nan"),
         (108, "<f", (np.inf,), "from byte inf"),
@@ -331,7 +331,7 @@ def test_a_nifti_header_that_does_not_fit_is_refused(tmp_path, at, form, value, 
 
 def test_a_nifti_bomb_is_not_unpacked(tmp_path):
     path = _nifti(tmp_path / "a.nii.gz", bytes(100 << 20), np.eye(4))
-    with pytest.raises(VolumeError, match="or more bytes of image data where its header says 120"):
+    with pytest.raises(VolumeError, match=r"or more bytes .* 120"):
         read_volume(path)
 
 

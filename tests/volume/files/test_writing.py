@@ -1,4 +1,4 @@
-"""What is written is where it was, and 3D Slicer's segments have their names and colours."""
+"""Written volumes lie where they were, and 3D Slicer's segments have their names and colours."""
 
 import gzip
 

@@ -1,9 +1,4 @@
-"""The upper arm: its anatomy in numbers, its echoes, and the same bytes every time.
-
-Noise, sheets and tubes, against their laws.
-
-Speckle: Rayleigh statistics, the size of a speckle, interfaces, and the display's scale.
-"""
+"""The upper arm: anatomy, textures and speckle against their laws, and equal bytes every time."""
 
 import numpy as np
 import pytest

@@ -1,9 +1,4 @@
-"""Reconstruction of synthetic sweeps through fields whose values are known everywhere.
-
-Calibrations of sweeps: Plus' XML, and what `us-sim calibrate probe` writes.
-
-The volumes that Plus reconstructed of its own test sweep, and a published sweep's.
-"""
+"""Reconstructions of known fields, calibrations of sweeps, and volumes of Plus."""
 
 import dataclasses
 
@@ -174,20 +169,20 @@ def test_a_part_that_is_none_is_refused(values, message):
 
 
 def test_a_part_beside_the_image_is_refused():
-    with pytest.raises(VolumeError, match="hold no pixel of images of 30 × 40"):
+    with pytest.raises(VolumeError, match=r"no pixel.*30 × 40"):
         image_mask(ImagePart(clip=(100, 0, 5, 5)), 30, 40)
 
 
 def test_a_grid_that_is_too_large_is_refused_before_it_is_made(sweep, monkeypatch):
-    with pytest.raises(VolumeError, match=r"536870912 are possible: give --spacing '0\.\d+ mm"):
+    with pytest.raises(VolumeError, match=r"536870912.*--spacing"):
         plan(sweep, Compounding(spacing=1e-5))
     planned = plan(sweep, Compounding(spacing=0.5e-3))
     monkeypatch.setattr(grids, "free_memory", lambda: 1e5)
     for compounding in ("mean", "median"):
         how = dataclasses.replace(planned.compounding, compounding=compounding)
-        with pytest.raises(VolumeError, match=r"GB of memory where 0\.00 GB are free"):
+        with pytest.raises(VolumeError, match="GB of memory"):
             reconstruct(dataclasses.replace(planned, compounding=how))
-    with pytest.raises(VolumeError, match=r"larger than the .* give a smaller --spacing"):
+    with pytest.raises(VolumeError, match="smaller --spacing"):
         grid_around(np.array([[0.0, 0, 0], [0.01, 0.01, 0.001]]), 0.005)
 
 
@@ -217,7 +212,7 @@ def test_late_stamps_are_undone(tmp_path):
     np.testing.assert_allclose(
         half[3] @ centre, 0.5 * (matrices[3] + matrices[4]) @ centre, atol=1e-9
     )
-    with pytest.raises(VolumeError, match="no image has a pose 5000 ms after its time"):
+    with pytest.raises(VolumeError, match="5000 ms"):
         shifted(late, 5.0)
 
 

@@ -142,7 +142,7 @@ class Motion:
 
     @cached_property
     def poses(self) -> list[Pose]:
-        """One a frame, those of the approach first."""
+        """One a frame, select of the approach first."""
         room = TISSUES[self.tissue].room
         return hand_motion(
             self.kind, self.haste, self.seed, self.duration, room, approach=APPROACH
@@ -327,7 +327,6 @@ class Point(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """Summary of the frames, by column."""
         frames, live, held, motion = self.frames, self.live, self.held, self.motion
         over = {
             f"residual_over_{limit:g}": (
@@ -367,7 +366,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The method and the motion."""
         return f"{self.method}, {self.motion}"
 
 
@@ -377,7 +375,7 @@ def _percentiles(name: str, values: _Array, percents: Sequence[int]) -> dict[str
     return {f"{name}_{'worst' if p == 100 else f'p{p}'}": percentile(known, p) for p in percents}
 
 
-def those(
+def select(
     points: Iterable[Point], *, method: str | None = None, **motion: str | None
 ) -> list[Point]:
     """Points that did not fail, of this method, tissue, kind and haste; None is any."""
@@ -501,7 +499,7 @@ class _Following:
         return (k, *errors, found.residual, self._inverted(found), 1e3 * slipped, *times)
 
     def _to_own_balance(self, balance: TissueSolver, pose: Pose, found: Deformation) -> float:
-        """m, from the frame to what it converges to at the pose; NaN where it does not."""
+        """m, from the frame to the converged one at its pose; NaN where it does not converge."""
         state = self._solver.state
         state.displacement[self._solver.model.fixed] = 0.0  # its motion has a column of its own
         balance.take_over(state)

@@ -27,7 +27,7 @@ from us_sim.evaluation.hand.measure import (
     Point,
     measured_points,
     motions,
-    those,
+    select,
 )
 from us_sim.evaluation.report import (
     ReportFolder,
@@ -82,10 +82,10 @@ def evaluate_hand(out: Path, quick: bool, settings: HandSettings | None = None) 
 
 def targets(points: Sequence[Point]) -> list[Target]:
     """Limits for `JUDGED`, against the measured numbers."""
-    mine = those(points, method=JUDGED)
-    brisk = those(mine, tissue=MAIN_TISSUE, haste="brisk")
-    careful = those(mine, tissue=MAIN_TISSUE, haste="careful")
-    violent = those(mine, haste="violent")
+    mine = select(points, method=JUDGED)
+    brisk = select(mine, tissue=MAIN_TISSUE, haste="brisk")
+    careful = select(mine, tissue=MAIN_TISSUE, haste="careful")
+    violent = select(mine, haste="violent")
     where = f"brisk on the {MAIN_TISSUE}"
 
     def most(
@@ -202,8 +202,8 @@ def _write_report(
         rate=f"{RATE:.0f}",
         judged=JUDGED,
         targets=table,
-        motions=_by_motion(those(points, kind=None if folder.quick else "free")),
-        live=_live(those(points)),
+        motions=_by_motion(select(points, kind=None if folder.quick else "free")),
+        live=_live(select(points)),
         hold=f"{HOLD}",
         tissues="\n".join(f"- `{name}`: {tissue.words}" for name, tissue in TISSUES.items()),
         kinds="\n".join(f"- {name}: {kind.words}" for name, kind in KINDS.items()),
@@ -231,7 +231,7 @@ def _plot_time(
         )
         for (error, depth, speed), motion in zip(panels.T, chosen, strict=True):
             error.set_title(str(motion), fontsize=11, loc="left")
-            for point in those(p for p in points if p.motion == motion):
+            for point in select(p for p in points if p.motion == motion):
                 time = (point.frames.number - motion.begins) / RATE
                 colour = TISSUE_METHODS[point.method].colour
                 shown = np.maximum(point.frames.error, _LOWEST)
@@ -281,7 +281,7 @@ def _plot_errors(points: Sequence[Point], chosen: Sequence[Motion], file: Path) 
     with picture(file, 4.2 * columns + 1.6, 3.6 * rows + 0.7, title) as figure:
         panels = panel_grid(figure, map(str, chosen), *labels)
         for panel, motion in zip(panels, chosen, strict=True):
-            for point in those(p for p in points if p.motion == motion):
+            for point in select(p for p in points if p.motion == motion):
                 frames, look = point.frames, TISSUE_METHODS[point.method]
                 if frames.compared >= ENOUGH:
                     x = [float(np.percentile(frames.cpu, part)) for part in (50, 99)]
@@ -309,7 +309,7 @@ def _plot_faults(points: Sequence[Point], file: Path) -> None:
         "tetrahedra inside out": lambda p: p.frames.inverted > 0,
         "poses skipped at 60 Hz": lambda p: np.arange(p.live.poses) >= len(p.live.frames.number),
     }
-    hastes = [haste for haste in HASTES if those(points, haste=haste)]
+    hastes = [haste for haste in HASTES if select(points, haste=haste)]
     width = 0.8 / max(1, len(hastes))
     title = "What goes wrong, in % of frames (all tissues and motions)"
     with picture(file, 14.5, 4.2, title) as figure:
@@ -319,7 +319,7 @@ def _plot_faults(points: Sequence[Point], file: Path) -> None:
             for place, haste in enumerate(hastes):
                 percent = []
                 for method in TISSUE_METHODS:
-                    found = _together(those(points, method=method, haste=haste), faulty)
+                    found = _together(select(points, method=method, haste=haste), faulty)
                     percent.append(100 * float(found.mean()) if len(found) else 0.0)
                 at = np.arange(len(percent)) + (place - 0.5 * (len(hastes) - 1)) * width
                 colour = dict(zip(HASTES, ("#9ecae1", "#3182bd", "#08306b"), strict=True))[haste]
@@ -344,7 +344,7 @@ def _plot_hold(points: Sequence[Point], file: Path) -> None:
         panels = figure.subplots(1, len(TISSUE_METHODS), sharex=True, sharey=True)
         for panel, method in zip(panels, TISSUE_METHODS, strict=True):
             panel.set_title(method, fontsize=11, loc="left")
-            for point in those(points, method=method):
+            for point in select(points, method=method):
                 shown = np.maximum(point.held.residual, 1e-9)
                 # A settled residual stays.
                 shown = np.append(shown, np.full(HOLD + 1 - len(shown), shown[-1]))

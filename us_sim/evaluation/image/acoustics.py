@@ -46,6 +46,8 @@ from us_sim.slicing.settings import ECHO_RANGE
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
+Array = NDArray[np.float64]
+
 _LOW, _HIGH = (-6e-3, 14e-3), (5.2e-3, 18e-3)  # m, x and z of a block of bone
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)
 
@@ -102,7 +104,7 @@ class Attenuation(Artefact):
         return filled("image", self.name, layers=", ".join(layer.name for layer in LAYERS))
 
 
-def _expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> NDArray[np.float64]:
+def _expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> Array:
     """(rows, columns) dB by which each pixel is changed; NaN where no beam reaches."""
     assert acoustics.frequency is not None
     line, distance = probe.pixel_beams.astype(np.float64)
@@ -122,7 +124,7 @@ def _worst_depths(
     degrees: float,
     probe: Probe,
     image: NDArray[np.uint8],
-    expected: NDArray[np.float64],
+    expected: Array,
 ) -> list[Point]:
     """The depth with the greatest error in each twelfth of the depth."""
     grey = GREY + GREYS_PER_DECIBEL * expected
@@ -190,7 +192,7 @@ class Enhancement(Artefact):
 class State:
     """Deformation of the tissue around a block of bone, and place of the probe."""
 
-    gradient: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    gradient: Array = field(default_factory=lambda: np.eye(3))
     """(3, 3) of the deformation, the same everywhere."""
     slid: float = 0.0  # m, of the probe along x
 
@@ -215,13 +217,13 @@ def _bone_volume() -> Volume:
     return Volume(grey, to_patient, labels, {1: "muscle", 2: "bone"})
 
 
-def corners(state: State) -> NDArray[np.float64]:
+def corners(state: State) -> Array:
     """(4, 2) m: x and z of the block's corners, in the plane y = 0."""
     rest = np.array([[x, 0.0, z] for x in (_LOW[0], _HIGH[0]) for z in (_LOW[1], _HIGH[1])])
     return (rest @ state.gradient.T)[:, [0, 2]]
 
 
-def _line_through(probe: Probe, pose: Pose, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _line_through(probe: Probe, pose: Pose, points: Array) -> Array:
     """(n,) place among all beams, 0 to 1, of those through points (n, 2), x and z, by bisection."""
     at = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) - pose.position
     x, _, z = (at @ pose.rotation).T
@@ -306,7 +308,7 @@ def _edges(
     degrees: float,
     probe: Probe,
     image: NDArray[np.uint8],
-    places: NDArray[np.float64],
+    places: Array,
     depth: float,
 ) -> list[Point]:
     """Both edges of the shadow at a depth, in pixels from the middle beam, along the arc."""
@@ -446,7 +448,7 @@ _ANGLES = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 _BOX = (200, 160, 450)  # voxels
 
 
-def _box_placed() -> NDArray[np.float64]:
+def _box_placed() -> Array:
     placed = np.diag([0.5e-3, 0.5e-3, 0.2e-3, 1.0])
     placed[:3, 3] = (-0.05 + 0.25e-3, -0.04 + 0.25e-3, -0.03 + 0.1e-3)
     return placed

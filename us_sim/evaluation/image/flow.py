@@ -130,7 +130,7 @@ def _angle(scan: TubeScan, name: str, degrees: float) -> Point:
 
 
 def _aliasing(scan: TubeScan, moments: int) -> list[Point]:
-    """What is shown of the axis over a beat; errors are of twice the Nyquist velocity."""
+    """Shown velocity on the axis over a beat; errors are of twice the Nyquist velocity."""
     found = []
     for nyquist in _NYQUIST:
         settings = ColourSettings(

@@ -26,6 +26,8 @@ from us_sim.slicing.acoustics.settings import TissueAcoustics
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
 from us_sim.volume.volume import Volume
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Point(Row):
@@ -71,7 +73,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """Artefact, probe and tilt."""
         return f"{self.artefact}, {self.probe}, {self.tilt_deg:g}°"
 
 
@@ -135,7 +136,7 @@ GREY = 170
 
 def voxel_grid(
     extent: Sequence[tuple[float, float]], voxel: Sequence[float]
-) -> tuple[list[int], NDArray[np.float64]]:
+) -> tuple[list[int], Array]:
     """Counts of voxels (m) that fill an extent (m), and the matrix from indices to ``patient``."""
     counts = [round((high - low) / step) for (low, high), step in zip(extent, voxel, strict=True)]
     to_patient = np.diag([*voxel, 1.0])
@@ -154,12 +155,7 @@ def layered_volume() -> Volume:
     return Volume(np.full(counts, GREY, dtype=np.uint8), to_patient, labels, names)
 
 
-def lost(
-    start: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    distance: NDArray[np.float64],
-    frequency: float,
-) -> NDArray[np.float64]:
+def lost(start: Array, direction: Array, distance: Array, frequency: float) -> Array:
     """dB by which echoes at distances (…,) m along beams are changed (Beer and Lambert).
 
     Args:

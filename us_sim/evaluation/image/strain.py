@@ -43,6 +43,8 @@ from us_sim.tissue.model import TissueModel, face_nodes
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
+Array = NDArray[np.float64]
+
 PROBES: dict[str, Probe] = {
     "linear": LinearProbe(aperture=0.06, depth=0.08),
     "convex": ConvexProbe(radius=0.04, opening_angle=np.radians(60), depth=0.08),
@@ -169,7 +171,7 @@ def ball_frame(ball: Ball, volume: Volume, press: float = _PRESS) -> Frame:
     return scanner.frame(Pose(np.array([0.0, 0.0, press])), ball_nodes(ball, press))
 
 
-def _unsmoothed(frame: Frame) -> NDArray[np.float64]:
+def _unsmoothed(frame: Frame) -> Array:
     """(rows, columns) along z, of the tetrahedron that each pixel lies in."""
     assert frame.mesh is not None
     rest, tetrahedra = frame.mesh
@@ -226,14 +228,14 @@ PLATE = RoundedBox(length=0.4, width=0.3, height=0.05, rounding=0.001)
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball that is stiffer than what is around it."""
+    """A ball that is stiffer than its surroundings."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.045)  # m
     radius: float = 0.018  # m
     stiffer: float = 3.0
     poisson_ratio: float = 0.45  # of both
 
-    def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def holds(self, points: Array) -> NDArray[np.bool_]:
         """Which of points (…, 3) m lie in it."""
         return np.asarray(np.linalg.norm(points - np.array(self.centre), axis=-1) <= self.radius)
 
@@ -257,7 +259,7 @@ def plate_model(
     )
 
 
-def pressed_by_plate(solver: TissueSolver, depth: float) -> NDArray[np.float64]:
+def pressed_by_plate(solver: TissueSolver, depth: float) -> Array:
     """(N, 3) m, the nodes with the plate ``depth`` m below the top, once nothing moves."""
     pose = Pose(np.array([0.0, 0.0, depth]))
     for _ in range(200):
@@ -285,7 +287,7 @@ def labelled(ball: Ball | None) -> Volume:
 def ball_mesh(ball: Ball) -> TetrahedralMesh:
     """As many tetrahedra as the finest of the paper's meshes, with planes closer in the ball."""
     half = ball.radius + 0.5e-3
-    planes: list[NDArray[np.float64]] = []
+    planes: list[Array] = []
     for (low, high), centre, count in zip(EXTENT, ball.centre, (15, 9, 9), strict=True):
         fine = np.linspace(centre - half, centre + half, count + 1)
         outside = (MESHES[-1][len(planes)] - count - 1) // 2
@@ -303,7 +305,7 @@ def ball_mesh(ball: Ball) -> TetrahedralMesh:
     return box_mesh(*planes)
 
 
-def _growing(length: float, size: float, count: int) -> NDArray[np.float64]:
+def _growing(length: float, size: float, count: int) -> Array:
     """Where planes lie whose distances grow from ``size`` on and fill a length, by bisection."""
     least, most = 0.1, 10.0
     for _ in range(60):
@@ -314,7 +316,7 @@ def _growing(length: float, size: float, count: int) -> NDArray[np.float64]:
 
 
 @cache
-def ball_nodes(ball: Ball, depth: float) -> NDArray[np.float64]:
+def ball_nodes(ball: Ball, depth: float) -> Array:
     """(N, 3) m, of that mesh with the ball in it, under the plate."""
     return pressed_by_plate(_ball_solver(ball), depth)
 
@@ -330,7 +332,7 @@ class Reference:
     """The linear solution on a fine mesh, for a unit of depth.
 
     Args:
-        ball: what is in the block.
+        ball: in the block.
         size: m, between planes around the ball.
 
     Raises:
@@ -380,7 +382,7 @@ class Reference:
         over = dia_array((1.0 / inner.diagonal()[None], [0]), shape=inner.shape)
         self._unit[free] = conjugate_gradients(inner, right, 1e-8, over, 20_000)
 
-    def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(self, points: Array) -> Array:
         """(P, 3, 3) the displacement's gradient per m of depth, at points (P, 3) m at rest."""
         signs = np.where(points[:, :2] < 0.0, -1.0, 1.0)
         mirror = np.column_stack([signs, np.ones(len(points))])
@@ -404,21 +406,21 @@ PRESS = 0.05
 
 
 @cache
-def pressed_block(counts: tuple[int, int, int]) -> NDArray[np.float64]:
+def pressed_block(counts: tuple[int, int, int]) -> Array:
     """(N, 3) m, the nodes of the block's mesh with so many of them along each axis."""
     material = Material(10e3, 0.0, 1000.0)
     model = plate_model(block(counts), material, material, labelled(None))
     return pressed_by_plate(create_solver("fem", model), PRESS * EXTENT[2][1])
 
 
-def beam_displacement(frame: Frame) -> NDArray[np.float64]:
+def beam_displacement(frame: Frame) -> Array:
     """(rows, columns, 2) m, lateral and axial: on the floor nothing moves, at the plate all."""
     floor = EXTENT[2][1]
     down = PRESS * (floor - frame.plane.pixels()[..., 2]) / (1.0 - PRESS)
     return np.asarray(down[..., None] * frame.pose.rotation[2, [0, 2]])
 
 
-def beam_strain(frame: Frame) -> NDArray[np.float64]:
+def beam_strain(frame: Frame) -> Array:
     """(rows, columns): a line along the beam now was |F⁻¹ d| as long, with F = diag(1, 1, 0.95)."""
     x, z = frame.probe.pixel_directions.astype(np.float64)
     directions = np.stack([x, np.zeros_like(x), z], axis=-1) @ frame.pose.rotation.T

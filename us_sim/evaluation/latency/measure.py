@@ -24,7 +24,7 @@ import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.processes import UsageOverTime, listening, start_program, usage_of
+from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, start_program
 from us_sim.evaluation.report import Row, percentile
 from us_sim.evaluation.timing import Tell
 from us_sim.recording.reader import read_bag
@@ -137,12 +137,10 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The case."""
         return str(self.case)
 
     @property
     def values(self) -> dict[str, object]:
-        """The case's settings, then ms, counts, cores and MB."""
         case = self.case
         columns, rows = case.image
         return {
@@ -288,13 +286,11 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
     processes.append(NodeProcess("path_player", player))
     with listening(viewer=case.viewer) as arrivals, _started(case, processes, folder) as running:
         _await_images(arrivals, running, tell)
-        usage: dict[str, UsageOverTime] = {node: UsageOverTime() for node in running.pids}
-        scheduling = running.scheduling
+        usage, scheduling = UsageByName(), running.scheduling
         began, began_ns = time.monotonic(), time.time_ns()
         while (passed := time.monotonic() - began) < case.seconds:
             running.check()
-            for node, pid in running.pids.items():
-                usage[node].add(passed, usage_of(pid))
+            usage.update({pid: node for node, pid in running.pids.items()})
             tell(passed, f"{len(arrivals.heard('ultrasound/image'))} images")
             time.sleep(0.5)
         ended_ns = time.time_ns()
@@ -304,7 +300,7 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
             for topic in arrivals.topics
         }
     recorded = _recorded(file, {s for s, _ in heard["ultrasound/image"]}) if case.recorder else None
-    return Point(case, heard, recorded, usage, scheduling)
+    return Point(case, heard, recorded, usage.uses, scheduling)
 
 
 def _path(scene: Scene) -> Path:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
+
+Array = NDArray[np.float64]
 
 SIZES = (256, 512, 1024)  # columns, and rows, of an image
 DEPTHS = {"rest": 0.0, "pressed_12mm": 0.012, "pressed_30mm": 0.03}
@@ -63,9 +66,9 @@ PLANES = {
 
 @dataclass(frozen=True)
 class Frame:
-    """What a slicer needs for one image."""
+    """Nodes and plane of one image."""
 
-    nodes: NDArray[np.float64]  # (N, 3) m, deformed
+    nodes: Array  # (N, 3) m, deformed
     plane: SlicePlane
 
 
@@ -138,7 +141,7 @@ def cases(quick: bool) -> list[Case]:
     return list(dict.fromkeys(found))
 
 
-def dented(nodes: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
+def dented(nodes: Array, depth: float) -> Array:
     """Nodes (N, 3) m of the block pressed by ``depth`` m in the middle of its top.
 
     A smooth field, so that nothing depends on a solver: down under a Gaussian dent that ends at
@@ -151,6 +154,7 @@ def dented(nodes: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
     return np.asarray(nodes + np.hstack([aside, depth * (1.0 - below) ** 2]) * dent)
 
 
+@cache
 def speckle(seed: int = 1) -> Volume:
     """The block's volume, and a little around it: speckle with balls and bright layers."""
     axes = _voxel_axes()
@@ -175,6 +179,7 @@ def speckle(seed: int = 1) -> Volume:
     return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
 
 
+@cache
 def black_and_white(seed: int = 1) -> Volume:
     """Of the same shape and place: every voxel black or white, so that a shift is seen at once."""
     shape = [len(places) for places in _voxel_axes()]
@@ -182,7 +187,7 @@ def black_and_white(seed: int = 1) -> Volume:
     return _placed(np.multiply(bits, 255, out=bits))
 
 
-def _voxel_axes() -> list[NDArray[np.float64]]:
+def _voxel_axes() -> list[Array]:
     """m, the centres of the voxels along x, y and z."""
     counts = (math.ceil((high - low + 2 * _BEYOND) / _VOXEL) for low, high in EXTENT)
     return [
@@ -197,7 +202,7 @@ def _placed(voxels: NDArray[np.uint8]) -> Volume:
     return Volume(voxels, placed)
 
 
-def _turn(about_z: float, about_x: float) -> NDArray[np.float64]:
+def _turn(about_z: float, about_x: float) -> Array:
     """The quaternion (x, y, z, w) of a tilt about x, then a turn about z, both in radians."""
     sx, cx = math.sin(about_x / 2), math.cos(about_x / 2)
     sz, cz = math.sin(about_z / 2), math.cos(about_z / 2)
@@ -209,18 +214,18 @@ _PAIRS = 1_000_000  # pairs of a pixel and a tetrahedron that are tried at once
 
 @dataclass(frozen=True)
 class ExactSlice:
-    """What every pixel of an image shows."""
+    """The truth of every pixel of an image."""
 
-    rest: NDArray[np.float64]  # (rows, columns, 3) m; NaN where there is nothing
+    rest: Array  # (rows, columns, 3) m; NaN where there is nothing
     tissue: NDArray[np.bool_]  # (rows, columns): in the deformed mesh
-    grey: NDArray[np.float64]  # (rows, columns)
+    grey: Array  # (rows, columns)
 
 
 def exact_slice(
     volume: Volume,
-    rest_nodes: NDArray[np.float64],
+    rest_nodes: Array,
     tetrahedra: NDArray[np.int32],
-    nodes: NDArray[np.float64],
+    nodes: Array,
     plane: SlicePlane,
 ) -> ExactSlice:
     """The image of tissue with its nodes at ``nodes`` (N, 3) m, as `slicing.slicer` defines it."""
@@ -234,7 +239,7 @@ def exact_slice(
     return ExactSlice(rest, tissue, sampled(volume, rest))
 
 
-def sampled(volume: Volume, rest: NDArray[np.float64]) -> NDArray[np.float64]:
+def sampled(volume: Volume, rest: Array) -> Array:
     """Trilinear grey values at ``rest`` (rows, columns, 3) m; 0 at NaN and beyond the volume."""
     index = rest @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
     beyond = ~((index >= -0.5) & (index <= np.array(volume.shape) - 0.5)).all(axis=-1)
@@ -246,19 +251,14 @@ def sampled(volume: Volume, rest: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(grey)
 
 
-def voxel_distance(
-    volume: Volume, one: NDArray[np.float64], other: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def voxel_distance(volume: Volume, one: Array, other: Array) -> Array:
     """(rows, columns) voxels between two sets of positions (rows, columns, 3) m."""
     return np.asarray(np.linalg.norm((one - other) @ volume.patient_to_index[:3, :3].T, axis=-1))
 
 
 def _located(
-    rest_nodes: NDArray[np.float64],
-    tetrahedra: NDArray[np.int32],
-    nodes: NDArray[np.float64],
-    plane: SlicePlane,
-) -> NDArray[np.float64]:
+    rest_nodes: Array, tetrahedra: NDArray[np.int32], nodes: Array, plane: SlicePlane
+) -> Array:
     """(rows, columns, 3) m at rest of every pixel in the mesh; NaN of the others."""
     placed = nodes @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]  # column, row, height
     corners = placed[tetrahedra]
@@ -296,7 +296,7 @@ def _located(
     return found
 
 
-def _determinants(nodes: NDArray[np.float64], tetrahedra: NDArray[np.int32]) -> NDArray[np.float64]:
+def _determinants(nodes: Array, tetrahedra: NDArray[np.int32]) -> Array:
     """(M,) m3, six times the signed volumes."""
     corners = nodes[tetrahedra]
     return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))

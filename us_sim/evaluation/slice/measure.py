@@ -40,6 +40,8 @@ from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorPr
 from us_sim.slicing.settings import Imaging
 from us_sim.volume.volume import Volume
 
+Array = NDArray[np.float64]
+
 OURS = "scan_conversion"
 """The method that the others are compared with, and that the targets are about."""
 
@@ -92,7 +94,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The method and its case."""
         return f"{self.method} on {self.size} px, {self.nodes} nodes"
 
 
@@ -103,7 +104,7 @@ class Contender:
     method: str
     threads: int
     image: Callable[[Frame], NDArray[np.uint8]]
-    rest_coordinates: Callable[[Frame], NDArray[np.float64]]
+    rest_coordinates: Callable[[Frame], Array]
     parts: Callable[[], tuple[float, float]] | None = None  # ms of the latest image, where known
 
 
@@ -243,8 +244,8 @@ def compare(
     frame: Frame,
     exact: ExactSlice,
     image: NDArray[np.uint8],
-    rest: NDArray[np.float64],
-    contrast: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None,
+    rest: Array,
+    contrast: tuple[Array, NDArray[np.uint8]] | None = None,
     tissue_only: bool = False,
 ) -> dict[str, float]:
     """Errors, by columns of `Point`, of an image (rows, columns) and of its places at rest.
@@ -278,8 +279,8 @@ def compare(
 
 
 def wrong_pixels(
-    volume: Volume, frame: Frame, exact: ExactSlice, rest: NDArray[np.float64], tissue_only: bool
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
+    volume: Volume, frame: Frame, exact: ExactSlice, rest: Array, tissue_only: bool
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
     """Which pixels' coverage is right and which wrong; arguments as for `compare`.
 
     Returns:
@@ -368,11 +369,7 @@ class VtkSlicer:
     """Processor time of finding the latest image's pixels, and of sampling the volume there."""
 
     def __init__(
-        self,
-        volume: Volume,
-        rest_nodes: NDArray[np.float64],
-        tetrahedra: NDArray[np.int32],
-        threads: int = 1,
+        self, volume: Volume, rest_nodes: Array, tetrahedra: NDArray[np.int32], threads: int = 1
     ) -> None:
         from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
         from vtkmodules.vtkCommonCore import VTK_ID_TYPE, vtkPoints, vtkSMPTools
@@ -421,7 +418,7 @@ class VtkSlicer:
         self._sampler.SetInputData(self._places)
         self._sampler.SetSourceData(self._voxels)
 
-    def image(self, nodes: NDArray[np.float64], plane: SlicePlane) -> NDArray[np.uint8]:
+    def image(self, nodes: Array, plane: SlicePlane) -> NDArray[np.uint8]:
         """(rows, columns): the grey values of tissue, 0 elsewhere."""
         begin = time.process_time()
         self._find(nodes, plane)
@@ -436,9 +433,7 @@ class VtkSlicer:
         self.sampling_ms = (time.process_time() - found) * 1e3
         return image
 
-    def rest_coordinates(
-        self, nodes: NDArray[np.float64], plane: SlicePlane
-    ) -> NDArray[np.float64]:
+    def rest_coordinates(self, nodes: Array, plane: SlicePlane) -> Array:
         """(rows, columns, 3) m, where each pixel's tissue lies at rest; NaN elsewhere."""
         self._find(nodes, plane)
         index = self._to_numpy(self._finder.GetOutput().GetPointData().GetArray("rest"))
@@ -448,7 +443,7 @@ class VtkSlicer:
         rest[~self._valid(plane)] = np.nan
         return np.asarray(rest)
 
-    def _find(self, nodes: NDArray[np.float64], plane: SlicePlane) -> None:
+    def _find(self, nodes: Array, plane: SlicePlane) -> None:
         # Threads are set for the whole process.
         self._workers.SetBackend("Sequential" if self._threads == 1 else "STDThread")
         self._workers.Initialize(self._threads)

@@ -31,7 +31,7 @@ from us_sim.errors import VolumeError
 from us_sim.evaluation.report import Row, filled, markdown_table, write_rows
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
-from us_sim.slicing.cutting.slicer import Slicer, create_slicer
+from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import ConvexProbe, Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
@@ -101,15 +101,12 @@ RESOLUTION = 1e-3
 """m, standard deviation of the Gaussian that smooths a frame to its volume's resolution."""
 
 MARGIN = 2e-3
-"""m, from the border of what the sweep covered; nearer, few frames were averaged, so that pixels
-are not compared."""
+"""m, from the border of the swept region; nearer, few frames were averaged: not compared."""
 
 SHIFT_STEP = 0.63e-3
 """m, between the shifts that are tried; about two pixels of the liver sweep."""
 
 _SHIFTS = SHIFT_STEP * np.arange(-3, 4)
-_COARSE = 5e-3  # m, standard deviation of the Gaussian that leaves no structures
-_MESH = (24, 20, 16)  # nodes along each axis of the tissue around the volume
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ class RecordedFrame(Row):
     coverage: float  # fraction of the fan in which the two are compared
     ncc_raw: float  # normalised cross-correlation with the frame as it was recorded
     ncc_smoothed: float  # with the frame smoothed to the volume's resolution
-    ncc_mirrored: float  # smoothed, left and right swapped: what a wrong image reaches
+    ncc_mirrored: float  # smoothed, left and right swapped, as of a wrong image
     grey_difference_rigid: int  # largest, between tissue at rest and the volume without tissue
 
 
@@ -138,30 +135,19 @@ class RecordedPair:
     compared: NDArray[np.bool_]  # (rows, columns), where both hold the tissue
 
 
-@dataclass(frozen=True, eq=False)
 class RecordedPairs:
-    """Makes and compares the pairs of one sweep."""
+    """Makes and compares the pairs of one sweep, with a box of tissue around the volume.
 
-    volume: Volume
-    support: Volume  # 255 where the volume holds something
-    fan: RecordedFan
-    spacing: float  # m, of the recorded pixels
-    probe: ConvexProbe
-    slicer: Slicer
-    nodes: NDArray[np.float64]  # (N, 3) m, of the tissue at rest
+    Raises:
+        VolumeError: the sweep's images are of another kind than the fan's.
+    """
 
-    @classmethod
-    def of(cls, volume: Volume, sweep: Sweep, fan: RecordedFan, method: str) -> RecordedPairs:
-        """A box of tissue around the volume, and the probe that took the sweep.
-
-        Raises:
-            VolumeError: the sweep's images are of another kind than the fan's.
-        """
+    def __init__(self, volume: Volume, sweep: Sweep, fan: RecordedFan, method: str) -> None:
         steps = sweep.image_to_reference[:, :3, :2]
         sizes = np.linalg.norm(steps, axis=1)
-        spacing = float(sizes.mean())
-        slant = np.einsum("ki,ki->k", steps[:, :, 0], steps[:, :, 1]) / spacing**2
-        if max(np.abs(sizes / spacing - 1.0).max(), np.abs(slant).max()) > 1e-3:
+        self.spacing = float(sizes.mean())  # m, of the recorded pixels
+        slant = np.einsum("ki,ki->k", steps[:, :, 0], steps[:, :, 1]) / self.spacing**2
+        if max(np.abs(sizes / self.spacing - 1.0).max(), np.abs(slant).max()) > 1e-3:
             raise VolumeError(
                 f"{sweep.path}: its pixels are not squares of one size ({1e3 * sizes.min():g} to "
                 f"{1e3 * sizes.max():g} mm); give a sweep that was taken at one depth"
@@ -171,19 +157,13 @@ class RecordedPairs:
                 f"{sweep.path}: its images of {sweep.columns} × {sweep.rows} pixels do not hold "
                 f"the probe's fan; give the sweep that this fan belongs to"
             )
-        mesh = box_mesh(
-            *(uniform_planes(a, b, n) for a, b, n in zip(*volume.extent, _MESH, strict=True))
-        )
-        support = np.where(volume.intensities > 0, np.uint8(255), np.uint8(0))
-        return cls(
-            volume,
-            Volume(support, volume.index_to_patient),
-            fan,
-            spacing,
-            fan.probe(spacing),
-            create_slicer(method, volume, mesh.nodes, mesh.tetrahedra),
-            mesh.nodes,
-        )
+        sides = zip(*volume.extent, (24, 20, 16), strict=True)
+        mesh = box_mesh(*(uniform_planes(a, b, n) for a, b, n in sides))
+        covered = np.where(volume.intensities > 0, np.uint8(255), np.uint8(0))
+        self.volume, self.fan, self.probe = volume, fan, fan.probe(self.spacing)
+        self.support = Volume(covered, volume.index_to_patient)
+        self.slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
+        self.nodes = mesh.nodes  # (N, 3) m, of the tissue at rest
 
     def pair(self, sweep: Sweep, index: int, image: NDArray[np.uint8]) -> RecordedPair:
         """A recorded frame, and the volume cut at its pose.
@@ -224,7 +204,7 @@ class RecordedPairs:
     def best_shift(self, pair: RecordedPair) -> NDArray[np.float64]:
         """(3,) m, along x, y, z of the probe: how far to move the cut for the best fit.
 
-        Judged by structures of 1 to 5 mm, since what is larger hardly minds a shift.
+        Judged by structures of 1 to 5 mm, since larger ones hardly mind a shift.
         """
         recorded = self._structures(pair.recorded)
         simulated = self._structures(pair.simulated)
@@ -245,18 +225,18 @@ class RecordedPairs:
         return np.array(max(found, key=lambda shift: (found[shift], -np.linalg.norm(shift))))
 
     def _covered(self, plane: SlicePlane) -> NDArray[np.bool_]:
-        """(rows, columns): in the fan, and not near the border of what the sweep covers."""
+        """(rows, columns): in the fan, and not near the border of the swept region."""
         covered = (sample_plane(self.support, plane) == 255) & plane.is_shown()
         width = 2 * round(MARGIN / self.spacing) + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
-        # The image's own border is one too, which is not what erosion does unasked.
+        # The image's own border counts too.
         eroded = cv2.erode(
             covered.astype(np.uint8), disc, borderType=cv2.BORDER_CONSTANT, borderValue=0
         )
         return np.asarray(eroded, dtype=np.bool_)
 
     def _structures(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        return self._smoothed(image, RESOLUTION) - self._smoothed(image, _COARSE)
+        return self._smoothed(image, RESOLUTION) - self._smoothed(image, 5e-3)
 
     def _smoothed(self, image: NDArray[np.uint8], width: float) -> NDArray[np.float32]:
         """By a Gaussian of that standard deviation, m."""
@@ -413,7 +393,7 @@ def compare_with_recorded(
             covers nothing of a frame.
     """
     volume, sweep = read_volume(volume_file), read_sweep(sweep_file)
-    frames = RecordedPairs.of(volume, sweep, fan, method)
+    frames = RecordedPairs(volume, sweep, fan, method)
     chosen = list(range(0, len(sweep.numbers), 10 if quick else 1))
     shown = {chosen[i] for i in np.linspace(0, len(chosen) - 1, 6).round().astype(int)}
     rows, pairs, shifts = [], [], []

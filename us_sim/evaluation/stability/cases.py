@@ -62,7 +62,7 @@ MOTIONS = (
 
 @dataclass(frozen=True)
 class StabilityCase:
-    """One tissue, how it is held, and what the probe does to it."""
+    """One tissue, its support, and the motion of the probe."""
 
     case: str
     young_modulus: float = 1e4  # Pa, of the softest tetrahedron

@@ -99,7 +99,6 @@ class Tried(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """By column; None where the method or a refused case has no such value."""
         trial, method = self.trial, TISSUE_METHODS[self.method]
         varied = {entry.name: None for entry in fields(StabilityCase)}
         if self.case is not None:
@@ -440,7 +439,7 @@ REFUSALS: dict[str, Callable[[str], None]] = {
     "a state that is not a number": lambda m: _state(m, np.nan),
     "a state of another mesh": lambda m: _state(m, 0.0, 9),
 }
-"""Each gives a method one broken input, by what is wrong with it."""
+"""Functions that give a method one broken input, by its fault."""
 
 
 def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]:

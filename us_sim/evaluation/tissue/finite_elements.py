@@ -49,6 +49,8 @@ except ImportError as error:
         "pip install 'us_sim[evaluate]'"
     ) from error
 
+Array = NDArray[np.float64]
+
 _DEGREE = 3  # of the smoothing polynomial
 _SMOOTHED = 20.0  # the smoother acts on eigenvalues down to the largest over this
 
@@ -80,11 +82,11 @@ class TwoLevel:
         )
         self._largest = 1.1 * self._largest_eigenvalue()
 
-    def __call__(self, right: NDArray[np.float64], tolerance: float) -> NDArray[np.float64]:
+    def __call__(self, right: Array, tolerance: float) -> Array:
         """(3N,) solution with a residual below ``tolerance`` times the right-hand side's norm.
 
         Where the matrix turns out not to be positive definite, which ``is_definite`` says then, the
-        search ends at what was found before, which still descends.
+        search ends at the solution so far, which still descends.
         """
         self.is_definite = True
         solution = np.zeros_like(right)
@@ -108,16 +110,14 @@ class TwoLevel:
             direction = preconditioned + (slope / before) * direction
         return solution
 
-    def _cycle(self, residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _cycle(self, residual: Array) -> Array:
         """Smooth, correct on the coarse level, smooth."""
         solution = self._smoothed(np.zeros_like(residual), residual)
         left = residual - self._matrix @ solution
         solution += self._up @ self._coarse.solve(self._down @ left)
         return self._smoothed(solution, residual)
 
-    def _smoothed(
-        self, solution: NDArray[np.float64], right: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _smoothed(self, solution: Array, right: Array) -> Array:
         high, low = self._largest, self._largest / _SMOOTHED
         centre, radius = 0.5 * (high + low), 0.5 * (high - low)
         step = self._over_diagonal(right - self._matrix @ solution) / centre
@@ -131,7 +131,7 @@ class TwoLevel:
             solution = solution + step
         return solution
 
-    def _over_diagonal(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _over_diagonal(self, vector: Array) -> Array:
         return np.einsum("nij,nj->ni", self._inverse, vector.reshape(-1, 3)).ravel()
 
     def _largest_eigenvalue(self) -> float:
@@ -218,7 +218,7 @@ class NeoHookeanHexahedra:
         self._element_of_cell[tuple(cells.T)] = np.arange(len(cells))
         self._shape_functions, self._mapping = basis.elem, basis.mapping
 
-    def energy(self, displacement: NDArray[np.float64]) -> float:
+    def energy(self, displacement: Array) -> float:
         """J, stored at a displacement (N, 3)."""
         gradient = self._deformation_gradient(displacement)
         ratio = np.linalg.det(gradient) - 1.0
@@ -227,7 +227,7 @@ class NeoHookeanHexahedra:
         density += 0.5 * self._linear * (ratio @ self._projection.T) ** 2
         return float((self._weights * density).sum())
 
-    def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    def forces(self, displacement: Array) -> Array:
         """(N, 3) N, derivative of the energy."""
         gradient = self._deformation_gradient(displacement)
         pressure = self._pressure(gradient)
@@ -243,7 +243,7 @@ class NeoHookeanHexahedra:
             axis=1,
         )
 
-    def stiffness(self, displacement: NDArray[np.float64]) -> bsr_array:
+    def stiffness(self, displacement: Array) -> bsr_array:
         """(3N, 3N) N/m, second derivative of the energy, in 3x3 blocks."""
         gradient = self._deformation_gradient(displacement)
         blocks = np.zeros((9, len(self._columns)))
@@ -259,24 +259,24 @@ class NeoHookeanHexahedra:
         data = np.ascontiguousarray(blocks.T).reshape(-1, 3, 3)
         return bsr_array((data, self._columns, self._start), shape=(size, size))
 
-    def volume(self, displacement: NDArray[np.float64]) -> float:
+    def volume(self, displacement: Array) -> float:
         """m3, of the deformed box."""
         return float(
             (self._weights * np.linalg.det(self._deformation_gradient(displacement))).sum()
         )
 
-    def smallest_volume_ratio(self, displacement: NDArray[np.float64]) -> float:
+    def smallest_volume_ratio(self, displacement: Array) -> float:
         """The least determinant of the deformation gradient at a quadrature point."""
         return float(np.linalg.det(self._deformation_gradient(displacement)).min())
 
-    def at(self, field: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, field: Array, points: Array) -> Array:
         """(P, D), a nodal field (N, D) interpolated at rest positions (P, 3) m in the box."""
         elements = self._element_of_cell[tuple(self._cells(points).T)]
         local = self._mapping.invF(points.T[:, :, None], elements)[:, :, 0]
         values = np.stack([self._shape_functions.lbasis(local, i)[0] for i in range(27)], axis=1)
         return np.einsum("pa,pad->pd", values, field[self.elements[elements]])
 
-    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
+    def _cells(self, points: Array) -> NDArray[np.intp]:
         """(P, 3) cell between the planes in which each point lies."""
         return np.stack(
             [
@@ -297,14 +297,14 @@ class NeoHookeanHexahedra:
         self._columns = (pairs % count).astype(np.int32)
         self._start = np.searchsorted(pairs, np.arange(count + 1) * count).astype(np.int32)
 
-    def _deformation_gradient(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _deformation_gradient(self, displacement: Array) -> Array:
         """(M, Q, 3, 3)."""
         count = len(self.elements)
         local = displacement[self.elements].swapaxes(1, 2)  # (M, 3, 27)
         product = local @ self._gradients.reshape(count, 27, -1)
         return product.reshape(count, 3, -1, 3).swapaxes(1, 2) + np.eye(3)
 
-    def _local_stiffness(self, gradient: NDArray[np.float64], batch: slice) -> NDArray[np.float64]:
+    def _local_stiffness(self, gradient: Array, batch: slice) -> Array:
         """(B, 729, 9) N/m of each pair of nodes, of a batch of elements."""
         count, points = gradient.shape[:2]
         cofactor = _cofactor(gradient)
@@ -329,21 +329,21 @@ class NeoHookeanHexahedra:
         local += bulk.reshape(count, 27, 3, 27, 3).swapaxes(2, 3).reshape(count, -1, 9)
         return local
 
-    def _pressure(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _pressure(self, gradient: Array) -> Array:
         """(M, Q) Pa, the factor of the cofactor in the stress."""
         ratio = np.linalg.det(gradient) - 1.0
         linear = self._linear * (ratio @ self._projection.T)
         return self._own * ratio - self._shear + linear
 
 
-def _onto_linear(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def _onto_linear(points: Array, weights: Array) -> Array:
     """(Q, Q), from values at quadrature points (3, Q) of a box to the nearest linear function's."""
     linear = np.vstack([np.ones(points.shape[1]), points]).T  # (Q, 4)
     weighted = linear * weights[:, None]
     return linear @ np.linalg.solve(linear.T @ weighted, weighted.T)
 
 
-def _cofactor(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cofactor(matrix: Array) -> Array:
     """The derivative of the determinant of (..., 3, 3) matrices."""
     rows = [np.cross(matrix[..., (i + 1) % 3, :], matrix[..., (i + 2) % 3, :]) for i in range(3)]
     return np.stack(rows, axis=-2)
@@ -384,13 +384,13 @@ class LinearEquations:
         self._spread = self._average.T.tocsr()
         self._nodal = float(split.nodal[0]) * volume  # (N,) Pa m3
 
-    def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    def forces(self, displacement: Array) -> Array:
         """(N, 3) N, that hold the tissue at a displacement (N, 3) m."""
         return self._product(displacement.ravel()).reshape(-1, 3)
 
     def solve(
-        self, touched: NDArray[np.int32], normals: NDArray[np.float64], depths: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        self, touched: NDArray[np.int32], normals: Array, depths: Array
+    ) -> tuple[Array, Array]:
         """Equilibrium with known displacements of the touched nodes along their normals.
 
         Args:
@@ -399,14 +399,14 @@ class LinearEquations:
             depths: (K,) m.
 
         Returns:
-            (N, 3) m, displacement, and (K,) N, what pushes the touched nodes along the normals.
+            (N, 3) m, displacement, and (K,) N, contact forces along the normals.
 
         Raises:
             SolverError: SciPy's conjugate gradients did not converge.
         """
         free = np.repeat(~self._model.fixed, 3).astype(float)
 
-        def project(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        def project(vector: Array) -> Array:
             kept = (vector * free).reshape(-1, 3)
             along = np.einsum("ij,ij->i", kept[touched], normals)
             kept[touched] -= along[:, None] * normals
@@ -428,5 +428,5 @@ class LinearEquations:
         pushes = np.einsum("ij,ij->i", self.forces(displacement)[touched], normals)
         return displacement, pushes
 
-    def _product(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _product(self, vector: Array) -> Array:
         return self._matrix @ vector + self._spread @ (self._nodal * (self._average @ vector))

@@ -63,7 +63,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The method, its settings, and the press."""
         return f"{self.method} ({self.setting}), {self.scene}, {self.nodes:,} nodes"
 
 

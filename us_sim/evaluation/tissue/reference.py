@@ -37,6 +37,8 @@ from us_sim.geometry.collider import Collider
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 
+Array = NDArray[np.float64]
+
 _SOFT = 200.0
 """Penalty, Pa/m over Young's modulus, of the first poses: a soft contact is found in few steps."""
 _HARDER = (200.0, 200.0, 1000.0, 5000.0, 20000.0)
@@ -57,18 +59,18 @@ class Solution:
     """The equilibrium under the last pose."""
 
     block: NeoHookeanHexahedra  # the half with y >= 0
-    displacement: NDArray[np.float64]  # (N, 3) m
-    pressure: NDArray[np.float64]  # (S,) Pa, of the probe on the block's surface points
-    force: NDArray[np.float64]  # (3,) N, of the whole tissue on the probe, frame probe
+    displacement: Array  # (N, 3) m
+    pressure: Array  # (S,) Pa, of the probe on the block's surface points
+    force: Array  # (3,) N, of the whole tissue on the probe, frame probe
     volume: float  # m3, of the whole deformed block
     penetration: float  # m, the deepest point of the surface inside the probe
 
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, points: Array) -> Array:
         """(P, 3) m, displacement of rest positions (P, 3) m anywhere in the block."""
         side = np.where(points[:, 1:2] < 0, -1.0, 1.0) * [[0, 1, 0]] + [[1, 0, 1]]
         return self.block.at(self.displacement, points * side) * side
 
-    def pressure_near(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pressure_near(self, points: Array) -> Array:
         """(P,) Pa at the surface points that are nearest to rest positions (P, 3) m."""
         return self.pressure[cKDTree(self.block.surface_points).query(points)[1]]
 
@@ -149,9 +151,7 @@ class _Search:
         self._mask = _diagonal(self.free.ravel().astype(float))
         self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
 
-    def pressure(
-        self, pose: Pose
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def pressure(self, pose: Pose) -> tuple[Array, Array, Array]:
         """At the surface points: Pa (S,), the direction of the push (S, 3), curvature (S, 3, 3)."""
         gap, normal, curvature = self._distance(pose)
         return np.maximum(self.push - self.penalty * gap, 0.0), normal, curvature
@@ -188,7 +188,7 @@ class _Search:
             f"the pose in smaller steps or on a finer mesh"
         )
 
-    def _step(self, pose: Pose, unbalanced: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step(self, pose: Pose, unbalanced: Array) -> Array:
         """(N, 3) m, of Newton's method; with a stiffer tangent where that is not definite."""
         tangent = self._tangent(pose)
         for part in _STIFFENED:
@@ -206,7 +206,7 @@ class _Search:
         contact = (self.block.surface_weights * pressure**2).sum() / (2 * self.penalty)
         return self.block.energy(self.displacement) + float(contact)
 
-    def _unbalanced(self, pose: Pose) -> tuple[NDArray[np.float64], float]:
+    def _unbalanced(self, pose: Pose) -> tuple[Array, float]:
         """Forces (N, 3) N that nothing balances, and the norm of the contact forces."""
         pressure, normal, _ = self.pressure(pose)
         weighted = (self.block.surface_weights * pressure)[:, None] * normal
@@ -231,9 +231,7 @@ class _Search:
         held = _diagonal(1.0 - self.free.ravel())
         return (self._mask @ matrix @ self._mask + held).tobsr((3, 3))
 
-    def _distance(
-        self, pose: Pose
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _distance(self, pose: Pose) -> tuple[Array, Array, Array]:
         """Gap (S,) m of the surface points to the probe, its gradient and its second derivative."""
         points = self.block.surface_points + self.block.surface_values @ self.displacement
         *half, rounding = self.collider.offset_box
@@ -252,7 +250,7 @@ def _diagonal(entries: NDArray[np.floating]) -> dia_array:
     return dia_array((entries[None], [0]), shape=2 * entries.shape)
 
 
-def _movable(block: NeoHookeanHexahedra, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
     """(P, 3): all but the bottom, and not out of the mirror plane."""
     free = np.ones(points.shape, dtype=bool)
     free[np.isclose(points[:, 1], block.planes[1][0]), 1] = False
@@ -260,7 +258,7 @@ def _movable(block: NeoHookeanHexahedra, points: NDArray[np.float64]) -> NDArray
     return free
 
 
-def _trilinear(planes: Sequence[NDArray[np.float64]], points: NDArray[np.float64]) -> csr_array:
+def _trilinear(planes: Sequence[Array], points: Array) -> csr_array:
     """(P, K), interpolation from the grid's K nodes, the last axis fastest, to points (P, 3)."""
     shape = tuple(len(coordinates) for coordinates in planes)
     cells, fractions = [], []
@@ -371,7 +369,7 @@ def _approach(scene: Scene) -> list[Pose]:
     return [*poses, scene.path[-1]]
 
 
-def _hash(scene: Scene, planes: tuple[NDArray[np.float64], ...]) -> str:
+def _hash(scene: Scene, planes: tuple[Array, ...]) -> str:
     """Of everything that decides the solution, the code included."""
     digest = hashlib.sha256()
     for file in (str(finite_elements.__file__), __file__):

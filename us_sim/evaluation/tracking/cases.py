@@ -24,6 +24,8 @@ from us_sim.share import shared_path
 from us_sim.tracking.camera.rendered_views import WEBCAMS, Conditions
 from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
+Array = NDArray[np.float64]
+
 SMALL, LARGE = WEBCAMS  # images, by their sizes
 RIGID_BODY, SINGLE = "rigid_body_6x30mm", "aruco_40mm"
 FRAMES = 5
@@ -65,7 +67,7 @@ class Marker:
         return self.make()
 
     @cached_property
-    def front(self) -> NDArray[np.float64]:
+    def front(self) -> Array:
         """(3,) unit, of the side that the camera is before at an angle of 0."""
         return self.body.normals[0] if self.facing is None else np.array(self.facing)
 
@@ -131,13 +133,13 @@ class Case:
         poses = []
         for frame in range(FRAMES):
             moved = exp((frame - FRAMES // 2) / _RATE * velocity)
-            # About the body's middle, which is what the case says the distance of.
+            # About the body's middle, whose distance is the case's.
             turned = Pose(np.zeros(3), (moved @ asked).orientation)
             position = place + moved.position - turned.rotation @ middle
             poses.append(Pose(position, turned.orientation))
         return poses
 
-    def velocity(self, number: int) -> NDArray[np.float64]:
+    def velocity(self, number: int) -> Array:
         """(6,) m/s and rad/s, of a sequence's middle, along the camera's axes."""
         random = np.random.default_rng([zlib.crc32(repr(self).encode()), number, 1])
         directions = random.normal(size=(2, 3))
@@ -145,7 +147,7 @@ class Case:
         haste = _HASTE if self.condition == "blur" else 1.0
         return haste * np.concatenate([_SPEED * directions[0], _TURNING * directions[1]])
 
-    def motion(self, number: int) -> NDArray[np.float64] | None:
+    def motion(self, number: int) -> Array | None:
         """(6,) from the beginning to the end of the exposure; None where it is too short."""
         return _EXPOSURE * self.velocity(number) if self.condition == "blur" else None
 
@@ -167,11 +169,11 @@ def cases(quick: bool) -> list[Case]:
     return found
 
 
-def _turn(vector: NDArray[np.float64]) -> Pose:
+def _turn(vector: Array) -> Pose:
     return Pose(np.zeros(3), rotation_exp(vector))
 
 
-def _between(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+def _between(one: Array, other: Array) -> Array:
     """(3,) rad, of the shortest rotation from one direction to another."""
     one, other = one / np.linalg.norm(one), other / np.linalg.norm(other)
     axis = np.cross(one, other)

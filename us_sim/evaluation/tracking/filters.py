@@ -27,6 +27,8 @@ from us_sim.tracking.filters import create_filter
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import KalmanSettings, OneEuroSettings
 
+Array = NDArray[np.float64]
+
 FILTER_METHODS = {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")}
 """By name, the colour and the mark of its points in a plot."""
 
@@ -36,7 +38,7 @@ _MOVING, _REST = 8.0, 8.0  # s
 _SWAY = ((0.25, 0.035, 0.25), (0.9, 0.009, 0.12), (2.3, 0.0012, 0.015))
 """Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor."""
 
-_Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+_Path = Callable[[Array], Array]
 FilterTrial = tuple[str, Settings | None, str]
 """A filter's name, its settings, and those in words."""
 
@@ -54,14 +56,13 @@ class FilterPoint(Row):
     rotation_lag: float  # s
     jitter: float  # m, at rest, root mean square over all three coordinates
     rotation_jitter: float  # rad
-    moving_jitter: float  # m, of what is left when the lag is taken out
+    moving_jitter: float  # m, without the lag
     error: float  # m, root mean square to where the probe is at that moment
-    stated: float  # s, what the filter itself says of its lag, in motion
+    stated: float  # s, the lag that the filter itself states, in motion
     seconds: float  # a pose
 
     @property
     def values(self) -> dict[str, object]:
-        """By column."""
         return {
             "filter": self.method,
             "setting": self.setting,
@@ -101,7 +102,7 @@ def filter_trials(quick: bool) -> list[FilterTrial]:
     return tried
 
 
-def delay(times: NDArray[np.float64], values: NDArray[np.float64], path: _Path) -> float:
+def delay(times: Array, values: Array, path: _Path) -> float:
     """s by which values (K, d) at times (K,) are behind a path, by least squares.
 
     The path is known at any time, so this is the peak of the correlation between grid points too.
@@ -162,7 +163,7 @@ def filter_point(method: str, settings: Settings | None, words: str) -> FilterPo
     )
 
 
-def _swayed(times: NDArray[np.float64], what: int) -> NDArray[np.float64]:
+def _swayed(times: Array, what: int) -> Array:
     """(K, 3) m or rad: the hand sways, comes to rest, and stays there."""
     ease = np.clip((_MOVING - times) / 0.5, 0.0, 1.0)
     ease = ease**3 * (10 - 15 * ease + 6 * ease**2)
@@ -178,5 +179,5 @@ def _swayed(times: NDArray[np.float64], what: int) -> NDArray[np.float64]:
 _position, _rotation = partial(_swayed, what=1), partial(_swayed, what=2)
 
 
-def _root_mean_square(values: NDArray[np.float64]) -> float:
+def _root_mean_square(values: Array) -> float:
     return float(np.sqrt((values**2).sum(axis=1).mean()))

@@ -71,7 +71,6 @@ class Point(Row):
 
     @property
     def values(self) -> dict[str, object]:
-        """Summary of the case's views, by column."""
         found = self.found
         return {
             "marker": self.case.marker,
@@ -99,7 +98,6 @@ class Point(Row):
 
     @property
     def title(self) -> str:
-        """The case."""
         return str(self.case)
 
     @property
@@ -126,7 +124,7 @@ class Point(Row):
         return percentile([view.degrees for view in self.found], percent)
 
 
-def those(points: Sequence[Point], **case: object) -> list[Point]:
+def select(points: Sequence[Point], **case: object) -> list[Point]:
     """Points whose case has these values, such as ``marker="aruco_40mm", distance=0.4``."""
     wanted = case.items()
     return [p for p in points if all(getattr(p.case, name) == value for name, value in wanted)]
@@ -134,7 +132,7 @@ def those(points: Sequence[Point], **case: object) -> list[Point]:
 
 def views_of(points: Sequence[Point], **case: object) -> list[View]:
     """All views of these."""
-    return [view for point in those(points, **case) for view in point.views]
+    return [view for point in select(points, **case) for view in point.views]
 
 
 class Bench:

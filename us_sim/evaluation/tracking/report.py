@@ -50,9 +50,9 @@ from us_sim.evaluation.tracking.measure import (
     Point,
     SmallMarkerPoint,
     View,
+    select,
     small_marker_point,
     small_marker_trials,
-    those,
     views_of,
 )
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
@@ -200,10 +200,10 @@ def _draw_views(file: Path) -> None:
 
 def _plot_views(points: Sequence[Point], file: Path) -> None:
     """Errors of position and rotation over the distance, and over the angle at 0.4 m."""
-    views = those(points, condition="plain", image_size=SMALL)
+    views = select(points, condition="plain", image_size=SMALL)
     at: dict[str, tuple[list[Point], Callable[[Point], float]]] = {
-        "distance, m (30°)": (those(views, angle=30), lambda p: p.case.distance),
-        "angle, degrees (0.4 m)": (those(views, distance=0.4), lambda p: p.case.angle),
+        "distance, m (30°)": (select(views, angle=30), lambda p: p.case.distance),
+        "angle, degrees (0.4 m)": (select(views, distance=0.4), lambda p: p.case.angle),
     }
     title = "Error of plain views, 640 × 480 (line: median; dashed: 95th percentile)"
     with picture(file, 10.5, 7.4, title) as figure:
@@ -252,7 +252,7 @@ def _plain(panel: Axes) -> None:
 
 def _plot_run_time(points: Sequence[Point], file: Path) -> None:
     """Median error against processor time: every body at 0.4 m, in images of both sizes."""
-    mine = those(points, condition="plain", distance=0.4)
+    mine = select(points, condition="plain", distance=0.4)
     title = "Error against run time at 0.4 m (full: 640 × 480; hollow: 1920 × 1080)"
     with picture(file, 10.5, 4.6, title) as figure:
         panels = figure.subplots(1, 2, sharex=True)
@@ -262,7 +262,7 @@ def _plot_run_time(points: Sequence[Point], file: Path) -> None:
         ):
             for name, kind in MARKERS.items():
                 for size in (SMALL, LARGE):
-                    some = those(mine, marker=name, image_size=size)
+                    some = select(mine, marker=name, image_size=size)
                     panel.plot(
                         [p.cpu_ms for p in some],
                         [value(p, 50) for p in some],
@@ -280,7 +280,7 @@ def _plot_run_time(points: Sequence[Point], file: Path) -> None:
 
 def _plot_conditions(points: Sequence[Point], file: Path) -> None:
     """Error, and how many views in a hundred show the body to the tracker, in every condition."""
-    mine = those(points, image_size=SMALL, distance=0.4, angle=30)
+    mine = select(points, image_size=SMALL, distance=0.4, angle=30)
     places, width = np.arange(len(CONDITIONS)), 0.8 / len(MARKERS)
     with picture(file, 10.5, 6.6, "Conditions at 0.4 m and 30°, 640 × 480") as figure:
         panels = figure.subplots(3, 1, sharex=True)
@@ -288,7 +288,7 @@ def _plot_conditions(points: Sequence[Point], file: Path) -> None:
             columns: list[tuple[float, float, float]] = []
             for condition in CONDITIONS:
                 columns.append((np.nan,) * 3)
-                for p in those(mine, marker=name, condition=condition)[:1]:
+                for p in select(mine, marker=name, condition=condition)[:1]:
                     percent = 100 * len(p.found) / max(1, len(p.views))
                     columns[-1] = (p.error(95), p.turned(95), percent)
             at = places + (place - 0.5 * (len(MARKERS) - 1)) * width
@@ -333,7 +333,7 @@ def _plot_filters(points: Sequence[FilterPoint], file: Path) -> None:
 
 def _bodies(points: Sequence[Point]) -> str:
     rows = []
-    views = [p for p in those(points, condition="plain") if p.views]
+    views = [p for p in select(points, condition="plain") if p.views]
     for name in MARKERS:
         for size in dict.fromkeys(p.case.image_size for p in views):
             for distance in sorted({p.case.distance for p in views}):
@@ -357,10 +357,10 @@ def _cells(views: Sequence[View]) -> tuple[str, ...]:
 def _times(points: Sequence[Point]) -> str:
     head = ("body", "image", "CPU ms an image", "detector, CPU ms", "solver, CPU ms")
     rows = []
-    near = those(points, condition="plain", distance=0.4)
+    near = select(points, condition="plain", distance=0.4)
     for name in MARKERS:
         for size in dict.fromkeys(p.case.image_size for p in near):
-            mine = [p for p in those(near, marker=name, image_size=size) if p.views]
+            mine = [p for p in select(near, marker=name, image_size=size) if p.views]
             if mine:
                 cells = [
                     [view.cpu_ms for p in mine for view in p.views],
@@ -372,7 +372,7 @@ def _times(points: Sequence[Point]) -> str:
 
 
 def _conditions(points: Sequence[Point]) -> str:
-    near = those(points, image_size=SMALL, distance=0.4)
+    near = select(points, image_size=SMALL, distance=0.4)
     rows = [
         (name, condition, *_cells(views_of(near, marker=name, condition=condition)))
         for name in MARKERS

@@ -79,22 +79,20 @@ class Point(Row):
     skipped: float = np.nan  # of 100 poses those without an image
     ages: Sequence[float] = ()  # ms, from a pose to its image in the graph
     shown: float = np.nan  # images a second in the page that gets the fewest
-    delay_median: float = np.nan  # ms, from what a person does to the image in the page
+    delay_median: float = np.nan  # ms, from a person's action to the image in the page
     delay_p99: float = np.nan
     delays: float = np.nan  # how many of these there are
     started: float = np.nan  # s, from the command to the first image in a page
     opened: float = np.nan  # s, from opening the page in a browser to its first image
-    usage: Mapping[str, UsageOverTime] = field(default_factory=dict)  # by what the process is
+    usage: Mapping[str, UsageOverTime] = field(default_factory=dict)  # by the process's name
     failure: str = ""
 
     @property
     def title(self) -> str:
-        """The case."""
         return str(self.case)
 
     @property
     def values(self) -> dict[str, object]:
-        """The case, then images a second, ms, s, cores and MB."""
         use = self.usage
         return {
             "case": str(self.case),
@@ -316,10 +314,6 @@ class Taker:
             time.sleep(max(0.0, began + number / COMMAND_RATE - time.monotonic()))
 
 
-_START_S = 300.0  # the first run compiles
-_WARMING_S = 2.0  # of images that do not count
-_STOP_S = 20.0
-_SAMPLE_S = 2.0
 _ADDRESS = re.compile(r"http://\S+")
 
 
@@ -333,20 +327,20 @@ def run_case(case: Case, tell: Tell) -> Point:
     with listening(viewer=False) as arrivals, _command(case) as command:
         pages = _Pages(case, command)
         try:
-            deadline = time.monotonic() + _START_S
+            deadline = time.monotonic() + 300.0  # the first run compiles
             while not arrivals.heard("ultrasound/image") and not pages.images():
                 command.check()
                 if time.monotonic() > deadline:
-                    raise UsSimError(f"no image came in {_START_S:g} s")
+                    raise UsSimError("no image came in 300 s")
                 time.sleep(0.02)
-            pages.wait(_WARMING_S)
+            pages.wait(2.0)  # these images do not count
             usage = UsageByName()
             began, began_ns, shown = time.monotonic(), time.time_ns(), pages.images()
             while (passed := time.monotonic() - began) < case.seconds:
                 command.check()
                 usage.update(started_by(command.pid) | started_by(os.getpid()))
                 tell(passed, f"{len(arrivals.heard('ultrasound/image'))} images")
-                pages.wait(min(_SAMPLE_S, case.seconds - passed))
+                pages.wait(min(2.0, case.seconds - passed))
             ended_ns, seconds = time.time_ns(), time.monotonic() - began
             drawn = [(b - a) / seconds for a, b in zip(shown, pages.images(), strict=True)]
             median, p99, count = pages.delays()
@@ -374,7 +368,7 @@ def run_case(case: Case, tell: Tell) -> Point:
 
 
 class _Pages:
-    """Those that look, of both kinds."""
+    """Pages of both kinds."""
 
     def __init__(self, case: Case, command: _Command) -> None:
         self._case = case
@@ -396,7 +390,7 @@ class _Pages:
             self.started = time.monotonic() - command.began
 
     def images(self) -> list[int]:
-        """How many each has got."""
+        """Number of images of each."""
         drawn = self._browser.images() if self._browser else []
         return [*drawn, *(len(taker.images) for taker in self._takers)]
 
@@ -448,8 +442,8 @@ class _Command:
         """That it has printed."""
         while not (found := _ADDRESS.search(self.said())):
             self.check()
-            if time.monotonic() - self.began > _START_S:
-                raise UsSimError(f"us-sim has printed no address in {_START_S:g} s")
+            if time.monotonic() - self.began > 300.0:
+                raise UsSimError("us-sim has printed no address in 300 s")
             time.sleep(0.005)
         return found[0]
 
@@ -473,7 +467,7 @@ def _command(case: Case) -> Iterator[_Command]:
             yield _Command(process, output, began)
         finally:
             process.send_signal(signal.SIGINT)
-            killer = threading.Timer(_STOP_S, process.kill)
+            killer = threading.Timer(20.0, process.kill)
             killer.start()
             process.wait()
             killer.cancel()

@@ -49,9 +49,9 @@ def sample_spans(
         voxels: (I*J*K,) uint8, shape: (3,) its sides; where K is 1 each voxel is there twice.
         maps, inside: as `cut_polygons.Cuts`; the map with the number ``rigid`` is that of pixels
             outside the mesh.
-        spans, used, runs: as for `spans.convert_cuts`.
+        spans, used, runs: as for `cut_polygons.convert_cuts`.
         is_covered: whether the spans are known to leave no pixel out; then there need be no
-            outline. outlines … outline_number: as `rest_outline.Outline`.
+            outline. outlines … outline_number: as `cut_polygons.Outline`.
         image: (rows, columns) uint8, filled here.
     """
     columns = image.shape[1]

@@ -140,11 +140,11 @@ class ParameterSections:
         self._body = ui.element("div").classes("us-sections")
 
     def watch(self) -> None:
-        """Somebody begins to look."""
+        """Follow the node's parameters."""
         self._board.watch(self._node)
 
     def unwatch(self) -> None:
-        """Nobody looks any more."""
+        """Follow them no longer."""
         self._board.unwatch(self._node)
 
     def refresh(self) -> None:

@@ -22,7 +22,7 @@ ANOTHER = (
     "loaded"
 )
 EVERY_S = 0.3
-"""How often it is looked whether something has changed."""
+"""How often the panels are brought up to date."""
 BY_HAND = ("", "pose")
 """Trackers of scenes that differ from others in more than their tracker."""
 
@@ -138,9 +138,6 @@ def build_cases(simulator: Simulator) -> None:
     _Cases(simulator)
 
 
-RATED_S = 5.0
-"""After which a recording's rate is known well enough to say how long there is room."""
-SHORT_MIN = 10.0
 SETTLE_S = 1.5
 """For what a person asked for to be so; until then controls stay as they were set."""
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
@@ -149,7 +146,6 @@ KINDS_TOLD = (
     "The probe's path moves the probe of the simulation. All as recorded takes the simulation's "
     "place; when you end it the nodes start again, with what was set before"
 )
-KINDS_FIXED = "While something is replayed this cannot be changed: end the replay first"
 
 
 class _Session:
@@ -251,7 +247,8 @@ class _Session:
         for control in (self._close, self._time):
             control.set_enabled(plays)
         self._kind.set_enabled(not plays)
-        self._kind_told.props["title"] = KINDS_FIXED if plays else KINDS_TOLD
+        fixed = "While something is replayed this cannot be changed: end the replay first"
+        self._kind_told.props["title"] = fixed if plays else KINDS_TOLD
         end = round(state.duration, 2)
         if end not in (0.0, self._time.props["max"]):
             self._time.props["max"] = end
@@ -349,13 +346,11 @@ def recorded(state: SessionState) -> tuple[str, bool]:
     minutes, rest = divmod(int(seconds), 60)
     shown = f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"
     told = f": {minutes}:{rest:02} min, {shown}"
-    if not size or seconds < RATED_S:
+    if not size or seconds < 5.0:  # the rate is not known well enough
         return f"{told}, room for {room / 1e9:.1f} GB", False
     left = room / size * seconds / 60.0
-    return (
-        f"{told}, room for {f'{left / 60:.0f} h' if left > 120 else f'{left:.0f} min'}",
-        left < SHORT_MIN,
-    )
+    room_for = f"{left / 60:.0f} h" if left > 120 else f"{left:.0f} min"
+    return f"{told}, room for {room_for}", left < 10.0
 
 
 def _proposed() -> str:

@@ -19,11 +19,7 @@ from us_sim.volume.deidentification.settings import Rectangle
 
 _STILL = 12  # grey levels by which the same letter differs between images; JPEG makes about ten
 _STROKE = 11  # px, wider than the strokes of the largest letters
-_CONTRAST = 45  # grey levels, of one image
-_STILL_CONTRAST = 16  # of three or more, where what stands still is little else than text
 _HEIGHTS = (5, 60)  # px
-_SMALL = 600  # px, rows or columns of a picture whose letters may touch
-_LETTERS = 3  # on a line, at least
 
 
 @dataclass(frozen=True)
@@ -41,29 +37,62 @@ class _Glyphs:
 
 
 def find_text(images: Sequence[NDArray[np.uint8]]) -> list[Rectangle]:
-    """Lines of what may be text, from the top down.
+    """Lines of possible text, from the top down.
 
     Args:
         images: (rows, columns) of equal size; several, from all over a recording, tell text from
-            what moves.
+            moving echoes.
     """
     stack = np.stack(images)
     low, high = stack.min(axis=0), stack.max(axis=0)
     still = (high - low) <= _STILL
-    contrast = _CONTRAST if len(images) < 3 else _STILL_CONTRAST
+    # Grey levels; in three images or more hardly anything but text stands still.
+    contrast = 45 if len(images) < 3 else 16
     lines = []
-    for scale in (1, 2) if min(low.shape) <= _SMALL else (1,):
+    # In a picture with few rows or columns letters may touch.
+    for scale in (1, 2) if min(low.shape) <= 600 else (1,):
         for picture in (low, 255 - high):
             lines += _lines(_glyphs(picture, still, contrast, scale), scale)
-    lines = _without_covered(lines)
-    return sorted(lines, key=lambda line: (line.top, line.left))
+    kept: list[Rectangle] = []  # each line once, where it was found at both scales
+    for line in sorted(lines, key=lambda line: -line.size[0] * line.size[1]):
+        x, y = (line.left + line.right) / 2, (line.top + line.bottom) / 2
+        if not any(one.left <= x <= one.right and one.top <= y <= one.bottom for one in kept):
+            kept.append(line)
+    return sorted(kept, key=lambda line: (line.top, line.left))
+
+
+def proposed_part(
+    images: Sequence[NDArray[np.uint8]], text: Sequence[Rectangle]
+) -> Rectangle | None:
+    """The part of images to keep, for a person to decide: the largest connected part that moves,
+    or of one image that is not black; no text.
+
+    Args:
+        images: (rows, columns) of equal size.
+        text: places of possible text.
+    """
+    stack = np.stack(images)
+    moving = np.ptp(stack, axis=0) > 16  # grey levels
+    seen = moving if moving.mean() > 0.01 else stack.max(axis=0) > 8
+    seen = seen.astype(np.uint8)
+    for line in text:
+        seen[line.slices] = 0
+    opened = cv2.morphologyEx(seen, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8))
+    count, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    if count < 2:
+        return None
+    left, top, width, height, _ = (
+        int(each) for each in stats[1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))]
+    )
+    return Rectangle(left, top, left + width - 1, top + height - 1)
 
 
 def _glyphs(
     picture: NDArray[np.uint8], still: NDArray[np.bool_], contrast: float, scale: int
 ) -> _Glyphs:
     """Strokes that stand out brightly, connected, and of a letter's size and evenness."""
-    if scale > 1:  # small letters touch one another
+    if scale > 1:
         size = (picture.shape[1] * scale, picture.shape[0] * scale)
         larger = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
         picture = np.asarray(larger, np.uint8)
@@ -82,13 +111,13 @@ def _glyphs(
     filled = area / (width * height)
     good = (_HEIGHTS[0] <= height) & (height <= _HEIGHTS[1]) & (width <= 2 * height)
     good &= (filled > 0.12) & ((filled < 0.9) | (width < 0.5 * height)) & (even > 0.5)
-    good[0] = False  # what is between the strokes
+    good[0] = False  # the background of the strokes
     edges = (left, top, left + width - 1, top + height - 1)
     return _Glyphs(*(each[good] for each in edges))
 
 
 def _lines(glyphs: _Glyphs, scale: int) -> list[Rectangle]:
-    """Glyphs of about one height, beside one another on a common base or top."""
+    """Three glyphs or more of about one height, beside one another on a common base or top."""
     order = np.argsort(glyphs.left, kind="stable")
     groups = np.arange(len(order))
     for place, a in enumerate(order):
@@ -101,41 +130,18 @@ def _lines(glyphs: _Glyphs, scale: int) -> list[Rectangle]:
     lines = []
     for group in np.unique(groups):
         members = np.flatnonzero(groups == group)
-        if len(members) >= _LETTERS and _is_line(glyphs, members):
-            lines.append(
-                Rectangle(
-                    int(glyphs.left[members].min()) // scale,
-                    int(glyphs.top[members].min()) // scale,
-                    int(glyphs.right[members].max()) // scale,
-                    int(glyphs.bottom[members].max()) // scale,
-                )
-            )
+        if len(members) >= 3 and _is_line(glyphs, members):
+            first = glyphs.left[members].min(), glyphs.top[members].min()
+            last = glyphs.right[members].max(), glyphs.bottom[members].max()
+            lines.append(Rectangle(*(int(edge) // scale for edge in (*first, *last))))
     return lines
 
 
-def _without_covered(lines: list[Rectangle]) -> list[Rectangle]:
-    """Each line once, where it was found at both scales."""
-    kept: list[Rectangle] = []
-    for line in sorted(lines, key=lambda line: -line.size[0] * line.size[1]):
-        middle = (line.left + line.right) / 2, (line.top + line.bottom) / 2
-        covered = (
-            one.left <= middle[0] <= one.right and one.top <= middle[1] <= one.bottom
-            for one in kept
-        )
-        if not any(covered):
-            kept.append(line)
-    return kept
-
-
 def _beside(glyphs: _Glyphs, a: int, b: int) -> bool:
-    heights = sorted((int(glyphs.height[a]), int(glyphs.height[b])))
+    low, high = sorted((int(glyphs.height[a]), int(glyphs.height[b])))
     between = glyphs.left[b] - glyphs.right[a]
     overlap = min(glyphs.bottom[a], glyphs.bottom[b]) - max(glyphs.top[a], glyphs.top[b])
-    return bool(
-        heights[1] <= 1.8 * heights[0]
-        and -2 <= between <= heights[1]
-        and overlap > 0.5 * heights[0]
-    )
+    return bool(high <= 1.8 * low and -2 <= between <= high and overlap > 0.5 * low)
 
 
 def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
@@ -148,34 +154,3 @@ def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
         for edge in (glyphs.bottom[members], glyphs.top[members])
     )
     return bool(aligned >= 0.7 and width > 1.5 * height)
-
-
-_MOVES = 16  # grey levels between images
-_SHINES = 8  # grey levels above black
-_CLOSE = 15  # px, gaps that are bridged
-
-
-def proposed_part(
-    images: Sequence[NDArray[np.uint8]], text: Sequence[Rectangle]
-) -> Rectangle | None:
-    """The largest connected part that moves, or of one image that is not black; no text.
-
-    Args:
-        images: (rows, columns) of equal size.
-        text: what may be text.
-    """
-    stack = np.stack(images)
-    moving = np.ptp(stack, axis=0) > _MOVES
-    seen = moving if moving.mean() > 0.01 else stack.max(axis=0) > _SHINES
-    seen = seen.astype(np.uint8)
-    for line in text:
-        seen[line.slices] = 0
-    opened = cv2.morphologyEx(seen, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((_CLOSE, _CLOSE), np.uint8))
-    count, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    if count < 2:
-        return None
-    left, top, width, height, _ = (
-        int(each) for each in stats[1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))]
-    )
-    return Rectangle(left, top, left + width - 1, top + height - 1)

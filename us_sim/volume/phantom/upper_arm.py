@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-_WAVELENGTH = 70e-3
-
 
 @dataclass(frozen=True)
 class Tube:
@@ -32,7 +30,7 @@ class Tube:
 
     def middle(self, y: float) -> tuple[float, float]:
         """(x, z) m of the centre line at y."""
-        angle = 2 * np.pi * y / _WAVELENGTH + self.phase
+        angle = 2 * np.pi * y / 70e-3 + self.phase
         return (
             self.centre[0] + self.swing[0] * float(np.sin(angle)),
             self.centre[1] + self.swing[1] * float(np.sin(0.7 * angle + 1.0)),

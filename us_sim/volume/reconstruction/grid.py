@@ -13,8 +13,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.stored_image import LARGEST_VOLUME, free_memory
 from us_sim.volume.reconstruction.settings import ImagePart
 
-_PROPOSED = 1 << 27  # voxels, where nobody asks for more
-
 
 @dataclass(frozen=True, eq=False)
 class Grid:
@@ -84,7 +82,7 @@ def proposed_spacing(
     """m: a pixel's size, or as much more as 134 million voxels around the points need."""
     along = points if axes is None else points @ axes
     size = np.maximum(np.ptp(along, axis=0), pixel)
-    needed = (math.prod(size) / _PROPOSED) ** (1 / 3)
+    needed = (math.prod(size) / (1 << 27)) ** (1 / 3)
     return pixel if needed <= pixel else math.ceil(1e5 * needed * 1.01) / 1e5
 
 

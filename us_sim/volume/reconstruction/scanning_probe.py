@@ -26,15 +26,9 @@ from us_sim.settings.registry import PROBES
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
-_OFTEN = 0.7
-"""Of some frames, in how many a pixel is not black where it was scanned: lossy compression spills
-a few grey levels beyond the border, other ones in every frame."""
-_OVERLAP = 0.95  # intersection over union of the seen pixels with the shape
 _COUNTED = 80.0  # percent of an edge's points that may not be farther off than is allowed
 _LEAST_POINTS = 16  # of an edge
-_CORNER = 0.1  # of the opening angle, beside which a fan's top is its side rather than its face
 _NARROW = math.radians(4.0)  # opening angle below which it is no fan
-_POSES = 33
 _POINT = 5e-3  # m: beams from a smaller arc are a phased array's, which all leave one place
 
 
@@ -121,7 +115,8 @@ def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
     often = np.zeros((sweep.rows, sweep.columns), dtype=np.int32)
     for image in sweep.images(picked.tolist()):
         often += image > 0
-    return np.asarray(often >= _OFTEN * len(picked))
+    # Lossy compression spills grey levels beyond the border, other ones in every frame.
+    return np.asarray(often >= 0.7 * len(picked))
 
 
 def fitted_part(
@@ -144,7 +139,7 @@ def fitted_part(
     rows, columns = np.indices(body.shape)
     x, z = columns * pixel[0], rows * pixel[1]
     best: Fan | Rectangle | None = None
-    least = _OVERLAP
+    least = 0.95  # intersection over union of the seen pixels with the shape
     for part in (_rectangle(edges), _fan(edges)):
         if part is None:
             continue
@@ -279,7 +274,8 @@ def _on_fan(
 ) -> list[NDArray[np.float64]]:
     """Of the points of four edges, those that lie where a fan's edges do."""
     angles = [np.arctan2(*(points - apex).T) for points in edges]
-    middle, corner = 0.5 * (first + last), _CORNER * (last - first)
+    # Beside a corner a fan's top is its side rather than its face.
+    middle, corner = 0.5 * (first + last), 0.1 * (last - first)
     left, right, over, under = edges
     across = (angles[2] > first + corner) & (angles[2] < last - corner)
     below = (angles[3] > first) & (angles[3] < last)
@@ -338,7 +334,7 @@ def _poses(
     middle = np.array([*((face + 0.5 * depth * ahead) / pixel), 0.0, 1.0])
     seen = (matrices @ middle)[:, :3]
     moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
-    evenly = np.linspace(0.0, moved[-1], _POSES)
+    evenly = np.linspace(0.0, moved[-1], 33)
     picked = np.unique(np.abs(moved[:, None] - evenly).argmin(axis=0))
     return tuple(_pose(matrices[k], face / pixel, ahead) for k in picked)
 

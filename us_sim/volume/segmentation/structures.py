@@ -26,9 +26,6 @@ from us_sim.volume.segmentation.region import (
 from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
 from us_sim.volume.volume import LabelMap, Volume
 
-_BYTES = 40
-"""Memory of a voxel that is looked at: some images in single precision, and parts as numbers."""
-
 Progress = Callable[[float, str], None]
 
 
@@ -77,7 +74,8 @@ def _found(
     spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
     seeds = seeds_of(volume, name, asked)
     box = box_of(volume, name, asked, seeds, spacing)
-    needed = _BYTES * float(np.prod([span.stop - span.start for span in box]))
+    # Bytes: some images in single precision, and parts as numbers.
+    needed = 40 * float(np.prod([span.stop - span.start for span in box]))
     if needed > (free := free_memory()):
         raise VolumeError(
             f"structures.{name}: takes {needed / 1e9:.1f} GB of memory where {free / 1e9:.1f} GB "

@@ -121,11 +121,6 @@ class TrackedSequence:
     def __len__(self) -> int:
         return len(self.numbers)
 
-    @property
-    def has_images(self) -> bool:
-        """Whether the file holds images, which may still be such as cannot be read."""
-        return self.columns > 0
-
     def require_images(self) -> StoredImages:
         """The images in the file.
 

@@ -1,7 +1,7 @@
 """Transforms of 3D Slicer: single files (`.h5`, `.tfm`), and sequences of them in its scenes.
 
 Slicer writes transforms through ITK, which stores the way from the parent to the child, in LPS and
-millimetres. What is returned is the matrix that Slicer itself shows: to the parent, in RAS.
+millimetres. Returned is the matrix that Slicer itself shows: to the parent, in RAS.
 
 A sequence of transforms is a bundle (`.mrb`); its times are in the scene (`.mrml`) that names it.
 """
@@ -29,10 +29,8 @@ from us_sim.volume.sequences.transforms import FrameTransforms, in_metres, split
 SLICER_SCENES = (".mrb", ".mrml")
 SLICER_TRANSFORMS = (".h5", ".hdf5", ".tfm")
 _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-_SECONDS = 180.0
 _LARGEST = 1 << 28  # bytes that are unpacked of a bundle
 _MOST = 100_000  # transforms
-_MISSING = "no transform at its time"
 
 
 def read_slicer_transform(path: str | Path) -> NDArray[np.float64]:
@@ -180,7 +178,7 @@ def _read(
         for when, *_ in series:
             placed[np.searchsorted(times, when)] = next(matrices)
         seen = np.isfinite(placed[:, 0, 0])
-        faults = tuple("" if each else _MISSING for each in seen)
+        faults = tuple("" if each else "no transform at its time" for each in seen)
         found[name] = FrameTransforms(in_metres(name, placed), faults)
     for name in still:
         placed = np.broadcast_to(in_metres(name, next(matrices)), (len(times), 4, 4))
@@ -215,7 +213,7 @@ def _to_parent(files: Sequence[tuple[Path, str]]) -> NDArray[np.float64]:
     task = json.dumps([str(file.resolve()) for file, _ in files]).encode()
     label = files[0][1]
     try:
-        done = subprocess.run(command, input=task, capture_output=True, timeout=_SECONDS)
+        done = subprocess.run(command, input=task, capture_output=True, timeout=180.0)
         rows = json.loads(done.stdout)
     except (subprocess.TimeoutExpired, ValueError):  # the file has ended what reads it
         raise VolumeError(f"{label}: is damaged, or no transform of ITK: export it again") from None

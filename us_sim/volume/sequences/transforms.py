@@ -53,31 +53,20 @@ class TransformChain:
 
 def shortest_chain(names: Iterable[str], start: str, goal: str) -> TransformChain | None:
     """The chain of the fewest transforms from one frame to another; None where there is none."""
-    return _chains(names, start).get(goal)
-
-
-def frames_reached(names: Iterable[str], start: str) -> tuple[str, ...]:
-    """The frames to which chains lead from a frame, the nearest first."""
-    return tuple(_chains(names, start))
-
-
-def _chains(names: Iterable[str], start: str) -> dict[str, TransformChain]:
-    """The shortest chain to each frame that is reached, the nearest first."""
     steps: dict[str, list[tuple[str, str, bool]]] = {}  # from a frame: where to, by what, forwards
     for name in names:
         if ends := split_transform_name(name):
             steps.setdefault(ends[0], []).append((ends[1], name, True))
             steps.setdefault(ends[1], []).append((ends[0], name, False))
-    chains = {start: TransformChain(start, ())}
+    chains: dict[str, tuple[tuple[str, bool], ...]] = {start: ()}
     waiting = deque([start])
-    while waiting:
+    while waiting and goal not in chains:
         frame = waiting.popleft()  # breadth first, so that the first chain is a shortest one
         for end, name, forward in steps.get(frame, []):
             if end not in chains:
-                chains[end] = TransformChain(end, (*chains[frame].steps, (name, forward)))
+                chains[end] = (*chains[frame], (name, forward))
                 waiting.append(end)
-    del chains[start]
-    return chains
+    return TransformChain(goal, chains[goal]) if chains.get(goal) else None
 
 
 @dataclass(frozen=True, eq=False)

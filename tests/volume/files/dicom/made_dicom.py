@@ -179,7 +179,7 @@ SCT = {"CodingSchemeDesignator": "SCT"}
 
 
 def segment(number: int, label: str, code: str, side: str = "") -> Dataset:
-    """What a segment is, with a patient's name where texts are free."""
+    """The description of a segment, with a patient's name where texts are free."""
     kind = item(CodeValue=code, CodeMeaning="Doe Jane", **SCT)
     if side:
         modifier = item(CodeValue=side, CodeMeaning="x", **SCT)

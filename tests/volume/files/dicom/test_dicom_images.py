@@ -180,7 +180,7 @@ def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
     made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
     made.Rows = 13
     path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
-    with pytest.raises(VolumeError, match="damaged, or not of the size and type"):
+    with pytest.raises(VolumeError, match="damaged"):
         images(path)
 
 
@@ -218,21 +218,21 @@ def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):
         (shadow / name).mkdir(parents=True)
         (shadow / name / "__init__.py").write_text("raise ImportError")
     monkeypatch.setenv("PYTHONPATH", str(shadow))
-    with pytest.raises(VolumeError, match=r"compressed as JPEG Baseline.*us_sim\[dicom\]"):
+    with pytest.raises(VolumeError, match=r"JPEG Baseline.*us_sim\[dicom\]"):
         images(path)
 
 
 def test_what_has_no_decoder_at_all_is_refused(tmp_path):
     made = compressed(header(CINE, US_MULTI_FRAME), JPEGBaseline8Bit)
     mpeg = "1.2.840.10008.1.2.4.102"
-    with pytest.raises(VolumeError, match=r"compressed as MPEG-4.*export them uncompressed"):
+    with pytest.raises(VolumeError, match="MPEG-4"):
         images(write(tmp_path / "a.dcm", made, mpeg))
 
 
 def test_without_pydicom_the_extra_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
     monkeypatch.setitem(sys.modules, "pydicom", None)
-    with pytest.raises(VolumeError, match=r"needs an extra package: pip install 'us_sim\[dicom\]'"):
+    with pytest.raises(VolumeError, match=r"us_sim\[dicom\]"):
         open_dicom(path)
 
 

@@ -149,7 +149,7 @@ def test_a_real_series_lies_where_simpleitk_says():
 
 
 def test_a_real_series_with_a_gap_is_refused():
-    with pytest.raises(VolumeError, match=r"are 1\.25 to 202\.5 mm apart, which is not even"):
+    with pytest.raises(VolumeError, match=r"1\.25 to 202\.5 mm"):
         placed_images(real_series("77654033/CT2"))
 
 
@@ -270,7 +270,7 @@ def test_a_two_dimensional_file_says_what_to_do(shared_data):
     folder = shared_data / "dicom-us-2d"
     if not folder.is_dir():
         pytest.skip(f"no {folder}")
-    with pytest.raises(VolumeError, match=r"is a 2D cine of 30 images.*not a volume.*Enhanced US"):
+    with pytest.raises(VolumeError, match="cine of 30 images"):
         read_volume(folder / "examples_ybr_color.dcm")
     with pytest.raises(VolumeError, match=r"is a 2D image, not a volume"):
         read_volume(folder / "US1_UNCR.dcm")
@@ -287,7 +287,7 @@ def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
     times = 5
     made = enhanced(VOXELS[:, :, :1], turned(), times=times)
     path = write(tmp_path / "a.dcm", made)
-    with pytest.raises(VolumeError, match=r"5 images at one place.*us-sim import a\.dcm"):
+    with pytest.raises(VolumeError, match=r"us-sim import a\.dcm"):
         placed_images([path])
     out = tmp_path / "a.igs.mha"
     import_files([path], out, ImportSettings(keep_whole_image=True))

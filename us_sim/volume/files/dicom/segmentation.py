@@ -22,8 +22,6 @@ from us_sim.volume.files.dicom.planes import sparse_grid_of, stated_planes
 from us_sim.volume.files.segments import Segment
 from us_sim.volume.structure_names import Colour
 
-_MOST = 1 << 28  # voxels
-
 
 @dataclass(frozen=True, eq=False)
 class DicomSegmentation:
@@ -81,7 +79,7 @@ def read_segmentation(file: DicomFile) -> DicomSegmentation:
     if (not is_map and not set(of) <= known) or not segments:
         raise VolumeError(f"{path}: has images of segments that it does not describe")
     shape = (form.columns, form.rows, max(slices) + 1)
-    if np.prod(shape, dtype=float) > _MOST:
+    if np.prod(shape, dtype=float) > 1 << 28:
         raise VolumeError(f"{path}: spans {shape[2]} slices, more than can be read; export a part")
     least = 0 if is_map else max(((whole(header, "MaximumFractionalValue") or 1) + 1) // 2, 1)
     return DicomSegmentation(
