@@ -38,7 +38,7 @@ def parts(text, type_name):
 
 
 def fields(text, package):
-    """What a message text defines: (type, name, default or constant) of each line."""
+    """The definitions of a message text: (type, name, default or constant) of each line."""
     lines = (re.sub(r"\s*#.*", "", line).strip() for line in text.splitlines())
     found = []
     for line in filter(None, lines):

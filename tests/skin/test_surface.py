@@ -4,41 +4,27 @@ import sys
 
 import numpy as np
 import pytest
+from sphere_surface import sphere
 
 from us_sim.errors import MeshError
 from us_sim.geometry.triangles import vertex_normals
 from us_sim.skin.surface import TriangleSurface, bent_surface, plane_surface, read_surface
 
 
-def sphere(radius, rings=40, sectors=80):
-    """A latitude-longitude sphere with outward triangles."""
-    polar = np.linspace(0, np.pi, rings + 1)[1:-1]
-    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
-    theta, phi = np.meshgrid(polar, around, indexing="ij")
-    ring = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    vertices = radius * np.concatenate([ring.reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]])
-    index = np.arange(ring.shape[0] * sectors).reshape(-1, sectors)
-    following = np.roll(index, -1, axis=1)
-    north, south = len(vertices) - 2, len(vertices) - 1
-    triangles = [
-        np.stack([index[:-1], index[1:], following[1:]], -1).reshape(-1, 3),
-        np.stack([index[:-1], following[1:], following[:-1]], -1).reshape(-1, 3),
-        np.stack([np.full(sectors, north), index[0], following[0]], -1),
-        np.stack([np.full(sectors, south), following[-1], index[-1]], -1),
-    ]
-    return TriangleSurface(vertices, np.concatenate(triangles))
+def ball(radius):
+    return TriangleSurface(*sphere(radius))
 
 
 def test_normals_of_a_sphere_point_away_from_its_centre():
-    ball = sphere(0.05)
-    normals = vertex_normals(ball.vertices, ball.triangles)
+    round_ = ball(0.05)
+    normals = vertex_normals(round_.vertices, round_.triangles)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
-    assert np.einsum("ij,ij->i", normals, ball.vertices / 0.05).min() > np.cos(np.radians(1.0))
+    assert np.einsum("ij,ij->i", normals, round_.vertices / 0.05).min() > np.cos(np.radians(1.0))
 
 
 def test_vertex_areas_add_up_to_the_surface():
     assert plane_surface((0.2, 0.1), 0.01).vertex_areas.sum() == pytest.approx(0.02, rel=1e-12)
-    assert sphere(0.05).vertex_areas.sum() == pytest.approx(4 * np.pi * 0.05**2, rel=3e-3)
+    assert ball(0.05).vertex_areas.sum() == pytest.approx(4 * np.pi * 0.05**2, rel=3e-3)
 
 
 def test_a_flat_sheet_lies_in_z_0_and_faces_out_of_the_body():

@@ -12,7 +12,7 @@ from rclpy.node import Node
 
 
 class Bench:
-    """Nodes in one context, and an executor that runs until something is so."""
+    """Nodes in one context, and an executor that runs until a condition holds."""
 
     def __init__(self, args: list[str] | None = None) -> None:
         self.context = Context()
@@ -27,14 +27,14 @@ class Bench:
         return node
 
     def spin_until(self, condition: Callable[[], Any], seconds: float = 10.0) -> bool:
-        """Whether it came true while callbacks ran, for so many seconds at most."""
+        """Run callbacks until the condition holds; False if it does not within the time."""
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
         return bool(condition())
 
     def result(self, future: Any) -> Any:
-        """What a future comes to."""
+        """The result of a future, once it is done."""
         assert self.spin_until(future.done)
         return future.result()
 

@@ -94,7 +94,7 @@ def api(shared_data: Path) -> dict[str, Any]:
 
 
 def ours(name: str) -> Any:
-    """What we have under a dotted name, None when we lack it."""
+    """Our attribute of a dotted name, None when we lack it."""
     module, _, attribute = name.rpartition(".")
     try:
         return getattr(importlib.import_module(module), attribute, None)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sphere_surface import sphere
 from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
@@ -14,40 +15,11 @@ MESH = block_mesh((9, 6, 6))
 CENTRE = np.array([0.0, 0.0, 0.05])
 
 
-def sphere(radius, rings=40, centre=CENTRE):
-    """Vertices and outward triangles of a sphere, a single vertex at each pole."""
-    polar, around = np.pi * np.arange(1, rings) / rings, np.pi * np.arange(2 * rings) / rings
-    points = np.stack(
-        [
-            np.outer(np.sin(polar), np.cos(around)),
-            np.outer(np.sin(polar), np.sin(around)),
-            np.repeat(np.cos(polar)[:, None], len(around), axis=1),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    n = len(around)
-    i, j = np.meshgrid(np.arange(rings - 2), np.arange(n), indexing="ij")
-    a, b, c, d = (1 + k for k in (i * n + j, i * n + (j + 1) % n, (i + 1) * n + (j + 1) % n,
-                                  (i + 1) * n + j))  # fmt: skip
-    j = np.arange(n)
-    last = (rings - 1) * n + 1
-    triangles = np.concatenate(
-        [
-            np.stack([a, d, c], -1).reshape(-1, 3),
-            np.stack([a, c, b], -1).reshape(-1, 3),
-            np.column_stack([np.zeros(n, int), 1 + j, 1 + (j + 1) % n]),
-            np.column_stack([np.full(n, last), last - n + (j + 1) % n, last - n + j]),
-        ]
-    )
-    vertices = np.vstack([[0.0, 0, 1], points, [0, 0, -1]])
-    return vertices * radius + centre, triangles
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=20, deadline=None)
 def test_affine_maps_of_the_tissue_are_affine_maps_of_the_surface(seed):
     random = np.random.default_rng(seed)
-    vertices, triangles = sphere(0.048, rings=12)
+    vertices, triangles = sphere(0.048, rings=12, centre=CENTRE)
     surface = EmbeddedSurface(MESH, vertices, triangles)
     matrix = np.eye(3) + random.uniform(-0.3, 0.3, (3, 3))
     shift = random.uniform(-0.05, 0.05, 3)
@@ -62,14 +34,14 @@ def test_affine_maps_of_the_tissue_are_affine_maps_of_the_surface(seed):
 
 
 def test_at_rest_the_surface_is_its_own_to_the_last_bit():
-    vertices, triangles = sphere(0.04)
+    vertices, triangles = sphere(0.04, centre=CENTRE)
     surface = EmbeddedSurface(MESH, vertices, triangles)
     np.testing.assert_array_equal(surface.carry(MESH.nodes), vertices.astype(np.float32))
     np.testing.assert_array_equal(surface.triangles, triangles)
 
 
 def test_normals_of_a_sphere_are_its_radii():
-    vertices, triangles = sphere(0.04, rings=60)
+    vertices, triangles = sphere(0.04, rings=60, centre=CENTRE)
     _, normals = EmbeddedSurface(MESH, vertices, triangles).deform(MESH.nodes)
     radii = (vertices - CENTRE) / 0.04
     angles = np.degrees(np.arccos((normals * radii).sum(axis=1).clip(-1, 1)))
@@ -80,7 +52,7 @@ def test_normals_of_a_sphere_are_its_radii():
 
 
 def test_volume_follows_the_tissues():
-    vertices, triangles = sphere(0.04)
+    vertices, triangles = sphere(0.04, centre=CENTRE)
     surface = EmbeddedSurface(MESH, vertices, triangles)
     squeezed = MESH.nodes * [1.2, 1.2, 0.7]
 
@@ -93,7 +65,9 @@ def test_volume_follows_the_tissues():
 
 
 def test_a_little_outside_is_carried_and_counted():
-    vertices, triangles = sphere(0.052)  # 2 mm beyond the block's sides, top and bottom
+    vertices, triangles = sphere(
+        0.052, centre=CENTRE
+    )  # 2 mm beyond the block's sides, top and bottom
     surface = EmbeddedSurface(MESH, vertices, triangles)
     beyond = (np.abs(vertices[:, 1]) > 0.05 + 1e-6) | (np.abs(vertices[:, 2] - 0.05) > 0.05 + 1e-6)
     assert surface.outside == beyond.sum() > 0
@@ -102,7 +76,7 @@ def test_a_little_outside_is_carried_and_counted():
 
 
 def test_far_outside_is_refused_or_trimmed():
-    vertices, triangles = sphere(0.09)
+    vertices, triangles = sphere(0.09, centre=CENTRE)
     with pytest.raises(MeshError, match=r"vertices lie outside the tissue mesh, vertex \d+ by 40"):
         EmbeddedSurface(MESH, vertices, triangles)
     trimmed = EmbeddedSurface.trimmed(MESH, vertices, triangles)
@@ -116,7 +90,7 @@ def test_far_outside_is_refused_or_trimmed():
 
 
 def test_the_same_nodes_give_the_same_bytes():
-    surface = EmbeddedSurface(MESH, *sphere(0.04))
+    surface = EmbeddedSurface(MESH, *sphere(0.04, centre=CENTRE))
     nodes = MESH.nodes + 1e-3 * np.sin(40 * MESH.nodes)
     first, second = surface.deform(nodes), surface.deform(nodes)
     assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
@@ -144,7 +118,7 @@ def test_what_is_no_surface_is_refused(vertices, triangles, words):
 
 
 def test_the_nodes_of_another_mesh_are_refused():
-    surface = EmbeddedSurface(MESH, *sphere(0.04))
+    surface = EmbeddedSurface(MESH, *sphere(0.04, centre=CENTRE))
     with pytest.raises(MeshError, match="embedded in a mesh of shape"):
         surface.deform(np.zeros((5, 3)))
 

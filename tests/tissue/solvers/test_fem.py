@@ -1,7 +1,4 @@
-"""The exact linear solver against independent sparse solves and the laws of contact.
-
-Reactions of nearly incompressible tissue against elements that do not lock.
-"""
+"""The exact linear solver against sparse solves, laws of contact, and elements that do not lock."""
 
 import logging
 from dataclasses import replace

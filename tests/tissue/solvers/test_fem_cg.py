@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from scipy.sparse import bmat, csc_array, csr_array
 from scipy.sparse.linalg import spsolve
-from tissue_block import SOFT, block, block_mesh
+from tissue_block import SOFT, at, block, block_mesh, settle
 
 from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
-from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.probe_gap import push_out
 from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
 from us_sim.tissue.elasticity.material import Material
@@ -17,18 +16,6 @@ from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
 
 PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
-
-
-def at(x=0.0, y=0.0, z=0.0, orientation=(0.0, 0.0, 0.0, 1.0)):
-    return Pose(np.array([x, y, z]), np.array(orientation))
-
-
-def settle(solver, pose, frames=120):
-    for _ in range(frames):
-        deformation = solver.deform(pose)
-        if solver.deform(pose) is deformation:
-            return deformation
-    raise AssertionError(f"not settled after {frames} frames: residual {deformation.residual}")
 
 
 def test_uniaxial_compression_has_hookes_force_and_a_linear_field():

@@ -7,14 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
-from tissue_block import block, block_mesh
+from tissue_block import at, block, block_mesh, pressed, settle
 
 from us_sim.errors import SolverError
 from us_sim.evaluation.independent_forces import averaged_hooke_forces, neo_hookean_forces
 from us_sim.evaluation.independent_residual import IndependentResidual
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
-from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.probe_gap import only_forward
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
@@ -28,29 +27,8 @@ PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
 FINE = (13, 7, 6)
 
 
-def at(x=0.0, y=0.0, z=0.0, orientation=(0.0, 0.0, 0.0, 1.0)):
-    return Pose(np.array([x, y, z]), np.array(orientation))
-
-
 def made_of(ratio, nodes=FINE, modulus=10e3):
     return uniform_material(block_mesh(nodes), Material(modulus, ratio, 1000.0))
-
-
-def settle(solver, pose, frames=150):
-    for _ in range(frames):
-        deformation = solver.deform(pose)
-        if solver.deform(pose) is deformation:
-            return deformation
-    raise AssertionError(f"not settled after {frames} frames: residual {deformation.residual}")
-
-
-def held(solver, pose, frames=10):
-    """The deformation after so many frames at one pose, or when it has settled."""
-    for _ in range(frames):
-        deformation = solver.deform(pose)
-        if solver.is_settled:
-            break
-    return deformation
 
 
 def deformation_gradients(mesh, nodes):
@@ -289,7 +267,7 @@ def test_nothing_turns_inside_out_whatever_the_probe_does(collider, ratio):
                 # of small rounding pushes along planes where the nodes were when it came.)
                 if found < 0.5 and len(deformation.contact_nodes) and not coarse:
                     assert checked < 1.01 * found / (1 - found) + 1e-5 + rounding
-        found = held(solver, pose)
+        found = pressed(solver, pose)
         if found.residual <= 1e-5 and not coarse:
             assert check.check(found, pose)[0] < 3e-5
         released = solver.deform(None)
@@ -480,7 +458,7 @@ def test_a_starved_solver_says_which_forces_are_not_in_balance(nearly_incompress
         if each.is_balanced:
             assert each.force[2] == pytest.approx(expected, rel=0.1, abs=0.1)
     assert not all(each.is_balanced for each in starved)
-    assert held(solver, poses[4], 100).is_balanced
+    assert pressed(solver, poses[4], 100).is_balanced
 
 
 @pytest.mark.parametrize(("live", "anew"), [(0.0141, True), (None, False)])
