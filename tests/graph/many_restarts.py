@@ -119,7 +119,8 @@ def nodes_of(parent):
             words = (folder / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        modules = [w.decode() for w in words if w.startswith(b"us_sim.nodes.")]
+        starts = b"us_sim.nodes.", b"us_sim.viewer.viewer"
+        modules = [word.decode() for word in words if word.startswith(starts)]
         if int(fields[1]) == parent and fields[0] != "Z" and modules:
             found[modules[0].rpartition(".")[2]] = int(folder.name)
     return found

@@ -26,7 +26,6 @@ STANDBY = "US_SIM_STANDBY"  # set in the environment of a process that is to wai
 STANDING_BY = "standing by"  # what it says when it is ready
 
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-_NICE = 19
 
 
 def stand_by(create: Callable[[], Node], args: list[str] | None) -> list[str] | None:
@@ -46,7 +45,7 @@ def stand_by(create: Callable[[], Node], args: list[str] | None) -> list[str] | 
 
 def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
     with contextlib.suppress(AttributeError, OSError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
     before = os.environ.get(_RANGE)
     os.environ[_RANGE] = "OFF"
     # What is wrong with the node is said when it is made in earnest.
@@ -61,18 +60,15 @@ def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
     gc.collect()
 
 
-_PRIORITY = 1  # the lowest of those that go first: drivers of devices may go before
-
-
 def go_first() -> str:
     """Let all present threads of this process go before ordinary ones, and none that they start.
 
     Returns:
         How they run from now on: ``realtime``, or ``ordinary`` where that is not allowed.
     """
-    if not hasattr(os, "sched_setscheduler"):
-        return "ordinary"
-    return "realtime" if _schedule(os.SCHED_RR, _PRIORITY) else "ordinary"
+    lowest = 1  # drivers of devices may go before
+    able = hasattr(os, "sched_setscheduler") and _schedule(os.SCHED_RR, lowest)
+    return "realtime" if able else "ordinary"
 
 
 def go_along() -> None:
@@ -100,9 +96,8 @@ def scheduling_of(pid: int) -> str:
         policy = os.sched_getscheduler(pid)
     except OSError:  # it has ended
         return "ordinary"
-    return (
-        "realtime" if policy & ~getattr(os, "SCHED_RESET_ON_FORK", 0) == os.SCHED_RR else "ordinary"
-    )
+    policy &= ~getattr(os, "SCHED_RESET_ON_FORK", 0)
+    return "realtime" if policy == os.SCHED_RR else "ordinary"
 
 
 INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done

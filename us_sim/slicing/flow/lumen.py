@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -333,6 +332,8 @@ def resampled(
     Raises:
         VolumeError: the curve is shorter than the spacing.
     """
+    from scipy.ndimage import gaussian_filter1d
+
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     if not along[-1] > spacing:
         raise VolumeError("is no tube: slices across it do not follow one another")
@@ -351,6 +352,8 @@ def resampled(
 
 
 def _one_piece(lumen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    from scipy.ndimage import label
+
     parts, count = label(lumen, structure=np.ones((3, 3, 3)))
     if count == 0:
         raise VolumeError("is nowhere in the volume")
@@ -380,6 +383,8 @@ def _require_no_branch(
     voxels: NDArray[np.int64], places: NDArray[np.float64], slices: NDArray[np.int64]
 ) -> None:
     """Each slice but those of the ends is one connected part."""
+    from scipy.ndimage import label
+
     last = slices.max()
     for which in range(2, last - 1):
         within = slices == which

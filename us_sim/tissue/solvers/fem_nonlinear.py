@@ -343,7 +343,7 @@ class FemNonlinear(TissueSolver):
         return start
 
     def _obstacle(self) -> str:
-        """What holds up a tissue that cannot be balanced."""
+        """The node and the tetrahedron at which a tissue cannot be balanced, for a person."""
         newton = self._newton
         pulled = int(np.argmax(np.linalg.norm(newton.residual, axis=0)))
         nodes = self.model.mesh.nodes + newton.displacement.T

@@ -32,7 +32,7 @@ _FILE_NAME = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,5}$")
 
 @dataclass(frozen=True)
 class Source:
-    """A file that went in: what it is, and its checksum.
+    """A file that went in: its kind and its checksum.
 
     Raises:
         CaseError: the kind reads like a name or a path, or the checksum is none.

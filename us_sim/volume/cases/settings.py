@@ -156,7 +156,7 @@ class CaseSettings(Settings):
                 raise self.refused(f"fixed[{i}]", unknown(name, (*_FACES, *self.structures)))
 
     def material_of(self, name: str) -> Material:
-        """Elastic constants of a structure, or of what is around them all (`AROUND`)."""
+        """Elastic constants of a structure, or of the tissue around them all (`AROUND`)."""
         if name == AROUND:
             return _material(self.around, AROUND)
         return _material(self.structures[name].material, name)

@@ -51,7 +51,7 @@ class CaseTissue:
 
 
 def write_tissue(path: Path, tissue: CaseTissue) -> None:
-    """Write ``tissue.npz``; what is there is replaced by the whole file.
+    """Write ``tissue.npz``; a file of that name is replaced by the whole new one.
 
     Raises:
         CaseError: it cannot be written.

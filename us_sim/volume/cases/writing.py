@@ -142,7 +142,7 @@ def write_moduli_into(
 
 
 def _finish(folder: Path, partial: Path) -> None:
-    """Propose where to start where that is not said; refuse what is no case.
+    """Propose a start where none is said; refuse a folder that is no case.
 
     Errors name the place that it was meant for.
     """

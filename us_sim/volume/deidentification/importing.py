@@ -146,7 +146,7 @@ class Import:
 def look_at(
     files: Sequence[str | os.PathLike[str]], out: Path | None, settings: ImportSettings
 ) -> Import:
-    """Find out what would go on, and write nothing.
+    """Plan an import, and write nothing.
 
     Args:
         files: DICOM files of one series, or a folder of them; or one MetaImage, NRRD or NIfTI

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -342,6 +341,8 @@ def file_order(voxels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
     OpenCV turns a plane in blocks that fit the cache, in a tenth of NumPy's time.
     """
+    import cv2  # which a node that plays poses alone does not need
+
     made = np.empty(voxels.shape[::-1], np.uint8)
     for j in range(voxels.shape[1]):
         made[:, j, :] = cv2.transpose(voxels[:, j, :])
@@ -360,6 +361,8 @@ def volume_of_slices(
         count: how many come.
         progress: told the fraction that is there.
     """
+    import cv2
+
     voxels: NDArray[np.uint8] | None = None
     slab: list[NDArray[np.uint8]] = []
     for k, image in enumerate(slices, start=1):

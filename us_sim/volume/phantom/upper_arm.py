@@ -307,7 +307,7 @@ class UpperArm:
 
 
 def _add_side_lobes(section: ArmSection) -> None:
-    """Add what side lobes hear of the surroundings, which lumens are not free of."""
+    """Add the echoes of the surroundings that side lobes receive, in lumens too."""
     step_x, step_z = section.steps
     power = gaussian_filter1d(section.diffuse**2 + section.specular**2, 2.5e-3 / step_x, axis=0)
     power = gaussian_filter1d(power, 0.5e-3 / step_z, axis=1)

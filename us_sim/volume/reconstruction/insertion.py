@@ -108,7 +108,7 @@ class Insertion:
 
 
 class Collection:
-    """All pixels of every voxel, for what needs them at once.
+    """All pixels of every voxel, for medians, which need them at once.
 
     Args:
         grid: of the voxels.
@@ -131,7 +131,7 @@ class Collection:
         self._go_through(np.ascontiguousarray(image), image_to_reference, used, _COUNT)
 
     def reserve(self) -> None:
-        """Take the memory for what was counted.
+        """Take the memory for the counted pixels.
 
         Raises:
             VolumeError: there is not enough.

@@ -33,7 +33,7 @@ def _rows(path: str) -> list[float] | str:
 
 
 def main() -> int:
-    """Read what standard input names."""
+    """Read the files that standard input names."""
     resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS))
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     print(json.dumps([_rows(path) for path in json.load(sys.stdin)]))

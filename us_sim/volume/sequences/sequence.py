@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,6 +81,8 @@ class StoredImages:
         Raises:
             VolumeError: there are fewer than promised, or they are damaged.
         """
+        import cv2  # which a node that plays poses alone does not need
+
         levels = self._levels
         for numbers in self.voxels.pieces(self._size, wanted):
             image = levels(numbers)

@@ -207,7 +207,7 @@ def _stored(path: Path, files: Sequence[tuple[bytes, str]]) -> NDArray[np.float6
 
 
 def _to_parent(files: Sequence[tuple[Path, str]]) -> NDArray[np.float64]:
-    """Transforms (N, 4, 4), mm, of files with what errors call them."""
+    """Transforms (N, 4, 4), mm, of files, each with its name in errors."""
     # -P: this folder is no place to import from.
     command = [sys.executable, "-P", str(Path(itk_reader.__file__))]
     task = json.dumps([str(file.resolve()) for file, _ in files]).encode()

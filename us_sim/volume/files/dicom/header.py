@@ -226,7 +226,7 @@ class _DeflatedError(Exception):
 
 
 class _Bounded(io.BufferedIOBase):
-    """A file of which never more is asked for than there is, as memory is taken for what is asked.
+    """A file that is never asked for more bytes than it has, as memory is taken for all of them.
 
     Only a deflated file is read to its end at once by pydicom, to be inflated without a limit.
     """

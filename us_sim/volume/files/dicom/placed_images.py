@@ -165,7 +165,7 @@ def _in_time(
 
 
 def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
-    """The kind of files that hold no volume, and what to do."""
+    """The kind of files that hold no volume, and advice."""
     count = len(images.all)
     as_images = f"`us-sim import {images.files[0].path.name} --out images.igs.mha`"
     if planes and count == 1:

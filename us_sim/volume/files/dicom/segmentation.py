@@ -1,5 +1,4 @@
-"""Segmentations of DICOM: which voxels are in which segment, and what each is called and coded
-(PS3.3, C.8.20).
+"""Segmentations of DICOM: the voxels of each segment, its name and codes (PS3.3, C.8.20).
 
 Frames are of one segment and one plane each, those without a voxel are left out, and segments may
 overlap; in a label map the values of all frames are the segments' numbers.
