@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "us_sim"
 LAYERS = (
     (
         "compose and measure",
-        (("command",), ("run", "evaluation", "to_rerun"), ("demo", "", "viewer")),
+        (("command",), ("evaluation", "run"), ("viewer",)),
     ),
     ("nodes", (("nodes",),)),
     (

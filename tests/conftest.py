@@ -22,7 +22,7 @@ _TISSUE = ("tissue", *(f"evaluation/{name}" for name in ("hand", "image", "stabi
 """Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
 the other one what is beside them."""
 
-_BESIDE = ("slicing", "evaluation", "demo", "tracking", "volume", "skin", "geometry")
+_BESIDE = ("slicing", "evaluation", "tracking", "volume", "skin", "geometry")
 
 _BY_GROUPS = pytest.StashKey[bool]()
 

@@ -63,8 +63,8 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _to_rerun(args: argparse.Namespace) -> int:
+    from us_sim.command.rerun import to_rerun
     from us_sim.progress import late_progress
-    from us_sim.to_rerun.conversion import to_rerun
 
     session: Path = args.file
     file: Path = args.out or session.with_suffix(".rrd")

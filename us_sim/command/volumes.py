@@ -148,7 +148,7 @@ def _cases(args: argparse.Namespace) -> int:
     rows = [listed(folder) for folder in folders]
     print(table(rows))
     if args.picture is not None:
-        from us_sim.demo.case_pictures import picture_cases
+        from us_sim.run.contact_sheet import picture_cases
 
         picture_cases([row.folder for row in rows if not row.problem], args.picture)
         print(args.picture)

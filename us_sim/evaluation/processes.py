@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from us_sim.nodes.arrivals import Arrivals
+    from us_sim.evaluation.latency.arrivals import Arrivals
 
 
 def start_program(name: str, *arguments: str) -> subprocess.Popen[str]:
@@ -160,7 +160,7 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
 
-    from us_sim.nodes.arrivals import Arrivals
+    from us_sim.evaluation.latency.arrivals import Arrivals
     from us_sim.nodes.process import go_along, go_first
 
     context = Context()

@@ -448,8 +448,6 @@ class TissueDeformer(SceneNode):
 def _inside_out(deformation: Deformation, name: str) -> str:
     count = deformation.inverted
     sentence = f"{count} {'tetrahedron is' if count == 1 else 'tetrahedra are'} inside out"
-    if name == "fem_nonlinear":
-        return sentence
     return (
         f"{sentence}: {name} is not made for a press this deep; fem_nonlinear is (set the "
         "parameter solver of tissue_deformer, or tissue.solver in the scene)"

@@ -1,1 +1,1 @@
-"""Running the nodes of a scene: as processes, followed until they end, or in lockstep."""
+"""Running the nodes of a scene: as processes, in lockstep, and as a demo with its pictures."""

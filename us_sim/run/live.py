@@ -37,7 +37,7 @@ from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import full_path
 
 if TYPE_CHECKING:
-    from us_sim.demo.camera_video import PathVideo
+    from us_sim.run.camera_video import PathVideo
 
 
 SETTLE_S = 1.2  # after the path's end: for the last images and each node's last report
@@ -283,7 +283,7 @@ def demo(
         lost = outcome.sentence()
         if not lost:
             raise
-        from us_sim.demo.session import write_summary
+        from us_sim.run.session_summary import write_summary
 
         write_summary({"scene": scene.name, "lost": outcome.summary()}, out / "summary.json")
         raise UsSimError(f"{lost}; {error}") from error
@@ -414,8 +414,8 @@ def _is_kept(scene: Scene) -> bool:
 
 
 def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
-    from us_sim.demo.camera_video import path_video
     from us_sim.recording.path import read_path
+    from us_sim.run.camera_video import path_video
 
     with contextlib.ExitStack() as stack:
         bar: list[Progress] = []
@@ -452,8 +452,8 @@ def _require_nothing_lost(outcome: Outcome) -> None:
 def _report(
     scene: Scene, out: Path, outcome: Outcome, wall: float, video: PathVideo | None
 ) -> None:
-    from us_sim.demo.contact_sheet import contact_sheet
-    from us_sim.demo.session import read_session, write_summary
+    from us_sim.run.contact_sheet import contact_sheet
+    from us_sim.run.session_summary import read_session, write_summary
 
     with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
@@ -463,7 +463,7 @@ def _report(
     summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
     tracked = None
     if video is not None:
-        from us_sim.demo.session import tracked_path
+        from us_sim.run.session_summary import tracked_path
 
         tracked = tracked_path(session, video)
         summary["tracked_path"] = tracked.summary

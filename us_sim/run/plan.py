@@ -27,7 +27,7 @@ from us_sim.share import full_path
 from us_sim.viewer.server import require_free
 
 if TYPE_CHECKING:
-    from us_sim.demo.camera_video import PathVideo
+    from us_sim.run.camera_video import PathVideo
 
 RECORDER, VIEWER = "session_recorder", "viewer"
 PLAYERS = ("path_player", "session_player")

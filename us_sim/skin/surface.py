@@ -1,6 +1,6 @@
 """Triangle surfaces of the skin: sheets made here, or read from a file.
 
-Of Wavefront OBJ files only positions and faces are read here: meshio 5.3 refuses three of six real
+Of Wavefront OBJ files only positions and faces are read here: meshio 5.3 refuses three of five real
 organs, whose texture coordinates and normals have counts of their own, and trimesh 4 takes vertex
 0, which no file has, for the first one.
 """

@@ -35,7 +35,7 @@ from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from us_sim.nodes.arrivals import Arrivals
+    from us_sim.evaluation.latency.arrivals import Arrivals
 
 
 RATE = 60.0

@@ -3,8 +3,7 @@
 Smoothing is the windowed sinc filter of G. Taubin, T. Zhang and G. Golub, "Optimal surface
 smoothing as filter design", ECCV 1996: a polynomial of the surface's umbrella operator in
 Chebyshev's form, which does not shrink as Laplace's does. The volume that it still loses is given
-back by moving every vertex a little along its normal. trimesh has no such filter, and its distances
-to a surface need a further library (rtree).
+back by moving every vertex a little along its normal. trimesh has no such filter.
 
 Edges are collapsed by the quadric error of M. Garland and P. Heckbert, "Surface simplification
 using quadric error metrics", SIGGRAPH 1997, in the library fast-simplification. That knows no

@@ -2,9 +2,8 @@
 
 DICOM says of every image where its first pixel is, which way its rows and columns go, and how far
 apart pixels are (PS3.3, C.7.6.2). A volume is a set of such images at even distances along their
-common normal, in any order. pydicom leaves this to others; highdicom's `get_volume_from_series` and
-its kin refuse the ultrasound objects that state no patient's coordinates (Enhanced US Volume) and
-the private ones, so it would not replace what is here.
+common normal, in any order. pydicom leaves this to others; highdicom 0.28 finds no coordinate
+system in an Enhanced US Volume.
 
 Three makers' volumes are read as 3D Slicer's SlicerHeart and ITK-SNAP read them: Philips' Cartesian
 export from QLAB, Philips Affiniti, and Eigen Artemis. None of them says where the patient is: the

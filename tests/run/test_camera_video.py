@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from us_sim.demo.camera_video import CAMERA, RATE, path_video, video_poses
-from us_sim.demo.session import IMAGES, Session, tracked_path
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.press_and_slide import press_and_slide
+from us_sim.run.camera_video import CAMERA, RATE, path_video, video_poses
+from us_sim.run.session_summary import IMAGES, Session, tracked_path
 from us_sim.scene.building import camera_body_of, tracker_poses_of
 from us_sim.scene.reading import load_scene
 from us_sim.tracking.camera.model import read_camera_info

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from us_sim.demo.session import LumenAreas, Session
 from us_sim.geometry.pose import Pose
+from us_sim.run.session_summary import LumenAreas, Session
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes

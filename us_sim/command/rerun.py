@@ -16,7 +16,7 @@ from us_sim.recording.topic import BagTopic
 from us_sim.settings.spelling import counted
 
 if TYPE_CHECKING:
-    from us_sim.to_rerun.converters import Shown
+    from us_sim.command.rerun_converters import Shown
 
 
 OLDEST = "0.41"  # of the versions of rerun, the oldest with which this works
@@ -145,7 +145,7 @@ def to_rerun(session: Path, file: Path, progress: Callable[[float, str], None]) 
 
 class _Conversion:
     def __init__(self, bag: Bag, tell: Callable[[float, str], None]) -> None:
-        from us_sim.to_rerun import converters  # which need rerun
+        from us_sim.command import rerun_converters as converters  # which need rerun
 
         self._converters = converters
         self._bag, self._tell = bag, tell

@@ -12,6 +12,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
+from us_sim.command.rerun import to_rerun
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
@@ -32,7 +33,6 @@ from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.to_rerun.conversion import to_rerun
 
 EPOCH = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -16,6 +16,7 @@ import rerun.blueprint as views
 from numpy.typing import NDArray
 from rerun.encodings import AbsoluteTimeRange
 
+from us_sim.command.rerun import STAMP, RerunFile
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.triangles import vertex_normals
@@ -35,7 +36,6 @@ from us_sim.recording.repair import extract
 from us_sim.scene.building import structures_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.to_rerun.conversion import STAMP, RerunFile
 
 
 class Shown(Protocol):

@@ -1,1 +1,0 @@
-"""The demo: the video its camera sees, what its session shows, one picture of it."""
