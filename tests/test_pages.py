@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseStamped
 from us_sim.command.main import main
 from us_sim.errors import SceneError
 from us_sim.nodes.probe_tracker import ProbeTracker
-from us_sim.scene.document import merged
+from us_sim.scene.reading import merged
 from us_sim.scene.scene import Scene
 from us_sim.settings.reading import Reader
 from us_sim.settings.tables import anchor

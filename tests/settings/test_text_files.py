@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from us_sim.errors import CalibrationError, SceneError, TrackingError
-from us_sim.scene.document import read_document
+from us_sim.scene.reading import read_document
 from us_sim.settings.text_files import LARGEST_YAML, MOST_NODES, YamlError, load_yaml, read_text
 from us_sim.tracking.calibration.landmarks import read_landmarks, read_wires
 from us_sim.tracking.calibration.transform_file import read_transform

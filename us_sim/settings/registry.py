@@ -42,7 +42,7 @@ SEGMENTATIONS = Choice(
     threshold=f"{_SEGMENTATION}.methods:Threshold",
     watershed=f"{_SEGMENTATION}.methods:Watershed",
     vesselness=f"{_SEGMENTATION}.methods:Vesselness",
-    dark_vessels=f"{_SEGMENTATION}.dark_vessels:DarkVessels",
+    dark_vessels=f"{_SEGMENTATION}.methods:DarkVessels",
     covered=f"{_SEGMENTATION}.methods:Covered",
 )
 

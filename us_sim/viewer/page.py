@@ -1,4 +1,4 @@
-"""The one page: header, 3D scene, image, and panels that can be opened; and the application."""
+"""The one page: header, 3D scene, image with its modes and strips, panels; and the application."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import json
 import logging
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -17,12 +18,206 @@ from nicegui import app as nicegui_app
 from nicegui import ui
 
 from us_sim.errors import UsSimError
+from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
-from us_sim.viewer.modes import build_modes
 from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import build_cases, build_session
+from us_sim.viewer.parameters import Kind
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import PageStream, Simulator
+
+NODE, OVERLAY, FLIP, BESIDE = "slice_interpolator", "overlay", "flip", "beside"
+MODES = {
+    "b-mode": ("B-mode", "The image as it is"),
+    "none": ("Outlines", "With the outlines and names of structures, and marked when it is old"),
+    **{name: mode[:2] for name, mode in OVERLAYS.items()},
+}
+"""Label and title by value of the parameter ``overlay``, and the plain image before them."""
+SWITCHES = {
+    BESIDE: ("Beside", "The B-mode image beside the one with outlines or colours, on all pages"),
+    FLIP: (
+        "Flip",
+        "Exchange left and right, on all pages; the dot is at the side of the probe's mark",
+    ),
+}
+"""Likewise, by parameters that are on or off."""
+_CONTACT = {
+    "none": "No contact: press the probe onto the skin",
+    "poor": "Poor contact: press more, or tilt less",
+}
+_ABSENT = {
+    "no_contact": "no contact there: press more, or tilt less",
+    "no_vessel": "no vessel with a flow there: drag it over one",
+    "no_flow": "the vessel is closed: press less",
+    "across_flow": "the beams cross the flow at a right angle: tilt the probe, or steer the beams",
+    "too_slow": "the flow is slower than the wall filter lets through",
+}
+TISSUE = "tissue_deformer"
+_UNMOVED = 1e-5  # m, or of the face: by how much a place that was dragged may be as it was
+
+
+class _Modes:
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._mode = "b-mode"
+        self._buttons: dict[str, ui.button] = {}
+        self._strips: dict[str, bool] = dict.fromkeys(STRIPS, False)
+        self._places: list[dict[str, Any]] = []
+        with ui.row().classes("us-modes").props('role="toolbar" aria-label="Image modes"') as bar:
+            for mode, (label, title) in MODES.items():
+                self._buttons[mode] = _button(label, title, lambda mode=mode: self._choose(mode))
+            ui.element("span").classes("us-gap")
+            for kind, (label, title, _) in STRIPS.items():
+                self._buttons[kind] = _button(label, title, lambda kind=kind: self._toggle(kind))
+            for name, (label, title) in SWITCHES.items():
+                self._buttons[name] = _button(label, title, lambda name=name: self._switch(name))
+        bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
+        self._mark()
+        self._remarks: list[str] = []
+        board, status = simulator.nodes, simulator.status
+        board.watch(NODE)
+        ui.context.client.on_delete(lambda: board.unwatch(NODE))
+        status.watch(pages=1)
+        ui.context.client.on_delete(lambda: status.watch(pages=-1))
+        ui.timer(0.3, self._refresh)
+
+    async def _choose(self, mode: str) -> None:
+        if mode == "b-mode" or await self._set(OVERLAY, mode):
+            self._show(mode)
+
+    async def _switch(self, name: str) -> None:
+        is_on = not self._is_on(name)
+        if await self._set(name, is_on) and name == BESIDE and is_on and self._mode == "b-mode":
+            await self._choose("none")
+        self._mark()
+
+    async def _set(self, name: str, value: object) -> bool:
+        """Set a parameter; whether that was not refused."""
+        refused = await asyncio.wrap_future(self._simulator.nodes.set(NODE, name, value))
+        if refused:
+            ui.notify(refused, type="warning", multi_line=True)
+        return not refused
+
+    def _is_on(self, name: str) -> bool:
+        parameter = self._simulator.nodes.of(NODE).parameters.get(name)
+        return parameter is not None and bool(parameter.raw)
+
+    def _show(self, mode: str) -> None:
+        self._mode = mode
+        kind = "b-mode" if mode == "b-mode" else "annotated"
+        shown = f"m.setMode('{kind}', {json.dumps(MODES[mode][0])})"
+        ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {shown})")
+        self._mark()
+
+    def _toggle(self, kind: str) -> None:
+        self._strips[kind] = on = not self._strips[kind]
+        text = "true" if on else "false"
+        ui.run_javascript(
+            f"import('/us_sim/assets/strips.js').then(m => m.showStrip('{kind}', {text}))"
+        )
+        self._mark()
+
+    def _refresh(self) -> None:
+        """Show changes that were made elsewhere, and the node's remarks on its images."""
+        remarks = self._wanted_remarks()
+        if remarks != self._remarks:
+            self._remarks = remarks
+            told = f"m.setRemarks({json.dumps(remarks)})"
+            ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {told})")
+        places = [] if self._probe_depth is None else list(self._dragged())
+        if places != self._places:
+            self._places = places
+            told = f"m.setPlaces({json.dumps(places)})"
+            ui.run_javascript(f"import('/us_sim/assets/image_tools/places.js').then(m => {told})")
+        parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
+        known = parameter.raw if parameter else None
+        if self._mode != "b-mode" and known in MODES and known != self._mode:
+            self._show(known)
+        self._mark()
+
+    def _wanted_remarks(self) -> list[str]:
+        """Reasons why the images show little, for a person."""
+        status = self._simulator.status.node(NODE, time.monotonic())
+        values = status.values if status else {}
+        remarks = [_CONTACT.get(values.get("contact", ""), "")]
+        tissue = self._simulator.status.node(TISSUE, time.monotonic())
+        force = (tissue.number("force") if tissue else None) or 0.0
+        if force > 20.0:  # N; sonographers press with some 5 to 10
+            remarks.append(f"Too much force: {force:.0f} N")
+        if self._mode == "velocity":
+            remarks.append(_absent("No colour", values.get("no_colour", ""), values))
+        if self._strips["spectrum"]:
+            remarks.append(_absent("No spectrum", values.get("no_spectrum", ""), values))
+        return [remark for remark in remarks if remark]
+
+    def _value(self, name: str) -> float | None:
+        """A number of the node in SI units; None where there is none."""
+        parameter = self._simulator.nodes.of(NODE).parameters.get(name)
+        if parameter is None or parameter.kind is not Kind.NUMBER or parameter.value is None:
+            return None
+        return float(parameter.raw)
+
+    @property
+    def _probe_depth(self) -> float | None:
+        return self._value("depth")
+
+    def _dragged(self) -> Iterator[dict[str, Any]]:
+        """The colour box, the gate and the line, which a person can drag; m and rad."""
+        deepest = self._probe_depth or 0.0
+        shown = {"colour": self._mode == "velocity", **self._strips}
+        for kind in (kind for kind, on in shown.items() if on):
+            lateral = self._value(f"{kind}.lateral")
+            if lateral is None:
+                continue
+            yield {
+                "kind": kind,
+                "lateral": lateral,
+                "deepest": deepest,
+                "depth": self._value(f"{kind}.depth") or 0.5 * deepest,
+                "steering": self._value(f"{kind}.steering") or 0.0,
+                "width": self._value(f"{kind}.width") or 0.0,
+                "height": self._value(f"{kind}.height") or 0.5 * deepest,
+                "size": self._value(f"{kind}.size") or 0.0,
+            }
+
+    async def _move(self, asked: Any) -> None:
+        """Move the box, the gate or the line to where a person has dragged it."""
+        wanted = asked if isinstance(asked, dict) else {}
+        kind = wanted.get("kind")
+        for name in ("lateral", "depth"):
+            parameter = self._simulator.nodes.of(NODE).parameters.get(f"{kind}.{name}")
+            value = wanted.get(name)
+            if parameter is None or kind not in ("colour", *STRIPS):
+                continue
+            if not isinstance(value, int | float) or abs(value - parameter.raw) < _UNMOVED:
+                continue
+            if not await self._set(parameter.name, value / parameter.size):
+                return
+
+    def _mark(self) -> None:
+        shown = {**self._strips, self._mode: True, **{name: self._is_on(name) for name in SWITCHES}}
+        for name, button in self._buttons.items():
+            pressed = str(shown.get(name, False)).lower()
+            if button.props.get("aria-pressed") != pressed:
+                button.props["aria-pressed"] = pressed
+
+
+def _button(label: str, title: str, on_click: Any) -> ui.button:
+    button = ui.button(label, color=None, on_click=on_click).props("flat dense no-caps")
+    button.props["title"] = title
+    return button
+
+
+def _absent(what: str, why: str, values: Mapping[str, str]) -> str:
+    """The reason why there is no flow, unless it is said of the whole image already."""
+    if why not in _ABSENT or (why == "no_contact" and values.get("contact") != "good"):
+        return ""
+    return f"{what}: {_ABSENT[why]}"
+
+
+def build_modes(simulator: Simulator) -> None:
+    """Make the bar inside the page."""
+    _Modes(simulator)
 
 
 def words_of(state: SessionState) -> tuple[str, str]:

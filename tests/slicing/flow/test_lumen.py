@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tubes import RADIUS, SIDES, around, block, grid, tube_volume
 
 from us_sim.errors import VolumeError
-from us_sim.slicing.flow.carried_lumen import CarriedLumen
 from us_sim.slicing.flow.lumen import centreline, lumen_of, resampled
+from us_sim.slicing.flow.vessel import CarriedLumen
 
 MIDDLE = np.array([0.0, 0.0, 0.5 * SIDES[2]])
 

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from us_sim.command.calibration import read_motion, seconds_of
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.landmarks import read_landmarks, read_wires, register_landmarks
 from us_sim.tracking.calibration.pivot import find_dwells
-from us_sim.tracking.calibration.recorded_motion import read_motion, seconds_of
 
 CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.06, 0], [0, 0.06, 0.03], [0.05, 0, 0.04]])
 number = st.floats(-1.0, 1.0)

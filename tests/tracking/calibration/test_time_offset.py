@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from us_sim.command.calibration import read_signal
 from us_sim.errors import CalibrationError
-from us_sim.tracking.calibration.recorded_motion import read_signal
 from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
     find_time_offset,

@@ -16,11 +16,10 @@ from made_dicom import US_IMAGE, US_MULTI_FRAME, enhanced, header, item, turned,
 from us_sim.command.main import main
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.deidentification.importing import import_files, look_at
+from us_sim.volume.deidentification.importing import find_text, import_files, look_at
 from us_sim.volume.deidentification.kept_values import CLOSED_LISTS, NUMBERS, USED, kept_values
 from us_sim.volume.deidentification.report import report_picture, report_text
 from us_sim.volume.deidentification.settings import ImportSettings
-from us_sim.volume.deidentification.text_detection import find_text
 from us_sim.volume.files.dicom.header import open_dicom
 from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.readers import read_volume

@@ -6,13 +6,15 @@ from scipy import stats
 
 from us_sim.errors import VolumeError
 from us_sim.volume.phantom.phantom import cached_phantom, upper_arm
-from us_sim.volume.phantom.speckle import PointSpread, echo_envelope, log_compress
 from us_sim.volume.phantom.upper_arm import (
     UPPER_ARM_BLOCK,
     UPPER_ARM_LABELS,
+    PointSpread,
     SmoothNoise,
     Tube,
     UpperArm,
+    echo_envelope,
+    log_compress,
     sheets,
 )
 from us_sim.volume.volume import Volume

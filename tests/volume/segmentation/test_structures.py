@@ -12,7 +12,7 @@ from us_sim.errors import VolumeError
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SEGMENTATIONS
 from us_sim.volume.files.readers import read_volume
-from us_sim.volume.segmentation.dark_vessels import DarkVessels
+from us_sim.volume.segmentation.methods import DarkVessels
 from us_sim.volume.segmentation.region import Region
 from us_sim.volume.segmentation.settings import SegmentationSettings, read_seeds
 from us_sim.volume.segmentation.structures import segment

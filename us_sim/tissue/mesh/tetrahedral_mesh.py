@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.mesh_faces import (
+from us_sim.geometry.pose import PLACE, Placement
+from us_sim.geometry.triangles import (
     FACES,
     MOST_NODES,
     boundary_faces,
@@ -21,7 +22,6 @@ from us_sim.geometry.mesh_faces import (
     connected_parts,
     face_order,
 )
-from us_sim.geometry.pose import PLACE, Placement
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted

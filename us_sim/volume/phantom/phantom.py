@@ -46,8 +46,14 @@ def upper_arm(
         VolumeError: the seed or the voxel size is out of range.
     """
     # A phantom that is kept needs none of it, and a node should start quickly.
-    from us_sim.volume.phantom.speckle import PointSpread, echo_envelope, log_compress
-    from us_sim.volume.phantom.upper_arm import UPPER_ARM_BLOCK, UPPER_ARM_LABELS, UpperArm
+    from us_sim.volume.phantom.upper_arm import (
+        UPPER_ARM_BLOCK,
+        UPPER_ARM_LABELS,
+        PointSpread,
+        UpperArm,
+        echo_envelope,
+        log_compress,
+    )
 
     for name, quantity, value in (("seed", SEED, seed), ("voxel size", VOXEL_SIZE, voxel_size)):
         try:
