@@ -9,12 +9,8 @@ from hypothesis import strategies as st
 
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
-from us_sim.slicing.formation.image_formation import (
-    WIDTH_PER_SIGMA,
-    Elevation,
-    ImageFormation,
-    Resolution,
-)
+from us_sim.slicing.formation.image_formation import WIDTH_PER_SIGMA, Elevation, ImageFormation
+from us_sim.slicing.formation.resolution import Resolution
 from us_sim.slicing.probe.beams import step_depths
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import Imaging

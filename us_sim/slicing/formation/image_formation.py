@@ -1,16 +1,16 @@
-"""From slices to the picture that the console asks for, each stage only where it is set.
+"""The picture as the console forms it from slices, each stage only where a setting asks for it.
 
 A volume's grey values are levels: 255 is the strongest echo, each 4.25 less is one decibel less,
-and 0 is no echo, which no gain makes visible. The point spread function spreads echoes as power:
-scatterers within a beam send echoes of random phase, whose expected power is the sum of theirs
-(Wagner, Smith, Sandrik, Lopez 1983). So tissue keeps its brightness, and 6 dB below its peak a
-point is as wide as the setting says. A volume of grey values holds no phases, so speckle finer than
-the beam becomes smoother, where a scanner's is coarser.
+and 0 is no echo, which no gain makes visible.
 
+>>> import numpy as np
 >>> from us_sim.slicing.formation.image_formation import ImageFormation
 >>> from us_sim.slicing.probe.probe import LinearProbe
+>>> from us_sim.slicing.settings import Imaging
 >>> slice_ = np.full((4, 4), 100, dtype=np.uint8)
 >>> probe = LinearProbe(aperture=0.04, depth=0.04, columns=4, rows=4)
+>>> ImageFormation(probe, Imaging()).form([slice_]) is slice_
+True
 >>> ImageFormation(probe, Imaging(gain=6.0)).form([slice_])[0]
 array([126, 126, 126, 126], dtype=uint8)
 """
@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,212 +29,12 @@ from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.slicing.probe.beams import beam_width, depth_steps, focus_of, step_depths
 from us_sim.slicing.probe.plane import SlicePlane
-from us_sim.slicing.probe.probe import LinearProbe, Probe
+from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ECHO_RANGE, Imaging
 
 if TYPE_CHECKING:
     from us_sim.slicing.formation.coupling import GelLayer, Reverberation
-
-
-_SIGMA_PER_WIDTH = 1 / (4 * math.sqrt(math.log(2)))
-"""Standard deviation of an amplitude over the width at half its power. Power is the square of the
-amplitude, and its standard deviation is √2 times less."""
-
-_REACH = 3.0  # standard deviations after which the point spread counts as 0
-
-_PULSE_GROWTH = (
-    10.0  # 1/m: attenuation takes the high frequencies, so 10 cm deep it is twice as long
-)
-
-_FINEST = 1 << 16  # entries of the table of levels; a step is a 65th of the faintest amplitude
-_LINE_STEP = 1.0  # pixels between the lines of a fan that is resampled, where they are widest
-
-
-class Resolution:
-    """Spreads echoes across and along the beams.
-
-    Across them the width is ``lateral_resolution`` at the focus and grows away from it as
-    `beams.beam_width` says; along them it is ``axial_resolution`` at the face and grows by a tenth
-    of that each centimetre.
-
-    Where beams are parallel, an image's columns and rows serve as lines and samples. A fan is
-    resampled to lines and samples so close that no pixel falls between them, and back.
-    """
-
-    def __init__(self, probe: Probe, imaging: Imaging) -> None:
-        self._fan = None if isinstance(probe, LinearProbe) else _Fan(probe)
-        if self._fan is None:
-            lines, samples = probe.columns, probe.rows
-            line_spacing: Any = probe.pixel_spacing[0]
-        else:
-            lines, samples = self._fan.lines, self._fan.samples
-            line_spacing = self._fan.line_spacing
-        sample_spacing = probe.depth / samples
-        depths = (np.arange(samples) + 0.5) * sample_spacing
-        across = beam_width(depths, imaging.lateral_resolution, focus_of(probe)) / line_spacing
-        along = imaging.axial_resolution * (1.0 + _PULSE_GROWTH * depths) / sample_spacing
-        self._across = _point_spreads(across, lines - 1)
-        self._along = _point_spreads(along, samples - 1)
-
-    def spread(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (rows, columns) of echo levels as the probe resolves it."""
-        beams = image if self._fan is None else self._fan.beams(image)
-        power = np.empty(beams.shape, dtype=np.float32)
-        _spread_across(beams, _POWERS, *self._across, power)
-        out = np.empty_like(beams)
-        _spread_along(power, *self._along, _LEVELS, out)
-        return out if self._fan is None else self._fan.pixels(out)
-
-
-class _Fan:
-    """Resampling between the pixels of a fan and a grid of its beams."""
-
-    def __init__(self, probe: Probe) -> None:
-        import cv2
-
-        # As fine as the pixels, however many lines and samples the probe has.
-        pixel = math.sqrt(probe.pixel_spacing.prod())
-        ends = probe.beam_starts + probe.depth * probe.beam_directions
-        widest = max(_length(probe.beam_starts), _length(ends))
-        self.lines = max(2, math.ceil(widest / (_LINE_STEP * pixel)))
-        self.samples = max(2, round(probe.depth / pixel))
-        # Their coordinates among the probe's lines, whose outermost are half a line from the edge.
-        number = np.arange(probe.lines)
-        line = (np.arange(self.lines) + 0.5) * (probe.lines / self.lines) - 0.5
-        starts, directions = (
-            np.column_stack([np.interp(line, number, column) for column in array.T])
-            for array in (probe.beam_starts, probe.beam_directions)
-        )
-        depths = (np.arange(self.samples) + 0.5) * (probe.depth / self.samples)
-        x, z = (starts[:, i] + depths[:, None] * directions[:, i] for i in range(2))
-        between = np.hypot(np.diff(x, axis=1), np.diff(z, axis=1))
-        self.line_spacing = np.maximum(np.median(between, axis=1), 1e-9)
-        lateral, axial = probe.pixel_spacing
-        left, top = probe.image_to_probe[[0, 2], 3]
-        self._to_beams = cv2.convertMaps(
-            ((x - left) / lateral).astype(np.float32),
-            ((z - top) / axial).astype(np.float32),
-            cv2.CV_16SC2,
-        )
-        line_of, distance = probe.pixel_beams
-        shown = np.isfinite(distance)
-        line_of = (line_of + 0.5) * (self.lines / probe.lines) - 0.5
-        line_of = np.clip(line_of, 0, self.lines - 1)
-        sample = np.clip(distance * (self.samples / probe.depth) - 0.5, 0, self.samples - 1)
-        self._to_pixels = cv2.convertMaps(
-            np.where(shown, line_of, -9).astype(np.float32),
-            np.where(shown, sample, -9).astype(np.float32),
-            cv2.CV_16SC2,
-        )
-
-    def beams(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(samples, lines) of an image (rows, columns)."""
-        return _remapped(image, self._to_beams, replicate=True)
-
-    def pixels(self, beams: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (rows, columns) of (samples, lines), black where no beam reaches."""
-        return _remapped(beams, self._to_pixels, replicate=False)
-
-
-def _remapped(image: NDArray[np.uint8], maps: Any, *, replicate: bool) -> NDArray[np.uint8]:
-    import cv2
-
-    border = cv2.BORDER_REPLICATE if replicate else cv2.BORDER_CONSTANT
-    nearest, fractions = maps
-    remapped: Any = cv2.remap(image, nearest, fractions, cv2.INTER_LINEAR, borderMode=border)
-    return np.asarray(remapped)
-
-
-def _length(points: NDArray[np.float64]) -> float:
-    count = len(points)
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return float(steps.sum()) * count / max(count - 1, 1)
-
-
-def _point_spreads(
-    widths: NDArray[Any], most: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Gaussian weights of full widths at half maximum (n,) in steps, and how far each reaches.
-
-    Returns:
-        (n, reach + 1) weights of a step and those on either side of it, which sum to 1; (n,).
-    """
-    sigma = np.maximum(widths, 1e-6) * _SIGMA_PER_WIDTH
-    reach = np.minimum(np.ceil(_REACH * sigma), most).astype(np.int64)
-    reach[widths == 0.0] = 0
-    away = np.arange(reach.max() + 1)
-    weights = np.exp(-0.5 * (away / sigma[:, None]) ** 2)
-    weights[away > reach[:, None]] = 0.0
-    weights /= weights[:, :1] + 2 * weights[:, 1:].sum(axis=1, keepdims=True)
-    return weights.astype(np.float32), reach
-
-
-def _powers() -> NDArray[np.float32]:
-    """(256,) the power of each grey value, 1 for 255 and nothing for 0."""
-    power = 10.0 ** ((np.arange(256) / 255.0 - 1.0) * ECHO_RANGE / 10.0)
-    power[0] = 0.0
-    return power.astype(np.float32)
-
-
-def _levels() -> NDArray[np.uint8]:
-    """(`_FINEST` + 1,) the grey value of each evenly spaced amplitude from 0 to 1."""
-    amplitude = np.maximum(np.arange(_FINEST + 1), 0.25) / _FINEST
-    level = 255.0 * (1.0 + 20.0 * np.log10(amplitude) / ECHO_RANGE)
-    return np.clip(np.floor(level + 0.5), 0, 255).astype(np.uint8)
-
-
-_POWERS = _powers()
-_LEVELS = _levels()
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _spread_across(image, powers, weights, reach, out):
-    """Rows of grey values (rows, lines), as power spread along the row, to ``out``."""
-    rows, lines = image.shape
-    padded = np.empty(lines + 2 * weights.shape[1], dtype=np.float32)
-    for row in range(rows):
-        r = reach[row]
-        inner = padded[r : r + lines]
-        echoes = image[row]
-        for i in range(lines):
-            inner[i] = powers[echoes[i]]
-        for i in range(r):
-            padded[i] = inner[0]
-            padded[r + lines + i] = inner[lines - 1]
-        line = out[row]
-        middle = weights[row, 0]
-        for i in range(lines):
-            line[i] = middle * inner[i]
-        for k in range(1, r + 1):
-            weight = weights[row, k]
-            left = padded[r - k : r - k + lines]
-            right = padded[r + k : r + k + lines]
-            for i in range(lines):
-                line[i] += weight * (left[i] + right[i])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _spread_along(power, weights, reach, levels, out):
-    """Power (rows, lines) spread across rows, as grey values to ``out``."""
-    rows, lines = power.shape
-    line = np.empty(lines, dtype=np.float32)
-    finest = np.float32(len(levels) - 1)
-    for row in range(rows):
-        middle = weights[row, 0]
-        own = power[row]
-        for i in range(lines):
-            line[i] = middle * own[i]
-        for k in range(1, reach[row] + 1):
-            weight = weights[row, k]
-            above = power[max(row - k, 0)]
-            below = power[min(row + k, rows - 1)]
-            for i in range(lines):
-                line[i] += weight * (above[i] + below[i])
-        for i in range(lines):
-            line[i] = min(np.sqrt(line[i]), np.float32(1.0)) * finest + np.float32(0.5)
-        shown = out[row]
-        for i in range(lines):
-            shown[i] = levels[np.int32(line[i])]
+    from us_sim.slicing.formation.resolution import Resolution
 
 
 class ImageFormation:
@@ -259,7 +59,7 @@ class ImageFormation:
         if imaging.elevation_planes > 1:
             self._elevation = Elevation(probe, imaging)
         if imaging.lateral_resolution > 0.0 or imaging.axial_resolution > 0.0:
-            from us_sim.slicing.formation.image_formation import Resolution
+            from us_sim.slicing.formation.resolution import Resolution
 
             self._resolution = Resolution(probe, imaging)
         if imaging.contact:
