@@ -16,8 +16,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
 from us_sim.errors import MeshError, SettingsError
-from us_sim.nodes.probe_lead import is_left_by_pages
-from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.scene_node import SceneNode, is_left_by_pages
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of
 from us_sim.slicing.cutting.resampling import Located

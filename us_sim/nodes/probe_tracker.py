@@ -21,8 +21,8 @@ from us_sim.nodes.messages import (
     transform_message,
 )
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
 from us_sim.nodes.process import run_node
+from us_sim.nodes.scene_node import NO_PAGE, is_left_by_pages
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of

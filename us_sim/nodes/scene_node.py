@@ -1,4 +1,4 @@
-"""A node of a scene: its parameters, its health, and lockstep or live input."""
+"""A node of a scene: its parameters, its health, lockstep or live input, and who moves the probe."""
 
 from __future__ import annotations
 
@@ -120,3 +120,20 @@ class SceneNode(GuardedNode):
         self.create_subscription(
             message_type, topic, callback, qos, qos_overriding_options=overridable(), **options
         )
+
+
+LEAD_TOPIC = "tracker/pose"
+VIEWER = "viewer"
+NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
+
+
+def is_left_by_pages(node: GuardedNode) -> bool:
+    """Whether poses stay away because no page is open, where pages could move the probe."""
+    name = node.resolve_topic_name(LEAD_TOPIC)
+    hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    viewer = (VIEWER, node.get_namespace())
+    return (
+        "probe_tracker" in hearers
+        and not node.count_publishers(name)
+        and viewer in node.get_node_names_and_namespaces()
+    )

@@ -29,8 +29,8 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
 from us_sim.nodes.posted import Posted
-from us_sim.nodes.probe_lead import LEAD_TOPIC
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.settings.spelling import shown
 from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance

@@ -15,8 +15,7 @@ from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import colour_image_message, nanoseconds_of
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.probe_lead import NO_PAGE, is_left_by_pages
-from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.scene_node import NO_PAGE, SceneNode, is_left_by_pages
 from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.nodes.streams.stream import FrameStream
 from us_sim.scene.building import colour_of
