@@ -176,10 +176,3 @@ def test_without_reachable_nodes_nothing_moves():
     model = replace(block(), contact_nodes=np.empty(0, np.int32))
     deformation = FemCg(model).deform(at(z=0.02))
     np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
-
-
-def test_a_held_node_is_passed_by():
-    model = block(held=("bottom", "top"))
-    deformation = FemCg(model).deform(at(z=0.02))
-    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
-    assert len(deformation.contact_nodes) == 0

@@ -482,10 +482,3 @@ def test_a_single_tetrahedron_with_one_free_corner():
     # It has no neighbour to carry part of the load, so the probe sinks deep into its spring.
     distance, _ = signed_distance(model.collider, pose, deformation.nodes[3:])
     assert -0.3 * 0.02 < distance[0] < 0.0
-
-
-@pytest.mark.parametrize("held", [("top",), ("bottom", "top")])
-def test_held_nodes_are_passed_by(held):
-    model = block(FINE, held=held)
-    deformation = FemNonlinear(model).deform(at(z=0.02))
-    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
