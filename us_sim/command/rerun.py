@@ -1,4 +1,4 @@
-"""A session as a recording of rerun, with what rerun's own reader of ROS 2 messages leaves out."""
+"""A session as a recording of rerun, with all that its own reader of ROS 2 leaves out."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class RerunFile:
         self._frames: dict[str, str] = {}
 
     def at(self, stamp: int | None, recorded: int) -> None:
-        """Say when what is logged from now on was.
+        """Set the time of everything that is logged from now on.
 
         Args:
             stamp: ns since 1970, of the measurement; None of what has no stamp.
@@ -79,7 +79,7 @@ class RerunFile:
             self._stream.set_time(timeline, timestamp=np.datetime64(moment, "ns"))
 
     def log(self, entity: str, *parts: Any, static: bool = False) -> None:
-        """Log archetypes of rerun, at the time that was said, or as what does not change."""
+        """Log archetypes of rerun at the time that `at` set, or as constant."""
         self._stream.log(entity, *parts, static=static)
 
     def place(self, entity: str, frame: str) -> None:
@@ -91,7 +91,7 @@ class RerunFile:
             self.log(entity, rerun.CoordinateFrame(frame), static=True)
 
     def show(self, blueprint: Any) -> None:
-        """Say what the viewer opens."""
+        """Set the layout that the viewer opens."""
         self._stream.send_blueprint(blueprint)
 
     def __enter__(self) -> RerunFile:
@@ -189,7 +189,7 @@ class _Conversion:
             self.left_out.append(f"the structures of the scene are left out: {error}")
 
     def write(self, file: RerunFile) -> None:
-        """Log all messages, and what the viewer opens."""
+        """Log all messages, and the viewer's layout."""
         total = sum(self._there[name].message_count for name in self.shown)
         refused: dict[str, tuple[int, str]] = {}
         stamps: list[int] = []  # of poses

@@ -475,7 +475,7 @@ _TITLES = {
 def blueprint_of(
     shown: Collection[str], images: Collection[str], frame: str, span: tuple[int, int] | None
 ) -> Any:
-    """Views of what is there.
+    """Views of the data that there are.
 
     Args:
         shown: entities of topics that have messages.

@@ -339,7 +339,7 @@ class ReportFolder:
         self.report.write_text(text + "\n", encoding="utf-8")
 
     def finish(self, table: str, failures: Sequence[str]) -> int:
-        """Print a table, where everything is, and what failed; 1 if anything did, else 0."""
+        """Print a table, the files, and the failures; return 1 if there are any, else 0."""
         print(table)
         print(f"Report: {self.report}; pictures: {', '.join(map(str, self._pictures))}")
         for failure in failures[:10]:

@@ -144,7 +144,7 @@ class CameraDriver(GuardedNode):
         self._guard.trigger()
 
     def _keep(self, taken: int) -> bool:
-        """Decode what was grabbed just now, for the node's thread to publish.
+        """Decode the newest image, for the node's thread to publish.
 
         Args:
             taken: ns, when it came from the camera.

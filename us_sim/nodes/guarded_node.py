@@ -63,7 +63,7 @@ LONGEST = 500  # characters of a sentence: an error may quote all of a message
 
 
 class GuardedNode(Node):
-    """Every callback of it is guarded: what it raises ends neither the callback's node nor others.
+    """A node whose callbacks are guarded: an exception ends neither this node nor others.
 
     Bad input, an error of this package, is *refused*: said, and counted by its kind. Any other
     exception is a *failure*: counted by where it happened, said once a second at most, its
@@ -172,7 +172,7 @@ class GuardedNode(Node):
         return super().create_service(srv_type, srv_name, entered, **options)
 
     def add_on_set_parameters_callback(self, callback: Any) -> None:
-        """As `rclpy.node.Node.add_on_set_parameters_callback`: what fails refuses the change."""
+        """As `rclpy.node.Node.add_on_set_parameters_callback`; an exception refuses the change."""
 
         def refuse(_: Any) -> SetParametersResult:
             return SetParametersResult(successful=False, reason=FAILED)
@@ -235,7 +235,7 @@ def kind_of(error: UsSimError) -> str:
 
 
 def _refusing(request: Any, response: Any) -> Any:
-    """The response, which says that what was asked for has failed where it has a field for that."""
+    """The response, which states the failure where it has a field for it."""
     refused = SetParametersResult(successful=False, reason=FAILED)
     if hasattr(response, "results") and hasattr(request, "parameters"):
         response.results = [refused for _ in request.parameters]
@@ -268,7 +268,7 @@ ANOTHER_CLOCK_S = 10.0
 
 
 class Health:
-    """Counts what a node does and publishes it on ``diagnostics`` at 1 Hz.
+    """Counts of a node's work, published on ``diagnostics`` at 1 Hz.
 
     Latency is the age of what goes out by its stamp. Where stamps are of another clock, as those
     of a recording are, that is said once, and latency counts from the arrival of what a message
@@ -342,7 +342,7 @@ class Health:
         self.report()
 
     def report(self) -> None:
-        """Publish what there is to say: once a second, and when it must be known at once."""
+        """Publish the report: once a second, and at once when it is urgent."""
         now = self._node.get_clock().now()
         elapsed = max(now.nanoseconds - self._last_time, 1) * 1e-9
         total = max(self._published.values(), default=0)

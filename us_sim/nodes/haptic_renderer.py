@@ -161,7 +161,7 @@ class HapticRenderer(SceneNode):
         self._rendering.distrust(f"{where}: {error}")
 
     def failed(self, where: str, error: Exception) -> None:
-        """Feel nothing, too, and render anew: what has failed may be of no use any more."""
+        """Send a zero wrench, and begin anew, since the failed state may be corrupt."""
         super().failed(where, error)
         self._rendering = haptic_rendering_of(self.scene)
         self._stops = 0

@@ -460,7 +460,7 @@ def field_from(message: Image) -> NDArray[np.float32]:
 
 
 def _lines(message: Image, size: int) -> NDArray[np.uint8]:
-    """The bytes of an image, row by row, without what fills the rows up.
+    """The bytes of an image, row by row, without padding.
 
     Args:
         message: the image.
@@ -542,7 +542,7 @@ def surface_marker(
     frame: str,
     opacity: float,
 ) -> bytes:
-    """A skin-coloured TRIANGLE_LIST marker, serialized; an opacity of 1 hides what lies below."""
+    """A skin-coloured TRIANGLE_LIST marker, serialized; an opacity of 1 hides everything below."""
     skin = ("skin", (0.85, 0.65, 0.55, opacity), vertices, triangles)
     return b"".join([CDR_LITTLE_ENDIAN, *_marker(skin, stamp, frame, 0)])
 

@@ -31,7 +31,7 @@ S = TypeVar("S", bound=Settings)
 
 
 def declared(node: Node, settings: S, names: Collection[str] | None = None, prefix: str = "") -> S:
-    """The settings with what the node's parameters were given at the start; these are declared.
+    """Declare parameters for settings; return the settings with the values given at the start.
 
     Args:
         node: that gets the parameters.
@@ -92,7 +92,7 @@ class LiveSettings:
         node.add_post_set_parameters_callback(self._change)
 
     def restore(self, values: Mapping[str, Any]) -> None:
-        """Set parameters back to what settings were, by the groups' names."""
+        """Set parameters back to former settings, by the groups' names."""
         back = []
         for key, settings in values.items():
             group = self._groups[key]

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class Posted:
-    """Does what it is called with in the node's thread, in order; any thread may call.
+    """Runs calls from any thread in the node's thread, in order.
 
     Args:
         node: that is spun.
@@ -25,7 +25,7 @@ class Posted:
         self._closed = False
 
     def __call__(self, work: Callable[[], T]) -> Future[T]:
-        """Have it done soon; the future holds what it returns or raises."""
+        """Run it soon; the future holds its result or exception."""
         future: Future[T] = Future()
         if self._closed:
             future.cancel()
@@ -35,7 +35,7 @@ class Posted:
         return future
 
     def close(self) -> None:
-        """The node ends: nothing more is done, and what waits is cancelled."""
+        """Cancel all waiting calls, as the node ends."""
         self._closed = True
         while self._work:
             self._work.popleft()[1].cancel()

@@ -191,7 +191,7 @@ def spin(node: Node) -> None:
 
 
 class _Executor(SingleThreadedExecutor):
-    """rclpy's own never serves a node again that has failed to take what came in for it."""
+    """rclpy's own never serves a node again that has failed to take a message."""
 
     def _take_subscription(self, entity: Any) -> Any:
         return self._taken(super()._take_subscription, entity)

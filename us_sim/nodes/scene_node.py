@@ -77,13 +77,13 @@ class SceneNode(GuardedNode):
         self.health: Health = Health(self, self.scene.name)
 
     def stream(self, message_type: Any, topic: str) -> Publisher:
-        """A publisher of what changes with every pose."""
+        """Create a publisher of messages that change with every pose."""
         return self.create_publisher(
             message_type, topic, STREAM, qos_overriding_options=overridable()
         )
 
     def latched(self, message_type: Any, topic: str) -> Publisher:
-        """A publisher of what is sent once and kept for those who come later."""
+        """Create a publisher of messages that are kept for later subscribers."""
         return self.create_publisher(
             message_type, topic, LATCHED, qos_overriding_options=overridable()
         )

@@ -30,7 +30,7 @@ class Controlled(Protocol):
         """Raise UsSimError when this cannot be; ``named`` are the parameters that were set."""
 
     def take(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
-        """Begin to do this; what the parameters say that were not set goes on."""
+        """Begin to do this; parameters that were not set stay in force."""
 
 
 class SessionControl(GuardedNode):
@@ -72,7 +72,7 @@ class SessionControl(GuardedNode):
         self.show(settings)
 
     def show(self, settings: SessionControlSettings) -> None:
-        """Set the parameters to what is so by now."""
+        """Set the parameters to the present state."""
         self._is_showing = True
         try:
             self.set_parameters_atomically(parameters_with(settings))
@@ -131,7 +131,7 @@ class SessionControl(GuardedNode):
         self._scenes.publish(message)
 
     def tell_thumbnail(self, origin: str, jpeg: bytes) -> None:
-        """Publish what the probe sees in a scene."""
+        """Publish the view of the probe in a scene."""
         message = CompressedImage(format="jpeg", data=jpeg)
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = origin

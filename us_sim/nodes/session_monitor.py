@@ -1,4 +1,4 @@
-"""Follows what the nodes of a session report on `diagnostics`, and reports what was lost."""
+"""Follows the reports of a session's nodes on `diagnostics`, and reports losses."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class SessionMonitor(GuardedNode):
             del self.reports[name], self.messages[name]
 
     def tell_lost(self, losses: Sequence[str]) -> None:
-        """Report what was lost so far, each in words, at once and from now on."""
+        """Report all losses so far, each in words, at once and from now on."""
         first = max(len(losses) - TOLD, 0)
         told = {f"lost {i}": text for i, text in enumerate(losses[first:], first + 1)}
         self.health.values = {"lost": str(len(losses)), **told}

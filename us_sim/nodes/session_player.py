@@ -107,7 +107,7 @@ class SessionPlayer(GuardedNode):
         self._playback.begin()
 
     def _tick(self) -> None:
-        """Send what is due."""
+        """Send the messages that are due."""
         if self.health.state == "finished":
             if self._settings.loop:
                 self._go_to(0)
@@ -166,7 +166,7 @@ class SessionPlayer(GuardedNode):
         self._playhead.go_to(position, self._playback.now)
 
     def _next(self) -> BagMessage | None:
-        """The next message; what is damaged is said, and passed over where that can be."""
+        """The next message; damaged parts are reported, and skipped where possible."""
         known = len(self._damage)
         try:
             message = next(self._messages, None)

@@ -91,7 +91,7 @@ class SessionRecorder(GuardedNode):
             self._bag.split()
 
     def snapshot(self) -> bool:
-        """Write what was kept in memory; False where nothing is kept."""
+        """Write the messages kept in memory; False where none are kept."""
         if self._bag is None or not self._settings.snapshot_mode:
             return False
         self._bag.put_all(self._kept.take())

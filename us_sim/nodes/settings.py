@@ -46,7 +46,7 @@ class PoseAgeSettings(Settings):
 
 @dataclass(frozen=True)
 class AnnotatedImageSettings(Settings):
-    """Of ``slice_interpolator``: what the annotated image shows."""
+    """Of ``slice_interpolator``: the contents of the annotated image."""
 
     live = True
 
@@ -68,7 +68,7 @@ class AnnotatedImageSettings(Settings):
 
 
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
-    """Settings of a scene that are parameters, too, each with what goes before their names."""
+    """Settings of a scene that are parameters, too, each with the prefix of their names."""
     yield "", type(probe_of(scene))
     yield "acoustics.", SoundSettings
     for label in scene.imaging.acoustics.tissues:
@@ -240,7 +240,7 @@ class SessionRecorderSettings(Settings):
 
     @property
     def at_once(self) -> bool:
-        """Whether it records from its start on what it records, and not when it is told to."""
+        """Whether it records from its start, and not only when told to."""
         return not (self.start_paused or self.snapshot_mode)
 
 
@@ -472,7 +472,7 @@ def is_live(settings: type[Settings], name: str) -> bool:
 
 
 def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, type[Settings]]]:
-    """The settings that are parameters of a node, each with what goes before their names.
+    """The settings that are parameters of a node, each with the prefix of their names.
 
     Args:
         node: its name.
@@ -500,7 +500,7 @@ def parameters_of(node: str, scene: Scene | None = None) -> Iterator[tuple[str, 
 def checked_parameters(
     node: str, scene: Scene | None, given: Mapping[str, str]
 ) -> dict[str, object]:
-    """Values of a node's parameters from what a person wrote, in SI units.
+    """Values of a node's parameters in SI units, from a person's texts.
 
     Args:
         node: its name.

@@ -261,7 +261,7 @@ class SliceInterpolator(SceneNode):
             self.health.report()
 
     def _reach(self, pose: Pose) -> dict[str, str]:
-        """Say once, and in diagnostics, that the image is deeper than what there is to see."""
+        """Report once, and in diagnostics, that the image is deeper than the tissue or volume."""
         too_deep = self._scanner.beyond(pose)
         if too_deep < _BEYOND:
             return {}

@@ -94,12 +94,12 @@ class LiveTissue:
 
     @property
     def state(self) -> str:
-        """The method in use, and what is being made ready."""
+        """The method in use, and the one in preparation."""
         preparing = self._preparation.state
         return f"{self.tissue.name}, {preparing}" if preparing else self.tissue.name
 
     def deform(self, pose: Pose) -> Deformation:
-        """One frame, with what is ready of what was set.
+        """Solve a frame, applying finished setting changes.
 
         Raises:
             UsSimError: the pose cannot be used.
@@ -165,7 +165,7 @@ class LiveTissue:
             return Failed(plan, str(error))
 
     def _tick(self) -> None:
-        """Adopt what is ready, and tell diagnostics how far it is, also while no pose comes."""
+        """Apply finished preparations, and report progress, also while no pose comes."""
         if preparing := self._preparation.state:
             self._node.health.state, self._node.health.preparing = self.state, preparing
         self._take_prepared()
@@ -371,13 +371,13 @@ class TissueDeformer(SceneNode):
         self._frame(message)
 
     def _go_on(self) -> None:
-        """While no pose comes: finish what the last frame had no time for."""
+        """Finish the last frame while no pose comes."""
         idle, self._came = self._came == 0, 0
         if idle and self._last is not None and not self._live.tissue.is_settled:
             self._frame(self._last, again=True)
 
     def _frame(self, message: PoseStamped, again: bool = False) -> None:
-        """Deform the tissue and send what somebody wants; ``again`` only if it is to be seen."""
+        """Deform the tissue and send topics with subscribers; ``again`` only if visible."""
         wanted = self._nodes.get_subscription_count() > 0
         felt = self._wrench.get_subscription_count() > 0
         touched = self._contact is not None and self._contact.is_wanted

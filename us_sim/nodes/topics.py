@@ -1,4 +1,4 @@
-"""The topics of the graph, without any ROS: what each carries, and who publishes and hears it.
+"""The topics of the graph, without any ROS: contents, publishers and subscribers of each.
 
 >>> from us_sim.nodes.topics import TOPICS
 >>> [topic.name for topic in TOPICS if topic.latched and "slice_interpolator" in topic.publishers]

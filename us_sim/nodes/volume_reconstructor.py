@@ -83,7 +83,7 @@ class VolumeReconstructor(GuardedNode):
             self.health.dropped += self._keep(self._images, stamp, pixels_from(message))
 
     def _keep(self, kept: dict[int, Any], stamp: int, value: Any) -> int:
-        """Keep what waits for its other half; how many had to be let go."""
+        """Keep a message until its counterpart comes; return how many were dropped."""
         kept[stamp] = value
         if len(kept) <= REMEMBERED:
             return 0

@@ -146,7 +146,7 @@ def _check_tables(database: sqlite3.Connection) -> None:
 
 
 def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
-    """Topics of a file of any schema version; the columns tell what it carries."""
+    """Topics of a file of any schema version; its columns tell the version."""
     columns = {row[1] for row in database.execute("PRAGMA table_info(topics)")}
     qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
     type_hash = "type_description_hash" if "type_description_hash" in columns else "''"

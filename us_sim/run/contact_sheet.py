@@ -210,7 +210,7 @@ def _is_seen(areas: LumenAreas, vessels: Collection[str], since: int) -> bool:
 
 
 def _seconds_before(session: Session, stamps: list[int], blood: Blood) -> Mapping[str, int]:
-    """Stamps by what happens then."""
+    """Stamps by the names of their moments."""
     times = 1e-9 * np.array(stamps)
     depth = np.array([session.poses[stamp].position[2] for stamp in stamps])
     deepest = max(float(depth.max()), 1e-9)
@@ -237,7 +237,7 @@ def _seconds_before(session: Session, stamps: list[int], blood: Blood) -> Mappin
 
 
 def _tilted(pose: Pose, aim: float) -> Pose:
-    """A probe that looks at what lies ``aim`` m under this one, tilted about its array."""
+    """A probe tilted about its array, aimed at the point ``aim`` m under this one."""
     half = math.radians(0.5 * TILT)
     turned = pose @ Pose(np.zeros(3), np.array([math.sin(half), 0.0, 0.0, math.cos(half)]))
     there = pose.position + aim * pose.rotation[:, 2]

@@ -1,4 +1,4 @@
-"""A process from which nodes are forked, so that what all of them import is imported once.
+"""A process from which nodes are forked, so that common modules are imported once.
 
 A node that is started as a program of its own imports rclpy, NumPy, Numba and SciPy again, which
 takes longer than all that it does until it is ready. Run as a program, this module is the server:

@@ -293,7 +293,7 @@ def demo(
 
 @contextlib.contextmanager
 def _made_unless_refused(out: Path) -> Iterator[None]:
-    """Make a folder before the work that fills it; on any error remove what was made, if empty."""
+    """Make a folder before the work that fills it; remove it again on an error, if empty."""
     place = out.absolute()
     made = [folder for folder in (place, *place.parents) if not folder.exists()]
     try:
@@ -429,7 +429,7 @@ def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
 
 
 def _require_a_cache() -> None:
-    """Raise VolumeError when what is made would be lost, and made again by every node."""
+    """Raise VolumeError where a phantom cannot be kept, so that every node would make it again."""
     from us_sim.cache import cache_folder
 
     folder = cache_folder()

@@ -21,7 +21,7 @@ TOLD = 4  # losses that are told one by one in a sentence
 
 @dataclass
 class Loss:
-    """A node that ended or hung, and what became of it."""
+    """A node that ended or hung, and its restart."""
 
     node: str
     what: str  # it did: "was ended by SIGKILL"

@@ -138,7 +138,7 @@ class Monitored:
         self.node.follow(nodes)
 
     def spin(self, seconds: float = 0.1) -> None:
-        """Take what has come next, or wait for it, at most so long."""
+        """Take the next message, waiting at most so long."""
         self._executor.spin_once(timeout_sec=seconds)
 
     def refuse_company(self, names: Collection[str]) -> None:

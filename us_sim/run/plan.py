@@ -91,7 +91,7 @@ def require_texts(parameters: Mapping[str, object]) -> None:
 
 @dataclass(frozen=True)
 class Request:
-    """A scene to run, and what is recorded, played and shown."""
+    """A scene to run, with its recording, its path and its page."""
 
     scene: Scene
     parameters: Parameters = field(default_factory=dict)  # given by a person, by node

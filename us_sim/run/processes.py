@@ -59,7 +59,7 @@ STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
 
 
 class RunningNode:
-    """A node's process, and the thread that reads what it says.
+    """A node's process, and the thread that reads its output.
 
     Args:
         node: what it runs.
@@ -155,7 +155,7 @@ HUNG_STOP_S = 2.0  # how long a node that hangs may take to end by itself, befor
 
 
 def keep_on_this_host(*, network: bool) -> None:
-    """Let what this process starts talk on this host only, unless the environment says otherwise.
+    """Keep the processes started from here on this host, unless the environment says otherwise.
 
     Nobody on a hospital's network should meet a simulator by accident.
     """
@@ -240,7 +240,7 @@ class ProcessGroup:
         return ended
 
     def last_words(self, node: str) -> str:
-        """The last line of a node's output, without what its logger puts before it."""
+        """The last line of a node's output, without its logger's prefix."""
         return self._running[node].said
 
     def check(self) -> None:

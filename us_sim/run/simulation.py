@@ -65,7 +65,7 @@ class Simulation:
         self._control.obey(self, self._shown())
 
     def update(self) -> None:
-        """As `Supervisor.update`; and go on with what was asked for.
+        """Update as `Supervisor.update`, and continue pending requests.
 
         Raises:
             UsSimError: a node cannot work, and there is nothing to go back to.
@@ -88,13 +88,13 @@ class Simulation:
         self._report()
 
     def close(self) -> None:
-        """End what works in the background."""
+        """End all work in the background."""
         for process in (self._making, self._catalogue):
             if process is not None:
                 process.end()
 
     def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
-        """Raise UsSimError when what the parameters say cannot be."""
+        """Raise UsSimError where the parameters ask for something impossible."""
         if _OF_SCENE & set(named):
             load_scene(wanted.scene, volume=wanted.volume)
             return
@@ -113,7 +113,7 @@ class Simulation:
                 )
 
     def take(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
-        """Begin to do what the parameters say."""
+        """Begin to do as the parameters say."""
         self._problem = ""
         if _OF_SCENE & set(named):
             self._make(wanted.scene, wanted.volume)
@@ -168,7 +168,7 @@ class Simulation:
         return self._kept.setdefault(_identity(self._request.scene), {})
 
     def _take_what_was_set(self) -> None:
-        """Keep what was set, whoever set it, but for what could not be run with."""
+        """Keep all values that were set, by whomever, but for those that a node died of."""
         kept, dropped = self._supervisor.take_set()
         for node, values in kept.items():
             self._kept_here.setdefault(node, {}).update(values)
@@ -238,7 +238,7 @@ class Simulation:
         return plan_of(replace(request, kept=self._kept.get(_identity(request.scene), {})))
 
     def _go_back(self, why: str) -> None:
-        """Run what ran before; a recording and a replay that had ended for it do not come back."""
+        """Return to the former scene; a recording and a replay ended for it do not come back."""
         assert self._settled is not None
         before = self._settled
         if RECORDER not in self._supervisor.started:

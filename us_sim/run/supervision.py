@@ -126,7 +126,7 @@ class Supervisor:
                 self._set.setdefault(node, {}).update(values)
 
     def update(self) -> None:
-        """Take what has come, and see to nodes that have ended or hang.
+        """Take new reports, and restart nodes that have ended or hang.
 
         Raises:
             UsSimError: a node that was never ready cannot work, in its own words.
@@ -150,7 +150,7 @@ class Supervisor:
             self._prepare()
 
     def _start_due(self) -> None:
-        """Start what is due, unless something that was dismissed may still publish beside it.
+        """Start nodes that are due, unless a dismissed one may still publish beside them.
 
         The recorder may take long to write, and disturbs nobody but another recorder.
         """
@@ -222,7 +222,7 @@ class Supervisor:
         self._away[node] = loss, time.monotonic()
 
     def _without_kept(self, node: str) -> str:
-        """Keep no longer what a node does not live long with; what to say of that."""
+        """Drop settings with which a node dies soon; return the sentence on it."""
         process = self._processes[node]
         lived = time.monotonic() - self._back.get(node, -LIVES_S)
         if not process.kept or (node not in self._away and lived > LIVES_S):

@@ -1,1 +1,1 @@
-"""A scene: what its file may say, how that is read, and the objects it names."""
+"""A scene: the keys of its file, their reading, and the objects it names."""

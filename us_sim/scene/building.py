@@ -446,7 +446,7 @@ class Structure:
 
 
 def colour_of(scene: Scene, name: str) -> Colour:
-    """Red, green and blue of a structure: the scene's, or what its label's name suggests."""
+    """Red, green and blue of a structure: the scene's, or a usual one for its label's name."""
     given = scene.structures[name]
     return given.colour or anatomical_colour(given.label or name)
 

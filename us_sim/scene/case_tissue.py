@@ -131,7 +131,7 @@ _IN_REACH = 0.015
 
 
 def footprint(collider: Collider) -> tuple[float, float]:
-    """Half the length and half the width (m, along the probe's x and y) of what presses."""
+    """Half the length and half the width (m, along the probe's x and y) of the collider."""
     if isinstance(collider, Sphere):
         return collider.radius, collider.radius
     if isinstance(collider, Capsule):
@@ -165,7 +165,7 @@ def box_planes(
 
 
 def counts(scene: Scene, label: str) -> bool:
-    """Whether planes are put close together for a label: not for what is held, nor for layers."""
+    """Whether planes are put close together for a label: not for held ones, nor for layers."""
     assert scene.tissue is not None
     named = {given.label or name for name, given in scene.structures.items()}
     return label in named and label not in scene.tissue.fixed and kind_of(label) not in LAYERS

@@ -69,7 +69,7 @@ class _Structure:
 def conforming_tissue(
     scene: Scene, volume: Volume, progress: Callable[[float, str], None] | None = None
 ) -> tuple[TetrahedralMesh, LabelFractions]:
-    """A mesh whose tetrahedra are in one structure each, and what else is in them.
+    """A mesh whose tetrahedra are in one structure each, and their other materials.
 
     Layers and what is held have no surfaces of their own in it: of these each tetrahedron has
     fractions, as in a grid. A box without other structures is a grid.

@@ -40,7 +40,7 @@ class ListedScene:
 
     @classmethod
     def from_json(cls, said: Mapping[str, Any]) -> ListedScene:
-        """From what `dataclasses.asdict` and JSON have made of one."""
+        """From a mapping that `dataclasses.asdict` and JSON have made of one."""
         return cls(**{**said, "structures": tuple(said["structures"])})
 
 

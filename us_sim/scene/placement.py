@@ -149,7 +149,7 @@ def part_inside(
 def check_path_in_volume(
     scene: Scene, file: Path, volume: Volume, topic: str | None = None
 ) -> None:
-    """Refuse a path of which no image shows what was scanned.
+    """Refuse a path of which no image shows any of the volume.
 
     Raises:
         SceneError: with where the volume is, and where the images are.

@@ -76,7 +76,7 @@ def read_document(
 
 
 def merged(below: dict[Any, Any], above: dict[Any, Any]) -> dict[Any, Any]:
-    """``below`` with what ``above`` says: mappings key by key, anything else replaced.
+    """``below`` overridden by ``above``: mappings key by key, anything else replaced.
 
     Where ``above`` chooses another kind of probe, collider, filter, ..., what only some kinds have
     goes with the one below; where it names a file in place of a box, the box goes. ``null`` takes
@@ -168,7 +168,7 @@ def _yaml(path: Path) -> Any:
 
 
 def check_files(scene: Scene) -> list[str]:
-    """Read what files the scene names, of its volume only the header; the keys that name them.
+    """Read the files that the scene names, of its volume only the header; return their keys.
 
     Raises:
         UsSimError: one cannot be used, and why.

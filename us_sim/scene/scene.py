@@ -113,7 +113,7 @@ class StructureSettings(Settings):
 
 @dataclass(frozen=True)
 class TrackerSettings(Settings):
-    """Where probe poses come from, and what is done to them.
+    """The source of the probe's poses, and their processing.
 
     A source's own settings stand under its name: ``source: camera`` and ``camera: {...}``.
     """
@@ -182,7 +182,7 @@ class TrackerSettings(Settings):
 
 @dataclass(frozen=True)
 class ImagingSettings(Imaging):
-    """The console's settings, and what sound meets on its way."""
+    """The console's settings, and the acoustics of the tissue."""
 
     acoustics: Acoustics = setting(
         description="artefacts of sound, and the acoustic constants of tissues", default=Acoustics()

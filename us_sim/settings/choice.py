@@ -1,4 +1,4 @@
-"""Choices by name: solvers, slicers, probes, and what else there are several of.
+"""Choices by name: solvers, slicers, probes and the like.
 
 A choice knows each option's class by where it is, so that only what is chosen is imported. An
 installed package adds options of its own under the choice's entry point group.

@@ -109,7 +109,7 @@ class Reader:
         return made
 
     def _other(self, kind: Any, value: object, rule: Rule, path: str) -> Any:
-        """A mapping made what its type says: settings, what a choice names, or by any name."""
+        """Convert a mapping to its type: settings, a choice's option, or settings by any name."""
         if kind is Chosen:
             assert rule.choice is not None
             return self._chosen(rule.choice, value, path)
@@ -272,7 +272,7 @@ def document_of(settings: Settings) -> dict[str, Any]:
 
 
 def _chosen(name: str, chosen: Chosen, rule: Rule) -> dict[str, Any]:
-    """The keys of what was chosen, where its rule says that they stand."""
+    """The keys of the chosen option, at the place that its rule states."""
     assert rule.choice is not None
     own = document_of(chosen.given) if chosen.given is not None else {}
     key = {rule.choice.key: chosen.name}

@@ -137,14 +137,14 @@ class Settings:
         """Refuse values that do not go together."""
 
     def refused(self, key: str, problem: str) -> UsSimError:
-        """The error that says what is wrong with a setting of these."""
+        """The error for a wrong value of one of these settings."""
         error = self.error(f"{self.section}.{key}: {problem}" if self.section else problem)
         error.key, error.problem = key, problem
         return error
 
 
 class Refusal(ValueError):
-    """A value will not do: the rest of the path of keys to it, and what is wrong."""
+    """A refused value: the rest of the path of keys to it, and the fault."""
 
     def __init__(self, problem: str, key: str = "") -> None:
         super().__init__(problem)

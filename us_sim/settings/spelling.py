@@ -1,4 +1,4 @@
-"""Names and numbers in sentences: what to say of a name that is not known, one or several.
+"""Names and numbers in sentences: suggestions for unknown names, singular and plural.
 
 >>> from us_sim.settings.spelling import unknown
 >>> unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])

@@ -1,4 +1,4 @@
-"""Settings as tables in Markdown, made from what the settings themselves say.
+"""Settings as tables in Markdown, made from the settings' own rules.
 
 >>> from us_sim.settings.tables import sections_of, table
 >>> from us_sim.tissue.elasticity.material import Material
@@ -121,7 +121,7 @@ def default_text(settings: type[Settings], name: str) -> str:
 
 
 def first_sentence(documented: Any) -> str:
-    """The first line of what a class or function says of itself, as Markdown."""
+    """The first line of a docstring, as Markdown."""
     text = (getattr(documented, "__doc__", None) or "").strip().partition("\n")[0]
     return re.sub(r"``(.+?)``", r"`\1`", text)
 
@@ -160,7 +160,7 @@ class _Options:
 
     @property
     def at(self) -> str:
-        """Keys that lead to what is chosen."""
+        """Keys that lead to the chosen option."""
         key = self.name if self.place == "within" else self.choice.key
         return f"{self.below}.{key}" if self.below else key
 
@@ -177,7 +177,7 @@ class _Options:
 
 
 def _options_of(kind: Any, name: str, rule: Rule, path: str) -> _Options | None:
-    """The options of a setting, if what is chosen has settings of its own."""
+    """The options of a setting, if they have settings of their own."""
     by_name = get_origin(kind) in (dict, Mapping)
     if rule.choice is None or not (by_name or Chosen in (kind, *get_args(kind))):
         return None
@@ -226,7 +226,7 @@ def _settings_in(kind: Any) -> type[Settings] | None:
 
 
 def _at(path: str, name: str, kind: Any) -> str:
-    """Keys that lead to what stands inside of a setting."""
+    """Keys that lead inside a setting."""
     at = f"{path}.{name}" if path else name
     return f"{at}.{ANY_NAME}" if get_origin(kind) in (dict, Mapping) else at
 

@@ -87,7 +87,7 @@ def load_yaml(text: str) -> Any:
 
 
 def _check(text: str) -> None:
-    """Count what a text holds without making any of it."""
+    """Count the values in a text without making any of them."""
     sizes: list[int] = [0]  # of what is open
     names: list[str | None] = []  # their anchors
     anchored: dict[str, int] = {}
@@ -130,7 +130,7 @@ class _RepeatedKey(yaml.constructor.ConstructorError):
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Refuses what YAML forbids and PyYAML lets pass: a key that is there twice."""
+    """Loader that refuses repeated keys, which YAML forbids and PyYAML lets pass."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         lines: dict[Any, int] = {}

@@ -98,7 +98,7 @@ class BMode:
         self._formation = ImageFormation(probe, imaging)
 
     def prepare(self, probe: Probe, imaging: Imaging, acoustics: Acoustics | None = None) -> None:
-        """Load what images with these settings will use, so that the first is not late.
+        """Load everything for images with these settings, so that the first is not late.
 
         Raises:
             ProbeError: volume, probe and settings do not go together.

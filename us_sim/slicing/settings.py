@@ -213,7 +213,7 @@ _ARTERIAL_PRESSURE, _VENOUS_PRESSURE = 12.4e3, 1.0e3
 
 @dataclass(frozen=True)
 class FlowSettings(Settings):
-    """The blood in a vessel: how fast, whereto, and what drives it.
+    """The blood in a vessel: its velocity, direction and pulse.
 
     The defaults of the pressures are those of Hall, Guyton and Hall Textbook of Medical Physiology,
     13th ed., 2016, chapters 14 and 15.

@@ -221,7 +221,7 @@ def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_pixels(shown, tetrahedra, corners, place, mean, maps):
-    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of what corners have.
+    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of the corners' values.
 
     Args:
         shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes. corners: (M, 4).

@@ -82,7 +82,7 @@ Window = tuple[Field, Field, Field]
 def track(
     earlier: ArrayLike, later: ArrayLike, *, window: tuple[int, int], search: int
 ) -> tuple[Field, Field]:
-    """How far what each sample of the later image shows has come along its beam, in samples.
+    """Displacement of each sample of the later image along its beam, in samples.
 
     Args:
         earlier, later: (samples, lines) of grey values, 0 to 255.
@@ -165,7 +165,7 @@ def _search(first: Field, later: Window, size: tuple[int, int], most: int) -> tu
 def _refine(
     first: Field, later: Window, size: tuple[int, int], moved: Field
 ) -> tuple[Field, Field]:
-    """The same in the image warped by what is known, up to a sample from there."""
+    """The same in the image warped by the known displacement, up to a sample from there."""
     levels = []
     for lag in (-1.0, 0.0, 1.0):
         warped = np.empty_like(first)
@@ -177,7 +177,7 @@ def _refine(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _warp(image, moved, lag, warped):
-    """Fills ``warped`` (samples, lines) with what lay ``moved + lag`` samples nearer the face.
+    """Fill ``warped`` (samples, lines) with samples from ``moved + lag`` nearer the face.
 
     Cubic convolution (Keys, IEEE Trans. ASSP 29:1153, 1981), exact for parabolas; OpenCV's takes
     places to a 32nd of a sample only. Beyond the ends goes on what is there.

@@ -2,8 +2,9 @@
 
 The format is the OMG's CDR (CORBA 3.3, part 2, 9.3): every primitive is aligned to its own size,
 counted from the end of the four-byte header. The functions that write and read a type are generated
-as Python source; consecutive primitives go through one ``struct`` call, and ``array.array`` and
-NumPy data are copied whole.
+as Python source; consecutive primitives go through one ``struct`` call, whose padding is chosen
+while the source is made wherever the position is known well enough, and at run time elsewhere.
+``array.array`` and NumPy data are copied whole.
 
 rosbags, from which the types come, generates such functions too (`Typestore.serialize_cdr`). They
 read and make rosbags' own objects, whose sequences are NumPy arrays where rclpy has
@@ -38,6 +39,7 @@ M = TypeVar("M", bound=Message)
 
 # Primitive: its character in a `struct` format.
 _FORMATS = {"bool": "?", "byte": "c", **{kind: code for kind, (code, _) in ARRAY_TYPES.items()}}
+_ORDERS = {b"\0\1": "<", b"\0\0": ">"}  # by a header's start
 
 
 class CdrError(Exception):
@@ -56,7 +58,7 @@ def deserialize(data: bytes | bytearray | memoryview, cls: type[M]) -> M:
         CdrError: the bytes end too early, hold text that is no UTF-8, or are of another encoding.
     """
     data = bytes(data)
-    order = {b"\0\1": "<", b"\0\0": ">"}.get(data[:2])
+    order = _ORDERS.get(data[:2])
     if order is None:
         raise CdrError(
             f"{len(data)} bytes starting with {data[:4].hex() or 'nothing'} are not the plain CDR "
@@ -102,6 +104,7 @@ class _Source(ABC):
         self.variables = 0
         self.codes: list[str] = []  # primitives that the next `struct` call takes,
         self.terms: list[str] = []  # and where their values are
+        self.at = {4}  # all that ``pos`` may be, modulo 8, before them
 
     def compile(self, signature: str) -> Callable[..., Any]:
         exec("\n".join([f"def {signature}:", *self.lines]), self.names)
@@ -137,23 +140,49 @@ class _Source(ABC):
 
     def flush(self) -> None:
         """Emit the `struct` call for the primitives so far."""
-        if self.codes:
-            table = self.constant(_packings(self.order, self.codes, self._method))
-            self.line(f"call, size = {table}[pos & 7]")
-            self.struct_call(", ".join(self.terms))
-            self.codes, self.terms = [], []
+        if not self.codes:
+            return
+        packings = [_packing(self.order, self.codes, position) for position in range(8)]
+        calls = tuple((getattr(packing, self._method), packing.size) for packing in packings)
+        if len({packings[at].format for at in self.at}) == 1:
+            call, size = calls[min(self.at)]
+            self.struct_call(self.constant(call), ", ".join(self.terms), size)
+        else:
+            self.line(f"call, size = {self.constant(calls)}[pos & 7]")
+            self.struct_call("call", ", ".join(self.terms), "size")
+        self.at = {(at + packings[at].size) & 7 for at in self.at}
+        self.codes, self.terms = [], []
 
-    def loop(self, header: str, body: Callable[[], None]) -> None:
-        self.line(header)
-        before, self.indent = self.indent, self.indent + "    "
-        body()
-        self.flush()
-        self.indent = before
+    def loop(self, header: str, field: Field, body: Callable[[], None]) -> None:
+        """A loop over messages or strings, laid out for all that ``pos`` may be at its turns."""
+        before, indent = self.at, self.indent
+        self.align(field, _first_size(field))
+        mark, entry = len(self.lines), set[int]()
+        while not self.at <= entry:
+            entry = self.at = entry | self.at
+            del self.lines[mark:]
+            self.line(header)
+            self.indent = indent + "    "
+            body()
+            self.flush()
+            self.indent = indent
+        self.at = entry | before
 
     def align(self, field: Field, size: int) -> None:
         """Emit the padding before the elements of an array or of a sequence that is not empty."""
-        if size > 1:
-            self.pad(f"-(pos - 4) & {size - 1}", "if n: " if field.shape == "sequence" else "")
+        padding = {at: (4 - at) % size for at in self.at}
+        if any(padding.values()):
+            self.pad(f"(4 - pos) & {size - 1}", "if n: " if field.shape == "sequence" else "")
+        self.at = {(at + padding[at]) & 7 for at in self.at}
+
+    def start_packed(self, field: Field, size: int) -> None:
+        """Align an array or a sequence of primitives, whose lines are to follow."""
+        before = self.at
+        self.align(field, size)
+        counts = [field.size] if field.shape == "array" else range(8)
+        self.at = {(at + size * count) & 7 for at in self.at for count in counts}
+        if field.shape == "sequence":
+            self.at |= before
 
     @abstractmethod
     def pad(self, amount: str, condition: str) -> None: ...
@@ -165,7 +194,7 @@ class _Source(ABC):
     def elements(self, field: Field, term: str) -> None: ...
 
     @abstractmethod
-    def struct_call(self, terms: str) -> None: ...
+    def struct_call(self, call: str, terms: str, size: int | str) -> None: ...
 
 
 class _WriterSource(_Source):
@@ -181,8 +210,8 @@ class _WriterSource(_Source):
     def pad(self, amount: str, condition: str) -> None:
         self.line(f"{condition}p = {amount}; add(bytes(p)); pos += p")
 
-    def struct_call(self, terms: str) -> None:
-        self.line(f"add(call({terms})); pos += size")
+    def struct_call(self, call: str, terms: str, size: int | str) -> None:
+        self.line(f"add({call}({terms})); pos += {size}")
 
     def element(self, field: Field, term: str) -> None:
         if field.is_message:
@@ -195,6 +224,7 @@ class _WriterSource(_Source):
             self.primitive("I", f"len({text})")
             self.flush()
             self.line(f"add({text}); pos += len({text})")
+            self.at = set(range(8))
         else:
             self.primitive(_FORMATS[field.kind], term)
 
@@ -206,7 +236,7 @@ class _WriterSource(_Source):
         self.flush()
         if field.is_message or field.kind == "string":
             item = self.variable()
-            self.loop(f"for {item} in {values}:", lambda: self.element(field, item))
+            self.loop(f"for {item} in {values}:", field, lambda: self.element(field, item))
             return
         if field.kind == "bool":
             values = f"bytes({values})"
@@ -215,7 +245,7 @@ class _WriterSource(_Source):
         elif field.shape == "array":
             values += ".tobytes()"
         size = _size(_FORMATS[field.kind])
-        self.align(field, size)
+        self.start_packed(field, size)
         self.line(f"add({values}); pos += {size} * n")
 
 
@@ -232,8 +262,8 @@ class _ReaderSource(_Source):
     def pad(self, amount: str, condition: str) -> None:
         self.line(f"{condition}pos += {amount}")
 
-    def struct_call(self, terms: str) -> None:
-        self.line(f"{terms}, = call(data, pos); pos += size")
+    def struct_call(self, call: str, terms: str, size: int | str) -> None:
+        self.line(f"{terms}, = {call}(data, pos); pos += {size}")
 
     def message(self, type_name: str) -> str:
         owner = self.variable()
@@ -250,6 +280,7 @@ class _ReaderSource(_Source):
             self.primitive("I", "m")
             self.flush()
             self.line(f'{term} = data[pos:pos + m - 1].decode() if m else ""; pos += m')
+            self.at = set(range(8))
         else:
             self.primitive(_FORMATS[field.kind], term)
 
@@ -272,10 +303,10 @@ class _ReaderSource(_Source):
                 self.flush()
                 self.line(f"{values}.append({item})")
 
-            self.loop("for _ in range(n):", body)
+            self.loop("for _ in range(n):", field, body)
             return
         size = _size(_FORMATS[field.kind])
-        self.align(field, size)
+        self.start_packed(field, size)
         self.line(f"end = pos + {size} * n")
         if field.kind == "bool":
             self.line(f"{term} = [byte != 0 for byte in data[pos:end]]")
@@ -295,22 +326,27 @@ class _ReaderSource(_Source):
         self.line("pos = end")
 
 
-def _packings(order: str, codes: list[str], method: str) -> tuple[tuple[Any, int], ...]:
-    """How to pack or unpack these primitives, and in how many bytes, by their position modulo 8."""
-    found = []
-    for position in range(8):
-        layout, end = order, position - 4  # the header does not count
-        for code in codes:
-            padding = -end % _size(code)
-            layout += "x" * padding + code
-            end += padding + _size(code)
-        packing = struct.Struct(layout)
-        found.append((getattr(packing, method), packing.size))
-    return tuple(found)
+def _packing(order: str, codes: list[str], position: int) -> struct.Struct:
+    """The packing of these primitives from a position, of which the header's four do not count."""
+    layout, end = order, position - 4
+    for code in codes:
+        padding = -end % _size(code)
+        layout += "x" * padding + code
+        end += padding + _size(code)
+    return struct.Struct(layout)
 
 
 def _size(code: str) -> int:
     return struct.calcsize(f"={code}")
+
+
+def _first_size(field: Field) -> int:
+    """Bytes of the first primitive of one element of a field, to which it is aligned."""
+    if not field.is_message:
+        return 4 if field.kind == "string" else _size(_FORMATS[field.kind])
+    for part in interface(field.kind).fields[:1]:
+        return 4 if part.shape == "sequence" else _first_size(part)
+    return 1
 
 
 def _least_size(field: Field) -> int:

@@ -60,7 +60,7 @@ def is_loopback(host: str) -> bool:
 
 
 class Access:
-    """An ASGI application that lets through to another only what may pass.
+    """An ASGI application that passes only permitted requests on to another.
 
     Args:
         app: the other.

@@ -1,4 +1,4 @@
-"""Files of what a page shows: videos of its pictures, and DICOM of its images.
+"""Files of a page's pictures and images: videos and DICOM.
 
 >>> from us_sim.viewer.export import exported
 >>> header = {"rows": 2, "columns": 3, "encoding": "mono8", "stamp": "0", "mode": "B-mode"}

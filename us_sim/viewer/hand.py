@@ -64,7 +64,7 @@ class HandCommand:
 
     @classmethod
     def read(cls, value: Any) -> HandCommand:
-        """The wish in what a page sent, decoded from JSON.
+        """The wish that a page sent, decoded from JSON.
 
         Raises:
             MessageError: it is none, with what is wrong.
@@ -88,7 +88,7 @@ class HandCommand:
         return cls(source, sequence, to, by, go)
 
     def stance(self, goal: Stance, surface: RestSurface) -> Stance:
-        """The stance that is wanted now, within what a hand can do.
+        """The stance that is wanted now, within a hand's limits.
 
         Args:
             goal: what was wanted before.

@@ -221,7 +221,7 @@ def build_modes(simulator: Simulator) -> None:
 
 
 def words_of(state: SessionState) -> tuple[str, str]:
-    """The scene's name, and what is to be known of it; the second is often nothing.
+    """The scene's name and a remark on it, which is often empty.
 
     >>> words_of(SessionState(is_there=True, scene="upper_arm", state="running"))
     ('upper arm', '')

@@ -1,1 +1,1 @@
-"""Error of what an image shows of sound, strain and flow against closed forms, and its run time."""
+"""Error of sound, strain and flow in an image against closed forms, and its run time."""

@@ -113,7 +113,7 @@ def _trace(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _ray(start, end, length, labels, taken, borders, blocks, of_blockers):
-    """dB lost on the way by what is taken along it and at borders, of blockers or of all else.
+    """dB lost along the way and at borders, in blockers or in all other tissue.
 
     Args:
         start, end: (3,) voxels. length: m. taken: (256,) dB/m. borders: (256, 256) dB.

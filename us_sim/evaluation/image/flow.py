@@ -245,7 +245,7 @@ class TubeScan:
         return float(self._vessel.pulse(time))
 
     def _seen(self, frame: Frame) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Velocity along each beam towards the probe, and the cosine with what flows along y."""
+        """Velocity along each beam towards the probe, and its cosine with a flow along y."""
         rotation = frame.pose.rotation
         along_y = np.sin(self._angles) * rotation[1, 0] + np.cos(self._angles) * rotation[1, 2]
         return self.blood.velocity(frame, self._beams), -along_y

@@ -166,7 +166,7 @@ def try_case(method: str, case: StabilityCase) -> Trial:
 def run_trial(
     solver: TissueSolver, residual: IndependentResidual, case: StabilityCase, trial: Trial
 ) -> None:
-    """Move the probe as the case says, release, and note what the solver returned."""
+    """Move the probe as the case says, release, and note the solver's results."""
     model = solver.model
     poses = poses_of(case.motion, model.mesh, case.depth)
     bound = _bound(model, poses)

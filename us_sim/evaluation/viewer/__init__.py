@@ -1,1 +1,1 @@
-"""The viewer: what it costs the simulator, and how long a page waits for an image."""
+"""The viewer: its cost to the simulator, and how long a page waits for an image."""

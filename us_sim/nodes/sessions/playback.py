@@ -23,7 +23,7 @@ RECORDER = "session_recorder"
 
 
 class Awaited:
-    """Waits for what the node's parameters of `AwaitedSettings` name, and for a subscriber.
+    """Waits for the topics that `AwaitedSettings` name, and for a subscriber.
 
     After a while what is missing is said, and told in diagnostics as ``awaited``.
 
@@ -112,7 +112,7 @@ class Playback:
         self._report()
 
     def _seek(self, parameters: list[Parameter]) -> None:
-        """Play on at a time, each time that it is set, also to what it was."""
+        """Continue at a time, whenever it is set, even to the same value."""
         times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
         if not self.has_begun or not times:
             return

@@ -31,7 +31,7 @@ REMEMBERED = 256  # poses whose arrival is kept for the images at them
 
 
 class PoseAge:
-    """How long ago the newest pose came, and what that makes of an image at it.
+    """The age of the newest pose, and the badge of an image at it.
 
     A pose ages from its arrival: its stamp may be of another clock, such as that of a tracker
     which is ahead, or of the day it was recorded. It ages while ROS's time goes on, and never by
@@ -101,7 +101,7 @@ Pixels = NDArray[np.uint8]
 
 
 class AnnotatedImage:
-    """``ultrasound/image_annotated``: the image, what is in it, and whether it is live.
+    """``ultrasound/image_annotated``: the image with outlines, scale and a badge.
 
     A picture is drawn for each image while somebody subscribes, with the colours of the stream
     that the parameter ``overlay`` chooses. When no pose has come for a while, the last image is

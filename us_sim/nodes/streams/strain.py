@@ -59,7 +59,7 @@ class _StrainImages(FrameStream):
         return None if values is None else field_message(values, stamp, "probe")
 
     def overlay(self, frame: Frame) -> Overlay | None:
-        """The strain in colours, and what the compression is like."""
+        """The strain in colours, and the quality of the compression."""
         values = self._of(frame)
         if values is None:
             return None
@@ -95,7 +95,7 @@ class StrainStream(_StrainImages):
         self._earlier = Earlier(lambda frame: frame.nodes)
 
     def prepare(self, probe: Probe) -> None:
-        """Compile what strain needs, or load it."""
+        """Compile the kernels of strain, or load them."""
         super().prepare(probe)
         warm_up()
 
@@ -117,7 +117,7 @@ class StrainStream(_StrainImages):
 
 
 class StrainEstimateStream(_StrainImages):
-    """``ultrasound/strain_estimate``: between two images, from what they show alone.
+    """``ultrasound/strain_estimate``: between two images, from their grey values alone.
 
     Args:
         probes: where the probe that images come of is put, for checks of parameters.
@@ -132,7 +132,7 @@ class StrainEstimateStream(_StrainImages):
         self._correlation = 0.0
 
     def prepare(self, probe: Probe) -> None:
-        """Compile what estimates need, or load it."""
+        """Compile the kernels of estimates, or load them."""
         warm_up()
         self._probes[:] = [probe]
 

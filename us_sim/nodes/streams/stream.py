@@ -45,7 +45,7 @@ class FrameStream(ABC):
         return bool(self._publisher.get_subscription_count() > 0)
 
     def prepare(self, probe: Probe) -> None:
-        """Load what images of this probe will use, so that the first is not late.
+        """Load everything for images of this probe, so that the first is not late.
 
         Raises:
             UsSimError: it cannot be used with this probe.
@@ -53,7 +53,7 @@ class FrameStream(ABC):
         del probe
 
     def show(self, frame: Frame, stamp: Time) -> None:
-        """Send what is made of the frame, under the stamp of its pose."""
+        """Send the image made of the frame, under the stamp of its pose."""
         message = self._message(frame, stamp)
         if message is not None:
             self._publisher.publish(message)
@@ -96,7 +96,7 @@ class SettableStream(FrameStream, Generic[M]):
         )
 
     def prepare(self, probe: Probe) -> None:
-        """See whether it can be made for this probe; what is in use stays.
+        """Check whether it can be made for this probe; the one in use stays.
 
         Raises:
             ProbeError: what is set lies outside the images of this probe.
@@ -123,7 +123,7 @@ class SettableStream(FrameStream, Generic[M]):
         return self._made
 
     def _go_on(self, made: M, before: M) -> None:
-        """Take over, from what made the topic before, what still holds."""
+        """Take over the state of the topic's former maker that still holds."""
         del made, before
 
     def _require(self, wanted: dict[str, Any]) -> None:

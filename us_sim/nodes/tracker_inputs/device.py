@@ -42,7 +42,7 @@ class TrackerInput:
         self._settings = settings
 
     def reset(self) -> None:
-        """Forget what was measured: it may be of no use, since taking a message has failed."""
+        """Forget all measurements, since taking a message has failed."""
 
     def close(self) -> None:
         """Let go of the device, where it is held by more than subscriptions."""
@@ -64,7 +64,7 @@ class Device(SceneNode):
         self.health.problem(kind, sentence)
 
     def refused(self, where: str, error: UsSimError) -> None:
-        """Count and say what cannot be used, in the probe's status too."""
+        """Count and report bad input, in the probe's status too."""
         self._tracking.refuse(kind_of(error), str(error))
         super().refused(where, error)
 

@@ -165,7 +165,7 @@ class TfInput(TrackerInput):
         device.listen(TFMessage, "tf_static", self._take_static, STATIC)
 
     def _take_static(self, message: TFMessage) -> None:
-        """Keep what does not move; a way of nothing else makes no poses."""
+        """Keep static transforms; a chain of these alone makes no poses."""
         self._fixed |= self._keep(message)
         chain = self._tree.chain(self._body, self._frame)
         if chain is not None and self._fixed.issuperset(chain):

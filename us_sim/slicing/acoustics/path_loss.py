@@ -347,7 +347,7 @@ AMPLITUDES = (10.0 ** (-np.arange(100 * _FINE + 2) / (20.0 * _FINE))).astype(np.
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cast_shadows(first, beams, blocked, blocker, distance, aperture, spacing, amplitudes, gain):
-    """Takes what blocks from the gain, with soft edges, from sample ``first`` on.
+    """Subtract the shadows of blockers from the gain, with soft edges, from sample ``first`` on.
 
     Args:
         beams: how many there are; the arrays may have room for more.
@@ -405,7 +405,7 @@ def cast_shadows(first, beams, blocked, blocker, distance, aperture, spacing, am
 
 @njit(inline="always", error_model="numpy")
 def _mean(total, low, high, count):
-    """The mean between two places of what sums up to ``total`` (count + 1,).
+    """The mean between two places, from the cumulative sums ``total`` (count + 1,).
 
     Beyond its ends the outermost values go on, so that an edge near them stays where it is.
     """
@@ -420,7 +420,7 @@ def _mean(total, low, high, count):
 def sharpen_edges(
     elements, wide, steps, maps, voxels, shape, lines, media, samples, beams, blocked, blocker
 ):
-    """Moves the edges of what blocks from halfway between two beams to where they are.
+    """Move the edges of blockers from halfway between two beams to their true places.
 
     Between a beam that is blocked and one that is not, further beams are followed, in finer steps;
     the part of a beam's width that is not blocked then lets that much through.

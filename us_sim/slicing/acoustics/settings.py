@@ -95,7 +95,7 @@ _TABLE: dict[str, tuple[float, float]] = {
 
 
 def table_constants(name: str) -> tuple[float, float] | None:
-    """Attenuation (dB/cm/MHz) and impedance (Rayl) of what a label's name says.
+    """Attenuation (dB/cm/MHz) and impedance (Rayl) of the tissue that a label names.
 
     Of several known words in a name the last one counts; None where there is none. Attenuation is
     taken as proportional to the frequency: the source's coefficient at 1 MHz.

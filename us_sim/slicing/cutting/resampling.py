@@ -91,7 +91,7 @@ class Located(NamedTuple):
 def evaluate(
     maps: NDArray[np.float64], elements: NDArray[np.int32], *, threads: int = 1
 ) -> NDArray[np.float32]:
-    """Values (rows, columns, K) of what is affine in (column, row) in each tetrahedron.
+    """Values (rows, columns, K) of functions affine in (column, row) in each tetrahedron.
 
     Args:
         maps: (E, K, 3) coefficients of (1, column, row).

@@ -66,7 +66,7 @@ class Slicer(ABC):
         self._prepare(settings)
 
     def _prepare(self, settings: Any) -> None:  # noqa: B027
-        """Make what is needed for every image of the mesh, which is there."""
+        """Prepare everything that all images of the mesh share."""
 
     @abstractmethod
     def image(self, nodes: ArrayLike, plane: SlicePlane) -> NDArray[np.uint8]:

@@ -258,7 +258,7 @@ class Vessel:
         return 1.0 if cosine > 0.0 else -1.0
 
     def use(self, settings: FlowSettings) -> None:
-        """Let blood flow with other settings from now on; what has filled up stays so.
+        """Use other settings from now on; blood that has filled up stays.
 
         Raises:
             SceneError: as `require`.

@@ -246,7 +246,7 @@ _NOT_FILLED = -1.0  # in place of how thick the layer is
 
 
 class GelLayer:
-    """Fills what no tetrahedron covers in front of a coupled face."""
+    """Gel in the pixels in front of a coupled face that no tetrahedron covers."""
 
     def __init__(self, probe: Probe) -> None:
         line, distance = probe.pixel_beams

@@ -378,7 +378,7 @@ class PenaltyFriction(PenaltyContact):
         return True
 
     def update_friction(self) -> float:
-        """Let a frame end: what slips is held by what the push allows now.
+        """End a frame: slipping points are held as far as the normal force allows now.
 
         Returns:
             m, by how much springs are longer or shorter for it at most.
@@ -400,7 +400,7 @@ class PenaltyFriction(PenaltyContact):
         self._anchor[points] += too_long[:, None] * trial
 
     def _attach(self, push: NDArray[np.float64]) -> None:
-        """Let friction hold what ``push`` (P,) N, and the normals there, allow."""
+        """Set friction's bounds by ``push`` (P,) N and the normals there."""
         fresh = (push > 0.0) & ~self._attached
         self._anchor[fresh] = self._positions[fresh]
         self._attached |= fresh

@@ -1,4 +1,4 @@
-"""Points spread over the surface that a probe can touch, and what they share with its nodes.
+"""Points spread over the surface that a probe can touch, and their weights at its nodes.
 
 They are in the middles of the triangles' parts (`TriangleParts`) and at the nodes. A node that the
 probe can touch, but no triangle's, is a point by itself.

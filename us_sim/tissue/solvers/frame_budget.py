@@ -63,7 +63,7 @@ class FrameBudget:
 
     @property
     def allows_load_step(self) -> bool:
-        """Whether time and iterations are left for a load step and what follows it."""
+        """Whether time and iterations are left for a load step and the rest of the frame."""
         spent = self._allowed - self.iterations_left
         if spent > TUNING.load_step_iterations * self._allowed:
             return False
@@ -71,7 +71,7 @@ class FrameBudget:
         return limit is None or self._clock() <= self._began + TUNING.load_step_time * limit
 
     def spend(self, iterations: int) -> None:
-        """Take off the iterations of a Newton step, and what it costs besides."""
+        """Subtract the iterations of a Newton step, and its fixed cost."""
         self.iterations_left -= iterations + TUNING.newton_step_cost
 
     def begin_step(self) -> None:

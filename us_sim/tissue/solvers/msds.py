@@ -132,7 +132,7 @@ class ProbeMotion(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """Which particles the probe can touch, and what kernels find out about them."""
+    """The particles that the probe can touch, and the kernels' results for them."""
 
     reachable: NDArray[np.int32]  # (C,), the particles
     touched: NDArray[np.bool_]  # (C,), in the last sub-step
@@ -177,7 +177,7 @@ class SpringTissue(TissueSolver):
         self._inversion.reset()
 
     def _untangle(self, touched: bool) -> tuple[str, Intervention]:
-        """Put tissue to rest that stayed inside out without a probe; says what was found."""
+        """Put tissue to rest that stayed inside out without a probe; return the finding."""
         words, hopeless = self._inversion.check(self._positions, touched)
         if not hopeless:
             return words, Intervention.NONE

@@ -222,7 +222,7 @@ class MsdsImplicit(SpringTissue):
         self._positions[rows] = self.model.mesh.nodes[rows] + surface[touched]
 
     def _unconfined(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The force (N, 3) without what holds fixed nodes and pushes touched ones."""
+        """The force (N, 3) without the reactions of fixed nodes and of contact."""
         left = force.copy()
         left[self.model.fixed] = 0.0
         touched = self._contact.touched
@@ -308,7 +308,7 @@ class MsdsImplicit(SpringTissue):
         return 0.5 * float(self.mass @ np.einsum("ij,ij->i", self._velocity, self._velocity))
 
     def _limit_speed(self, kinetic: float, initial: float, energy: float) -> None:
-        """Take away what an unfinished minimisation or a jump of the probe brings in as speed.
+        """Remove the speed that an unfinished minimisation or a jump of the probe brings in.
 
         The energy of inertia, springs and volumes at the start, with touched nodes where the probe
         has put them, is the value of the function there; no more can be left at the end. And a jump

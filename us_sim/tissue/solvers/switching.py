@@ -245,7 +245,7 @@ class SwitchableTissue:
 
 
 class Preparation:
-    """Makes what a plan needs in a thread; the newest plan wins.
+    """Prepares a plan's parts in a thread; the newest plan wins.
 
     Args:
         tissue: that goes on meanwhile, and that adopts what was made.
@@ -271,7 +271,7 @@ class Preparation:
             return f"preparing {self._newest.reason} for {seconds:.0f} s{self._progress}"
 
     def want(self, plan: Plan) -> None:
-        """Begin to make what a plan needs; what is still being made for another is then dropped."""
+        """Begin to prepare a plan; the preparation of another one is dropped."""
         with self._lock:
             self._wanted = self._newest = plan
             self._outcome = None
@@ -281,7 +281,7 @@ class Preparation:
                 self._thread.start()
 
     def drop(self) -> None:
-        """Want nothing any more; a thread ends with what it is making."""
+        """Drop all plans; a thread ends with the part that it is making."""
         with self._lock:
             self._wanted = self._newest = self._outcome = None
 
@@ -435,7 +435,7 @@ def _make_elsewhere(
 
 
 def _main() -> None:
-    """Make what comes in at stdin; a line on stdout for each word of progress."""
+    """Make the solver read from stdin; print a line for each step of progress."""
     if hasattr(os, "nice"):
         os.nice(5)  # it gives way to the process that deforms
     solver, model, settings = pickle.load(sys.stdin.buffer)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tuning:
-    """The constants, each with its unit, its meaning, and what other values cost."""
+    """The constants, each with its unit, its meaning, and the cost of other values."""
 
     # Newton's method (`us_sim.tissue.solvers.newton`)
     first_iteration_limit: int = 12

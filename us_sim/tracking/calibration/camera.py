@@ -215,7 +215,7 @@ class CameraCalibration:
 
     @property
     def note(self) -> str:
-        """A sentence on what the photos do not determine, or ""."""
+        """A sentence on parameters that the photos do not determine, or ""."""
         notes = []
         if self.rms > _GOOD_RMS * _scale(self.camera.width):
             notes.append(

@@ -1,4 +1,4 @@
-"""Controls of parameters, each made from what its node says of the parameter.
+"""Controls of parameters, each made from the parameter's descriptor.
 
 >>> from us_sim.viewer.panels.controls import on_sliders, slider_span
 >>> slider_span(-60.0, 60.0, 6.0)

@@ -32,7 +32,7 @@ class Section:
 
 
 def common_first(common: tuple[str, ...]) -> Arrange:
-    """These first, then the others, group by group, and last what was given at the start.
+    """These first, then the others group by group, and last those fixed at the start.
 
     Without any of these, the parameters of no group are first.
     """
@@ -49,7 +49,7 @@ def common_first(common: tuple[str, ...]) -> Arrange:
 
 
 def groups_of(parameters: Mapping[str, Parameter], names: Iterable[str]) -> list[Section]:
-    """A section for each group of these names, of what may change; those of none are "More"."""
+    """A section for each group of these names that may change; the rest are "More"."""
     groups: dict[str, list[str]] = {}
     for name in names:
         if parameters[name].is_live:
