@@ -31,12 +31,8 @@ def path_of(positions, orientations=None, **fields):
 @pytest.mark.parametrize("name", ["mcap", "chunkzstd", "zstd", "sqlite3"])
 def test_real_bags_hold_the_path_that_was_published(shared_data, name):
     path = read_path(shared_data / f"ros2-jazzy/bags/probe_path_{name}")
-    assert (path.topic, path.frame_id, path.rejected, path.note) == (
-        "/tracker/pose",
-        "patient",
-        0,
-        "",
-    )
+    assert (path.topic, path.frame_id) == ("/tracker/pose", "patient")
+    assert (path.rejected, path.note) == (0, "")
     assert len(path) in (273, 275)
     x, y, z = path.positions.T
     # The recorder missed the first poses, so the first z says with which k the bag begins.
@@ -110,7 +106,7 @@ def test_poses_without_orientation_are_left_out_and_counted(tmp_path):
 
 def test_no_usable_pose_at_all(tmp_path):
     write_path(tmp_path / "path.mcap", path_of(np.full((3, 3), np.nan)))
-    with pytest.raises(BagError, match="no usable pose: 3 of the 3 poses"):
+    with pytest.raises(BagError, match="3 of the 3 poses"):
         read_path(tmp_path)
 
 
@@ -128,19 +124,17 @@ def test_which_topic(tmp_path):
         bag.add_topic("/note", "std_msgs/msg/String")
         bag.write("/note", HI, EPOCH)
         bag.flush()
-        with pytest.raises(BagError, match=r"no topic of .*PoseStamped.*it has /note \(std_msgs"):
+        with pytest.raises(BagError, match=r"PoseStamped.* /note \(std_msgs"):
             read_path(tmp_path / "bag.mcap")
         for topic in ("/haptic/pose", "/probe/pose"):
             bag.add_topic(topic, POSE_STAMPED)
-    with pytest.raises(BagError, match="name one by --pose, of /haptic/pose, /probe/pose"):
+    with pytest.raises(BagError, match="--pose, of /haptic/pose, /probe/pose"):
         read_path(tmp_path, option="--pose")
-    with pytest.raises(
-        BagError, match="/note as std_msgs/msg/String: a path needs one of geometry_msgs"
-    ):
+    with pytest.raises(BagError, match=r"/note as std_msgs/msg/String.*geometry_msgs"):
         read_path(tmp_path, "note")
-    with pytest.raises(BagError, match="no topic /moon/pose; it has /haptic/pose, /note"):
+    with pytest.raises(BagError, match=r"/moon/pose; .* /haptic/pose, /note"):
         read_path(tmp_path, "/moon/pose")
-    with pytest.raises(BagError, match="holds no pose on /probe/pose; it is silent"):
+    with pytest.raises(BagError, match=r"/probe/pose; .*silent"):
         read_path(tmp_path, "probe/pose")
 
 
@@ -158,7 +152,7 @@ def test_of_a_sessions_poses_the_trackers_are_the_path(tmp_path):
 
 def test_another_encoding(shared_data, tmp_path):
     wrong = shared_data / "mcap-rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test"
-    with pytest.raises(BagError, match="no topic of geometry_msgs/msg/PoseStamped"):
+    with pytest.raises(BagError, match=POSE_STAMPED):
         read_path(wrong)
     file = tmp_path / "path.mcap"
     write_path(file, path_of(np.zeros((3, 3))))
@@ -166,7 +160,7 @@ def test_another_encoding(shared_data, tmp_path):
         bag.add_topic("/tracker/pose", POSE_STAMPED)
         for message in read_bag(file).messages():
             bag.write("/tracker/pose", b"\0\7" + message.data[2:], message.log_time)
-    with pytest.raises(BagError, match="that is no geometry_msgs/msg/PoseStamped"):
+    with pytest.raises(BagError, match=POSE_STAMPED):
         read_path(tmp_path / "xcdr2.mcap")
 
 
@@ -175,7 +169,7 @@ def test_several_frames_are_refused(tmp_path):
         one = path_of(np.zeros((2, 3)))
         path = ProbePath("/tracker/pose", frame, one.stamps, one.positions, one.orientations)
         write_path(tmp_path / f"path_{k}.mcap", path, sidecar=False)
-    with pytest.raises(BagError, match="frames patient, camera_optical: a path has one frame"):
+    with pytest.raises(BagError, match="patient, camera_optical"):
         read_path(tmp_path)
 
 
@@ -196,7 +190,7 @@ def test_what_else_is_a_path_is_said(tmp_path, name, words):
 
 
 def test_arrays_of_different_lengths():
-    with pytest.raises(BagError, match="a path of 2 stamps"):
+    with pytest.raises(BagError, match="2 stamps"):
         ProbePath("/p", "patient", np.arange(2), np.zeros((3, 3)), np.zeros((2, 4)))
 
 
@@ -286,9 +280,9 @@ def test_every_kind_of_pose_message_is_a_path(tmp_path, kind, body):
     np.testing.assert_array_equal(path.positions, [[k, 0, 0] for k in range(4)])
     np.testing.assert_array_equal(path.stamps - EPOCH // 10**9 * 10**9, range(4))
     if body:
-        with pytest.raises(BagError, match=f"name one by --topic, of /poses:.*, /poses{body}"):
+        with pytest.raises(BagError, match=f"--topic, of /poses:.*, /poses{body}"):
             read_path(file, option="--topic")
-        with pytest.raises(BagError, match=f"no /poses:moon; it has .*/poses{body}"):
+        with pytest.raises(BagError, match=f"/poses:moon; .*/poses{body}"):
             read_path(file, "poses:moon")
 
 
@@ -300,7 +294,7 @@ def test_a_frame_of_tf_is_followed_up_to_another(tmp_path):
     assert path.frame_id == "base"
     np.testing.assert_array_equal(path.positions[:, 0], [0.5, 1.5, 2.5])
     assert read_path(file, "/tf:tip:map").positions[-1, 0] == 11.0
-    with pytest.raises(BagError, match="no way in /tf from 'base' up to 'tip'"):
+    with pytest.raises(BagError, match=r"/tf from 'base' .*'tip'"):
         read_path(file, "/tf:base:tip")
 
 
@@ -320,7 +314,7 @@ def test_where_a_hand_and_a_device_took_turns_the_probes_own_poses_are_the_path(
     own = message(POSE_STAMPED, header=header("patient", 1), pose=pose_at(2.0))
     record(file, {"/tracker/pose": [seen, own], "/probe/pose": [own]})
     assert read_path(file).topic == "/probe/pose"
-    with pytest.raises(BagError, match="in the frames ndi, patient"):
+    with pytest.raises(BagError, match="ndi, patient"):
         read_path(file, "tracker/pose")
 
 
@@ -350,21 +344,21 @@ def test_wrenches_of_two_frames_on_one_topic_are_refused(tmp_path):
     with BagWriter(tmp_path / "two.mcap") as writer:
         write_wrenches(writer, wrenches())
         write_wrenches(writer, wrenches("flange"))
-    with pytest.raises(BagError, match="in the frames probe, flange"):
+    with pytest.raises(BagError, match="probe, flange"):
         read_wrenches(tmp_path / "two.mcap")
 
 
 def test_another_type_a_silent_topic_and_a_missing_one_are_refused(tmp_path):
     path = press_and_slide(rate=5.0)
     write_path(tmp_path / "path.mcap", path)
-    with pytest.raises(BagError, match="as geometry_msgs/msg/PoseStamped, not"):
+    with pytest.raises(BagError, match=POSE_STAMPED):
         read_wrenches(tmp_path / "path.mcap", path.topic)
-    with pytest.raises(BagError, match="has no topic probe/wrench"):
+    with pytest.raises(BagError, match="topic probe/wrench"):
         read_wrenches(tmp_path / "path.mcap")
     none = WrenchRecord("/probe/wrench", "probe", np.zeros(0, np.int64), np.zeros((0, 6)))
     (tmp_path / "silent").mkdir()
     write_wrenches(tmp_path / "silent" / "silent.mcap", none)
-    with pytest.raises(BagError, match="holds no wrench"):
+    with pytest.raises(BagError, match="no wrench"):
         read_wrenches(tmp_path / "silent" / "silent.mcap")
 
 

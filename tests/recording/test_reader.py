@@ -99,7 +99,7 @@ def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared
         assert len(read) == bag.message_count > 0
         assert [time for _, time, _ in read] == sorted(time for _, time, _ in read)
         if "wrong_rmw" in str(path):
-            with pytest.raises(BagError, match="encoding 'wrong_format': only cdr"):
+            with pytest.raises(BagError, match="wrong_format"):
                 bag.deserialize(next(bag.messages()))
             continue
         parts = [path] if path.is_file() else sorted(path.glob("*.mcap"))
@@ -111,7 +111,7 @@ def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared
             assert sorted(read) == sorted(by_rosbags)
         for message in bag.messages():
             if message.type_name.endswith("_Event"):
-                with pytest.raises(BagError, match="_Event cannot be understood"):
+                with pytest.raises(BagError, match="_Event"):
                     bag.deserialize(message)
             else:
                 bag.deserialize(message)
@@ -125,9 +125,9 @@ def test_known_contents_of_rosbag2s_own_tests(shared_data):
     seek = read_bag(root / "rosbag2_transport/test/resources/mcap/test_bag_for_seek")
     assert [topic.type_name for topic in seek.topics] == ["test_msgs/msg/BasicTypes"]
     assert [seek.deserialize(m).int32_value for m in seek.messages()] == [1, 2, 3, 4, 5]
-    with pytest.raises(BagError, match=r"empty_bag_0.db3, which is not there"):
+    with pytest.raises(BagError, match=r"empty_bag_0.db3"):
         read_bag(root / "ros2bag/test/resources/empty_bag")
-    with pytest.raises(BagError, match=r"several bags.*only_services.mcap, only_topics.mcap"):
+    with pytest.raises(BagError, match=r"only_services.mcap, only_topics.mcap"):
         read_bag(root / "rosbag2_cpp/test/rosbag2_cpp/bags")
 
 
@@ -143,7 +143,7 @@ def test_files_of_a_split_bag_are_read_in_their_order_without_metadata(shared_da
 
 
 def test_the_real_recorder_killed_left_nothing(shared_data):
-    with pytest.raises(BagError, match="is empty: its recorder was ended before"):
+    with pytest.raises(BagError, match="is empty"):
         read_bag(shared_data / "ros2-jazzy/bags/probe_path_killed")
 
 
@@ -285,7 +285,7 @@ def test_a_packed_file_is_unpacked_only_where_there_is_room(tmp_path, monkeypatc
         file.write_bytes(compressor.compress(bytes(20_000_000)) + compressor.flush())
         assert file.stat().st_size < 10_000
         held = "20000000" if says else "more"
-        with pytest.raises(BagError, match=f"holds {held} bytes .* 10000000 are the most"):
+        with pytest.raises(BagError, match=f"{held} bytes .* 10000000"):
             read_bag(file)
         gc.collect()
         assert sum(f.stat().st_size for f in tmp_path.rglob("*") if f.is_file()) < 10_000
@@ -304,31 +304,8 @@ def test_a_compressed_file_leaves_nothing_behind(tmp_path, monkeypatch):
     del bag
     assert not list(scratch.iterdir())
     packed.write_bytes(packed.read_bytes()[:100])
-    with pytest.raises(BagError, match=r"bag.mcap.zstd (cannot be decompressed|is empty|is not)"):
+    with pytest.raises(BagError, match=r"bag.mcap.zstd"):
         read_bag(packed)
-
-
-def test_old_sqlite_without_qos_or_definitions(tmp_path):
-    file = tmp_path / "old.db3"
-    with sqlite3.connect(file) as database:
-        database.executescript(
-            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
-            " serialization_format TEXT);"
-            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
-            " data BLOB);"
-            f"INSERT INTO topics VALUES (1, '/note', '{STRING}', 'cdr'),"
-            " (2, '/thing', 'my_msgs/msg/Thing', 'cdr');"
-        )
-        database.executemany(
-            "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",
-            [(1, EPOCH + 1, HI), (2, EPOCH, HI)],
-        )
-    database.close()
-    bag = read_bag(file)
-    thing, note = bag.messages()
-    assert bag.deserialize(note).data == "hi"
-    with pytest.raises(BagError, match="my_msgs/msg/Thing without its definition"):
-        bag.deserialize(thing)
 
 
 def _database(file, count=600, journal=False):
@@ -351,6 +328,19 @@ def _database(file, count=600, journal=False):
     return database
 
 
+def test_old_sqlite_without_qos_or_definitions(tmp_path):
+    with closing(_database(tmp_path / "old.db3", count=1)) as database:
+        database.execute("INSERT INTO topics VALUES (2, '/thing', 'my_msgs/msg/Thing', 'cdr')")
+        row = (2, EPOCH - 1, HI)
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", row)
+        database.commit()
+    bag = read_bag(tmp_path / "old.db3")
+    thing, note = bag.messages()
+    assert bag.deserialize(note).data == "hi"
+    with pytest.raises(BagError, match="my_msgs/msg/Thing"):
+        bag.deserialize(thing)
+
+
 def test_a_text_where_sqlite_should_have_a_time_is_left_out_and_said(tmp_path):
     with closing(_database(tmp_path / "bag.db3")) as database:
         database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 7")
@@ -367,7 +357,7 @@ def test_messages_that_sqlite_lost_are_said(tmp_path):
         database.commit()
     bag = read_bag(tmp_path / "bag.db3")
     assert bag.message_count == 573
-    assert bag.note.endswith("the last one has the number 600: 27 were lost")
+    assert bag.note.endswith("27 were lost")
 
 
 def test_messages_that_metadata_promises_and_the_files_lack_are_said(tmp_path):
@@ -376,7 +366,7 @@ def test_messages_that_metadata_promises_and_the_files_lack_are_said(tmp_path):
     text = metadata.read_text()
     assert "\n  message_count: 20\n" in text
     metadata.write_text(text.replace("\n  message_count: 20\n", "\n  message_count: 25\n"))
-    assert read_bag(tmp_path / "bag").note.endswith("metadata.yaml says 25: 5 were lost")
+    assert read_bag(tmp_path / "bag").note.endswith("5 were lost")
 
 
 def test_what_a_killed_recorder_left_in_the_journal_is_read(tmp_path):
@@ -395,7 +385,7 @@ def test_a_table_that_is_an_endless_query_is_refused(tmp_path):
             "(SELECT 1 UNION ALL SELECT id + 1 FROM n) "
             "SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM n;"
         )
-    with pytest.raises(BagError, match="it has no table messages"):
+    with pytest.raises(BagError, match="table messages"):
         read_bag(tmp_path / "bag.db3")
 
 
@@ -404,12 +394,12 @@ def test_sqlite_that_is_no_bag_or_damaged(shared_data, tmp_path):
     with sqlite3.connect(other) as database:
         database.execute("CREATE TABLE things(id)")
     database.close()
-    with pytest.raises(BagError, match="cannot be read as a rosbag2 database"):
+    with pytest.raises(BagError, match="rosbag2 database"):
         read_bag(other)
     real = shared_data / "ros2-jazzy/bags/probe_path_sqlite3/probe_path_sqlite3_0.db3"
     cut = tmp_path / "cut.db3"
     cut.write_bytes(real.read_bytes()[:100_000])
-    with pytest.raises(BagError, match=r"damaged|cannot be read as a rosbag2 database"):
+    with pytest.raises(BagError, match=r"damaged|rosbag2 database"):
         list(read_bag(cut).messages())
 
 
@@ -417,7 +407,7 @@ def test_sqlite_that_is_no_bag_or_damaged(shared_data, tmp_path):
     ("content", "message"),
     [
         (b"", "is empty"),
-        (b"\x89MCAP", "is not a bag: it is neither MCAP nor SQLite"),
+        (b"\x89MCAP", "MCAP nor SQLite"),
         (b"#ROSBAG V2.0\n", "is a bag of ROS 1"),
         (b"hello, world, this is a text", "is not a bag"),
     ],
@@ -431,7 +421,7 @@ def test_files_that_are_no_bags(tmp_path, content, message):
 
 
 def test_places_without_a_bag(tmp_path):
-    with pytest.raises(BagError, match="there is no bag at"):
+    with pytest.raises(BagError, match=r"missing.mcap"):
         read_bag(tmp_path / "missing.mcap")
     with pytest.raises(BagError, match="holds no bag"):
         read_bag(tmp_path)
@@ -444,9 +434,9 @@ def test_what_does_not_fit_its_type(tmp_path):
         writer.write("/note", b"", EPOCH + 1)
     bag = read_bag(tmp_path)
     for message in bag.messages():
-        with pytest.raises(BagError, match=f"at {message.log_time} ns that is no {STRING}"):
+        with pytest.raises(BagError, match=f"{message.log_time} ns .*{STRING}"):
             bag.deserialize(message)
-    with pytest.raises(BagError, match="has no topic /other; it has /note"):
+    with pytest.raises(BagError, match=r"/other; .* /note"):
         next(bag.messages(["/other"]))
 
 
@@ -454,7 +444,7 @@ def test_a_topic_of_two_types_is_refused(tmp_path):
     for k, type_name in enumerate([STRING, "geometry_msgs/msg/PoseStamped"]):
         with BagWriter(tmp_path / f"bag_{k}.mcap", sidecar=False) as bag:
             bag.add_topic("/note", type_name)
-    with pytest.raises(BagError, match="a topic has one type"):
+    with pytest.raises(BagError, match="one type"):
         read_bag(tmp_path)
 
 

@@ -30,6 +30,11 @@ def text(content):
     return b"\0\1\0\0" + (len(content) + 1).to_bytes(4, "little") + content.encode() + b"\0"
 
 
+def write_all(bag, messages):
+    for message in messages:
+        bag.write(message.topic, message.data, message.log_time, message.publish_time)
+
+
 def mcap_content(file):
     """Header, channels, schemas and rosbag2 metadata records of an MCAP file."""
     with file.open("rb") as stream:
@@ -53,8 +58,7 @@ def test_a_real_bag_written_again_is_the_same_bag(shared_data, tmp_path, name):
         for entry in real.metadata.topics:
             schema = real.topic(entry.name).schema
             ours.add_topic(entry.name, entry.type_name, entry.qos, schema=schema)
-        for message in real.messages():
-            ours.write(message.topic, message.data, message.log_time, message.publish_time)
+        write_all(ours, real.messages())
     file = tmp_path / name / f"{name}_0.mcap"
     real_header, *expected = mcap_content(folder / file.name)
     header, *written = mcap_content(file)
@@ -70,8 +74,7 @@ def test_a_real_bag_of_another_storage_keeps_its_topics(shared_data, tmp_path, n
     with BagWriter(tmp_path / "copy.mcap", compression="zstd") as ours:
         for topic in real.topics:
             ours.add_topic(topic.name, topic.type_name, topic.qos, schema=topic.schema)
-        for message in real.messages():
-            ours.write(message.topic, message.data, message.log_time, message.publish_time)
+        write_all(ours, real.messages())
     copy = read_bag(tmp_path)
     assert copy.topics == real.topics
     assert list(copy.messages()) == list(real.messages())
@@ -159,7 +162,7 @@ def test_what_metadata_that_cannot_be_written_says_to_do_helps(tmp_path, name):
     bag.split()
     bag.write("/note", HI, EPOCH + 1)
     (folder / "metadata.yaml").mkdir()
-    with pytest.raises(BagError, match=f"`us-sim bag repair {folder}` makes a bag that has it"):
+    with pytest.raises(BagError, match=f"`us-sim bag repair {folder}`"):
         bag.close()
     (folder / "metadata.yaml").rmdir()
     assert repair(folder, tmp_path / "repaired").message_count == 2
@@ -177,13 +180,13 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_flushed(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
-        with pytest.raises(BagError, match=r"cannot be written \(File too large\)") as caught:
+        with pytest.raises(BagError, match="File too large") as caught:
             record_until_full()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     # Records of 1040 bytes, flushed every second: 91 of them fit into 100 kB, 101 would not.
-    assert "first 91 messages can" in str(caught.value)
-    with pytest.raises(BagError, match="cannot be written"):
+    assert "91 messages" in str(caught.value)
+    with pytest.raises(BagError, match="be written"):
         bag.write("/note", HI, EPOCH)
     assert bag.lost == {"/note": 11}  # ten in the chunk that did not fit, and the last
     read = read_bag(tmp_path / "session.mcap")
@@ -212,7 +215,7 @@ def test_a_topic_may_be_added_again_but_not_change_its_type(tmp_path):
         bag.add_topic("/note", STRING)
         bag.add_topic("/note", STRING)
         assert bag.topics == ("/note",)
-        with pytest.raises(BagError, match="recorded as std_msgs/msg/String"):
+        with pytest.raises(BagError, match="std_msgs/msg/String"):
             bag.add_topic("/note", "geometry_msgs/msg/PoseStamped")
 
 
@@ -227,9 +230,9 @@ def test_several_bags_in_one_folder_without_a_sidecar(tmp_path):
 def test_nothing_is_overwritten(tmp_path):
     with BagWriter(tmp_path / "first.mcap"):
         pass
-    with pytest.raises(BagError, match=r"first.mcap exists already"):
+    with pytest.raises(BagError, match=r"first.mcap"):
         BagWriter(tmp_path / "first.mcap")
-    with pytest.raises(BagError, match=r"belongs to another recording.*second/second.mcap"):
+    with pytest.raises(BagError, match=r"second/second.mcap"):
         BagWriter(tmp_path / "second.mcap")
     for folder in (tmp_path, "/", ""):
         with pytest.raises(BagError, match="not empty"):
@@ -243,32 +246,28 @@ def test_places_that_cannot_be_written(tmp_path):
     (tmp_path / "file").touch()
     nameless = (tmp_path / "a\0b.mcap", tmp_path / "a\0b", tmp_path / f"{'a' * 5000}.mcap")
     for path in (tmp_path / "file/session.mcap", Path("/proc/session.mcap"), *nameless):
-        with pytest.raises(BagError, match="cannot be made"):
+        with pytest.raises(BagError, match="be made"):
             BagWriter(path)
 
 
 def test_misuse(tmp_path):
-    with pytest.raises(BagError, match="compressed with 'lz5'"):
+    with pytest.raises(BagError, match="lz5"):
         BagWriter(tmp_path / "bag.mcap", compression="lz5")
     bag = BagWriter(tmp_path / "bag.mcap")
-    with pytest.raises(BagError, match="'' is not a topic name"):
+    with pytest.raises(BagError, match="topic name"):
         bag.add_topic("", STRING)
-    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown"):
+    with pytest.raises(BagError, match="my_msgs/msg/Unheard"):
         bag.add_topic("/thing", "my_msgs/msg/Unheard")
-    with pytest.raises(BagError, match="/note was not added"):
+    with pytest.raises(BagError, match="/note"):
         bag.write("/note", HI, EPOCH)
     bag.add_topic("/note", STRING)
-    with pytest.raises(BagError, match="before 1970"):
+    with pytest.raises(BagError, match="1970"):
         bag.write("/note", HI, -1)
     bag.close()
     bag.close()
-    for late in (
-        lambda: bag.write("/note", HI, EPOCH),
-        bag.flush,
-        lambda: bag.add_topic("/b", STRING),
-    ):
-        with pytest.raises(BagError, match="is closed"):
-            late()
+    for late in (bag.write, "/note", HI, EPOCH), (bag.flush,), (bag.add_topic, "/b", STRING):
+        with pytest.raises(BagError, match="closed"):
+            late[0](*late[1:])
 
 
 def test_a_bag_split_as_a_real_one_has_its_metadata(shared_data, tmp_path):
@@ -282,8 +281,7 @@ def test_a_bag_split_as_a_real_one_has_its_metadata(shared_data, tmp_path):
         for part in real.files:
             if part != real.files[0]:
                 ours.split()
-            for message in read_bag(folder / part.path).messages():
-                ours.write(message.topic, message.data, message.log_time, message.publish_time)
+            write_all(ours, read_bag(folder / part.path).messages())
     made = read_bag(tmp_path / "wbag").metadata
     assert made.files == real.files
     whole = read_bag(folder)  # its metadata's times are not those of its messages
@@ -341,7 +339,7 @@ def test_quality_of_service_that_is_offered_later_is_in_the_metadata(tmp_path):
 
 @pytest.fixture
 def bag(tmp_path):
-    """Of one message, which the operating system has."""
+    """A bag of one message, which the operating system has."""
     bag = BagWriter(tmp_path / "here" / "session.mcap")
     bag.add_topic("/note", "std_msgs/msg/String")
     bag.write("/note", HI, EPOCH)
@@ -352,7 +350,7 @@ def bag(tmp_path):
 def test_a_file_that_was_removed_is_said_to_be_lost(bag, tmp_path):
     bag.path.unlink()
     bag.write("/note", HI, EPOCH + 1)
-    with pytest.raises(BagError, match=r"session.mcap was removed .* 2 messages are lost with"):
+    with pytest.raises(BagError, match=r"session.mcap .* 2 messages"):
         bag.flush()
     assert bag.lost == {"/note": 2}
     bag.flush()  # it is said once
@@ -366,7 +364,7 @@ def test_a_file_that_was_removed_is_said_to_be_lost(bag, tmp_path):
 def test_a_file_that_was_moved_is_complete_where_it_is(bag, tmp_path):
     bag.path.rename(tmp_path / "kept.mcap")
     bag.write("/note", HI, EPOCH + 1)
-    with pytest.raises(BagError, match=r"was moved away .* 2 messages; .* goes on in .*_1.mcap"):
+    with pytest.raises(BagError, match=r"moved away .* 2 messages.*_1.mcap"):
         bag.split()
     assert read_bag(tmp_path / "kept.mcap").complete
     assert read_bag(tmp_path / "kept.mcap").message_count == 2
@@ -376,7 +374,7 @@ def test_a_file_that_was_moved_is_complete_where_it_is(bag, tmp_path):
 
 def test_a_folder_that_was_removed_is_made_again(bag, tmp_path):
     shutil.rmtree(tmp_path / "here")
-    with pytest.raises(BagError, match="was removed"):
+    with pytest.raises(BagError, match="removed"):
         bag.flush()
     bag.write("/note", HI, EPOCH + 1)
     bag.close()
@@ -386,7 +384,7 @@ def test_a_folder_that_was_removed_is_made_again(bag, tmp_path):
 def test_where_nothing_can_go_on_it_waits_until_it_can(bag, tmp_path):
     shutil.rmtree(tmp_path / "here")
     (tmp_path / "here").touch()
-    with pytest.raises(BagError, match=r"here cannot be written .* 1 message is lost"):
+    with pytest.raises(BagError, match=r"here .* 1 message "):
         bag.flush()
     assert not bag.resume()
     (tmp_path / "here").unlink()
@@ -399,7 +397,7 @@ def test_where_nothing_can_go_on_it_waits_until_it_can(bag, tmp_path):
 @pytest.mark.parametrize("whole_folder", [False, True])
 def test_what_was_removed_before_the_end_is_said_at_the_end(bag, whole_folder):
     shutil.rmtree(bag.path.parent) if whole_folder else bag.path.unlink()
-    with pytest.raises(BagError, match="1 message is lost with it"):
+    with pytest.raises(BagError, match="1 message "):
         bag.close()
     assert bag.lost == {"/note": 1}
     bag.close()
@@ -421,7 +419,7 @@ def test_a_file_that_was_cut_keeps_what_is_left_and_the_rest_is_said(tmp_path, p
     for k in range(100, 120):
         bag.write("/other", HI, EPOCH + k)
         bag.write("/note", HI, EPOCH + k)
-    with pytest.raises(BagError, match="was cut by another process"):
+    with pytest.raises(BagError, match="another process"):
         (bag.close if ends else bag.flush)()
     if not ends:
         bag.write("/note", HI, EPOCH + 200)

@@ -61,15 +61,16 @@ def test_a_wall_gives_stiffness_times_depth_and_its_energy(depth):
 def test_at_its_pose_it_is_the_wrench_and_near_it_falls_by_the_stiffness(seed):
     random = np.random.default_rng(seed)
     model = random_model(random)
-    np.testing.assert_allclose(model.wrench_at(model.pose), model.wrench, atol=1e-12)
-    energy, slope = model._slope(np.zeros(6))
-    step = 1e-9 * random.normal(size=6)
-    lacking = model._split[4] + np.outer(model._split[2], model._split[2]) / float(
-        model._split[0] @ model._split[2][:3]
-    )
-    change = model._slope(step)[1] - slope
-    np.testing.assert_allclose(change, -lacking @ step, atol=1e-11)
+    along = np.concatenate([model.push, np.zeros(3)])
+    stiff = model.stiffness + 2e3 * np.outer(along, along)  # so that the push ends within 30 mm
+    model = dataclasses.replace(model, stiffness=stiff)
+    energy, wrench = model.answer(np.zeros(6))
+    np.testing.assert_allclose(wrench, model.wrench, atol=1e-12)
     assert energy >= 0.0
+    step = 1e-9 * random.normal(size=6)
+    expected = -stiff @ step
+    expected[3:] += 0.5 * np.cross(step[3:], wrench[3:])  # a torque's axes turn half as far
+    np.testing.assert_allclose(model.answer(step)[1] - wrench, expected, atol=1e-11)
 
 
 @given(SEEDS)
@@ -89,10 +90,8 @@ def test_the_wrench_is_what_works_against_the_energy(seed):
 def test_where_the_push_has_ended_there_is_nothing(seed):
     model = random_model(np.random.default_rng(seed))
     away = Pose(model.pose.position + 0.5 * model.push, model.pose.orientation)
-    twist = model.displacement(away)
-    if model._split[1] - model._split[2] @ twist <= 0.0:
-        np.testing.assert_array_equal(model.wrench_at(away), 0.0)
-        assert model.energy_at(away) == 0.0
+    np.testing.assert_array_equal(model.wrench_at(away), 0.0)
+    assert model.energy_at(away) == 0.0
 
 
 @given(SEEDS)
@@ -103,13 +102,14 @@ def test_a_light_touch_ends_without_a_kick(seed):
     model = random_model(random)
     light = ContactModel(0, model.pose, 0.01 * model.wrench, model.stiffness)
     size = np.linalg.norm(light.wrench[:3])
-    spring = float(light._split[2][:3] @ light.push)
+    slope = light.stiffness[:, :3] @ light.push
+    # However soft the tissue is, the push ends within 30 mm.
+    slope[:3] += max(size / 0.03 - light.push @ slope[:3], 0.0) * light.push
     for _ in range(50):
         here = moved(light.pose, random.uniform(-1, 1, 6) * [0.02, 0.02, 0.02, 0.3, 0.3, 0.3])
-        deeper = max(0.0, -float(light._split[2] @ light.displacement(here)))
+        deeper = max(0.0, -float(slope @ light.displacement(here)))
         along = float(light.wrench_at(here)[:3] @ light.push)
         assert abs(along) <= (2.5 * size + deeper) * (1 + 1e-9)
-    assert spring > 0.0
 
 
 def test_without_contact_nothing_is_felt_anywhere():
@@ -121,12 +121,12 @@ def test_without_contact_nothing_is_felt_anywhere():
 @pytest.mark.parametrize(
     ("wrench", "stiffness", "sentence"),
     [
-        (np.zeros(3), np.zeros((6, 6)), "a wrench of 6 numbers"),
-        (np.zeros(6), np.zeros((3, 3)), "a 6 by 6 stiffness"),
+        (np.zeros(3), np.zeros((6, 6)), "6 numbers"),
+        (np.zeros(6), np.zeros((3, 3)), "6 by 6"),
         (np.full(6, np.nan), np.zeros((6, 6)), "not finite"),
         (np.zeros(6), np.full((6, 6), np.inf), "not finite"),
-        (np.full(6, 1e9), np.zeros((6, 6)), "a wrench of 1e\\+09 N"),
-        (np.zeros(6), 1e12 * np.eye(6), "a stiffness of 1e\\+12 N/m: no tissue is so"),
+        (np.full(6, 1e9), np.zeros((6, 6)), "1e\\+09 N"),
+        (np.zeros(6), 1e12 * np.eye(6), "1e\\+12 N/m"),
         (np.zeros(6), np.triu(np.ones((6, 6))), "not symmetric"),
     ],
 )
@@ -271,10 +271,10 @@ def test_a_wrench_is_turned_into_the_arms_frame():
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ({"scale": 0.0}, "haptic.scale: 0 is outside 0.01 to 100"),
+        ({"scale": 0.0}, "haptic.scale"),
         ({"force_limit": -1.0}, "haptic.force_limit"),
-        ({"rate": "1 m"}, "haptic.rate: '1 m' is not a frequency"),
-        ({"ramp": float("nan")}, "haptic.ramp: nan is not finite"),
+        ({"rate": "1 m"}, "haptic.rate"),
+        ({"ramp": float("nan")}, "haptic.ramp"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(setting, sentence):
@@ -326,36 +326,37 @@ class Bench:
         self._frames = registration, calibration
         self._world, self._delay = world, delay
         self._random = np.random.default_rng(seed)
-        self._answers = []
-        self._free = 0
+        self.answers = []
+        self.free = 0
         self.tick = 0
         self.given = 0.0  # J, to the handle
         self.most_given = 0.0
         self.largest = 0.0  # J, of the work done on the tissue so far
-        self._last = None
+        self.last = self.known = None
         self.felt = np.zeros(6)
 
     def move(self, pose, *, poses=True, models=True):
         """One tick with the handle at a pose; what it feels until the next."""
         now = self.tick * MS
         stamp = now + 1
-        if self._last is not None:
-            turn = se3.rotation_between(self._last.orientation, pose.orientation)
-            way = np.concatenate([pose.position - self._last.position, turn])
+        if self.last is not None:
+            turn = se3.rotation_between(self.last.orientation, pose.orientation)
+            way = np.concatenate([pose.position - self.last.position, turn])
             self.given += float(self.felt @ way)
             self.most_given = max(self.most_given, self.given)
             self.largest = max(self.largest, -self.given)
-        self._last = pose
+        self.last = pose
         if poses:
             self.rendering.pose(stamp, pose, now)
-        if models and self.tick >= self._free:
+        if models and self.tick >= self.free:
             registration, calibration = self._frames
             probe = registration @ self.arm.take(pose, stamp).pose @ calibration
             lag = int(self._random.integers(*self._delay))
-            self._answers.append((self.tick + lag, self._world.model(stamp, probe)))
-            self._free = self.tick + lag
-        while self._answers and self._answers[0][0] <= self.tick:
-            self.rendering.model(self._answers.pop(0)[1], now)
+            self.answers.append((self.tick + lag, self._world.model(stamp, probe)))
+            self.free = self.tick + lag
+        while self.answers and self.answers[0][0] <= self.tick:
+            self.known = self.answers.pop(0)[1]
+            self.rendering.model(self.known, now)
         self.tick += 1
         self.felt = self.rendering.render(now)
         return self.felt
@@ -444,14 +445,14 @@ def test_a_new_answer_makes_no_step():
     bench = wall(hand_over=0.03, delay=(40, 41))
     press(bench, 0.005)
     stiffer = Wall().model(bench.tick * MS + 1, Pose([0.0, 0.0, 0.005]))
-    bench._answers.append((bench.tick, dataclasses.replace(stiffer, wrench=2 * stiffer.wrench)))
-    bench._free = bench.tick + 1000
+    bench.answers.append((bench.tick, dataclasses.replace(stiffer, wrench=2 * stiffer.wrench)))
+    bench.free = bench.tick + 1000
     felt = [bench.felt[2], *(bench.move(Pose([0.0, 0.0, 0.005]))[2] for _ in range(60))]
     assert felt[-1] == pytest.approx(-2 * COUPLING * 0.005)
     assert np.abs(np.diff(felt)).max() == pytest.approx(COUPLING * 0.005 / 30, rel=1e-6)
 
 
-def test_between_answers_the_force_goes_on_as_the_tissue_would():
+def test_betweenanswers_the_force_goes_on_as_the_tissue_would():
     """Pressed steadily into tissue that answers late, next to the same that answers at once."""
     slow, quick = Bench(Tissue("fem")), Bench(Tissue("fem"), delay=(1, 2))
     ways = np.linspace(-0.002, 0.012, 1400)  # 10 mm/s
@@ -520,26 +521,27 @@ def test_the_handle_is_never_pulled_into_the_tissue():
     bench = Bench(Tissue("fem"), seed=5)
     for pose in random_path(np.random.default_rng(5), 1500):
         force = bench.move(pose)[:3]
-        push = bench.rendering._model.push if bench.rendering._model else np.zeros(3)
+        push = bench.known.push if bench.known else np.zeros(3)
         assert force @ push >= -1e-12
+    assert bench.rendering.stops == 0
 
 
 @pytest.mark.parametrize(
     ("disturb", "sentence"),
     [
-        (lambda b: b.move(Pose([0.02, 0.0, 0.005])), "the handle has jumped by 20.0 mm"),
+        (lambda b: b.move(Pose([0.02, 0.0, 0.005])), "20.0 mm"),
         (
             lambda b: b.move(Pose([0, 0, 0.005], se3.rotation_exp(np.array([0, 0.5, 0])))),
-            "the handle has jumped by 29°",
+            "29°",
         ),
-        (lambda b: [b.move(Pose([0, 0, 0.005]), poses=False) for _ in range(60)], "no pose of the"),
+        (lambda b: [b.move(Pose([0, 0, 0.005]), poses=False) for _ in range(60)], "no pose"),
         (
             lambda b: [b.move(Pose([0, 0, 0.005]), models=False) for _ in range(340)],
-            "no model of the contact for 3",
+            "no model",
         ),
         (
             lambda b: [b.move(Pose([1e-3 * k, 0, 0.005]), models=False) for k in range(22)],
-            "mm from where the contact is known",
+            "mm from",
         ),
         (
             lambda b: [
@@ -548,7 +550,7 @@ def test_the_handle_is_never_pulled_into_the_tissue():
                 )
                 for k in range(7)
             ],
-            "from where the contact is known",
+            "° from",
         ),
         (
             lambda b: (b.rendering.distrust("the pose is not finite"), b.move(Pose([0, 0, 0.005]))),
@@ -557,7 +559,7 @@ def test_the_handle_is_never_pulled_into_the_tissue():
         (lambda b: (b.rendering.clutch(True), b.move(Pose([0, 0, 0.005]))), "the clutch is held"),
         (
             lambda b: (setattr(b, "tick", b.tick - 3000), b.move(Pose([0, 0, 0.005]))),
-            "have jumped back",
+            "jumped back",
         ),
     ],
 )
@@ -569,9 +571,9 @@ def test_at_any_doubt_nothing_is_felt_and_then_again(disturb, sentence):
     assert not bench.felt.any()
     assert bench.rendering.stops == 1
     bench.rendering.clutch(False)
-    bench._answers.clear()
-    bench._free = bench.tick
-    last, back = bench._last, Pose([0.0, 0.0, 0.005])
+    bench.answers.clear()
+    bench.free = bench.tick
+    last, back = bench.last, Pose([0.0, 0.0, 0.005])
     for part in np.linspace(0.0, 1.0, 40):
         bench.move(se3.interpolate(last, back, part), models=part == 1.0)
     felt = press(bench, 0.004, start=0.005)
@@ -582,7 +584,7 @@ def test_at_any_doubt_nothing_is_felt_and_then_again(disturb, sentence):
 def test_a_model_of_before_a_doubt_is_not_believed():
     bench = wall(delay=(30, 31))
     press(bench, 0.005)
-    bench._free = bench.tick
+    bench.free = bench.tick
     bench.move(Pose([0.0, 0.0, 0.005]))  # asks; the answer comes 30 ms later
     bench.rendering.distrust("something was wrong")
     felt = [bench.move(Pose([0.0, 0.0, 0.005])).any() for _ in range(100)]

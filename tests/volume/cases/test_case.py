@@ -56,20 +56,20 @@ def changed(folder, text):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "is empty; a case has at least a name"),
-        ("name: a\nregoin: arm\n", "regoin: unknown key; did you mean `region`?"),
-        ("name: ../../etc\n", "name: '../../etc': a name is no path"),
-        ("name: a\nstructures: {../../up: {label: 6}}\n", "a name is no path"),
-        ("name: a\nstructures: {vein: {label: 6}, vena: {label: 6}}\n", "6 is `vein` already"),
-        ("name: a\nstructures: {vein: {label: 0}}\n", "label: 0 is outside 1 to 255"),
-        ("name: a\nstructures: {top: {label: 6}}\n", "means something else already"),
-        ("name: a\nfixed: [botom]\n", "did you mean 'bottom'?"),
-        ("name: a\naround: livr\n", "did you mean 'liver'"),
-        ("name: a\nname: b\n", "key `name` is there twice"),
-        ("name: [\n", "is not YAML"),
-        ("- a\n", "must be a mapping of keys"),
+        ("", "is empty"),
+        ("name: a\nregoin: arm\n", "mean `region`?"),
+        ("name: ../../etc\n", "name: '../../etc'"),
+        ("name: a\nstructures: {../../up: {label: 6}}\n", "no path"),
+        ("name: a\nstructures: {vein: {label: 6}, vena: {label: 6}}\n", "`vein`"),
+        ("name: a\nstructures: {vein: {label: 0}}\n", "label: 0"),
+        ("name: a\nstructures: {top: {label: 6}}\n", "something else"),
+        ("name: a\nfixed: [botom]\n", "mean 'bottom'?"),
+        ("name: a\naround: livr\n", "mean 'liver'"),
+        ("name: a\nname: b\n", "`name`"),
+        ("name: [\n", "YAML"),
+        ("- a\n", "a mapping"),
         ("name: a\nstart: {position: [1 km, 0, 0]}\n", "start.position"),
-        ("name: a\nvolume: ../../../etc/passwd\n", "volume: unknown key"),
+        ("name: a\nvolume: ../../../etc/passwd\n", "volume:"),
     ],
 )
 def test_what_a_case_cannot_say_is_refused_in_a_sentence(make_case, text, sentence):
@@ -81,26 +81,26 @@ def test_what_a_case_cannot_say_is_refused_in_a_sentence(make_case, text, senten
 
 
 def test_a_place_without_a_case_is_refused(tmp_path, make_case):
-    with pytest.raises(CaseError, match="there is no such case"):
+    with pytest.raises(CaseError, match="nothing"):
         read_case(tmp_path / "nothing")
-    with pytest.raises(CaseError, match=r"it has no case\.yaml"):
+    with pytest.raises(CaseError, match=r"case\.yaml"):
         read_case(tmp_path)
     folder = make_case()
     (folder / "volume.nrrd").unlink()
-    with pytest.raises(CaseError, match=r"it has no volume\.nrrd"):
+    with pytest.raises(CaseError, match=r"volume\.nrrd"):
         read_case(folder)
 
 
 def test_links_in_a_circle_are_refused(tmp_path, make_case):
     os.symlink(tmp_path / "b", tmp_path / "a")
     os.symlink(tmp_path / "a", tmp_path / "b")
-    with pytest.raises(CaseError, match="in a circle"):
+    with pytest.raises(CaseError, match="circle"):
         read_case(tmp_path / "a")
     folder = make_case()
     os.symlink("labels.nrrd", folder / "again")
     (folder / "labels.nrrd").unlink()
     os.symlink("again", folder / "labels.nrrd")
-    with pytest.raises(CaseError, match="in a circle"):
+    with pytest.raises(CaseError, match="circle"):
         read_case(folder)
 
 
@@ -110,7 +110,7 @@ def test_a_link_out_of_the_case_is_refused_and_one_to_the_case_is_not(tmp_path, 
     assert read_case(tmp_path / "elsewhere").settings.name == "block"
     shutil.move(folder / "labels.nrrd", tmp_path / "secret.nrrd")
     os.symlink("../secret.nrrd", folder / "labels.nrrd")
-    with pytest.raises(CaseError, match="leads out of the case"):
+    with pytest.raises(CaseError, match="leads out"):
         read_case(folder)
 
 
@@ -120,7 +120,7 @@ def test_voxels_in_another_file_are_refused(tmp_path, make_case):
     header, _, voxels = data.partition(b"\n\n")
     (tmp_path / "secret.raw").write_bytes(voxels)
     (folder / "volume.nrrd").write_bytes(header + b"\ndata file: ../secret.raw\n\n")
-    with pytest.raises(VolumeError, match="keeps its voxels in another file"):
+    with pytest.raises(VolumeError, match="another file"):
         read_case(folder).volume()
 
 
@@ -133,16 +133,16 @@ def test_labels_must_be_on_the_volumes_grid(make_case, block):
         read_case(folder).volume()
     fewer = block.labels[:, :, :-1]
     write_labels(folder / "labels.nrrd", Volume(fewer, block.index_to_patient, fewer))
-    with pytest.raises(CaseError, match=r"30 × 20 × 24 voxels, 30 × 20 × 25 there"):
+    with pytest.raises(CaseError, match=r"30 × 20 × 24 .*30 × 20 × 25"):
         read_case(folder).volume()
 
 
 def test_every_label_is_a_structure_and_every_structure_is_there(make_case):
     folder = changed(make_case(), "name: a\n")
-    with pytest.raises(CaseError, match="has the label 6, which is no structure"):
+    with pytest.raises(CaseError, match="label 6"):
         read_case(folder).volume()
     changed(folder, "name: a\nstructures: {vein: {label: 6}, artery: {label: 7}}\n")
-    with pytest.raises(CaseError, match=r"structures.artery: label 7 occurs nowhere"):
+    with pytest.raises(CaseError, match=r"structures.artery: label 7"):
         read_case(folder).volume()
 
 
@@ -151,10 +151,10 @@ def test_a_damaged_volume_is_refused_before_it_takes_memory(make_case, block):
     write_volume(folder / "volume.nrrd", block)
     data = (folder / "volume.nrrd").read_bytes()
     (folder / "volume.nrrd").write_bytes(data.replace(b"sizes: 30 20 25", b"sizes: 3000 20 25"))
-    with pytest.raises(VolumeError, match="bytes of image data where its header says"):
+    with pytest.raises(VolumeError, match="its header"):
         read_case(folder).volume()
     (folder / "volume.nrrd").write_bytes(data.replace(b"sizes: 30 20 25", b"sizes: 9000 9000 9000"))
-    with pytest.raises(VolumeError, match="are read at most"):
+    with pytest.raises(VolumeError, match="at most"):
         read_case(folder).volume()
 
 
@@ -193,19 +193,18 @@ def test_a_path_is_a_case_too_and_goes_first(roots, tmp_path):
 def test_an_unknown_name_is_told_those_that_are_known():
     with pytest.raises(CaseError, match=r"livr.* arm, liver .*mean liver\?"):
         find_case("livr")
-    with pytest.raises(CaseError, match="there is no case"):
-        find_case("../one/nothing")
-    with pytest.raises(CaseError, match="there is no case"):
-        find_case("")
+    for name in ("../one/nothing", ""):
+        with pytest.raises(CaseError, match="no case"):
+            find_case(name)
 
 
 @pytest.mark.usefixtures("roots")
 def test_what_is_there_but_no_case_is_said(tmp_path):
     (tmp_path / "plain").mkdir()
     (tmp_path / "file.nrrd").touch()
-    with pytest.raises(CaseError, match=r"plain: is a folder without a case\.yaml"):
+    with pytest.raises(CaseError, match=r"plain: .*case\.yaml"):
         find_case(tmp_path / "plain")
-    with pytest.raises(CaseError, match=r"file\.nrrd: is a file"):
+    with pytest.raises(CaseError, match=r"file\.nrrd:"):
         find_case(tmp_path / "file.nrrd")
 
 
@@ -222,5 +221,5 @@ def test_a_listing_passes_by_what_is_no_case(roots):
     os.symlink("..", roots[1] / "up")
     assert cases_in(roots[1]) == [roots[1] / "arm", roots[1] / "liver"]
     assert cases_in(roots[1] / "arm") == [roots[1] / "arm"]
-    with pytest.raises(CaseError, match="cannot be read"):
+    with pytest.raises(CaseError, match="nowhere"):
         cases_in(roots[1] / "nowhere")

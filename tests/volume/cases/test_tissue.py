@@ -32,18 +32,17 @@ def test_tissue_is_read_as_it_was_written(tmp_path, tissue):
 
 def test_what_is_no_tissue_is_refused_in_a_sentence(tmp_path, tissue):
     path = tmp_path / "tissue.npz"
-    with pytest.raises(CaseError, match="remove it"):
-        read_tissue(path)
-    path.write_bytes(b"nothing")
-    with pytest.raises(CaseError, match="remove it"):
-        read_tissue(path)
-    np.savez(path, nodes=np.zeros((4, 3)))
-    with pytest.raises(CaseError, match="no tissue that us_sim wrote"):
-        read_tissue(path)
     write_tissue(path, tissue)
     whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
+    path.unlink()
     with pytest.raises(CaseError, match="remove it"):
+        read_tissue(path)
+    for content in (b"nothing", whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(CaseError, match="remove it"):
+            read_tissue(path)
+    np.savez(path, nodes=np.zeros((4, 3)))
+    with pytest.raises(CaseError, match="us_sim wrote"):
         read_tissue(path)
 
 
@@ -52,16 +51,15 @@ def test_arrays_that_do_not_go_together_are_refused(tmp_path, tissue):
     write_tissue(path, tissue)
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
-    for wrong in ({"fractions": np.ones((1, 2))}, {"fractions": 2 * arrays["fractions"]}):
-        np.savez(path, **{**arrays, **wrong})
-        with pytest.raises(CaseError, match="do not go together"):
+    for name, wrong, message in (
+        ("fractions", np.ones((1, 2)), "go together"),
+        ("fractions", 2 * arrays["fractions"], "go together"),
+        ("tetrahedra", arrays["tetrahedra"] + 100, "remove it"),
+        ("made_from", np.array(["x"], dtype=object), "remove it"),
+    ):
+        np.savez(path, **{**arrays, name: wrong})
+        with pytest.raises(CaseError, match=message):
             read_tissue(path)
-    np.savez(path, **{**arrays, "tetrahedra": arrays["tetrahedra"] + 100})
-    with pytest.raises(CaseError, match="remove it"):
-        read_tissue(path)
-    np.savez(path, **{**arrays, "made_from": np.array(["x"], dtype=object)})
-    with pytest.raises(CaseError, match="remove it"):
-        read_tissue(path)
 
 
 def test_gigabytes_in_a_small_file_are_refused_before_they_are_unpacked(tmp_path):
@@ -74,5 +72,5 @@ def test_gigabytes_in_a_small_file_are_refused_before_they_are_unpacked(tmp_path
         for _ in range(33):
             entry.write(zeros)
     assert path.stat().st_size < 1 << 22
-    with pytest.raises(CaseError, match="are read at most"):
+    with pytest.raises(CaseError, match="at most"):
         read_tissue(path)

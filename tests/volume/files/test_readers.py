@@ -38,6 +38,20 @@ def _metaimage(path, data=None, **fields):
     return path
 
 
+def _stored(path, voxels):
+    """A file of an array (k, j, i), as SimpleITK writes it."""
+    sitk.WriteImage(sitk.GetImageFromArray(voxels), str(path))
+    return path
+
+
+def _changed(path, at, form, *values):
+    """A file with other values at a place in it."""
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, at, *values)
+    path.write_bytes(content)
+    return path
+
+
 def _nifti(path, data, matrix_ras):
     """A NIfTI-1 file of uint8 voxels placed by its sform, written byte by byte."""
     header = bytearray(352)
@@ -111,9 +125,7 @@ def test_nifti_is_turned_from_ras_to_lps(tmp_path, suffix):
 def test_other_types_are_spread_over_the_whole_range(tmp_path, dtype):
     lowest = 0 if dtype == np.uint16 else -100
     stored = (lowest + np.array([0, 51, 102, 153, 204])).astype(dtype)
-    image = sitk.GetImageFromArray(np.resize(stored, (5, 5, 5)))
-    sitk.WriteImage(image, str(tmp_path / "a.nrrd"))
-    grey = read_volume(tmp_path / "a.nrrd").intensities
+    grey = read_volume(_stored(tmp_path / "a.nrrd", np.resize(stored, (5, 5, 5)))).intensities
     # 0, 1/4, 1/2, 3/4 and 1 of 255, halves rounded up.
     np.testing.assert_array_equal(grey[:, 0, 0], [0, 64, 128, 191, 255])
 
@@ -122,8 +134,7 @@ def test_a_float_image_may_have_holes_and_a_vast_range(tmp_path):
     stored = np.zeros((3, 3, 3))
     stored[0, 0] = [-1.7e308, np.nan, 1.7e308]
     stored[0, 1] = [np.inf, -np.inf, 0.0]
-    sitk.WriteImage(sitk.GetImageFromArray(stored), str(tmp_path / "a.nrrd"))
-    grey = read_volume(tmp_path / "a.nrrd").intensities[:, :, 0]
+    grey = read_volume(_stored(tmp_path / "a.nrrd", stored)).intensities[:, :, 0]
     np.testing.assert_array_equal(grey[:, 0], [0, 0, 255])
     np.testing.assert_array_equal(grey[:, 1], [255, 0, 128])
     (_, missing, infinite) = grey_voxels(open_image(tmp_path / "a.nrrd"))[1]
@@ -132,11 +143,10 @@ def test_a_float_image_may_have_holes_and_a_vast_range(tmp_path):
 
 
 def test_a_constant_image_is_dark_and_one_without_a_number_is_refused(tmp_path):
-    path = str(tmp_path / "a.nrrd")
-    sitk.WriteImage(sitk.GetImageFromArray(np.full((3, 3, 3), 7, np.int16)), path)
+    path = _stored(tmp_path / "a.nrrd", np.full((3, 3, 3), 7, np.int16))
     assert not read_volume(path).intensities.any()
-    sitk.WriteImage(sitk.GetImageFromArray(np.full((3, 3, 3), np.nan)), path)
-    with pytest.raises(VolumeError, match=r"a\.nrrd: holds no finite value"):
+    _stored(path, np.full((3, 3, 3), np.nan))
+    with pytest.raises(VolumeError, match=r"a\.nrrd: .*finite"):
         read_volume(path)
 
 
@@ -165,7 +175,7 @@ def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_data):
     path = shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha"
     if not path.exists():
         pytest.skip(f"no {path}")
-    with pytest.raises(VolumeError, match="sequence of tracked frames"):
+    with pytest.raises(VolumeError, match="tracked frames"):
         read_volume(path)
 
 
@@ -185,9 +195,9 @@ def test_a_real_volume_in_which_plus_left_the_status_of_a_frame_is_a_volume(shar
     ("kinds", "frames", "message"),
     [
         ("domain domain domain", 1, None),
-        ("domain domain list", 1, "images without poses"),
+        ("domain domain list", 1, "without poses"),
         ("", 1, None),
-        ("", 2, "images without poses"),
+        ("", 2, "without poses"),
     ],
 )
 def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
@@ -211,29 +221,29 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
         ({"ElementType": "MET_SHORT"}, None, "header says 240"),
         ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
         ({"ElementSpacing": "1 -2 1"}, None, "spacing 1 × -2 × 1 mm"),
-        ({"ElementSpacing": "1 nan 1"}, None, "every one must be a number"),
-        ({"ElementSpacing": "1 1 inf"}, None, "every one must be a number"),
-        ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular direction matrix"),
-        ({"DimSize": "4 5 1"}, b"\0" * 20, "two or more along each axis"),
-        ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers per voxel"),
+        ({"ElementSpacing": "1 nan 1"}, None, "a number"),
+        ({"ElementSpacing": "1 1 inf"}, None, "a number"),
+        ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular"),
+        ({"DimSize": "4 5 1"}, b"\0" * 20, "each axis"),
+        ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers"),
         ({"DimSize": ":4 5 6"}, None, "DimSize is ':4 5 6'"),
-        ({"DimSize": "-4 5 6"}, None, "whole numbers above zero"),
-        ({"DimSize": "4 5_0 6"}, None, "whole numbers above zero"),
-        ({"NDims": "2"}, None, "NDims says 2 numbers"),
-        ({"DimSize": "1024 1024 1024"}, None, "536870912 are read at most"),
-        ({"DimSize": "4000000000 4000000000 4000000000"}, None, "are read at most"),
-        ({"ElementSpacing": "1e-30 1 1"}, None, "spacing 1e-30 × 1 × 1 mm; that of a body is"),
+        ({"DimSize": "-4 5 6"}, None, "above zero"),
+        ({"DimSize": "4 5_0 6"}, None, "above zero"),
+        ({"NDims": "2"}, None, "NDims"),
+        ({"DimSize": "1024 1024 1024"}, None, "536870912"),
+        ({"DimSize": "4000000000 4000000000 4000000000"}, None, "536870912"),
+        ({"ElementSpacing": "1e-30 1 1"}, None, "spacing 1e-30"),
         ({"Offset": "nan 0 0"}, None, "Offset is 'nan 0 0'"),
-        ({"Offset": "0 0"}, None, "where 3 finite numbers belong"),
-        ({"Offset": "0 0 1e9"}, None, "lies 1e\\+06 m from its origin"),
-        ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "axes that are sheared or scaled"),
-        ({"TransformMatrix": "2 0 0 0 2 0 0 0 2"}, None, "axes that are sheared or scaled"),
-        ({"HeaderSize": "-2"}, None, "its HeaderSize is '-2'"),
+        ({"Offset": "0 0"}, None, "3 finite"),
+        ({"Offset": "0 0 1e9"}, None, "1e\\+06 m"),
+        ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "sheared"),
+        ({"TransformMatrix": "2 0 0 0 2 0 0 0 2"}, None, "sheared"),
+        ({"HeaderSize": "-2"}, None, "HeaderSize"),
         ({"BinaryData": "False"}, b"1 2 3", "holds 3 bytes"),
-        ({"BinaryData": "False"}, b"1 2 x", "not the uint8 numbers"),
-        ({"BinaryData": "False"}, b"256 " * 120, "not the uint8 numbers"),
-        ({"DistanceUnits": "furlong"}, None, "no known unit"),
-        ({"ElementType": "MET_STRING"}, None, "save it with one of MET_CHAR"),
+        ({"BinaryData": "False"}, b"1 2 x", "uint8"),
+        ({"BinaryData": "False"}, b"256 " * 120, "uint8"),
+        ({"DistanceUnits": "furlong"}, None, "furlong"),
+        ({"ElementType": "MET_STRING"}, None, "MET_CHAR"),
     ],
 )
 def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, message):
@@ -263,8 +273,10 @@ def test_a_compressed_metaimage_holds_what_its_header_says(tmp_path):
 def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
     with pytest.raises(VolumeError, match=r"or more bytes .* 120"):
         read_volume(_compressed(tmp_path / "a.mha", bytes(100 << 20)))
-    with pytest.raises(VolumeError, match="536870912 are read at most"):
+    with pytest.raises(VolumeError, match="536870912"):
         read_volume(_compressed(tmp_path / "a.mha", bytes(100), DimSize="1024 1024 1024"))
+    with pytest.raises(VolumeError, match=r"or more bytes .* 120"):
+        read_volume(_nifti(tmp_path / "a.nii.gz", bytes(100 << 20), np.eye(4)))
 
 
 def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
@@ -277,22 +289,21 @@ def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch
     ("old", "new", "message"),
     [
         ("sizes: 4 5 6", "sizes: 4 5 7", "holds 120 bytes .* 140"),
-        ("sizes: 4 5 6", "sizes: 4 5 6 1", "its dimension '3'"),
-        ("sizes: 4 5 6", "sizes: 4 5 -6", "whole numbers above zero"),
+        ("sizes: 4 5 6", "sizes: 4 5 6 1", "dimension"),
+        ("sizes: 4 5 6", "sizes: 4 5 -6", "above zero"),
         # ITK writes beyond its memory for these.
-        ("space directions: ", "space directions: " + 25 * "(1,0,0) ", "has 28 entries where"),
-        ("space origin: (0,0,0)", "space origin: (0,0,nan)", "vectors of three finite numbers"),
-        ("encoding: raw", "encoding: hex", "in the encoding 'hex'"),
-        ("encoding: raw", "encoding: raw\nencoding: gzip", "has 'encoding' twice"),
-        ("encoding: raw", "encoding: raw\nbyte skip: -2", "its byte skip is '-2'"),
+        ("space directions: ", "space directions: " + 25 * "(1,0,0) ", "28 entries"),
+        ("space origin: (0,0,0)", "space origin: (0,0,nan)", "three finite"),
+        ("encoding: raw", "encoding: hex", "'hex'"),
+        ("encoding: raw", "encoding: raw\nencoding: gzip", "'encoding' twice"),
+        ("encoding: raw", "encoding: raw\nbyte skip: -2", "byte skip"),
         ("encoding: raw", "encoding: raw\nbyte skip: 9", "holds 111 bytes"),
-        ("encoding: raw", "encoding: bzip2", "compression is broken"),
-        ("space directions: ", "space units: furlong mm mm\nspace directions: ", "no known unit"),
+        ("encoding: raw", "encoding: bzip2", "compression"),
+        ("space directions: ", "space units: furlong mm mm\nspace directions: ", "furlong"),
     ],
 )
 def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, old, new, message):
-    path = tmp_path / "a.nrrd"
-    sitk.WriteImage(sitk.GetImageFromArray(GREY.transpose(2, 1, 0)), str(path))
+    path = _stored(tmp_path / "a.nrrd", GREY.T)
     content = path.read_bytes()
     assert old.encode() in content
     path.write_bytes(content.replace(old.encode(), new.encode()))
@@ -301,8 +312,7 @@ def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, old, new, message
 
 
 def test_an_nrrd_header_may_say_much_in_its_own_words(tmp_path):
-    path = tmp_path / "a.nrrd"
-    sitk.WriteImage(sitk.GetImageFromArray(GREY.transpose(2, 1, 0)), str(path))
+    path = _stored(tmp_path / "a.nrrd", GREY.T)
     words = f"# {3000 * 'a'}\nterminology:={3000 * 'b'}\nencoding: "
     path.write_bytes(path.read_bytes().replace(b"encoding: ", words.encode()))
     np.testing.assert_array_equal(read_volume(path).intensities, GREY)
@@ -322,17 +332,8 @@ def test_an_nrrd_header_may_say_much_in_its_own_words(tmp_path):
 )
 def test_a_nifti_header_that_does_not_fit_is_refused(tmp_path, at, form, value, message):
     path = _nifti(tmp_path / "a.nii", GREY.tobytes(order="F"), np.eye(4))
-    content = bytearray(path.read_bytes())
-    struct.pack_into(form, content, at, *value)
-    path.write_bytes(content)
     with pytest.raises(VolumeError, match=message):
-        read_volume(path)
-
-
-def test_a_nifti_bomb_is_not_unpacked(tmp_path):
-    path = _nifti(tmp_path / "a.nii.gz", bytes(100 << 20), np.eye(4))
-    with pytest.raises(VolumeError, match=r"or more bytes .* 120"):
-        read_volume(path)
+        read_volume(_changed(path, at, form, *value))
 
 
 @pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz"])
@@ -346,26 +347,24 @@ def test_a_cut_file_is_refused(tmp_path, suffix, compressed):
         read_volume(path)
 
 
-@pytest.mark.parametrize("dimension", [2, 5])
-def test_images_of_other_dimensions_are_refused(tmp_path, dimension):
-    path = tmp_path / "flat.mha"
-    sitk.WriteImage(sitk.Image([6] * dimension, sitk.sitkUInt8), str(path))
-    with pytest.raises(VolumeError, match=rf"is {dimension}-dimensional"):
-        read_volume(path)
-
-
-def test_colour_is_refused(tmp_path):
-    path = tmp_path / "colour.nrrd"
-    sitk.WriteImage(sitk.Image([6, 6, 6], sitk.sitkVectorUInt8, 3), str(path))
-    with pytest.raises(VolumeError, match="3 numbers per voxel"):
-        read_volume(path)
+@pytest.mark.parametrize(
+    ("name", "image", "message"),
+    [
+        ("flat.mha", sitk.Image([6] * 2, sitk.sitkUInt8), "2-dimensional"),
+        ("flat.mha", sitk.Image([6] * 5, sitk.sitkUInt8), "5-dimensional"),
+        ("colour.nrrd", sitk.Image([6] * 3, sitk.sitkVectorUInt8, 3), "3 numbers"),
+    ],
+)
+def test_images_of_other_dimensions_and_colour_are_refused(tmp_path, name, image, message):
+    sitk.WriteImage(image, str(tmp_path / name))
+    with pytest.raises(VolumeError, match=message):
+        read_volume(tmp_path / name)
 
 
 def test_a_header_without_its_data_file_is_refused(tmp_path):
-    path = tmp_path / "a.mhd"
-    sitk.WriteImage(sitk.GetImageFromArray(GREY), str(path))
+    path = _stored(tmp_path / "a.mhd", GREY)
     (tmp_path / "a.raw").unlink()
-    with pytest.raises(VolumeError, match=r"data file a\.raw, which is not there"):
+    with pytest.raises(VolumeError, match=r"a\.raw"):
         read_volume(path)
 
 
@@ -374,12 +373,12 @@ def test_a_header_without_its_data_file_is_refused(tmp_path):
 def test_what_is_no_image_is_refused(tmp_path, name, content):
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(VolumeError, match="cannot be read as an image"):
+    with pytest.raises(VolumeError, match="an image"):
         read_volume(path)
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    with pytest.raises(VolumeError, match="there is no such file"):
+    with pytest.raises(VolumeError, match="no such file"):
         read_volume(tmp_path / "nowhere.mha")
     with pytest.raises(VolumeError, match="no DICOM files"):
         read_volume(tmp_path)
@@ -540,17 +539,14 @@ def test_nifti_1_in_two_files_is_read_and_one_half_alone_is_not(tmp_path):
         np.diag(read_placement(tmp_path / "a.hdr"))[:3] * 1e3, [0.5, 0.25, 2]
     )
     (tmp_path / "a.img").unlink()
-    with pytest.raises(VolumeError, match=r"a\.img, which is not there"):
+    with pytest.raises(VolumeError, match=r"a\.img"):
         read_volume(tmp_path / "a.hdr")
 
 
 def test_analyze_and_a_sheared_nifti_are_called_what_they_are(tmp_path):
     path = _nifti(tmp_path / "a.nii", GREY.tobytes(order="F"), np.eye(4))
-    content = bytearray(path.read_bytes())
-    content[344:348] = bytes(4)
-    path.write_bytes(content)
     with pytest.raises(VolumeError, match=r"Analyze 7\.5"):
-        read_volume(path)
+        read_volume(_changed(path, 344, "<i", 0))
     sheared = np.eye(4)
     sheared[0, 2] = 0.4
     with pytest.raises(VolumeError, match="sheared"):
@@ -560,11 +556,8 @@ def test_analyze_and_a_sheared_nifti_are_called_what_they_are(tmp_path):
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
 def test_the_quaternion_of_nifti_turns_as_in_itk(tmp_path, mirror):
     path = _nifti(tmp_path / "a.nii", GREY.tobytes(order="F"), MATRIX_RAS)
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<4f", content, 76, mirror, 0.5, 0.25, 2.0)
-    struct.pack_into("<2h", content, 252, 1, 0)
-    struct.pack_into("<6f", content, 256, 0.3, -0.5, 0.2, 4.0, 5.0, 6.0)
-    path.write_bytes(content)
+    _changed(path, 76, "<4f", mirror, 0.5, 0.25, 2.0)
+    _changed(path, 252, "<2h6f", 1, 0, 0.3, -0.5, 0.2, 4.0, 5.0, 6.0)
     image = sitk.ReadImage(str(path))
     for index in ((0, 0, 0), (3, 0, 0), (0, 4, 0), (1, 2, 5)):
         expected = np.array(image.TransformIndexToPhysicalPoint(index)) * 1e-3
