@@ -1,4 +1,4 @@
-"""A node of a scene: its parameters, its health, lockstep or live input, and who moves the probe."""
+"""A node of a scene: its parameters, its health, lockstep or live input; who moves the probe."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ def colour_pictures(
         seen = [stamp for stamp in stamps if _is_seen(areas, named, stamp - min(session.poses))]
     if not seen:
         return {}
-    titles = {stamp: title for title, stamp in _moments(session, seen, blood).items()}
+    titles = {stamp: title for title, stamp in _flow_moments(session, seen, blood).items()}
     pictures = {}
     for stamp in stamps:  # all of them, as a closed vein fills up
         pose = _tilted(session.poses[stamp], aim)
@@ -209,7 +209,7 @@ def _is_seen(areas: LumenAreas, vessels: Collection[str], since: int) -> bool:
     return all(np.isfinite(areas.at_rest[name][sample]) for name in vessels)
 
 
-def _moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[str, int]:
+def _flow_moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[str, int]:
     """Stamps by the names of their moments."""
     times = 1e-9 * np.array(stamps)
     depth = np.array([session.poses[stamp].position[2] for stamp in stamps])
