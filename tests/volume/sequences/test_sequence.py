@@ -202,12 +202,12 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kinds": "list domain domain domain"}, "along another axis than the last"),
+        ({"kinds": "list domain domain domain"}, "another axis"),
         ({"kinds": "domain domain domain domain"}, "is a volume"),
-        ({"sizes": "5 4 2 3"}, "is a sequence of volumes"),
-        ({"sizes": "5 4 1 4000000"}, "says it holds 4000000 frames"),
-        ({"sizes": "5 4 1 8"}, "holds 60 bytes of image data where its header says 160"),
-        ({"sizes": "5 four 1 3"}, "where a sequence has columns, rows and frames"),
+        ({"sizes": "5 4 2 3"}, "of volumes"),
+        ({"sizes": "5 4 1 4000000"}, "4000000 frames"),
+        ({"sizes": "5 4 1 8"}, "60 bytes .* 160"),
+        ({"sizes": "5 four 1 3"}, "four"),
     ],
 )
 def test_an_nrrd_file_of_another_kind_is_refused(tmp_path, change, message):
@@ -353,9 +353,9 @@ def test_a_sequence_without_frames_in_its_name_is_in_ras(tmp_path):
 @pytest.mark.parametrize(
     ("file", "times", "said"),
     [
-        ("../outside.mrb", "s1:0", "does not lie beside it"),
+        ("../outside.mrb", "s1:0", "beside it"),
         ("none.mrb", "s1:0", "No such file"),
-        ("probe.seq.mrb", "s1:never", "cannot be understood"),
+        ("probe.seq.mrb", "s1:never", "never"),
         ("probe.seq.mrb", "other:1", "no sequence"),
         ("probe.seq.mrb", "s1:1", "is damaged"),
     ],
