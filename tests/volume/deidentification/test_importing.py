@@ -230,10 +230,8 @@ def test_of_several_volumes_the_one_of_that_number_is_imported(tmp_path):
     assert (read_volume(tmp_path / "o.nrrd").intensities == 7).all()
 
 
-def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_data, tmp_path):
-    folder = shared_data / "foreign-files"
-    if not folder.exists():
-        pytest.skip(f"no {folder}")
+def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_file, tmp_path):
+    folder = shared_file("foreign-files")
     with pytest.raises(VolumeError, match="may be text"):
         import_files([folder / "burned_in_stack.nrrd"], tmp_path / "a.nrrd")
     whole = ImportSettings(keep_whole_image=True)
@@ -400,10 +398,8 @@ SEEN = {
 
 
 @pytest.mark.parametrize("name", SEEN)
-def test_words_in_real_images_are_found(shared_data, name):
-    path = shared_data / "dicom-us-2d" / f"{name}.dcm"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_words_in_real_images_are_found(shared_file, name):
+    path = shared_file(f"dicom-us-2d/{name}.dcm")
     image = next(GreyImages([open_dicom(path)]).images())
     covered = np.zeros(image.shape, bool)
     for line in find_text([image]):
@@ -412,10 +408,8 @@ def test_words_in_real_images_are_found(shared_data, name):
         assert covered[top:bottom, left:right].mean() > 0.25, word
 
 
-def test_a_sweep_without_text_has_none(shared_data):
-    folder = shared_data / "imfusion-liver-sweep"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_a_sweep_without_text_has_none(shared_file):
+    folder = shared_file("imfusion-liver-sweep")
     frames = list(read_sweep(folder / "liver_sweep.igs.mha").images(range(0, 140, 35)))
     assert find_text(frames) == []
     assert [find_text([frame]) for frame in frames[:2]] == [[], []]

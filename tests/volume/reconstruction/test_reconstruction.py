@@ -303,10 +303,8 @@ def within(made, reference, levels):
 
 
 @pytest.mark.parametrize("name", PLUS)
-def test_volumes_of_plus_come_out_as_plus_made_them(shared_data, name):
-    folder = shared_data / SPINE
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_volumes_of_plus_come_out_as_plus_made_them(shared_file, name):
+    folder = shared_file(SPINE)
     made, reference = of_plus(folder, name, plus_rounding=True)
     assert made.volume.shape == reference.shape
     # The file gives its place to six digits.
@@ -316,19 +314,15 @@ def test_volumes_of_plus_come_out_as_plus_made_them(shared_data, name):
         assert within(made, reference, 0) == 1.0
 
 
-def test_the_mean_is_two_levels_brighter_than_the_one_that_plus_rounds_down(shared_data):
-    folder = shared_data / SPINE
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_the_mean_is_two_levels_brighter_than_the_one_that_plus_rounds_down(shared_file):
+    folder = shared_file(SPINE)
     made, reference = of_plus(folder, "NNMEAN", compounding="mean")
     difference = made.volume.intensities.astype(int) - reference.intensities
     assert difference[made.covered].mean() == pytest.approx(2.4, abs=0.3)  # as its source says
 
 
-def test_the_liver_sweep_comes_out_as_others_compounded_it(shared_data):
-    folder = shared_data / LIVER
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_the_liver_sweep_comes_out_as_others_compounded_it(shared_file):
+    folder = shared_file(LIVER)
     reference = read_volume(folder / "liver_sweep_compounded_1mm.mha")
     sweep = read_sweep(folder / "liver_sweep.igs.mha")
     fan = ImagePart(

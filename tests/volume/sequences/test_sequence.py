@@ -147,10 +147,8 @@ def test_a_flat_sequence_of_two_dimensions_is_that_of_three(tmp_path):
     np.testing.assert_array_equal(list(read_sweep(path).images()), GREY[:, :, ::-1])
 
 
-def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_data):
-    path = shared_data / "foreign-files" / "NwirePhantomFreehand.igs.nrrd"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_file):
+    path = shared_file("foreign-files/NwirePhantomFreehand.igs.nrrd")
     sequence = read_sequence(path)
     assert (sequence.columns, sequence.rows, len(sequence)) == (820, 616, 97)
     stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))  # (row, column, frame)
@@ -174,10 +172,8 @@ def test_plus_rule_for_names():
         assert split_transform_name(name) == ends, name
 
 
-def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says(shared_data):
-    path = shared_data / "plus-spine-freehand" / "SpinePhantomFreehand.igs.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says(shared_file):
+    path = shared_file("plus-spine-freehand/SpinePhantomFreehand.igs.mha")
     sequence = read_sequence(path)
     calibration = np.diag([0.08, 0.08, 0.08, 1.0])
     calibration[:3, 3] = (15.4, 49.6, -8.6)  # mm

@@ -169,10 +169,8 @@ def test_what_is_no_sequence_is_refused(tmp_path):
             read_sweep(path)
 
 
-def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_data):
-    path = shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_file):
+    path = shared_file("imfusion-liver-sweep/liver_sweep.igs.mha")
     sweep = read_sweep(path)
     assert (sweep.columns, sweep.rows, len(sweep.numbers)) == (739, 593, 140)
     assert (sweep.times[0], sweep.times[-1]) == (0.0, 6.084)

@@ -266,10 +266,8 @@ def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
         placed_images(paths)
 
 
-def test_a_two_dimensional_file_says_what_to_do(shared_data):
-    folder = shared_data / "dicom-us-2d"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_a_two_dimensional_file_says_what_to_do(shared_file):
+    folder = shared_file("dicom-us-2d")
     with pytest.raises(VolumeError, match="30 images"):
         read_volume(folder / "examples_ybr_color.dcm")
     with pytest.raises(VolumeError, match="2D image"):
@@ -316,10 +314,8 @@ def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "message"), [("MOVEKNEE.dcm", "19 images")])
-def test_real_files_are_called_what_they_are(shared_data, name, message):
-    path = shared_data / "foreign-files" / name
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_real_files_are_called_what_they_are(shared_file, name, message):
+    path = shared_file(f"foreign-files/{name}")
     with pytest.raises(VolumeError, match=message):
         placed_images([path])
 
