@@ -43,7 +43,8 @@ $ENDELM
 def test_real_meshes_are_read(shared_data, name, nodes, tetrahedra, left_out):
     mesh, said = read_mesh(shared_data / "meshes-sofa" / name, metres_per_unit=0.01)
     assert (len(mesh.nodes), len(mesh.tetrahedra)) == (nodes, tetrahedra)
-    assert [f" {left_out} nodes" in each for each in said] == [True] * bool(left_out)
+    assert len(said) == bool(left_out)
+    assert all(f" {left_out} nodes" in each for each in said)
     a, b, c = np.moveaxis(mesh.nodes[mesh.boundary], 1, 0)
     enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
     assert mesh.volumes.sum() == pytest.approx(enclosed, rel=1e-9)

@@ -392,7 +392,7 @@ def test_a_hands_motion_is_followed_to_a_hundredth_in_every_frame(collider, rati
     solver = FemNonlinear(model)
     for seed in range(2):
         solver.reset()
-        poses = hand_motion(seed, 3.0)
+        poses = hand_motion(seed, 2.0)
         for pose in poses:
             deformation = solver.deform(pose)
             assert deformation.residual <= 0.01
