@@ -24,6 +24,9 @@ the other one what is beside them."""
 
 _BESIDE = ("slicing", "evaluation", "tracking", "volume", "skin", "geometry")
 
+_RUNNING = ("graph/", "evaluation/latency")
+"""Tests of whole graphs: sooner, their processes would compile what others just compile."""
+
 _BY_GROUPS = pytest.StashKey[bool]()
 
 
@@ -74,16 +77,16 @@ def _group(nodeid: str) -> str:
     file = _file(nodeid)
     if file.startswith(_TISSUE):
         return "tissue"
-    return "graph" if file.startswith("graph/") else file
+    return "graph" if file.startswith(_RUNNING) else file
 
 
 def _turn(nodeid: str) -> int:
     file = _file(nodeid)
     if file.startswith(_TISSUE):
         return 0
-    if file.startswith(_BESIDE):
-        return 1
-    return 2 if file.startswith("graph/") else 3
+    if file.startswith(_RUNNING):
+        return 2
+    return 1 if file.startswith(_BESIDE) else 3
 
 
 def _file(nodeid: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import functools
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,27 +23,32 @@ from us_sim.volume.volume import Volume
 STRUCTURES = {"vein": CaseStructure(3), "rib": CaseStructure(4, colour=(0.9, 0.9, 0.8))}
 
 
-def made(folder: Path) -> Path:
-    """A whole case of 2,500 voxels."""
+@functools.cache
+def whole() -> dict[str, bytes]:
+    """The files of a whole case of 2,500 voxels."""
     labels = np.zeros((12, 14, 15), np.uint8)
     labels[4:7, :, 5:8], labels[:, :, 13:] = 3, 4
     volume = Volume(
         np.where(labels == 3, 10, 90).astype(np.uint8), np.diag([3e-3] * 3 + [1.0]), labels
     )
-    with new_case(folder / "case") as partial:
-        write_volume(partial / "volume.nrrd", volume)
-        write_labels(partial / "labels.nrrd", volume)
-        write_case_settings(partial, CaseSettings("case", "arm", structures=STRUCTURES))
-        source = Source("volume", 64 * "a")
-        add_step(partial, Step("imported", {"spacing": 1e-3}, {"files": 1}, (source,)))
-    return folder / "case"
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "case"
+        with new_case(made) as partial:
+            write_volume(partial / "volume.nrrd", volume)
+            write_labels(partial / "labels.nrrd", volume)
+            write_case_settings(partial, CaseSettings("case", "arm", structures=STRUCTURES))
+            source = Source("volume", 64 * "a")
+            add_step(partial, Step("imported", {"spacing": 1e-3}, {"files": 1}, (source,)))
+        return {file.name: file.read_bytes() for file in made.iterdir()}
 
 
 def with_changed(path: Path, name: str) -> None:
     """A case of which one file is the changed one, made a scene and its volume."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        case = made(Path(folder))
-        shutil.copy(path, case / name)
+        case = Path(folder) / "case"
+        case.mkdir()
+        for file, content in (whole() | {name: path.read_bytes()}).items():
+            (case / file).write_bytes(content)
         read = read_case(case)
         volume = read.volume()
         assert volume.labels is None or set(np.unique(volume.labels)) <= set(volume.label_names)
@@ -55,8 +60,8 @@ def with_changed(path: Path, name: str) -> None:
 def seeds_of(name: str):  # type: ignore[no-untyped-def]
     """Makes the whole file of that name."""
 
-    def seeds(folder: Path) -> Iterator[bytes]:
-        yield (made(folder) / name).read_bytes()
+    def seeds(_: Path) -> Iterator[bytes]:
+        yield whole()[name]
 
     return seeds
 

@@ -53,9 +53,9 @@ def test_matrix_round_trip(pose):
         ([0, 0, 0], [0, np.inf, 0, 1], "not finite"),
         ([0, 0, 0], [0, 0, 0, 0], "quaternion is zero"),
         ([0, 0, 0], [0, 0, 0, 5e-324], "quaternion is zero"),
-        ([0, 0, 0], [0, 0, 1e308, 1], "where one of length 1 is meant"),
-        ([0, 1e200, 0], [0, 0, 0, 1], "beyond any place"),
-        ([0, 0], [0, 0, 0, 1], "needs 3 coordinates"),
+        ([0, 0, 0], [0, 0, 1e308, 1], "length 1"),
+        ([0, 1e200, 0], [0, 0, 0, 1], "beyond"),
+        ([0, 0], [0, 0, 0, 1], "3 coordinates"),
     ],
 )
 def test_what_is_no_pose_is_refused(position, orientation, words):

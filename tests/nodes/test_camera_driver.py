@@ -146,28 +146,24 @@ def test_a_camera_that_comes_and_goes_is_waited_for(bench, monkeypatch, calibrat
         bench.spin_until(lambda before=problems: node.health.problems("camera") > before)
     assert (images[-1].width, images[-1].height, images[-1].step) == (64, 48, 64)
     assert node.health.problems("size") > 0
-    said = "camera 7 gives no images"
-    bench.spin_until(lambda: any(said in report.status[0].message for report in reports))
+    bench.spin_until(lambda: any("camera 7" in report.status[0].message for report in reports))
 
 
 @pytest.mark.parametrize(
-    ("bad", "sentence"),
+    ("bad", "fact"),
     [
-        ({"source": "nothing.avi"}, "there is no such file"),
-        ({"source": "{text}"}, "no video that OpenCV can read"),
-        ({"source": "{pipe}"}, "neither a file nor a device"),
-        (
-            {"source": "0", "encoding": "yuv"},
-            "encoding: 'yuv' is not one of mono8, bgr8",
-        ),
+        ({"source": "nothing.avi"}, "no such file"),
+        ({"source": "{text}"}, "OpenCV"),
+        ({"source": "{pipe}"}, "neither a file"),
+        ({"source": "0", "encoding": "yuv"}, "encoding: 'yuv' .*mono8, bgr8"),
         ({"source": "0", "camera_info": "nothing.yaml"}, "nothing.yaml"),
         ({"source": "0", "camera_info": "{text}"}, "camera info"),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_a_sentence(bench, tmp_path, bad, sentence):
+def test_what_cannot_be_used_is_refused_in_a_sentence(bench, tmp_path, bad, fact):
     text = tmp_path / "text.avi"
     text.write_text("no video\n")
     os.mkfifo(tmp_path / "pipe.avi")
     bad = {k: v.format(text=text, pipe=tmp_path / "pipe.avi") for k, v in bad.items()}
-    with pytest.raises(UsSimError, match=sentence):
+    with pytest.raises(UsSimError, match=fact):
         bench.make(CameraDriver, **bad)

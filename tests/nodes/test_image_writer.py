@@ -90,21 +90,21 @@ def test_padded_lines_are_read():
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("change", "fact"),
     [
-        ({"encoding": "mono8"}, "the image is mono8; it must be 32FC1 to 32FC4, little-endian"),
-        ({"encoding": "32FC5"}, "the image is 32FC5"),
-        ({"is_bigendian": 1}, "the image is big-endian 32FC2"),
-        ({"height": 9}, "holds 96 bytes, but says it has 9 rows of 4 pixels of 8 bytes in 32"),
-        ({"step": 31}, "in 31 bytes each"),
-        ({"width": 0}, "3 rows of 0 pixels"),
+        ({"encoding": "mono8"}, "mono8.*32FC1 to 32FC4"),
+        ({"encoding": "32FC5"}, "32FC5"),
+        ({"is_bigendian": 1}, "big-endian"),
+        ({"height": 9}, "96 .* 9 "),
+        ({"step": 31}, " 31 "),
+        ({"width": 0}, "3 .* 0 "),
     ],
 )
-def test_messages_that_are_no_field_are_refused(change, sentence):
+def test_messages_that_are_no_field_are_refused(change, fact):
     message = field_message(np.zeros((3, 4, 2), np.float32), STAMP, "probe")
     for name, value in change.items():
         setattr(message, name, value)
-    with pytest.raises(VolumeError, match=sentence):
+    with pytest.raises(VolumeError, match=fact):
         field_from(message)
 
 

@@ -134,58 +134,66 @@ def test_a_mesh_has_vertices_and_triangles():
 
 
 def test_a_mesh_of_vertices_that_are_not_there_is_refused():
-    mesh = mesh_message(np.eye(3), np.array([[2, 1, 3]]))
-    with pytest.raises(MeshError, match="name vertex 3, but it has 3"):
-        mesh_from(mesh)
-    mesh = mesh_message(np.full((3, 3), np.inf), np.array([[2, 1, 0]]))
-    with pytest.raises(MeshError, match="not finite"):
-        mesh_from(mesh)
+    with pytest.raises(MeshError, match="vertex 3"):
+        mesh_from(mesh_message(np.eye(3), np.array([[2, 1, 3]])))
+    with pytest.raises(MeshError, match="finite"):
+        mesh_from(mesh_message(np.full((3, 3), np.inf), np.array([[2, 1, 0]])))
 
 
-def test_what_does_not_fit_is_refused():
-    cloud = cloud_message({"x": np.zeros(2), "y": np.zeros(2)}, STAMP, "patient")
-    with pytest.raises(MeshError, match="no float field for 'z'"):
-        vectors_from(cloud)
-    cloud = cloud_message(dict(zip("xyz", np.zeros((3, 2)), strict=True)), STAMP, "patient")
-    cloud.width = 5
-    with pytest.raises(MeshError, match="holds 24 bytes, but says it has 5 points"):
-        vectors_from(cloud)
-    with pytest.raises(MeshError, match="5 node indices do not make whole tetrahedra"):
-        tetrahedra_from(Int32MultiArray(data=array("i", range(5))))
-    with pytest.raises(MeshError, match="node index -1 is of no node"):
-        tetrahedra_from(Int32MultiArray(data=array("i", [0, 1, -1, 2])))
-    with pytest.raises(VolumeError, match="the image is rgb8"):
-        pixels_from(Image(encoding="rgb8"))
-    with pytest.raises(VolumeError, match="holds 0 bytes"):
-        pixels_from(Image(encoding="mono8", height=2, width=2, step=2))
+def cloud_of(x, y, z, frame="patient"):
+    return cloud_message({"x": x, "y": y, "z": z}, STAMP, frame)
+
+
+FLAT = cloud_message(dict.fromkeys("xy", np.zeros(2)), STAMP, "patient")
 
 
 @pytest.mark.parametrize(
-    ("sizes", "sentence"),
+    ("read", "message", "error", "fact"),
     [
-        *(({"offset": 2**31 - k}, "ends 2147483") for k in (4, 3, 2, 1)),
-        ({"offset": 2**32 - 4}, "ends 4294967296 bytes into a point of 12 bytes"),
-        ({"point_step": 0}, "into a point of 0 bytes"),
-        ({"point_step": 11}, "ends 12 bytes into a point of 11 bytes"),
-        ({"point_step": 2**31}, "2 points of 2147483648 bytes"),
-        ({"point_step": 2**32 - 1}, "2 points of 4294967295 bytes"),
-        ({"width": 2**32 - 1, "height": 2**32 - 1}, "18446744065119617025 points"),
-        ({"width": 1, "height": 2**32 - 1, "row_step": 0}, "in rows of 0 bytes"),
-        ({"width": 1, "height": 2, "row_step": 2**32 - 1}, "in rows of 4294967295 bytes"),
-        ({"width": 1, "height": 2, "row_step": 13}, "in rows of 13 bytes"),
+        (
+            vectors_from,
+            cloud_message(dict.fromkeys("xy", np.zeros(2)), STAMP, "patient"),
+            MeshError,
+            "'z'",
+        ),
+        (tetrahedra_from, Int32MultiArray(data=array("i", range(5))), MeshError, "5 "),
+        (tetrahedra_from, Int32MultiArray(data=array("i", [0, 1, -1, 2])), MeshError, "-1 "),
+        (pixels_from, Image(encoding="rgb8"), VolumeError, "rgb8"),
+        (pixels_from, Image(encoding="mono8", height=2, width=2, step=2), VolumeError, "0 bytes"),
     ],
 )
-def test_clouds_whose_sizes_do_not_fit_their_data_are_refused(sizes, sentence):
-    cloud = cloud_message(dict(zip("xyz", np.ones((3, 2)), strict=True)), STAMP, "patient")
+def test_what_does_not_fit_is_refused(read, message, error, fact):
+    with pytest.raises(error, match=fact):
+        read(message)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "fact"),
+    [
+        *(({"offset": 2**31 - k}, "2147483") for k in (4, 3, 2, 1)),
+        ({"offset": 2**32 - 4}, "4294967296 .* 12 "),
+        ({"point_step": 0}, " 0 bytes"),
+        ({"point_step": 11}, "12 .* 11 "),
+        ({"point_step": 2**31}, "2147483648"),
+        ({"point_step": 2**32 - 1}, "4294967295"),
+        ({"width": 5}, "24 .* 5 "),
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "18446744065119617025"),
+        ({"width": 1, "height": 2**32 - 1, "row_step": 0}, " 0 bytes"),
+        ({"width": 1, "height": 2, "row_step": 2**32 - 1}, "4294967295"),
+        ({"width": 1, "height": 2, "row_step": 13}, " 13 "),
+    ],
+)
+def test_clouds_whose_sizes_do_not_fit_their_data_are_refused(sizes, fact):
+    cloud = cloud_of(*np.ones((3, 2)))
     for name, value in sizes.items():
         setattr(cloud.fields[2] if name == "offset" else cloud, name, value)
-    with pytest.raises(MeshError, match=sentence):
+    with pytest.raises(MeshError, match=fact):
         vectors_from(cloud)
 
 
 def test_the_rows_of_a_cloud_may_end_with_a_gap():
     points = np.arange(18.0).reshape(6, 3)
-    cloud = cloud_message(dict(zip("xyz", points.T, strict=True)), STAMP, "patient")
+    cloud = cloud_of(*points.T)
     cloud.height, cloud.width, cloud.row_step = 2, 3, 40
     gap = array("B", [255] * 4)
     cloud.data = cloud.data[:36] + gap + cloud.data[36:] + gap
@@ -197,18 +205,18 @@ def test_the_rows_of_a_cloud_may_end_with_a_gap():
 @pytest.mark.parametrize(("rows", "columns", "step"), [(2, 9, 4), (0, 4, 4), (2, 0, 4)])
 def test_images_whose_rows_do_not_hold_their_pixels_are_refused(rows, columns, step):
     image = Image(encoding="mono8", height=rows, width=columns, step=step, data=array("B", [1] * 8))
-    with pytest.raises(VolumeError, match=f"{rows} rows of {columns} pixels in {step} bytes"):
+    with pytest.raises(VolumeError, match=f"{rows} .* {columns} .* {step} "):
         pixels_from(image)
 
 
 @pytest.mark.parametrize("frame", ["", "/patient", "moon"])
 def test_poses_and_clouds_of_another_frame_are_refused(frame):
-    cloud = cloud_message(dict(zip("xyz", np.ones((3, 2)), strict=True)), STAMP, frame)
+    cloud = cloud_of(*np.ones((3, 2)), frame)
     for convert, message in (
         (vectors_from, cloud),
         (pose_from, pose_message(Pose(), STAMP, frame)),
     ):
-        with pytest.raises(MessageError, match=f"is in frame '{frame}', not 'patient'"):
+        with pytest.raises(MessageError, match=f"'{frame}'.*'patient'"):
             convert(message, "patient")
         convert(message)
 
@@ -220,9 +228,9 @@ def test_stamps_round_trip(nanoseconds):
 
 def test_stamps_that_are_no_time_are_refused():
     for stamp in (Time(sec=-1), Time(nanosec=10**9), Time(sec=2**31 - 1, nanosec=2**32 - 1)):
-        with pytest.raises(StampError, match=f"{stamp.sec} s and {stamp.nanosec} ns is no time"):
+        with pytest.raises(StampError, match=f"{stamp.sec} .* {stamp.nanosec} "):
             nanoseconds_of(stamp)
-    with pytest.raises(StampError, match="later than a stamp can say"):
+    with pytest.raises(StampError, match="later"):
         stamp_message(2**31 * 10**9)
     assert stamp_message(-5) == Time()
 
@@ -306,10 +314,10 @@ def test_what_is_no_affine_map_is_refused():
     too_wide = affine_message(np.eye(4))
     too_wide.layout.dim.append(MultiArrayDimension(label="depth", size=1, stride=1))
     for message in (Float64MultiArray(), columns_first, too_short, too_wide):
-        with pytest.raises(ProbeError, match="it must be 4 by 4, row after row"):
+        with pytest.raises(ProbeError, match="4 by 4"):
             affine_from(message)
     for matrix in (np.diag([1.0, np.nan, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 2.0])):
-        with pytest.raises(ProbeError, match="give finite numbers, and 0 0 0 1"):
+        with pytest.raises(ProbeError, match="finite"):
             affine_from(affine_message(matrix))
 
 
@@ -327,7 +335,7 @@ def test_a_transducers_markers_are_read_as_they_were_made():
     assert colour == pytest.approx((0.2, 0.2, 0.25))
     np.testing.assert_array_equal(read, corners[triangles.ravel()])
     np.testing.assert_array_equal(line_from(message, "probe"), outline)
-    with pytest.raises(MessageError, match="is in frame 'probe', not 'patient'"):
+    with pytest.raises(MessageError, match=r"'probe'.*'patient'"):
         triangles_from(message, "patient")
 
 

@@ -135,13 +135,13 @@ def test_the_image_is_served_where_it_lies(bench, tmp_path, small_scene, referen
 
 
 @pytest.mark.parametrize(
-    ("bad", "sentence"),
+    ("bad", "fact"),
     [
-        ({"world": "moon"}, "openigtlink_bridge.world: 'moon' is not one of ras, lps"),
-        ({"reference": "x"}, "openigtlink_bridge.reference: 'x' is not one of volume, patient"),
+        ({"world": "moon"}, r"openigtlink_bridge\.world: 'moon' .*ras, lps"),
+        ({"reference": "x"}, r"openigtlink_bridge\.reference: 'x' .*volume, patient"),
         ({"port": -1}, "port"),
     ],
 )
-def test_wrong_parameters_are_refused(bench, small_scene, bad, sentence):
-    with pytest.raises((SettingsError, ParameterException), match=sentence):
+def test_wrong_parameters_are_refused(bench, small_scene, bad, fact):
+    with pytest.raises((SettingsError, ParameterException), match=fact):
         bench.make(OpenIGTLinkBridge, scene=str(small_scene), **bad)

@@ -320,26 +320,24 @@ def test_parameters_of_the_command_line_have_units(scene, node, given, checked):
 
 
 @pytest.mark.parametrize(
-    ("node", "given", "sentence"),
+    ("node", "given", "fact"),
     [
-        ("slice_interpolator", {"gian": "6"}, "gian' is not known; did you mean 'gain'"),
-        ("slice_interpolator", {"gain": "6 mm"}, "gain: '6 mm' is not a level: its unit is dB$"),
-        ("slice_interpolator", {"gain": "99"}, "gain: 99 dB is outside -60 to 60 dB$"),
-        ("slice_interpolator", {"depth": "60"}, "depth: 60 m is outside .*; did you mean '60 mm'"),
-        ("slice_interpolator", {"grey_map": "purple"}, "grey_map: 'purple' is not one of linear,"),
-        ("slice_interpolator", {"contact": "3"}, "contact: must be true or false, not 3$"),
-        ("slice_interpolator", {"gain": "[1"}, r"gain=\[1: is not YAML: "),
-        ("slice_interpolator", {"time_gain": "3"}, "time_gain: must be a list, not 3$"),
-        ("slice_interpolator", {"lines": "3"}, "lines' is not one of "),  # not while it runs
-        ("slice_interpolator", {"gain": "2001-99-99"}, "gain=2001-99-99: is not YAML"),
-        ("tissue_deformer", {"solver": "fme"}, "solver: 'fme' is not one of .* mean 'fem'"),
-        ("tissue_deformer", {"fem_cg.iterations": "-3"}, "iterations: -3 is outside 1 to 10000$"),
-        ("tissue_deformer", {"materials.fta.density": "3"}, "did you mean 'materials.fat.density'"),
-        ("path_player", {"rate": "0"}, "rate: 0 is outside 0.01 to 100$"),
+        ("slice_interpolator", {"gian": "6"}, "gian'.* 'gain'"),
+        ("slice_interpolator", {"gain": "6 mm"}, "gain: '6 mm' .*level.* dB"),
+        ("slice_interpolator", {"gain": "99"}, "gain: 99 dB .* -60 to 60 dB"),
+        ("slice_interpolator", {"depth": "60"}, "depth: 60 m .*'60 mm'"),
+        ("slice_interpolator", {"grey_map": "purple"}, "grey_map: 'purple' .*linear,"),
+        ("slice_interpolator", {"contact": "3"}, "contact: .*3"),
+        ("slice_interpolator", {"gain": "[1"}, r"gain=\[1: .*YAML"),
+        ("slice_interpolator", {"time_gain": "3"}, "time_gain: .*list"),
+        ("slice_interpolator", {"lines": "3"}, "lines' "),  # not while it runs
+        ("slice_interpolator", {"gain": "2001-99-99"}, "gain=2001-99-99: .*YAML"),
+        ("tissue_deformer", {"solver": "fme"}, "solver: 'fme' .*'fem'"),
+        ("tissue_deformer", {"fem_cg.iterations": "-3"}, "iterations: -3 .* 1 to 10000"),
+        ("tissue_deformer", {"materials.fta.density": "3"}, "'materials.fat.density'"),
+        ("path_player", {"rate": "0"}, "rate: 0 .* 0.01 to 100"),
     ],
 )
-def test_a_wrong_parameter_of_the_command_line_is_one_sentence(scene, node, given, sentence):
-    with pytest.raises(UsSimError, match=sentence) as caught:
+def test_a_wrong_parameter_of_the_command_line_is_one_sentence(scene, node, given, fact):
+    with pytest.raises(UsSimError, match=rf"\A--param {node}\..*{fact}.*\Z"):
         checked_parameters(node, load_scene(scene), given)
-    assert str(caught.value).startswith(f"--param {node}.")
-    assert "\n" not in str(caught.value)

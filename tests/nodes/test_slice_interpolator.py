@@ -213,25 +213,23 @@ def test_the_console_is_changed_while_running(bench, rigid):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "sentence"),
+    ("name", "value", "fact"),
     [
         ("gain", 100.0, "gain"),
         ("gain", float("nan"), "gain"),
-        ("grey_map", "purple", "'purple' is not one of linear"),
-        ("time_gain", [0.0, 200.0], "time_gain[1]: 200 dB is outside"),
+        ("grey_map", "purple", "'purple'"),
+        ("time_gain", [0.0, 200.0], "time_gain[1]: 200 dB"),
         ("elevation_planes", 99, "elevation_planes"),
         ("depth", 3.0, "depth"),
     ],
 )
-def test_a_setting_that_cannot_be_is_refused_and_nothing_changes(
-    bench, rigid, name, value, sentence
-):
+def test_a_setting_that_cannot_be_is_refused_and_nothing_changes(bench, rigid, name, value, fact):
     node, images, poses = rigid
     before = node.get_parameter(name).value
     image = image_at(bench, images, poses, 1)
     result = node.set_parameters([Parameter(name, value=value)])[0]
     assert not result.successful
-    assert sentence in result.reason
+    assert fact in result.reason
     assert node.get_parameter(name).value == before
     np.testing.assert_array_equal(image_at(bench, images, poses, 2), image)
 
@@ -240,8 +238,7 @@ def test_a_setting_given_at_the_start_is_refused_before_the_volume_is_made(
     bench, small_scene, monkeypatch
 ):
     monkeypatch.setattr(slice_interpolator, "volume_of", None)
-    words = "^slice_interpolator.grey_map: 'purple' is not one of linear, soft, contrast$"
-    with pytest.raises(ProbeError, match=words):
+    with pytest.raises(ProbeError, match=r"^slice_interpolator\.grey_map: 'purple'"):
         bench.make(SliceInterpolator, scene=str(small_scene), grey_map="purple")
 
 

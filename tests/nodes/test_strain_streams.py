@@ -155,19 +155,19 @@ def test_strain_is_laid_over_the_annotated_image_with_what_the_press_is_like(ben
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "sentence"),
+    ("name", "value", "fact"),
     [
-        ("strain.since", "then", "'then' is not one of rest, image"),
+        ("strain.since", "then", "'then'"),
         ("strain.interval", 0, "strain.interval"),
         ("strain.window", 3.0, "strain.window"),
-        ("strain.window", 0.021, "21 mm is more than half of the beams, which are 40 mm long"),
+        ("strain.window", 0.021, "21 mm"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(pressed, name, value, sentence):
+def test_settings_that_cannot_be_are_refused(pressed, name, value, fact):
     node = pressed()
     result = node.node.set_parameters([Parameter(name, value=value)])[0]
     assert not result.successful
-    assert sentence in result.reason
+    assert fact in result.reason
 
 
 def test_without_tissue_there_is_no_strain(bench, tmp_path):
@@ -182,4 +182,4 @@ def test_without_tissue_there_is_no_strain(bench, tmp_path):
     assert not topics & {"ultrasound/strain", "ultrasound/strain_estimate"}
     assert not node.has_parameter("strain.since")
     result = node.set_parameters([Parameter("overlay", value="strain")])[0]
-    assert "bare has nothing for 'strain'; it has none" in result.reason
+    assert "'strain'" in result.reason

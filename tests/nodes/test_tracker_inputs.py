@@ -438,29 +438,21 @@ def test_another_source_may_be_named_at_the_start(bench, tmp_path, small_scene):
 
 
 @pytest.mark.parametrize(
-    ("tracker", "parameters", "sentence"),
+    ("tracker", "parameters", "fact"),
     [
-        ({}, {}, "tracker.file: is missing"),
-        ({"file": "{bag}"}, {"lockstep": True}, "give the recording with --path"),
-        (
-            {"file": "{recording}", "body": "ProbeToTracker", "frame": "moon"},
-            {},
-            "in frame 'Tracker'",
-        ),
+        ({}, {}, r"tracker\.file: "),
+        ({"file": "{bag}"}, {"lockstep": True}, "--path"),
+        ({"file": "{recording}", "body": "ProbeToTracker", "frame": "moon"}, {}, "'Tracker'"),
         ({"file": "{bag}", "body": "nothing"}, {}, "nothing"),
-        (
-            {"file": "{recording}"},
-            {},
-            "name one by tracker.body, of ProbeToTracker, Ref",
-        ),
-        ({}, {"source": "moon"}, "probe_tracker.source: 'moon' is not one of pose, pose_array"),
+        ({"file": "{recording}"}, {}, r"tracker\.body.*ProbeToTracker, Ref"),
+        ({}, {"source": "moon"}, r"probe_tracker\.source: 'moon' .*pose, pose_array"),
     ],
 )
 def test_what_cannot_be_played_is_refused_in_a_sentence(
-    bench, tmp_path, small_scene, bag, recording, tracker, parameters, sentence
+    bench, tmp_path, small_scene, bag, recording, tracker, parameters, fact
 ):
     files = {"bag": bag, "recording": recording}
     tracker = {key: value.format(**files) for key, value in tracker.items()}
     scene = scene_with(tmp_path, small_scene, **tracker)
-    with pytest.raises(UsSimError, match=sentence):
+    with pytest.raises(UsSimError, match=fact):
         bench.make(ProbeTracker, scene=scene, **parameters)

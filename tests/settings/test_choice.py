@@ -34,9 +34,9 @@ def test_what_a_package_adds_is_chosen_by_its_name(numbers):
 
 def test_a_name_of_ours_is_not_taken_and_that_is_said(numbers, caplog):
     assert numbers.load("fraction")(1, 2) * 2 == 1
-    assert caplog.messages == [
-        "number fraction of the package numbers-of-a-lab is not used: the name is taken"
-    ]
+    (said,) = caplog.messages
+    assert "number fraction" in said
+    assert "numbers-of-a-lab" in said
 
 
 def test_what_cannot_be_imported_is_left_out_told_once_and_refused_when_chosen(numbers, caplog):
@@ -44,6 +44,7 @@ def test_what_cannot_be_imported_is_left_out_told_once_and_refused_when_chosen(n
         assert numbers.importable == ("fraction", "decimal")
         assert numbers.importable == ("fraction", "decimal")
     (said,) = (text for text in caplog.messages if "broken" in text)
-    assert "numbers_of_a_lab:Number, which the package numbers-of-a-lab adds, cannot be" in said
-    with pytest.raises(SettingsError, match="No module named 'what_is_not_installed'"):
+    assert "numbers_of_a_lab:Number" in said
+    assert "numbers-of-a-lab" in said
+    with pytest.raises(SettingsError, match="what_is_not_installed"):
         numbers.load("broken")

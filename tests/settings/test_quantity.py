@@ -32,13 +32,13 @@ def test_units(dimension, text, si):
 
 @pytest.mark.parametrize("text", ["40 parsec", "mm", "", "1 2 mm", None, [1], True, "40 Pa"])
 def test_what_is_no_length(text):
-    with pytest.raises(ValueError, match="is not a length"):
+    with pytest.raises(ValueError, match="length"):
         Quantity("length").parse(text)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, 10**400, -(10**400), "1e999"])
 def test_what_is_not_finite(number):
-    with pytest.raises(ValueError, match="is not finite"):
+    with pytest.raises(ValueError, match="finite"):
         Quantity("length").parse(number)
 
 

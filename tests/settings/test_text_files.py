@@ -41,7 +41,7 @@ def test_a_pipe_is_read(tmp_path):
 def test_what_has_no_end_is_refused(tmp_path, read, error, name):
     path = tmp_path / name
     path.symlink_to("/dev/zero")
-    with pytest.raises(error, match="more than 64 MiB, and no text is so long"):
+    with pytest.raises(error, match="64 MiB"):
         read(path)
 
 
@@ -60,30 +60,27 @@ def merge_bomb():
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "fact"),
     [
-        (bomb(), "line 6: holds more than 100000 values"),
-        (merge_bomb(), "line 6: holds more than 100000 values"),
-        ("[" * 1000 + "]" * 1000, "line 1: has more than 64 lists and mappings within each"),
-        ("- " * 100_000, "line 1: has more than 64 lists and mappings within each"),
-        ("a: &a [1, *a]", "`*a` is within itself"),
-        ("a: &a {b: [*a]}", "`*a` is within itself"),
-        ("a: 'x" + "x" * LARGEST_YAML + "'", f"of which {LARGEST_YAML} are read at most"),
-        ("- 1\n" * (MOST_NODES + 1), "holds more than 100000 values up to here"),
-        ("1:" * 100_000 + "1", "a number of 200001 characters"),
-        ("9" * 100_000, "a number of 100000 characters"),
-        ("a: 1\nb: 2\na: 3", "line 3: key `a` is there twice, first in line 1: keep one"),
-        ("x: &x {a: 1}\ny: {<<: *x, <<: *x}", "line 2: key `<<` is there twice"),
-        ("a: {b: [{c: 1, c: 2}]}", "line 1: key `c` is there twice"),
-        ("!!timestamp foo", "is not YAML: "),
-        ("!!int ''", "is not YAML: "),
-        ("? [a]\n: b", "is not YAML: "),
+        (bomb(), f"line 6: .*{MOST_NODES}"),
+        (merge_bomb(), f"line 6: .*{MOST_NODES}"),
+        ("[" * 1000 + "]" * 1000, "line 1: .*64"),
+        ("- " * 100_000, "line 1: .*64"),
+        ("a: &a [1, *a]", r"`\*a`"),
+        ("a: &a {b: [*a]}", r"`\*a`"),
+        ("a: 'x" + "x" * LARGEST_YAML + "'", str(LARGEST_YAML)),
+        ("- 1\n" * (MOST_NODES + 1), str(MOST_NODES)),
+        ("1:" * 100_000 + "1", "200001"),
+        ("9" * 100_000, "100000"),
+        ("a: 1\nb: 2\na: 3", "line 3: .*`a`.*line 1"),
+        ("x: &x {a: 1}\ny: {<<: *x, <<: *x}", "line 2: .*`<<`"),
+        ("a: {b: [{c: 1, c: 2}]}", "line 1: .*`c`"),
+        *((text, "YAML") for text in ("!!timestamp foo", "!!int ''", "? [a]\n: b")),
     ],
 )
-def test_what_nobody_writes_by_hand_is_refused(text, sentence):
-    with pytest.raises(YamlError) as refused:
+def test_what_nobody_writes_by_hand_is_refused(text, fact):
+    with pytest.raises(YamlError, match=fact):
         load_yaml(text)
-    assert sentence in str(refused.value)
 
 
 def test_what_people_write_is_read():

@@ -111,24 +111,23 @@ def test_a_real_head_with_texture_coordinates_is_read(shared_data):
 def test_faces_may_count_backwards(tmp_path):
     path = tmp_path / "back.obj"
     path.write_text("# a comment\nv 0 0 0\nv 1 0 0\nv 0 0 1\nvn 0 1 0\nf -3//1 -2//1 -1//1\n")
-    np.testing.assert_array_equal(
-        vertex_normals(read_surface(path).vertices, read_surface(path).triangles),
-        np.tile([0, -1.0, 0], (3, 1)),
-    )
+    read = read_surface(path)
+    normals = vertex_normals(read.vertices, read.triangles)
+    np.testing.assert_array_equal(normals, np.tile([0, -1.0, 0], (3, 1)))
 
 
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("broken.stl", "solid nothing\nfacet", "not a surface that can be read"),
-        ("what.xyzzy", "?", "not a surface that can be read"),
-        ("points.obj", "v 0 0 0\nv 1 0 0\n", "has no triangles"),
+        ("broken.stl", "solid nothing\nfacet", "not a surface"),
+        ("what.xyzzy", "?", "not a surface"),
+        ("points.obj", "v 0 0 0\nv 1 0 0\n", "no triangles"),
         ("nan.obj", "v 0 0 0\nv 1 nan 0\nv 0 0 1\nf 1 2 3\n", "not finite"),
-        ("flat.obj", "v 0 0\n", "line 1: 'v 0 0': a vertex has three"),
-        ("word.obj", "v 0 0 zero\n", "line 1: 'v 0 0 zero': could not convert"),
-        ("far.obj", "v 0 0 0\nf 1 2 3\n", "line 2: 'f 1 2 3': there is no vertex 2 among the 1"),
-        ("zero.obj", "v 0 0 0\nf 0 1 1\n", "there is no vertex 0"),
-        ("line.obj", "v 0 0 0\nv 1 0 0\nf 1 2\n", "three vertices or more"),
+        ("flat.obj", "v 0 0\n", "line 1: 'v 0 0'"),
+        ("word.obj", "v 0 0 zero\n", "line 1: 'v 0 0 zero'"),
+        ("far.obj", "v 0 0 0\nf 1 2 3\n", "line 2: 'f 1 2 3': .*vertex 2"),
+        ("zero.obj", "v 0 0 0\nf 0 1 1\n", "vertex 0"),
+        ("line.obj", "v 0 0 0\nv 1 0 0\nf 1 2\n", "three vertices"),
     ],
 )
 def test_files_that_cannot_be_read_are_refused(tmp_path, name, text, words):
@@ -139,10 +138,10 @@ def test_files_that_cannot_be_read_are_refused(tmp_path, name, text, words):
 
 
 def test_a_missing_file_and_a_wrong_unit_are_refused(tmp_path):
-    with pytest.raises(MeshError, match="no such surface file"):
+    with pytest.raises(MeshError, match=r"missing\.obj"):
         read_surface(tmp_path / "missing.obj")
     (tmp_path / "fine.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\n")
-    with pytest.raises(MeshError, match="metres_per_unit is 0"):
+    with pytest.raises(MeshError, match="metres_per_unit"):
         read_surface(tmp_path / "fine.obj", metres_per_unit=0)
 
 
@@ -157,14 +156,14 @@ def test_without_meshio_the_way_out_is_said(tmp_path, monkeypatch):
     ("vertices", "triangles", "words"),
     [
         (np.eye(3)[:, :2], [[0, 1, 2]], r"give \(N, 3\)"),
-        (np.eye(3) * np.nan, [[0, 1, 2]], "vertex 0 is not finite"),
-        (np.eye(3), [[0, 1, 3]], "name vertices 0 to 3"),
-        (np.eye(3), [[0, 1, -1]], "name vertices -1"),
+        (np.eye(3) * np.nan, [[0, 1, 2]], "vertex 0"),
+        (np.eye(3), [[0, 1, 3]], "vertices 0 to 3"),
+        (np.eye(3), [[0, 1, -1]], "vertices -1"),
         (np.eye(3), [[0, 1]], r"give \(T, 3\) integers"),
         (np.eye(3), [[0.5, 1, 2]], r"give \(T, 3\) integers"),
         (np.eye(3), np.empty((0, 3), int), "no triangle"),
-        (np.eye(3), [[0, 1, 2], [0, 1, 1]], "triangle 1 names a vertex twice"),
-        (np.vstack([np.eye(3), [[0, 0, 0]]]), [[0, 1, 2]], "vertex 3 is in no triangle"),
+        (np.eye(3), [[0, 1, 2], [0, 1, 1]], "triangle 1 "),
+        (np.vstack([np.eye(3), [[0, 0, 0]]]), [[0, 1, 2]], "vertex 3 "),
     ],
 )
 def test_a_surface_that_cannot_be_is_refused(vertices, triangles, words):
@@ -175,11 +174,11 @@ def test_a_surface_that_cannot_be_is_refused(vertices, triangles, words):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: plane_surface((0.1, -0.1), 0.01), "size is -0.1 m"),
-        (lambda: plane_surface((0.1, 0.1), 0.0), "spacing is 0.0 m"),
-        (lambda: plane_surface((1.0, 0.1), 1e-5), "give a wider spacing"),
-        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.2, radius=0.1), "flat_width is 0.2"),
-        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.0, radius=0.0), "radius is 0.0"),
+        (lambda: plane_surface((0.1, -0.1), 0.01), "size .*-0.1 m"),
+        (lambda: plane_surface((0.1, 0.1), 0.0), "spacing .*0.0 m"),
+        (lambda: plane_surface((1.0, 0.1), 1e-5), "spacing"),
+        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.2, radius=0.1), "flat_width"),
+        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.0, radius=0.0), "radius"),
         (lambda: bent_surface((0.5, 0.1), 0.01, flat_width=0.0, radius=0.05), "half a circle"),
     ],
 )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
@@ -37,3 +38,19 @@ def assert_slopes(tissue: NeoHookean, size: float) -> None:
     product = tissue.tangent_product(change)
     error = np.linalg.norm(product - slope(tissue.forces))
     assert error < 1e-6 * np.linalg.norm(product)
+
+
+def assert_cells_are_tetrahedra(materials: TissueMaterials, size: float, seed: int) -> None:
+    """Energy, forces and tangent of `CELLS` are those of their `TETRAHEDRA`, at a random field."""
+    displacement, change = random_field(size, seed), random_field(1.0, seed + 1)
+    cells, tetrahedra = (NeoHookean(mesh, materials, np.float64) for mesh in (CELLS, TETRAHEDRA))
+
+    def near(got, expected):
+        assert abs(got - expected).max() <= 1e-12 * abs(expected).max() + 1e-18
+
+    near(cells.forces(displacement), tetrahedra.forces(displacement))
+    assert cells.energy(displacement) == pytest.approx(tetrahedra.energy(displacement), rel=1e-11)
+    cells.linearise(displacement)
+    tetrahedra.linearise(displacement)
+    near(cells.tangent_product(change), tetrahedra.tangent_product(change))
+    near(cells.diagonal_blocks(), tetrahedra.diagonal_blocks())

@@ -46,12 +46,10 @@ def test_sides_are_all_but_top_and_bottom():
 def test_it_is_said_how_many_nodes_are_held_where_they_may_be_few():
     organ, box = unstructured(), block_mesh((6, 5, 4))
     bottom = face_nodes(organ, "bottom")
-    assert held_remark("bottom", bottom, organ) == "fixed: `bottom` holds 30 of 120 nodes"
+    assert "`bottom` holds 30 of 120" in (held_remark("bottom", bottom, organ) or "")
     assert held_remark("bottom", face_nodes(box, "bottom"), box) is None
-    assert "holds 6 of 120 nodes, which is little" in (
-        held_remark("bottom", bottom[:6], organ) or ""
-    )
-    assert "`bone` holds 0 of 120 nodes" in (held_remark("bone", bottom[:0], box) or "")
+    assert "tissue.mesh.margin" in (held_remark("bottom", bottom[:6], organ) or "")
+    assert "`bone` holds 0 of 120" in (held_remark("bone", bottom[:0], box) or "")
 
 
 def unstructured(nodes=(6, 5, 4)):
@@ -89,7 +87,7 @@ def test_what_looks_at_the_probe_is_the_near_half_of_an_organ(shared_data):
 
 def test_an_unknown_face_is_refused():
     assert "bottom" in FACES
-    with pytest.raises(MeshError, match="no face 'lid'"):
+    with pytest.raises(MeshError, match="lid"):
         face_nodes(block_mesh((2, 2, 2)), "lid")
 
 
@@ -130,11 +128,11 @@ FREE = np.zeros(27, dtype=bool)
 @pytest.mark.parametrize(
     ("fixed", "contact", "words"),
     [
-        (np.zeros(26, dtype=bool), [0], "give 27 booleans"),
-        (np.zeros(27), [0], "give 27 booleans"),
-        (FREE, [27], "run from 27 to 27"),
-        (FREE, [-1], "run from -1 to -1"),
-        (FREE, [1, 1], "names a node twice"),
+        (np.zeros(26, dtype=bool), [0], "27 booleans"),
+        (np.zeros(27), [0], "27 booleans"),
+        (FREE, [27], "27 to 27"),
+        (FREE, [-1], "-1 to -1"),
+        (FREE, [1, 1], "twice"),
         (FREE, [0.5], "node indices"),
         (FREE, [[1, 2]], "node indices"),
     ],
@@ -145,7 +143,7 @@ def test_models_that_do_not_fit_their_mesh_are_refused(fixed, contact, words):
 
 
 def test_materials_of_another_mesh_are_refused():
-    with pytest.raises(MeshError, match="materials are given for 5 tetrahedra"):
+    with pytest.raises(MeshError, match="5 tetrahedra"):
         TissueModel(
             MESH,
             uniform_material(block_mesh((2, 2, 2)), SOFT),

@@ -20,6 +20,15 @@ def block_mesh(nodes: tuple[int, int, int]) -> TetrahedralMesh:
     return block(nodes).mesh
 
 
+def irregular(mesh: TetrahedralMesh, size: float = 0.005) -> TetrahedralMesh:
+    """The same mesh with its inner nodes displaced by up to ``size`` m along each axis."""
+    inner = np.ones(len(mesh.nodes), dtype=bool)
+    inner[mesh.boundary] = False
+    nodes = mesh.nodes.copy()
+    nodes[inner] += np.random.default_rng(0).uniform(-size, size, (inner.sum(), 3))
+    return TetrahedralMesh(nodes, mesh.tetrahedra)
+
+
 def block(
     nodes: tuple[int, int, int] = (9, 5, 5),
     collider: Collider | None = None,

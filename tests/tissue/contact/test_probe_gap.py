@@ -229,14 +229,12 @@ def test_adopted_nodes_are_those_on_the_surface():
     np.testing.assert_array_equal(contact.touched, [True, False, False])
 
 
-FLARED_FINE, FLARED_COARSE = (
-    0.002,
-    0.012,
-)  # m, spacings that resolve the roundings below, and that do not
-FLARED_SPHERE = Sphere(0.022)
+# m, spacings that resolve the roundings below, and that do not
+RESOLVING, WIDE = 0.002, 0.012
+SMALL_SPHERE = Sphere(0.022)
 # The ends of the curved faces are 38.5 and 72 degrees steep.
 COLLIDERS = [
-    FLARED_SPHERE,
+    SMALL_SPHERE,
     Capsule(0.02, 0.04),
     RoundedBox(0.05, 0.03, 0.06, 0.006),
     Convex(radius=0.055, length=0.076, width=0.036, height=0.06, rounding=0.01),
@@ -246,11 +244,8 @@ TURNED = Pose(np.array([0.1, -0.2, 0.3]), np.array([0.3, -0.2, 0.5, 0.8]))
 STEEPEST = math.tan(math.radians(60))
 
 colliders = st.sampled_from(COLLIDERS)
-spacings = st.sampled_from([FLARED_FINE, FLARED_COARSE])
-flared_lateral = st.floats(-0.06, 0.06)
-places = st.tuples(flared_lateral, flared_lateral, st.floats(-0.08, 0.03)).map(
-    lambda p: np.round(p, 8)
-)
+spacings = st.sampled_from([RESOLVING, WIDE])
+places = st.tuples(lateral, lateral, st.floats(-0.08, 0.03)).map(lambda p: np.round(p, 8))
 EXAMPLES = settings(deadline=None, max_examples=300)
 
 
@@ -267,7 +262,7 @@ def test_the_distance_is_convex(collider, spacing, a, b, share):
     assert gap[2] <= (1 - share) * gap[0] + share * gap[1] + 1e-12
 
 
-@pytest.mark.parametrize("spacing", [FLARED_FINE, FLARED_COARSE])
+@pytest.mark.parametrize("spacing", [RESOLVING, WIDE])
 @pytest.mark.parametrize("collider", COLLIDERS)
 def test_the_distance_is_convex_deep_in_the_core_too(collider, spacing):
     # Where a curved front's arc is no longer near, its ends must not take its place.
@@ -290,7 +285,7 @@ def test_the_normal_is_the_distances_gradient_and_its_length_is_one(collider, sp
     np.testing.assert_allclose((gap[:3] - gap[3:]) / (2 * step), normal, atol=1e-3)
 
 
-@pytest.mark.parametrize(("spacing", "least"), [(FLARED_FINE, 1.0), (FLARED_COARSE, 0.875)])
+@pytest.mark.parametrize(("spacing", "least"), [(RESOLVING, 1.0), (WIDE, 0.875)])
 @pytest.mark.parametrize("collider", COLLIDERS)
 def test_only_where_two_leaning_flanks_meet_the_normal_jumps(collider, spacing, least):
     # There from (0, s, c) to (s c, s, c^2), of 60 degrees: by 29 degrees.
@@ -316,11 +311,11 @@ def test_the_curvature_is_how_the_normal_turns(collider, spacing, where):
     np.testing.assert_allclose(probe.curvature(Pose(), where[None])[0], turn, atol=1.0)
 
 
-@pytest.mark.parametrize("spacing", [FLARED_FINE, FLARED_COARSE])
+@pytest.mark.parametrize("spacing", [RESOLVING, WIDE])
 @pytest.mark.parametrize("height", [0.0, -0.001, 0.01])
 def test_the_curvature_of_a_sphere_is_that_of_a_sphere_about_its_middle(spacing, height):
     # At the pole too, where its core, a point, is neither beside nor ahead.
-    turn = FlaredProbe(FLARED_SPHERE, spacing).curvature(Pose(), np.array([[0.0, 0.0, height]]))
+    turn = FlaredProbe(SMALL_SPHERE, spacing).curvature(Pose(), np.array([[0.0, 0.0, height]]))
     np.testing.assert_allclose(turn[0], np.diag([1.0, 1.0, 0.0]) / (0.022 + height), atol=1e-9)
 
 
@@ -344,7 +339,7 @@ def test_a_rounding_that_the_nodes_resolve_keeps_its_own_flanks(collider, where)
     where[2] = max(where[2], -box[3] - 2 * box[2])  # behind that it goes on
     expected, direction = signed_distance(collider, Pose(), where[None])
     assume(expected[0] > -0.99 * box[3])
-    gap, normal = distance_at(FlaredProbe(collider, FLARED_FINE), where)
+    gap, normal = distance_at(FlaredProbe(collider, RESOLVING), where)
     assert gap == pytest.approx(expected[0], abs=1e-12)
     np.testing.assert_allclose(normal, direction[0], atol=1e-6)
 
@@ -358,8 +353,8 @@ def test_it_contains_the_collider(collider, spacing, where):
 
 
 def test_leaning_flanks_end_a_part_of_the_spacing_beside_the_collider():
-    box, flare = RoundedBox(0.05, 0.03, 0.06, 0.006), 0.6 * FLARED_COARSE
-    probe = FlaredProbe(box, FLARED_COARSE)
+    box, flare = RoundedBox(0.05, 0.03, 0.06, 0.006), 0.6 * WIDE
+    probe = FlaredProbe(box, WIDE)
     for where, side in [((0.025, 0, -0.05), (1, 0, 0)), ((0, -0.015, -0.05), (0, -1, 0))]:
         gap, normal = distance_at(probe, where)
         assert gap == pytest.approx(-flare)
@@ -376,16 +371,14 @@ def test_leaning_flanks_end_a_part_of_the_spacing_beside_the_collider():
 def test_behind_it_there_is_nothing(collider):
     box = collider.offset_box
     end = -box[3] - 2 * box[2] - 0.1  # the grip is 0.1 m long
-    probe = FlaredProbe(collider, FLARED_COARSE)
+    probe = FlaredProbe(collider, WIDE)
     assert distance_at(probe, (0.0, 0.0, end + 1e-6))[0] < 0.0
     assert distance_at(probe, (0.0, 0.0, end - 1e-6))[0] == np.inf
     assert not probe.curvature(Pose(), np.array([[0.0, 0.0, end - 1e-6]])).any()
 
 
 def test_points_that_are_not_near_are_infinitely_far():
-    gap, _ = FlaredProbe(FLARED_SPHERE, FLARED_COARSE).distance(
-        Pose(), np.zeros((3, 3)), np.array([1])
-    )
+    gap, _ = FlaredProbe(SMALL_SPHERE, WIDE).distance(Pose(), np.zeros((3, 3)), np.array([1]))
     np.testing.assert_array_equal(gap, [np.inf, 0.0, np.inf])
 
 
@@ -440,14 +433,14 @@ def test_points_enter_through_the_plane_that_touches_where_their_way_goes_in(
 
 
 def test_without_a_last_pose_points_came_from_before_the_front():
-    probe = FlaredProbe(RoundedBox(0.05, 0.03, 0.06, 0.006), FLARED_COARSE)
+    probe = FlaredProbe(RoundedBox(0.05, 0.03, 0.06, 0.006), WIDE)
     gap, normal = probe.entered(None, TURNED, TURNED.apply(np.array([[0.018, 0.0, -0.05]])))
     assert gap[0] == pytest.approx(-0.05, abs=2e-6)
     np.testing.assert_allclose(normal[0], TURNED.rotation[:, 2], atol=1e-9)
 
 
 def test_a_point_that_was_inside_is_pushed_out_where_it_was():
-    probe = FlaredProbe(FLARED_SPHERE, FLARED_FINE)
+    probe = FlaredProbe(SMALL_SPHERE, RESOLVING)
     last = Pose(position=[0.0, 0.0, -0.02])
     gap, normal = probe.entered(last, Pose(), np.array([[0.0, 0.0, -0.021]]))
     assert gap[0] == pytest.approx(-0.021)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
-from tissue_block import SOFT, block_mesh
+from tissue_block import SOFT, block_mesh, irregular
 
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import (
@@ -16,18 +16,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
-
-def irregular() -> TetrahedralMesh:
-    """A block whose inner nodes are shifted by up to a fifth of a cell."""
-    mesh = block_mesh((6, 5, 4))
-    inner = np.ones(len(mesh.nodes), dtype=bool)
-    inner[mesh.boundary] = False
-    nodes = mesh.nodes.copy()
-    nodes[inner] += np.random.default_rng(0).uniform(-0.005, 0.005, (inner.sum(), 3))
-    return TetrahedralMesh(nodes, mesh.tetrahedra)
-
-
-MESH = irregular()
+MESH = irregular(block_mesh((6, 5, 4)))
 MATRIX = stiffness(MESH, uniform_material(MESH, SOFT))
 ON_BOUNDARY = np.isin(np.arange(len(MESH.nodes)), MESH.boundary)
 
@@ -120,7 +109,7 @@ def test_stiffness_is_proportional_to_the_modulus():
     [
         ([], "has 0 fixed nodes"),
         ([0, 1], "has 2 fixed nodes"),
-        ([0, 2, 4], "has 3 fixed nodes on one line; fix at least three that are not"),
+        ([0, 2, 4], "3 fixed nodes on one line"),
     ],
 )
 def test_tissue_that_can_move_as_a_whole_is_refused(held, words):

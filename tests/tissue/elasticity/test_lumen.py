@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from neo_hookean_meshes import BOTH, CELLS, TETRAHEDRA, assert_slopes, random_field
+from neo_hookean_meshes import BOTH, CELLS, assert_cells_are_tetrahedra, assert_slopes, random_field
 from scipy.integrate import quad
 from scipy.optimize import brentq, minimize
 from tissue_block import block, block_mesh
@@ -136,21 +136,11 @@ def test_forces_are_the_slope_of_the_energy_and_the_tangent_theirs(mesh, size):
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(0.0, 0.02))
 @settings(max_examples=25, deadline=None)
 def test_cells_tetrahedra_and_the_formulas_written_again_agree(seed, size):
-    displacement, change = random_field(size, seed), random_field(1.0, seed + 1)
-    materials = vessels(CELLS, seed)
-    cells, tetrahedra = (NeoHookean(m, materials, np.float64) for m in (CELLS, TETRAHEDRA))
-
-    def near(got, expected, digits=1e-12):
-        assert abs(got - expected).max() <= digits * abs(expected).max() + 1e-18
-
-    near(cells.forces(displacement), tetrahedra.forces(displacement))
+    materials, displacement = vessels(CELLS, seed), random_field(size, seed)
+    assert_cells_are_tetrahedra(materials, size, seed)
     expected = neo_hookean_forces(CELLS, materials, displacement.T).T
-    assert abs(cells.forces(displacement) - expected).max() < 1e-6 * abs(expected).max() + 1e-12
-    assert cells.energy(displacement) == pytest.approx(tetrahedra.energy(displacement), rel=1e-11)
-    cells.linearise(displacement)
-    tetrahedra.linearise(displacement)
-    near(cells.tangent_product(change), tetrahedra.tangent_product(change))
-    near(cells.diagonal_blocks(), tetrahedra.diagonal_blocks())
+    error = abs(NeoHookean(CELLS, materials, np.float64).forces(displacement) - expected).max()
+    assert error < 1e-6 * abs(expected).max() + 1e-12
 
 
 @BOTH
@@ -192,9 +182,8 @@ def test_fractions_are_those_of_the_labels_and_pressures_those_of_the_lumens():
     index[:3, 3] = -0.5
     fractions = label_fractions(mesh, labels, index)
     averaged = average_over_labels(fractions, {1: MUSCLE, 2: VEIN})
-    assert averaged.lumen_fraction @ mesh.volumes / mesh.volumes.sum() == pytest.approx(
-        0.75, abs=0.01
-    )
+    filled = averaged.lumen_fraction @ mesh.volumes / mesh.volumes.sum()
+    assert filled == pytest.approx(0.75, abs=0.01)
     np.testing.assert_allclose(averaged.lumen_pressure, 1000.0)
     solid = average_over_labels(fractions, {1: MUSCLE, 2: MUSCLE})
     assert not solid.lumen_fraction.any()
@@ -308,7 +297,7 @@ def test_a_tube_in_incompressible_tissue_closes_at_the_pressure_of_the_blood_and
 def test_a_model_that_is_lumen_everywhere_is_refused():
     mesh = block_mesh((4, 3, 3))
     model = block((4, 3, 3), materials=uniform_material(mesh, VEIN))
-    with pytest.raises(SolverError, match="around node 0 is lumen everywhere, so that nothing"):
+    with pytest.raises(SolverError, match="lumen everywhere"):
         FemNonlinear(model)
     require_solid(mesh, uniform_material(mesh, MUSCLE))
 
@@ -344,15 +333,10 @@ def test_a_pressed_lumen_in_a_block_empties_and_fills_again():
 
 
 @pytest.mark.parametrize(
-    ("pressure", "words"),
-    [
-        (-100.0, "material.lumen_pressure: -100 Pa is outside 1 to 100000 Pa"),
-        (np.nan, "material.lumen_pressure: nan is not finite; give 1 to 100000 Pa"),
-        ("8 mmHg", "material.lumen_pressure: '8 mmHg' is not a pressure"),
-    ],
+    ("pressure", "found"), [(-100.0, "-100 Pa"), (np.nan, "nan"), ("8 mmHg", "8 mmHg")]
 )
-def test_a_pressure_that_cannot_be_is_refused(pressure, words):
-    with pytest.raises(MaterialError, match=words):
+def test_a_pressure_that_cannot_be_is_refused(pressure, found):
+    with pytest.raises(MaterialError, match=f"material.lumen_pressure: .*{found}"):
         Material(5e3, 0.1, 1000.0, lumen_pressure=pressure)
     assert Material(5e3, lumen_pressure="1.3 kPa").lumen_pressure == 1300.0
 
@@ -363,9 +347,7 @@ def test_a_pressure_that_cannot_be_is_refused(pressure, words):
 )
 def test_constants_of_a_lumen_that_cannot_be_are_refused(fraction, pressure):
     one = np.ones(2)
-    with pytest.raises(
-        MaterialError, match=r"tetrahedron 1 has a lumen of .* fractions are 0 to 1"
-    ):
+    with pytest.raises(MaterialError, match=r"tetrahedron 1 .*lumen"):
         TissueMaterials(one, 0 * one, one, np.array([0.0, fraction]), np.array([0.0, pressure]))
-    with pytest.raises(MaterialError, match="lumen_fraction needs one number"):
+    with pytest.raises(MaterialError, match="lumen_fraction"):
         TissueMaterials(one, 0 * one, one, np.ones(3), one)

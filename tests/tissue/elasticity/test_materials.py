@@ -99,13 +99,13 @@ def test_a_label_without_material_is_named():
     labels = voxels()
     labels[:50] = 8
     fractions = label_fractions(block_mesh((5, 3, 3)), labels, INDEX)
-    with pytest.raises(MaterialError, match="label 8 fills"):
+    with pytest.raises(MaterialError, match="label 8"):
         average_over_labels(fractions, {1: FAT})
 
 
 def test_a_mesh_outside_the_volume_is_refused():
     mesh = box_mesh([1.0, 1.1], [0.0, 0.1], [0.0, 0.1])
-    with pytest.raises(MaterialError, match="lies outside the labelled volume"):
+    with pytest.raises(MaterialError, match="outside"):
         label_fractions(mesh, voxels(), INDEX)
 
 
@@ -125,18 +125,18 @@ def test_labels_and_map_must_be_what_they_say(labels, index):
 
 
 @pytest.mark.parametrize(
-    ("modulus", "ratio", "density", "words"),
+    ("modulus", "ratio", "density", "key"),
     [
-        (0.0, 0.4, 1000.0, "material.young_modulus: 0 Pa is outside"),
-        (np.nan, 0.4, 1000.0, "young_modulus: nan is not finite"),
-        (1e4, 0.5, 1000.0, "poisson_ratio: 0.5 is outside"),
-        (1e4, -1.0, 1000.0, "poisson_ratio: -1 is outside"),
-        (1e4, np.nan, 1000.0, "poisson_ratio: nan is not finite"),
-        (1e4, 0.4, -1.0, "density: -1 kg/m3 is outside"),
+        (0.0, 0.4, 1000.0, "young_modulus"),
+        (np.nan, 0.4, 1000.0, "young_modulus"),
+        (1e4, 0.5, 1000.0, "poisson_ratio"),
+        (1e4, -1.0, 1000.0, "poisson_ratio"),
+        (1e4, np.nan, 1000.0, "poisson_ratio"),
+        (1e4, 0.4, -1.0, "density"),
     ],
 )
-def test_unphysical_constants_are_refused(modulus, ratio, density, words):
-    with pytest.raises(MaterialError, match=words):
+def test_unphysical_constants_are_refused(modulus, ratio, density, key):
+    with pytest.raises(MaterialError, match=rf"material\.{key}: "):
         Material(modulus, ratio, density)
     with pytest.raises(MaterialError, match="tetrahedron 1"):
         TissueMaterials(
@@ -145,7 +145,7 @@ def test_unphysical_constants_are_refused(modulus, ratio, density, words):
 
 
 def test_constants_of_different_lengths_are_refused():
-    with pytest.raises(MaterialError, match="density needs one number"):
+    with pytest.raises(MaterialError, match="density"):
         TissueMaterials(np.ones(2), np.zeros(2), np.ones(3))
 
 

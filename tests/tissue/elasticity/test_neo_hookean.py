@@ -2,10 +2,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from neo_hookean_meshes import BOTH, CELLS, TETRAHEDRA, assert_slopes, random_field
+from neo_hookean_meshes import (
+    BOTH,
+    CELLS,
+    TETRAHEDRA,
+    assert_cells_are_tetrahedra,
+    assert_slopes,
+    random_field,
+)
 from skfem import Basis, ElementTetP1, ElementVector, LinearForm, MeshTet
 from skfem.helpers import ddot, det, grad, identity, inv, transpose
-from tissue_block import block_mesh
+from tissue_block import block_mesh, irregular
 
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients, stiffness
@@ -43,17 +50,6 @@ def tangent_matrix(tissue, count=COUNT):
     return np.array([tissue.tangent_product(np.ascontiguousarray(c)).ravel() for c in columns])
 
 
-def irregular(mesh=CELLS, size=1.0e-3):
-    """The same mesh with its inner nodes displaced."""
-    shift = np.random.default_rng(3).uniform(-size, size, mesh.nodes.shape)
-    shift[np.unique(mesh.boundary)] = 0.0
-    return TetrahedralMesh(mesh.nodes + shift, mesh.tetrahedra)
-
-
-def with_inner_nodes():
-    return irregular(block_mesh((5, 4, 5)), 8e-3)
-
-
 @BOTH
 @pytest.mark.parametrize("size", [1e-4, 1e-2])
 def test_forces_are_the_slope_of_the_energy_and_the_tangent_theirs(mesh, size):
@@ -82,7 +78,7 @@ def test_a_rigid_motion_has_no_forces_and_no_energy(mesh, ratio):
 
 @pytest.mark.parametrize("ratio", [0.3, 0.49, 0.4999])
 def test_patch_of_uniform_stress(ratio):
-    mesh = with_inner_nodes()
+    mesh = irregular(block_mesh((5, 4, 5)), 8e-3)
     tissue = NeoHookean(mesh, uniform(ratio, mesh), np.float64)
     gradient = np.eye(3) + np.array([[0.2, 0.1, -0.3], [0.05, -0.1, 0.2], [0.0, 0.4, 0.1]])
     displacement = np.ascontiguousarray((mesh.nodes @ gradient.T - mesh.nodes).T)
@@ -163,20 +159,11 @@ def test_diagonal_blocks_are_those_of_the_tangent(mesh):
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(0.0, 0.1))
 @settings(max_examples=25, deadline=None)
 def test_cells_are_five_tetrahedra(seed, size):
-    displacement, change = random_field(size, seed), random_field(1.0, seed + 1)
-    cells, tetrahedra = (NeoHookean(m, mixed(), np.float64) for m in (CELLS, TETRAHEDRA))
-
-    def near(got, expected):
-        assert abs(got - expected).max() <= 1e-12 * abs(expected).max() + 1e-20
-
-    near(cells.forces(displacement), tetrahedra.forces(displacement))
-    assert cells.energy(displacement) == pytest.approx(tetrahedra.energy(displacement), rel=1e-11)
-    cells.linearise(displacement)
-    tetrahedra.linearise(displacement)
-    near(cells.tangent_product(change), tetrahedra.tangent_product(change))
-    near(cells.diagonal_blocks(), tetrahedra.diagonal_blocks())
+    assert_cells_are_tetrahedra(mixed(), size, seed)
+    displacement = random_field(size, seed)
     ratios = np.linalg.det(deformation_gradients(CELLS, displacement))
-    for tissue in (cells, tetrahedra):
+    for mesh in (CELLS, TETRAHEDRA):
+        tissue = NeoHookean(mesh, mixed(), np.float64)
         assert tissue.smallest_volume_ratio(displacement) == pytest.approx(ratios.min(), abs=1e-9)
         assert tissue.inverted(displacement) == (ratios <= 0).sum()
 
@@ -242,7 +229,7 @@ def test_a_contrast_of_1e9_leaves_the_soft_side_its_digits():
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 0.4])
 def test_scikit_fem_has_the_same_forces(ratio):
-    mesh = irregular()
+    mesh = irregular(CELLS, 1e-3)
     shear = 10e3 / (2 * (1 + ratio))
     bulk = shear / (1 - 2 * ratio)
 
@@ -325,12 +312,12 @@ def test_a_field_of_another_kind_is_refused(field):
         lambda: tissue.inverted(field),
     ]
     for call in calls:
-        with pytest.raises(SolverError, match=r"give C-contiguous float32 of shape \(3, 48\)"):
+        with pytest.raises(SolverError, match=r"float32.*\(3, 48\)"):
             call()
 
 
 def test_another_precision_is_refused():
-    with pytest.raises(SolverError, match="give float32 or float64"):
+    with pytest.raises(SolverError, match="float32 or float64"):
         NeoHookean(CELLS, uniform(0.3), np.float16)
 
 

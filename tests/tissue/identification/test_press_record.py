@@ -61,10 +61,7 @@ def test_poses_alone_are_a_record_without_channels():
 @pytest.mark.parametrize(
     ("spoil", "sentence"),
     [
-        (
-            lambda felt: felt.__setitem__((7, 2), np.nan),
-            "1 of 50 wrenches are not finite.*number 8",
-        ),
+        (lambda felt: felt.__setitem__((7, 2), np.nan), "1 of 50 wrenches.* 8"),
         (lambda felt: felt.__setitem__(slice(None), 0.4), "never changes"),
     ],
 )
@@ -76,7 +73,7 @@ def test_what_is_no_force_is_refused(spoil, sentence):
 
 
 def test_clocks_that_never_met_are_refused():
-    with pytest.raises(StiffnessError, match="0 of 50 poses have a wrench within 10 ms"):
+    with pytest.raises(StiffnessError, match="0 of 50 poses"):
         paired(POSES, (STAMPS + 10**12, ramp(STAMPS)), tolerance=0.01)
 
 
@@ -127,11 +124,11 @@ def test_places_ascend_once_each_and_hold_both_ends(steps, count):
 @pytest.mark.parametrize(
     ("record", "sentence"),
     [
-        (lambda: pressed(DOWN - 0.02, DOWN), "10.0 mm away from it at its nearest"),
-        (lambda: pressed(DOWN - 0.0097), "0.30 mm deep in it at its deepest"),
-        (lambda: pressed(np.repeat([-0.01, 0.005], 40)), "1 different poses press the tissue"),
-        (lambda: pressed(HELD, 0.01 * np.sin(np.arange(len(HELD)))), "do not go together"),
-        (lambda: pressed(HELD, np.maximum(-4.0, -1e3 * np.maximum(HELD, 0))), "the sensor saturat"),
+        (lambda: pressed(DOWN - 0.02, DOWN), "10.0 mm away"),
+        (lambda: pressed(DOWN - 0.0097), "0.30 mm deep"),
+        (lambda: pressed(np.repeat([-0.01, 0.005], 40)), "1 different poses"),
+        (lambda: pressed(HELD, 0.01 * np.sin(np.arange(len(HELD)))), "go together"),
+        (lambda: pressed(HELD, np.maximum(-4.0, -1e3 * np.maximum(HELD, 0))), "saturat"),
     ],
 )
 def test_what_is_no_press_is_refused(record, sentence):
@@ -168,7 +165,7 @@ def test_a_press_that_only_goes_in_or_is_too_short_is_refused():
     stamps = np.round(1e9 * TIMES).astype(np.int64)
     poses = stamps, np.outer(TIMES, [0, 0, 1e-3]), np.tile([0.0, 0, 0, 1], (len(TIMES), 1))
     felt = np.outer(TIMES**2, [0.0, 0, -1, 0, 0, 0])
-    with pytest.raises(StiffnessError, match="has to go in and out"):
+    with pytest.raises(StiffnessError, match="in and out"):
         find_delay(poses, (stamps, felt), lambda pose: -pose.position[2], 0.3)
     few = [array[:40] for array in poses]
     with pytest.raises(StiffnessError, match="too short"):

@@ -71,7 +71,7 @@ def test_two_springs_in_series_are_told_as_one_and_either_from_the_other():
     found = fit_stiffness(column, record, StiffnessSettings(poses=14, keep=("base",)))
     assert found.moduli["top"] == pytest.approx(true["top"], rel=0.04)  # the probe sinks in a bit
     assert found.intervals["top"].factor < 1.05
-    with pytest.raises(StiffnessError, match=r"(base|top) cannot be told from (top|base)"):
+    with pytest.raises(StiffnessError, match=r"(base|top) .* from (top|base)"):
         fit_stiffness(column, record, StiffnessSettings(poses=14))
 
 
@@ -86,9 +86,7 @@ def test_a_structure_that_no_force_reaches_is_refused_by_name(press, random):
 
     more = Tissue(tissue.model, with_bone, {**tissue.moduli, "bone": 1e5})
     record = press.record(press.noisy(0.01, random))
-    with pytest.raises(
-        StiffnessError, match=r"does not determine bone: bone hardly matters.*--keep bone"
-    ):
+    with pytest.raises(StiffnessError, match="--keep bone"):
         fit_stiffness(more, record, FEW)
     found = fit_stiffness(more, record, replace(FEW, keep=("bone",)))
     assert found.moduli["bone"] == 1e5
@@ -139,9 +137,9 @@ def test_landmarks_alone_tell_ratios_and_refuse_the_scale(press):
 @pytest.mark.parametrize(
     ("keep", "sign", "sentence"),
     [
-        (("skin",), 1.0, "there is no such structure; there are fat, muscle"),
+        (("skin",), 1.0, "fat, muscle"),
         (("fat", "muscle"), 1.0, "nothing to fit"),
-        (("fat",), -1.0, "points the other way"),
+        (("fat",), -1.0, "other way"),
     ],
 )
 def test_what_cannot_be_fitted_is_refused(press, keep, sign, sentence):
@@ -156,9 +154,9 @@ GOOD = "name,time,x,y,z\nvein,,0,0,10 mm\nvein,0.5,0,0,12 mm\n"
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("name,x,y,z\n", "has no column time"),
+        ("name,x,y,z\n", "column time"),
         ("name,time,x,y,z\nvein,,0,0,1 kg\n", "line 2: .*1 kg"),
-        ("name,time,x,y,z\nvein,1,0,0,0.01\n", "where it is at rest"),
+        ("name,time,x,y,z\nvein,1,0,0,0.01\n", "at rest"),
         ("name,time,x,y,z\nvein,,0,0,0.01\n", "nothing was seen"),
         ("name,time,x,y,z\nvein,,0,0,0.01\nvein,,0,0,0.02\n", "at rest twice"),
         ("name,time,x,y,z\nvein,,0,0\n", "line 2"),
@@ -171,17 +169,17 @@ def test_what_is_no_list_of_landmarks_is_refused(tmp_path, text, sentence):
         read_landmarks(file)
 
 
-def test_a_missing_file_is_one_sentence(tmp_path):
-    with pytest.raises(StiffnessError, match="cannot be read"):
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(StiffnessError, match=r"none\.csv"):
         read_landmarks(tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        (GOOD.replace("0.5", "9"), "no pose with a wrench is within 10 ms"),
-        (GOOD.replace("10 mm", "-40 mm"), "40.0 mm outside the tissue's mesh"),
-        (GOOD.replace("0.5", "0.0"), "no landmark was seen while the probe pressed"),
+        (GOOD.replace("0.5", "9"), "within 10 ms"),
+        (GOOD.replace("10 mm", "-40 mm"), "40.0 mm outside"),
+        (GOOD.replace("0.5", "0.0"), "no landmark"),
     ],
 )
 def test_landmarks_must_fit_the_press_and_the_tissue(tmp_path, press, text, sentence):

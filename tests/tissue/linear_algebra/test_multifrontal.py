@@ -5,7 +5,7 @@ import tempfile
 import numpy as np
 import pytest
 from scipy.sparse.linalg import splu
-from tissue_block import block, block_mesh
+from tissue_block import block, block_mesh, irregular
 
 from us_sim.errors import SolverError
 from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure, stiffness
@@ -13,7 +13,6 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra import multifrontal
 from us_sim.tissue.linear_algebra.multifrontal import eliminate, nested_dissection
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
 def sparse_fields(system, fixed, nodes):
@@ -96,16 +95,11 @@ def test_up_to_a_moderate_poisson_ratio_it_is_the_ordinary_linear_element():
 
 @pytest.mark.parametrize("ratio", [0.3, 0.45, 0.4999])
 def test_constant_strain_patch(ratio):
-    mesh = block_mesh((6, 5, 5))
-    inner = np.ones(len(mesh.nodes), dtype=bool)
-    inner[mesh.boundary] = False
-    shifted = mesh.nodes.copy()
-    shifted[inner] += np.random.default_rng(0).uniform(-0.005, 0.005, (inner.sum(), 3))
-    mesh = TetrahedralMesh(shifted, mesh.tetrahedra)
+    mesh = irregular(block_mesh((6, 5, 5)))
     gradient = np.random.default_rng(2).uniform(-0.1, 0.1, (3, 3))
     exact = (mesh.nodes @ gradient.T).ravel()
     matrix = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, ratio))).stiffness
-    free = np.repeat(inner, 3)
+    free = np.repeat(~np.isin(np.arange(len(mesh.nodes)), mesh.boundary), 3)
     load = -(matrix[free][:, ~free] @ exact[~free])
     found = splu(matrix[free][:, free].tocsc()).solve(load)
     assert abs(found - exact[free]).max() <= 1e-10 * abs(exact).max()
@@ -115,5 +109,5 @@ def test_a_stiffness_that_is_not_positive_definite_is_refused():
     mesh = block_mesh((4, 4, 4))
     system = averaged_pressure(mesh, uniform_material(mesh, Material(10e3, 0.3)))
     nothing = np.zeros(len(mesh.nodes), dtype=bool)
-    with pytest.raises(SolverError, match="not positive definite to rounding"):
+    with pytest.raises(SolverError, match="positive definite"):
         eliminate(mesh, system, nothing, np.array([0], np.int32))

@@ -65,9 +65,8 @@ def test_volume_follows_the_tissues():
 
 
 def test_a_little_outside_is_carried_and_counted():
-    vertices, triangles = sphere(
-        0.052, centre=CENTRE
-    )  # 2 mm beyond the block's sides, top and bottom
+    # 2 mm beyond the block's sides, top and bottom
+    vertices, triangles = sphere(0.052, centre=CENTRE)
     surface = EmbeddedSurface(MESH, vertices, triangles)
     beyond = (np.abs(vertices[:, 1]) > 0.05 + 1e-6) | (np.abs(vertices[:, 2] - 0.05) > 0.05 + 1e-6)
     assert surface.outside == beyond.sum() > 0
@@ -77,7 +76,7 @@ def test_a_little_outside_is_carried_and_counted():
 
 def test_far_outside_is_refused_or_trimmed():
     vertices, triangles = sphere(0.09, centre=CENTRE)
-    with pytest.raises(MeshError, match=r"vertices lie outside the tissue mesh, vertex \d+ by 40"):
+    with pytest.raises(MeshError, match=r"outside .*vertex \d+ by 40"):
         EmbeddedSurface(MESH, vertices, triangles)
     trimmed = EmbeddedSurface.trimmed(MESH, vertices, triangles)
     assert 0 < len(trimmed.triangles) < len(triangles)
@@ -85,7 +84,7 @@ def test_far_outside_is_refused_or_trimmed():
     whole, kept = vertices[triangles], trimmed.vertices[trimmed.triangles]
     same = (np.abs(whole[:, None, 0] - kept[None, :5, 0]) < 1e-8).all(axis=2).any(axis=0)
     assert same.all()
-    with pytest.raises(MeshError, match="the surface lies outside the tissue mesh"):
+    with pytest.raises(MeshError, match="outside the tissue"):
         EmbeddedSurface.trimmed(MESH, vertices + 1.0, triangles)
 
 
@@ -104,12 +103,12 @@ def test_a_triangle_without_area_has_no_normal():
 @pytest.mark.parametrize(
     ("vertices", "triangles", "words"),
     [
-        (np.zeros((3, 2)), [[0, 1, 2]], r"surface vertices have shape \(3, 2\)"),
-        (np.full((3, 3), np.nan), [[0, 1, 2]], "surface vertex 0 is not finite"),
-        (np.zeros((3, 3)), [[0, 1, 3]], "name vertices 0 to 3, but there are only 3"),
-        (np.zeros((3, 3)), [[-1, 1, 2]], "name vertices -1 to 2"),
+        (np.zeros((3, 2)), [[0, 1, 2]], r"\(3, 2\)"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], "vertex 0"),
+        (np.zeros((3, 3)), [[0, 1, 3]], "vertices 0 to 3"),
+        (np.zeros((3, 3)), [[-1, 1, 2]], "vertices -1 to 2"),
         (np.zeros((3, 3)), np.zeros((0, 3), int), "T > 0"),
-        (np.zeros((3, 3)), [[0.0, 1.0, 2.0]], "float64 of shape"),
+        (np.zeros((3, 3)), [[0.0, 1.0, 2.0]], "float64"),
     ],
 )
 def test_what_is_no_surface_is_refused(vertices, triangles, words):
@@ -119,7 +118,7 @@ def test_what_is_no_surface_is_refused(vertices, triangles, words):
 
 def test_the_nodes_of_another_mesh_are_refused():
     surface = EmbeddedSurface(MESH, *sphere(0.04, centre=CENTRE))
-    with pytest.raises(MeshError, match="embedded in a mesh of shape"):
+    with pytest.raises(MeshError, match="mesh of shape"):
         surface.deform(np.zeros((5, 3)))
 
 

@@ -29,21 +29,22 @@ $ENDELM
 
 # Counts as stated by the makers (SOURCE.txt); the volume by Gauss's theorem on the boundary.
 @pytest.mark.parametrize(
-    ("name", "nodes", "tetrahedra", "report"),
+    ("name", "nodes", "tetrahedra", "left_out"),
     [
-        ("liver.msh", 181, 596, ()),
-        ("liver2.msh", 507, 1493, ()),
-        ("truthcylinder1.msh", 642, 2524, ()),
-        ("volumetricTongue.vtu", 2238, 10980, ()),
-        ("Ossicles.vtu", 1733, 5058, ()),
-        ("Armadillo_Tetra_4406.vtu", 1446, 4406, ()),
-        ("raptorTetra_8418.vtu", 2993, 8418, ("left out 3 nodes that no tetrahedron uses",)),
+        ("liver.msh", 181, 596, 0),
+        ("liver2.msh", 507, 1493, 0),
+        ("truthcylinder1.msh", 642, 2524, 0),
+        ("volumetricTongue.vtu", 2238, 10980, 0),
+        ("Ossicles.vtu", 1733, 5058, 0),
+        ("Armadillo_Tetra_4406.vtu", 1446, 4406, 0),
+        ("raptorTetra_8418.vtu", 2993, 8418, 3),
     ],
 )
-def test_real_meshes_are_read(shared_data, name, nodes, tetrahedra, report):
+def test_real_meshes_are_read(shared_data, name, nodes, tetrahedra, left_out):
     mesh, said = read_mesh(shared_data / "meshes-sofa" / name, metres_per_unit=0.01)
     assert (len(mesh.nodes), len(mesh.tetrahedra)) == (nodes, tetrahedra)
-    assert said == report
+    assert len(said) == bool(left_out)
+    assert all(f" {left_out} nodes" in each for each in said)
     a, b, c = np.moveaxis(mesh.nodes[mesh.boundary], 1, 0)
     enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
     assert mesh.volumes.sum() == pytest.approx(enclosed, rel=1e-9)
@@ -57,18 +58,10 @@ def test_the_cylinder_has_the_volume_of_a_cylinder(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("liver.vtk", "not a tetrahedral mesh that can be read"),
-        ("skull.vtp", "not a tetrahedral mesh that can be read"),
-        ("head.obj", "not a tetrahedral mesh that can be read"),
-        ("liver.obj", "the file has no tetrahedra"),
-        ("SOURCE.txt", "not a tetrahedral mesh that can be read"),
-        ("nowhere.msh", "there is no such mesh file"),
-    ],
+    "name", ["liver.vtk", "skull.vtp", "head.obj", "liver.obj", "SOURCE.txt", "nowhere.msh"]
 )
-def test_real_files_of_other_things_are_refused_by_name(shared_data, name, words):
-    with pytest.raises(MeshError, match=f"{name}: .*{words}"):
+def test_real_files_of_other_things_are_refused_by_name(shared_data, name):
+    with pytest.raises(MeshError, match=f"{name}: "):
         read_mesh(shared_data / "meshes-sofa" / name)
 
 
@@ -102,10 +95,8 @@ def test_quadratic_tetrahedra_lose_their_middle_nodes(tmp_path):
     meshio.Mesh(points, [("tetra10", np.arange(10)[None])]).write(file)
     mesh, report = read_mesh(file)
     np.testing.assert_allclose(mesh.nodes, ends)
-    assert report == (
-        "straightened the edges of 1 quadratic tetrahedra",
-        "left out 6 nodes that no tetrahedron uses",
-    )
+    assert "1 quadratic" in report[0]
+    assert "6 nodes" in report[1]
 
 
 def test_cells_that_would_leave_holes_are_refused(tmp_path):
@@ -114,27 +105,27 @@ def test_cells_that_would_leave_holes_are_refused(tmp_path):
         [[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float
     )
     meshio.Mesh(points, [("hexahedron", np.arange(8)[None])]).write(file)
-    with pytest.raises(MeshError, match=r"brick\.vtu: the file has 1 cells of type hexahedron"):
+    with pytest.raises(MeshError, match=r"brick\.vtu: .*hexahedron"):
         read_mesh(file)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("$ENDNOD", ""), r"no whole part \$NOD"),
-        (("$NOD\n4", "$NOD\n5"), r"part \$NOD of the file has 4 lines, but says 5"),
-        (("12 30 0 0", "12 30 0"), "a node of the file is not a number and three coordinates"),
-        (("12 30 0 0", "12 30 x 0"), "something else where a number should be"),
-        (("2 4 1 1 4 11 12 5 9", "2 4 1 1 4 11 12 5"), "more or fewer nodes than it says"),
-        (("4 11 12 5 9", "4 11 12 5 8"), "names node 8, which is not there"),
-        (("12 30 0 0", "11 30 0 0"), "two nodes of the file have the number 11"),
-        (("11 0 0 0", "99999999999999999999 0 0 0"), "something else where a number should be"),
-        (("11 12 5 9", "11 12 5 99999999999999999999"), "should be: 9{20} is no node"),
-        (("2 4 1 1 4 11 12 5 9", "2 5 1 1 4 11 12 5 9"), "elements of Gmsh's type 5"),
-        (("2 4 1 1 4 11 12 5 9", "2 2 1 1 3 11 12 5"), "the file has no tetrahedra"),
-        (("12 30 0 0", "12 nan 0 0"), "mesh node is not finite"),
+        (("$ENDNOD", ""), r"\$NOD"),
+        (("$NOD\n4", "$NOD\n5"), "4 lines.* 5"),
+        (("12 30 0 0", "12 30 0"), "three coordinates"),
+        (("12 30 0 0", "12 30 x 0"), "a number should"),
+        (("2 4 1 1 4 11 12 5 9", "2 4 1 1 4 11 12 5"), "fewer nodes"),
+        (("4 11 12 5 9", "4 11 12 5 8"), "node 8"),
+        (("12 30 0 0", "11 30 0 0"), "the number 11"),
+        (("11 0 0 0", "99999999999999999999 0 0 0"), "a number should"),
+        (("11 12 5 9", "11 12 5 99999999999999999999"), "9{20}"),
+        (("2 4 1 1 4 11 12 5 9", "2 5 1 1 4 11 12 5 9"), "type 5"),
+        (("2 4 1 1 4 11 12 5 9", "2 2 1 1 3 11 12 5"), "no tetrahedra"),
+        (("12 30 0 0", "12 nan 0 0"), "not finite"),
         (("12 30 0 0", "12 0 30 0"), "tetrahedron names a node|M > 0"),
-        (("12 30 0 0", "12 0 -40 0"), "1 tetrahedron is flat"),
+        (("12 30 0 0", "12 0 -40 0"), "flat"),
     ],
 )
 def test_what_is_wrong_in_an_old_gmsh_file_is_said(tmp_path, change, words):
@@ -148,20 +139,18 @@ def test_a_unit_that_cannot_be_meant_is_refused(tmp_path):
     file = tmp_path / "small.msh"
     file.write_text(GMSH)
     assert read_mesh(file, 0.001)[0].volumes.sum() == pytest.approx(4.5e-6)
-    with pytest.raises(MeshError, match=r"30 m long, and no body is: say .* `tissue\.mesh\.unit`"):
+    with pytest.raises(MeshError, match=r"30 m .*tissue\.mesh\.unit"):
         read_mesh(file)
-    with pytest.raises(MeshError, match="metres_per_unit is 0"):
+    with pytest.raises(MeshError, match="metres_per_unit"):
         read_mesh(file, 0)
 
 
-@pytest.mark.parametrize(
-    ("metres_per_unit", "said"), [(1e-4, "0.003 m long"), (0.05, "1.5 m long")]
-)
-def test_a_size_that_is_hardly_that_of_a_body_is_remarked_on(tmp_path, metres_per_unit, said):
+@pytest.mark.parametrize(("metres_per_unit", "length"), [(1e-4, "0.003 m"), (0.05, "1.5 m")])
+def test_a_size_that_is_hardly_that_of_a_body_is_remarked_on(tmp_path, metres_per_unit, length):
     file = tmp_path / "small.msh"
     file.write_text(GMSH)
     (remark,) = read_mesh(file, metres_per_unit)[1]
-    assert remark.startswith(f"it is {said}, where parts of a body are 1 to 80 cm: ")
+    assert length in remark
     assert "`tissue.mesh.unit`" in remark
 
 
@@ -173,7 +162,7 @@ def test_the_second_file_of_a_pair_is_named_where_it_is_missing(tmp_path, missin
     there = tmp_path / {"node": "organ.ele", "ele": "organ.node"}[missing]
     assert len(read_mesh(there)[0].nodes) == 4
     (tmp_path / f"organ.{missing}").unlink()
-    with pytest.raises(MeshError, match=f"it goes with organ.{missing}, which is not beside it"):
+    with pytest.raises(MeshError, match=f"organ.{missing}"):
         read_mesh(there)
 
 
@@ -184,7 +173,7 @@ def test_a_missing_meshio_is_named_where_it_is_needed(tmp_path, monkeypatch):
     assert len(read_mesh(old, 0.001)[0].tetrahedra) == 1
     other = tmp_path / "small.vtu"
     other.write_text("<VTKFile/>")
-    with pytest.raises(MeshError, match=r"reading a \.vtu file needs meshio; install it"):
+    with pytest.raises(MeshError, match=r"\.vtu .*meshio"):
         read_mesh(other)
 
 
@@ -216,17 +205,17 @@ def test_a_gmsh_node_0_is_none(tmp_path, form):
     text = file.read_text()
     assert text.count(f" {first}\n") == 1
     file.write_text(text.replace(f" {first}\n", f" 0 {first.split(' ', 1)[1]}\n"))
-    with pytest.raises(MeshError, match="names node 0, which is not there"):
+    with pytest.raises(MeshError, match="node 0"):
         read_mesh(file)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("$Nodes\n1 27 ", "$Nodes\n1 28 ", "says it has 28 nodes, and holds 27"),
-        ("$Nodes\n1 27 ", "$Nodes\n2 27 ", "fewer numbers than it says"),
-        ("$Elements\n1 40 ", "$Elements\n1 4800000000 ", "says it has 4800000000 elements"),
-        ("4.1 0 8", "4.1 0 4", "save it as version"),
+        ("$Nodes\n1 27 ", "$Nodes\n1 28 ", "28 nodes.* 27"),
+        ("$Nodes\n1 27 ", "$Nodes\n2 27 ", "fewer numbers"),
+        ("$Elements\n1 40 ", "$Elements\n1 4800000000 ", "4800000000 elements"),
+        ("4.1 0 8", "4.1 0 4", "version"),
         ("$EndNodes", "$End", "no whole part"),
     ],
 )

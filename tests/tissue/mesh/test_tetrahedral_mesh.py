@@ -67,33 +67,25 @@ def test_node_order_is_x_then_y_then_z():
 @pytest.mark.parametrize(
     ("nodes", "tetrahedra", "words"),
     [
-        (CORNER[:, :2], ONE, r"nodes have shape \(4, 2\)"),
-        (CORNER, [[0, 1, 2]], r"tetrahedra have shape \(1, 3\)"),
+        (CORNER[:, :2], ONE, r"nodes .*\(4, 2\)"),
+        (CORNER, [[0, 1, 2]], r"tetrahedra .*\(1, 3\)"),
         (CORNER, np.empty((0, 4), int), "M > 0"),
-        (CORNER, ONE.astype(float), "float64: give integer"),
-        (
-            np.where(CORNER == 1, np.nan, CORNER),
-            ONE,
-            "3 mesh nodes are not finite, such as node 1 at",
-        ),
-        (CORNER * 1e300, ONE, "3 mesh nodes are farther than 1e.06 m away, such as node 1"),
+        (CORNER, ONE.astype(float), "float64"),
+        (np.where(CORNER == 1, np.nan, CORNER), ONE, "3 .*not finite.* node 1"),
+        (CORNER * 1e300, ONE, "3 .*farther.* node 1"),
         (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
-        (CORNER, [[-1, 1, 2, 3]], "name nodes -1 to 3"),
-        (
-            np.vstack([CORNER, [5.0, 5, 5]]),
-            ONE,
-            "1 mesh node belongs to no tetrahedron, such as node 4",
-        ),
-        (CORNER, [[0, 2, 1, 3]], "1 tetrahedron is inverted, such as tetrahedron 0"),
-        (FLAT, ONE, "1 tetrahedron is flat, such as tetrahedron 0"),
-        (CORNER, [[0, 1, 2, 2]], "1 mesh node belongs to no tetrahedron, such as node 3"),
-        (CORNER[[0, 1, 2, 3, 3]], [[0, 1, 2, 3], [0, 1, 2, 4]], "such as node 4 on node 3"),
-        (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "repeated, such as tetrahedron 1, which has"),
-        (TWO_ABOVE, [[0, 1, 2, 3], [0, 1, 2, 4]], "same side of the face they share, such as 0"),
-        (THREE, AT_A_FACE, "1 face belongs to more than two .* one of tetrahedra 0, 1, 2"),
-        (BOTH, [[0, 1, 2, 3], [3, 4, 5, 6]], "2 parts .* 1 node in all, such as node 3 between"),
-        (BOTH[:6], [[0, 1, 2, 3], [2, 4, 5, 3]], "by nodes or edges only, 2 nodes"),
-        (np.zeros((2**21 + 1, 3)), ONE, "give a coarser one, of 2097152 at most"),
+        (CORNER, [[-1, 1, 2, 3]], "nodes -1 to 3"),
+        (np.vstack([CORNER, [5.0, 5, 5]]), ONE, "no tetrahedron.* node 4"),
+        (CORNER, [[0, 2, 1, 3]], "inverted.* tetrahedron 0"),
+        (FLAT, ONE, "flat.* tetrahedron 0"),
+        (CORNER, [[0, 1, 2, 2]], "no tetrahedron.* node 3"),
+        (CORNER[[0, 1, 2, 3, 3]], [[0, 1, 2, 3], [0, 1, 2, 4]], "node 4 on node 3"),
+        (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "repeated.* tetrahedron 1"),
+        (TWO_ABOVE, [[0, 1, 2, 3], [0, 1, 2, 4]], "same side.* such as 0"),
+        (THREE, AT_A_FACE, "more than two.* 0, 1, 2"),
+        (BOTH, [[0, 1, 2, 3], [3, 4, 5, 6]], "2 parts.* node 3"),
+        (BOTH[:6], [[0, 1, 2, 3], [2, 4, 5, 3]], "parts.* 2 nodes"),
+        (np.zeros((2**21 + 1, 3)), ONE, "2097152"),
     ],
 )
 def test_bad_meshes_are_refused(nodes, tetrahedra, words):
@@ -152,22 +144,19 @@ def test_any_disorder_of_these_kinds_is_mended_and_counted(seed):
     assert mended.volumes.sum() == pytest.approx(0.002)
     assert len(mended.boundary) == len(mesh.boundary)
     joined = 4 * len(mesh.tetrahedra) - len(mesh.nodes)
-    assert report[0] == f"joined {joined} nodes with another in their place"
-    assert report[1:3] == (
-        "left out 5 tetrahedra repeated",
-        "left out 4 nodes that no tetrahedron uses",
-    )
-    assert report[3].startswith("turned 7 ") or report[3].startswith("turned ")
+    for said, part in zip(
+        report, (f" {joined} nodes", " 5 tetrahedra", " 4 nodes", "turned "), strict=True
+    ):
+        assert part in said
 
 
 def test_a_tetrahedron_whose_nodes_become_one_is_left_out():
     nodes = CORNER[[0, 1, 2, 3, 3]]
     mesh, report = repair(nodes, [[0, 1, 2, 3], [0, 1, 3, 4]])
     assert len(mesh.tetrahedra) == 1
-    assert report == (
-        "joined 1 node with another in its place",
-        "left out 1 tetrahedron that names a node twice",
-    )
+    joined, left_out = report
+    assert "1 node " in joined
+    assert "1 tetrahedron " in left_out
 
 
 def test_a_tetrahedron_pulled_inside_out_is_refused():
@@ -175,17 +164,17 @@ def test_a_tetrahedron_pulled_inside_out_is_refused():
     nodes = mesh.nodes.copy()
     centre = np.flatnonzero(~np.isin(np.arange(len(nodes)), mesh.boundary))[0]
     nodes[centre] += [0.0, 0.0, 0.08]
-    with pytest.raises(MeshError, match=r"same side of the face they share.*after repair: turned"):
+    with pytest.raises(MeshError, match=r"same side.*repair: turned"):
         repair(nodes, mesh.tetrahedra)
 
 
 @pytest.mark.parametrize(
     ("nodes", "tetrahedra", "words"),
     [
-        (np.where(CORNER == 1, np.nan, CORNER), [[0, 1, 2, 3]], "not finite, such as node 1"),
-        (CORNER, [[0, 1, 2, 4]], "the mesh has nodes 0 to 3"),
-        (CORNER, [[0.0, 1, 2, 3]], "float64: give integer"),
-        ([*CORNER[:3], [1.0, 1, 0]], [[0, 1, 2, 3]], "1 tetrahedron is flat"),
+        (np.where(CORNER == 1, np.nan, CORNER), [[0, 1, 2, 3]], "not finite.* node 1"),
+        (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
+        (CORNER, [[0.0, 1, 2, 3]], "float64"),
+        ([*CORNER[:3], [1.0, 1, 0]], [[0, 1, 2, 3]], "flat"),
         (CORNER[[0, 0, 0, 0]], [[0, 1, 2, 3]], "M > 0"),
     ],
 )

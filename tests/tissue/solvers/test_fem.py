@@ -1,7 +1,6 @@
 """The exact linear solver against sparse solves, laws of contact, and elements that do not lock."""
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from scipy.sparse.linalg import splu
 from tissue_block import block, block_mesh
 
 from us_sim.cache import cache_folder
-from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.compliant_contact import FrictionalContact
@@ -80,7 +78,7 @@ def test_gaps_pushes_and_residual_are_as_they_should_be(collider, ratio):
         touched = deformation.contact_nodes
         if len(touched) == 0:
             continue
-        assert deformation.action == ""
+        assert not deformation.action
         skirt = np.zeros(len(model.contact_nodes))
         skirt[np.isin(model.contact_nodes, touched)] = model.contact_spacing
         gap, normal = push_out(
@@ -205,23 +203,31 @@ def test_compression_is_as_exact_beside_bone_and_when_incompressible(monkeypatch
 
 def test_what_takes_long_is_kept_and_mended(cache, monkeypatch, caplog):
     monkeypatch.setattr(compliance_module, "_KEPT", 0)
+
+    def deformed(model):
+        """The deformation, and whether its compliance was computed for it."""
+        done = []
+        solver = Fem(model, progress=lambda fraction, _: done.append(fraction))
+        return solver.deform(PRESSED), bool(done)
+
     model = block((9, 5, 5))
-    made = Fem(model).deform(PRESSED)
-    monkeypatch.setattr(compliance_module, "_made", None)  # not called any more
-    np.testing.assert_array_equal(Fem(model).deform(PRESSED).nodes, made.nodes)
-    monkeypatch.undo()
-    monkeypatch.setenv("US_SIM_CACHE", str(cache))
-    monkeypatch.setattr(compliance_module, "_KEPT", 0)
+    made, computed = deformed(model)
+    assert computed
     (entry,) = (path for path in cache.iterdir() if path.is_dir())
-    (entry / "fields.npy").write_bytes(b"half")
-    with caplog.at_level(logging.WARNING):
-        np.testing.assert_array_equal(Fem(model).deform(PRESSED).nodes, made.nodes)
-    assert "is damaged" in caplog.text
+    fields = (entry / "fields.npy").read_bytes()
+    for damaged in (False, True):
+        if damaged:
+            (entry / "fields.npy").write_bytes(b"half")
+        with caplog.at_level(logging.WARNING):
+            again, computed = deformed(model)
+        np.testing.assert_array_equal(again.nodes, made.nodes)
+        assert computed == damaged == (str(entry) in caplog.text)
+    assert (entry / "fields.npy").read_bytes() == fields
 
     other = block((9, 5, 5), materials=uniform_material(model.mesh, Material(20e3, 0.45)))
-    assert np.linalg.norm(Fem(other).deform(PRESSED).force) == pytest.approx(
-        2 * np.linalg.norm(made.force)
-    )
+    twice, computed = deformed(other)
+    assert computed
+    assert np.linalg.norm(twice.force) == pytest.approx(2 * np.linalg.norm(made.force))
 
 
 def test_without_a_place_to_keep_it_there_is_a_warning(tmp_path, monkeypatch, caplog):
@@ -230,39 +236,12 @@ def test_without_a_place_to_keep_it_there_is_a_warning(tmp_path, monkeypatch, ca
     monkeypatch.setattr(compliance_module, "_KEPT", 0)
     with caplog.at_level(logging.WARNING):
         assert Fem(block((5, 4, 4))).deform(PRESSED).force[2] < 0
-    assert "cannot be written" in caplog.text
+    assert str(tmp_path / "file" / "cache") in caplog.text
 
 
 def test_small_meshes_and_warming_up_leave_the_disk_alone():
     Fem(block((5, 4, 4))).warm_up()
     assert not cache_folder().exists()
-
-
-def test_tissue_that_is_not_held_is_refused():
-    with pytest.raises(SolverError, match="can move as a whole"):
-        Fem(block((3, 3, 3), held=()))
-
-
-@pytest.mark.parametrize("ratio", [0.2, 0.45])  # without and with averaged pressures
-def test_tissue_that_is_all_held_does_not_move(ratio):
-    model = block((3, 3, 3))
-    materials = uniform_material(model.mesh, Material(10e3, ratio))
-    model = replace(model, materials=materials, fixed=np.ones(27, dtype=bool))
-    deformation = Fem(model).deform(PRESSED)
-    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
-    assert not deformation.force.any()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"contact": "glued"}, "fem.contact: 'glued' is not one of frictionless, coulomb"),
-        ({"friction": -0.1}, "fem.friction: -0.1 is outside 1e-09 to 10"),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings, words):
-    with pytest.raises(SolverError, match=words):
-        Fem(block((3, 3, 3)), FemSettings(**settings))
 
 
 def test_one_node_sticks_and_slips_as_coulomb_says():
@@ -285,7 +264,7 @@ def test_forces_stay_in_the_friction_cone_and_the_wrench_with_them():
         deformation = solver.deform(pose)
         if len(deformation.contact_nodes) == 0:
             continue
-        assert deformation.action == ""
+        assert not deformation.action
         forces = nodal_forces(model, deformation.nodes)[deformation.contact_nodes]
         touched = deformation.nodes[deformation.contact_nodes]
         gap, normal = push_out(model.collider, pose, touched, model.contact_spacing)

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tissue_block import at, block, block_mesh, settle
 
-from us_sim.errors import SolverError
 from us_sim.evaluation.independent_forces import neo_hookean_forces
 from us_sim.geometry.collider import RoundedBox, Sphere
 from us_sim.tissue.contact.penalty_contact import PenaltyFriction
@@ -212,19 +211,6 @@ def test_stiff_tissue_sticks_as_soft_one_does():
     )
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"contact": "glued"}, "contact: 'glued' is not one of frictionless, coulomb, sticking"),
-        ({"friction": -0.1}, "friction: -0.1 is outside 1e-09 to 10"),
-        ({"friction": 11.0}, "friction: 11 is outside 1e-09 to 10"),
-    ],
-)
-def test_settings_out_of_range_are_refused(given, words):
-    with pytest.raises(SolverError, match=f"fem_nonlinear.{words}"):
-        FemNonlinearSettings(**given)
-
-
 DEPTH, SHARE, TIME, FRAME = 1e-4, 0.5, 0.4, 0.01
 
 
@@ -317,14 +303,16 @@ def test_what_has_relaxed_is_as_without():
     viscous = FemNonlinear(
         model, FemNonlinearSettings(viscosity=0.5, relaxation_time=0.02, **given)
     )
+    ends = []
     for solver in (plain, viscous):
         for _ in range(60):
             deformation = solver.deform(pose)
         assert deformation.residual <= 1e-5
         assert solver.deform(pose) is deformation
+        ends.append(deformation)
     # Friction remembers how the tissue came there.
-    np.testing.assert_allclose(viscous._last.force, plain._last.force, atol=0.2)
-    np.testing.assert_allclose(viscous._last.nodes, plain._last.nodes, atol=3e-4)
+    np.testing.assert_allclose(ends[1].force, ends[0].force, atol=0.2)
+    np.testing.assert_allclose(ends[1].nodes, ends[0].nodes, atol=3e-4)
 
 
 def test_no_step_raises_the_energy_of_viscous_tissue():
@@ -347,16 +335,3 @@ def test_a_state_that_is_taken_over_is_relaxed(sunk):
     for _ in range(3):
         force = second.deform(at(z=DEPTH)).force
     assert force[2] == pytest.approx(-0.2 / (1 + sunk), rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"viscosity": -0.1}, "viscosity: -0.1 is outside 0 to 10"),
-        ({"relaxation_time": 0.0}, "relaxation_time: 0 s is outside 0.001 to 1000 s"),
-        ({"frame_interval": 0.0}, "frame_interval: 0 s is outside 0.0001 to 10 s"),
-    ],
-)
-def test_settings_of_viscosity_out_of_range_are_refused(given, words):
-    with pytest.raises(SolverError, match=f"fem_nonlinear.{words}"):
-        FemNonlinearSettings(**given)

@@ -7,8 +7,9 @@ from tissue_block import at, block
 from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
+from us_sim.tissue.elasticity.springs import springs_of
 from us_sim.tissue.elasticity.stability import count_inverted
-from us_sim.tissue.model import TissueState
+from us_sim.tissue.model import Intervention, TissueState
 from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 FRAME = 20 * 0.01  # s
@@ -61,23 +62,13 @@ def test_held_by_its_bottom_the_block_passes_the_push_on():
     solver = Msds(block((9, 5, 5)))
     for _ in range(400):
         deformation = solver.deform(at(z=0.008))
-    force = solver._springs.forces(deformation.nodes, np.zeros_like(deformation.nodes))
-    on_the_ground = force[solver.model.fixed].sum(axis=0)
+    model = solver.model
+    springs = springs_of(model.mesh, model.materials)
+    force = springs.forces(deformation.nodes, np.zeros_like(deformation.nodes))
+    on_the_ground = force[model.fixed].sum(axis=0)
     assert deformation.residual < 1e-3
     assert on_the_ground[2] > 0.5
     np.testing.assert_allclose(on_the_ground, -deformation.force, atol=0.01)
-
-
-def test_a_release_ends_at_rest():
-    solver = Msds(block((9, 5, 5)))
-    for frame in range(30):
-        solver.deform(at(z=0.0004 * frame))
-    assert abs(solver.state.displacement).max() > 0.01
-    for _ in range(400):
-        deformation = solver.deform(at(z=-0.05))
-    np.testing.assert_array_equal(deformation.nodes, solver.model.mesh.nodes)
-    assert deformation.residual == 0
-    assert solver.deform(at(z=-0.05)) is deformation
 
 
 def test_touched_nodes_lie_on_the_probe():
@@ -111,8 +102,7 @@ def test_substeps_reach_the_same_rest_as_scaled_masses():
     for frame in range(300):
         pose = at(z=min(2e-4 * frame, 0.006))
         ours, theirs = scaled.deform(pose), divided.deform(pose)
-    assert "masses scaled" in ours.action
-    assert "sub-steps" in theirs.action
+    assert scaled.mass.sum() > divided.mass.sum() == pytest.approx(divided.model.lumped_mass.sum())
     np.testing.assert_allclose(ours.nodes, theirs.nodes, atol=2e-5)
     np.testing.assert_allclose(ours.force, theirs.force, atol=0.01)
 
@@ -129,16 +119,16 @@ def test_rough_handling_is_survived_and_what_it_broke_is_mended(collider):
             deformation = solver.deform(pose)
             assert np.isfinite(deformation.nodes).all()
             assert np.isfinite(deformation.force).all()
-    assert "inside out" in deformation.action
-    actions = [solver.deform(None).action for _ in range(200)]
-    assert any("put back to rest" in action for action in actions)
+    assert count_inverted(deformation.nodes, model.mesh.tetrahedra) > 0
+    done = [solver.deform(None).interventions for _ in range(200)]
+    assert any(Intervention.PUT_TO_REST in each for each in done)
     np.testing.assert_array_equal(solver.deform(None).nodes, model.mesh.nodes)
 
 
 def test_a_probe_that_appears_inside_comes_from_above():
     solver = Msds(block((9, 5, 5), RoundedBox(0.06, 0.04, 0.1, 0.003)))
     deformation = solver.deform(at(z=0.012))
-    assert "inside out" not in deformation.action
+    assert count_inverted(deformation.nodes, solver.model.mesh.tetrahedra) == 0
     assert len(deformation.contact_nodes) > 0
 
 
@@ -150,29 +140,8 @@ def test_a_turning_probe_is_followed():
     assert deformation.force[2] < 0
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("steps", 0),
-        ("maximum_substeps", -1),
-        ("time_step", 0.0),
-        ("time_step", "10 mm"),
-        ("stiffness_factor", -0.002),
-        ("damping_factor", -0.1),
-        ("damping_factor", float("inf")),
-        ("rest_tolerance", float("nan")),
-        ("stabilisation", "hope"),
-        ("stiffness", "stiff"),
-        ("volume", 1),
-    ],
-)
-def test_settings_out_of_range_are_refused(setting, value):
-    with pytest.raises(SolverError, match=f"msds.{setting}: "):
-        MsdsSettings(**{setting: value})
-
-
 def test_too_many_substeps_are_refused():
-    with pytest.raises(SolverError, match="use stabilisation mass_scaling"):
+    with pytest.raises(SolverError, match="mass_scaling"):
         Msds(block((6, 4, 4)), MsdsSettings(stabilisation="substeps", maximum_substeps=20))
 
 

@@ -1,16 +1,20 @@
 """What holds for every tissue solver, and how one goes on from where another is."""
 
+import contextlib
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from tissue_block import block
+from tissue_block import block, block_mesh
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SOLVERS
-from us_sim.tissue.model import TissueState
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.model import Intervention, TissueState
 from us_sim.tissue.solvers.solver import create_solver
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.008]))
@@ -98,26 +102,56 @@ def test_held_nodes_stay(solver):
     np.testing.assert_array_equal(deformation.nodes[held], solver.model.mesh.nodes[held])
 
 
-def test_the_last_good_state_is_kept_when_a_frame_fails(solver, monkeypatch):
+def test_a_release_ends_at_rest(solver):
+    for frame in range(30):
+        solver.deform(Pose(np.array([0.0, 0.0, 0.0004 * frame])))
+    assert abs(solver.state.displacement).max() > 0.01
+    deformation = settled(solver, AWAY)
+    np.testing.assert_array_equal(deformation.nodes, solver.model.mesh.nodes)
+    assert deformation.residual == 0
+    assert not deformation.force.any()
+    assert len(deformation.contact_nodes) == 0
+    assert solver.deform(AWAY) is deformation
+
+
+@contextlib.contextmanager
+def failing(solver, node, value):
+    """Within it, each frame of the solver puts a node at ``value``."""
+    advance = type(solver)._advance
+
+    def fail(self, pose):
+        deformation = advance(self, pose)
+        deformation.nodes[node] = value
+        return deformation
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(solver), "_advance", fail)
+        yield
+
+
+def test_the_last_good_state_is_kept_when_a_frame_fails(solver):
     good = solver.deform(PRESSED)
     before = solver.state.displacement.copy()
     for broken in (np.nan, np.inf, 1e6):
-        advance = type(solver)._advance
-
-        def fail(self, pose, value=broken, advance=advance):
-            deformation = advance(self, pose)
-            deformation.nodes[-1] = value
-            return deformation
-
-        with monkeypatch.context() as patch:
-            patch.setattr(type(solver), "_advance", fail)
+        with failing(solver, -1, broken):
             deformation = solver.deform(Pose(np.array([0.0, 0.0, 0.01])))
-        assert "last good state was kept" in deformation.action
+        assert deformation.interventions == Intervention.FRAME_FAILED | Intervention.KEPT_STATE
+        assert deformation.action
         np.testing.assert_array_equal(deformation.nodes, good.nodes)
         np.testing.assert_allclose(solver.state.displacement, before, atol=1e-15)
     after = settled(solver, PRESSED, 60)
     assert after.residual < 0.1
-    assert "good state" not in after.action
+    assert not after.interventions
+
+
+def test_a_tissue_that_goes_on_failing_is_put_to_rest(solver):
+    solver.deform(PRESSED)
+    with failing(solver, 0, np.nan):
+        done = [solver.deform(Pose([0.0, 0.0, 0.001 * k])).interventions for k in range(5)]
+    assert all(Intervention.KEPT_STATE in each for each in done[:4])
+    assert Intervention.PUT_TO_REST in done[4]
+    assert not solver.state.displacement.any()
+    assert settled(solver, PRESSED, 60).residual < 0.1
 
 
 def test_a_deformed_tissue_that_is_taken_over_untouched_goes_back(solver):
@@ -139,9 +173,9 @@ def state(count=225, **changes):
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (state(count=8), "has 8 nodes, the mesh 225"),
-        (state(displacement=np.nan), "is not finite"),
-        (state(velocity=np.inf), "is not finite"),
+        (state(count=8), "8 nodes.* 225"),
+        (state(displacement=np.nan), "not finite"),
+        (state(velocity=np.inf), "not finite"),
     ],
 )
 def test_states_that_do_not_fit_are_refused(solver, wrong, words):
@@ -152,14 +186,14 @@ def test_states_that_do_not_fit_are_refused(solver, wrong, words):
 def test_a_state_that_moves_held_nodes_is_refused(solver):
     moved = state()
     moved.displacement[np.flatnonzero(solver.model.fixed)[0]] = 0.001
-    with pytest.raises(SolverError, match="moves fixed nodes"):
+    with pytest.raises(SolverError, match="fixed nodes"):
         solver.take_over(moved)
 
 
 def test_unknown_names_are_refused_with_the_known_ones():
-    with pytest.raises(SolverError, match="solver 'magic' is not one of fem, fem_nonlinear"):
+    with pytest.raises(SolverError, match=r"magic.*fem_nonlinear"):
         create_solver("magic", block((3, 3, 3)))
-    with pytest.raises(SolverError, match="solver fem_cg: speed: unknown key; known keys: "):
+    with pytest.raises(SolverError, match=r"fem_cg: speed: .*iterations"):
         create_solver("fem_cg", block((3, 3, 3)), speed=3)
 
 
@@ -173,19 +207,84 @@ def test_a_solver_that_is_not_asked_for_is_not_imported():
     assert ran.stdout.strip() == "[]"
 
 
-def test_a_tissue_that_goes_on_failing_is_put_to_rest(solver, monkeypatch):
-    solver.deform(PRESSED)
-    advance = type(solver)._advance
+@pytest.mark.parametrize("name", [name for name in SOLVERS if SOLVERS.load(name).must_be_held])
+def test_tissue_that_is_not_held_is_refused(name):
+    with pytest.raises(SolverError, match="0 fixed nodes"):
+        create_solver(name, block((3, 3, 3), held=()))
 
-    def fail(self, pose):
-        deformation = advance(self, pose)
-        deformation.nodes[0] = np.nan
-        return deformation
 
-    with monkeypatch.context() as patch:
-        patch.setattr(type(solver), "_advance", fail)
-        actions = [solver.deform(Pose([0.0, 0.0, 0.001 * k])).action for k in range(5)]
-    assert all("last good state was kept" in action for action in actions[:4])
-    assert "put to rest" in actions[4]
-    assert not solver.state.displacement.any()
-    assert settled(solver, PRESSED, 60).residual < 0.1
+@pytest.mark.parametrize("held", [("top",), ("bottom", "top")])
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_held_nodes_are_passed_by(name, held):
+    model = block(held=held)
+    deformation = create_solver(name, model).deform(Pose(np.array([0.0, 0.0, 0.02])))
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+    assert len(deformation.contact_nodes) == 0
+
+
+@pytest.mark.parametrize("ratio", [0.2, 0.45])  # without and with averaged pressures
+@pytest.mark.parametrize("name", list(SOLVERS))
+def test_tissue_that_is_all_held_does_not_move(name, ratio):
+    materials = uniform_material(block_mesh((3, 3, 3)), Material(10e3, ratio))
+    model = replace(block((3, 3, 3), materials=materials), fixed=np.ones(27, dtype=bool))
+    deformation = create_solver(name, model).deform(PRESSED)
+    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
+    assert deformation.residual == 0
+    assert not deformation.force.any()
+
+
+OUT_OF_RANGE = {
+    "fem": {"contact": ["glued"], "friction": [-0.1]},
+    "fem_nonlinear": {
+        "most_iterations": [0, True],
+        "tolerance": [0.0, float("nan")],
+        "frame_tolerance": [1.5, "0.1 mm"],
+        "frame_budget": [0.0, "0.1 ms", 11.0],
+        "contact": ["glued"],
+        "friction": [-0.1, 11.0],
+        "viscosity": [-0.1],
+        "relaxation_time": [0.0],
+        "frame_interval": [0.0],
+    },
+    "fem_cg": {
+        "iterations": [0, 2.5, True],
+        "contact_updates": [0],
+        "tolerance": [0.0, 1.5, "tiny", float("nan")],
+    },
+    "msds": {
+        "steps": [0],
+        "maximum_substeps": [-1],
+        "time_step": [0.0, "10 mm"],
+        "stiffness_factor": [-0.002],
+        "damping_factor": [-0.1, float("inf")],
+        "rest_tolerance": [float("nan")],
+        "stabilisation": ["hope"],
+        "stiffness": ["stiff"],
+        "volume": [1],
+    },
+    "msds_implicit": {
+        "iterations": [0],
+        "contact_updates": [2.5],
+        "tolerance": [1.5],
+        "time_step": [0.0, "10 mm"],
+        "stiffness": ["stiff"],
+        "volume": ["yes"],
+        "stiffness_factor": [-0.002],
+        "damping_factor": [-0.1],
+        "rest_tolerance": [float("nan")],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        (name, key, value)
+        for name, wrong in OUT_OF_RANGE.items()
+        for key, values in wrong.items()
+        for value in values
+    ],
+)
+def test_settings_out_of_range_are_refused_by_their_key(name, key, value):
+    with pytest.raises(SolverError, match=rf"^{name}\.{key}: "):
+        SOLVERS.load(name).Settings(**{key: value})

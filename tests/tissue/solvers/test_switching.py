@@ -118,7 +118,7 @@ def test_another_material_takes_over_where_the_tissue_is(model):
 
 def test_a_solver_is_not_compared_with_itself_nor_with_an_unknown_one(model):
     tissue = SwitchableTissue(model, "fem_cg")
-    with pytest.raises(SolverError, match="in use already"):
+    with pytest.raises(SolverError, match="fem_cg"):
         tissue.compare_with("fem_cg")
     with pytest.raises(SolverError, match="magic"):
         tissue.compare_with("magic")
@@ -131,7 +131,7 @@ def test_tissue_that_is_not_held_is_refused_before_anything_is_compiled(model, m
     tissue = SwitchableTissue(replace(model, fixed=np.zeros_like(model.fixed)), "msds")
     monkeypatch.setattr(switching, "compiled_solver", None)
     for name in ("fem", "fem_cg", "fem_nonlinear"):
-        with pytest.raises(SolverError, match="around node 0 has 0 fixed nodes"):
+        with pytest.raises(SolverError, match="0 fixed nodes"):
             tissue.use(name)
     assert tissue.name == "msds"
 
@@ -236,7 +236,7 @@ def test_another_process_compiles_and_this_one_loads(slow):
 def test_where_the_other_process_fails_this_one_compiles(slow, monkeypatch, caplog):
     monkeypatch.setenv("ALONE", str(os.getpid()))
     assert prepared(slow) == (SAID, 0)
-    assert "slow is compiled in this process: OSError: no more memory" in caplog.text
+    assert "no more memory" in caplog.text
 
 
 def test_a_solver_that_no_other_process_can_import_is_compiled_here(slow):
