@@ -1,7 +1,7 @@
 """How the whole suite runs, and fixtures shared by all tests."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,18 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real data: {folder} is not a folder; set US_SIM_TEST_DATA to one")
     return folder
+
+
+@pytest.fixture(scope="session")
+def shared_file(shared_data: Path) -> Callable[[str], Path]:
+    """Find a file or folder among the real recordings; without it the test is skipped."""
+
+    def find(name: str) -> Path:
+        if not (shared_data / name).exists():
+            pytest.skip(f"no {shared_data / name}")
+        return shared_data / name
+
+    return find
 
 
 SMALL_SCENE = Path(__file__).with_name("small_scene.yaml")

@@ -117,8 +117,7 @@ def test_labels_that_are_not_there_are_named(organ):
         },
         origin="my.yaml",
     )
-    words = r"my.yaml: structures.stone: label: the volume has no label `kidney`; it has skin, .*"
-    with pytest.raises(SceneError, match=words):
+    with pytest.raises(SceneError, match=r"my.yaml: structures.stone: .*`kidney`.*skin, "):
         require_labels(unknown, volume)
 
 
@@ -129,9 +128,9 @@ def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, shared_data)
             folders=[shared_data / "meshes-sofa"],
         )
 
-    with pytest.raises(MeshError, match=r"truthcylinder1.msh: the mesh is 35.6 m long, and no"):
+    with pytest.raises(MeshError, match=r"truthcylinder1\.msh: .*35\.6 m"):
         tissue_model_of(scene({"file": "truthcylinder1.msh"}), volume_of(organ))
-    with pytest.raises(MeshError, match=r"liver.vtk: this is not a tetrahedral mesh"):
+    with pytest.raises(MeshError, match=r"liver\.vtk: .*tetrahedral"):
         tissue_model_of(scene({"file": "liver.vtk"}), volume_of(organ))
 
 
@@ -148,12 +147,6 @@ def scene_with(tmp_path, small_scene):
         return load_scene(file)
 
     return scene
-
-
-def refusal(scene):
-    with pytest.raises(SceneError) as caught:
-        blood_of(scene, volume_of(scene))
-    return str(caught.value)
 
 
 def test_the_arm_has_blood_in_its_vein_and_its_artery():
@@ -175,36 +168,30 @@ def test_a_flow_of_another_label_than_its_structures_name(scene_with):
     assert "with blood in deep" in scene.parts()[3].reason
 
 
-def test_what_is_no_tube_is_refused_with_file_key_and_reason(scene_with):
-    scene = scene_with(structures={"muscle": {"flow": FLOW}})
-    text = refusal(scene)
-    assert text.startswith(f"{scene.origin}: structures.muscle.flow: the structure ")
-    assert text.endswith(": a flow needs a tube")
-
-
-def test_a_flow_across_its_vessel_and_one_of_no_label_are_refused(scene_with):
-    across = scene_with(structures={"vein": {"flow": FLOW | {"direction": [1, 0, 0]}}})
-    assert "structures.vein.flow.direction: [1.0, 0.0, 0.0] is across the" in refusal(across)
-    nowhere = scene_with(structures={"aorta": {"flow": FLOW}})
-    assert "structures.aorta: the volume has no label `aorta`" in refusal(nowhere)
+@pytest.mark.parametrize(
+    ("name", "own", "fact"),
+    [
+        ("muscle", {}, r"muscle\.flow: .*tube"),
+        ("vein", {"direction": [1, 0, 0]}, r"vein\.flow\.direction: \[1\.0, 0\.0, 0\.0\]"),
+        ("aorta", {}, "aorta: .*`aorta`"),
+    ],
+)
+def test_what_cannot_flow_is_refused_with_file_key_and_reason(scene_with, name, own, fact):
+    scene = scene_with(structures={name: {"flow": FLOW | own}})
+    with pytest.raises(SceneError, match=rf"^{scene.origin}: structures\.{fact}"):
+        blood_of(scene, volume_of(scene))
 
 
 @pytest.mark.parametrize(
-    ("keys", "sentence"),
+    ("keys", "fact"),
     [
-        ({"structures": {"vein": {"flow": {**FLOW, "kind": "lymph"}}}}, "flow.kind: 'lymph' is no"),
-        ({"structures": {"vein": {"flow": {"kind": "venous"}}}}, "flow.direction: is missing"),
-        ({"colour": {"nyquist_velocity": 0}}, "colour.nyquist_velocity: 0 m/s is outside"),
+        ({"structures": {"vein": {"flow": {**FLOW, "kind": "lymph"}}}}, r"flow\.kind: 'lymph'"),
+        ({"structures": {"vein": {"flow": {"kind": "venous"}}}}, r"flow\.direction: "),
+        ({"structures": {"vein": {"file": "vein.stl", "flow": FLOW}}}, r"vein\.flow: .*label"),
+        ({"colour": {"nyquist_velocity": 0}}, r"colour\.nyquist_velocity: 0 m/s"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_with_file_and_key(scene_with, keys, sentence):
-    with pytest.raises(SceneError) as caught:
-        scene_with(**keys)
-    assert sentence in str(caught.value)
-    assert "flow.yaml: " in str(caught.value)
-
-
-def test_a_surface_from_a_file_has_no_room_for_blood(scene_with, tmp_path):
+def test_settings_that_cannot_be_are_refused_with_file_and_key(scene_with, tmp_path, keys, fact):
     (tmp_path / "vein.stl").write_text("")
-    with pytest.raises(SceneError, match=r"structures.vein.flow: is for structures around a label"):
-        scene_with(structures={"vein": {"file": "vein.stl", "flow": FLOW}})
+    with pytest.raises(SceneError, match=rf"flow\.yaml: .*{fact}"):
+        scene_with(**keys)

@@ -227,43 +227,40 @@ def test_a_volume_and_a_tissue_of_its_own_may_take_a_cases_volume(tmp_path, case
     assert scene.volume.name == "case block"
 
 
+PROBE = "probe: {depth: 4 cm, aperture: 3 cm}\n"
+
+
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "fact"),
     [
-        ("case: blok\n", "there is no case blok; cases are block in"),
-        ("case: 3\n", "must be a text, not 3: name a case"),
-        ("case: ../../../../etc\n", "there is no case"),
-        ("name: a\nvolume: {case: blok}\nprobe: {depth: 4 cm, aperture: 3 cm}\n", "volume.case"),
-        (
-            "name: a\nvolume: {case: block, phantom: upper_arm}\n"
-            "probe: {depth: 4 cm, aperture: 3 cm}\n",
-            "has both `case` and `phantom`",
-        ),
-        ("case: block\ntissue: {mesh: {nodes: 10}}\n", "10 make no box: give 64 or more"),
-        ("case: block\ntissue: {mesh: {nodes: [500, 4, 4]}}\n", "500 is outside 2 to 400"),
-        ("case: block\ntissue: {mesh: {planes: {x: [0, 1]}}}\n", "must be three numbers where"),
-        ("case: block\ntissue: {materials: {fat: {young_modulus: 1 kPa}}}\n", "no such label"),
+        ("case: blok\n", "blok.*block"),
+        ("case: 3\n", "not 3"),
+        ("case: ../../../../etc\n", "etc"),
+        (f"name: a\nvolume: {{case: blok}}\n{PROBE}", r"volume\.case"),
+        (f"name: a\nvolume: {{case: block, phantom: upper_arm}}\n{PROBE}", "`case` and `phantom`"),
+        ("case: block\ntissue: {mesh: {nodes: 10}}\n", "10 .*64"),
+        ("case: block\ntissue: {mesh: {nodes: [500, 4, 4]}}\n", "500 .* 2 to 400"),
+        ("case: block\ntissue: {mesh: {planes: {x: [0, 1]}}}\n", "three numbers"),
+        ("case: block\ntissue: {materials: {fat: {young_modulus: 1 kPa}}}\n", "such label"),
     ],
 )
-def test_wrong_cases_are_refused_in_a_sentence_that_names_the_scene(tmp_path, text, sentence):
-    file = scene_file(tmp_path, text)
-
-    def build():
+def test_wrong_cases_are_refused_in_a_sentence_that_names_the_scene(tmp_path, text, fact):
+    def build(file):
         scene = load_scene(file)
         tissue_model_of(scene, volume_of(scene))
 
-    with pytest.raises(UsSimError, match=str(file)) as refused:
-        build()
-    assert sentence in str(refused.value)
+    file = scene_file(tmp_path, text)
+    with pytest.raises(UsSimError, match=f"{file}.*{fact}"):
+        build(file)
 
 
 def test_a_case_that_is_broken_is_said_with_the_file_that_is(tmp_path, cases):
     shutil.copytree(cases / "block", tmp_path / "broken")
     (tmp_path / "broken" / "case.yaml").write_text("name: a\nprobes: 3\n")
-    with pytest.raises(SceneError, match=r"broken/case\.yaml: probes: unknown key"):
+    with pytest.raises(SceneError, match=r"broken/case\.yaml: probes: "):
         load_scene(f"case:{tmp_path / 'broken'}")
     os.symlink(tmp_path / "loop", tmp_path / "loop")
-    with pytest.raises(SceneError, match="there is no case"):
+    with pytest.raises(SceneError, match="loop"):
         load_scene(f"case:{tmp_path / 'loop'}")
 
 
@@ -376,7 +373,7 @@ def test_what_the_mesher_cannot_do_is_said_in_a_sentence(volume, monkeypatch):
 
     given = scene(1000, "conforming")
     monkeypatch.setattr("us_sim.tissue.mesh.conforming.subprocess.run", slow)
-    with pytest.raises(MeshError, match=r"fTetWild made no mesh .*kind: grid"):
+    with pytest.raises(MeshError, match="fTetWild"):
         conforming_tissue(given, volume)
     crashed = subprocess.CompletedProcess([], -11, b"", b"")
     monkeypatch.setattr("us_sim.tissue.mesh.conforming.subprocess.run", lambda *_, **__: crashed)

@@ -85,8 +85,8 @@ def test_without_regions_a_person_decides(cine, tmp_path, capsys):
     out.parent.mkdir()
     assert main(["import", str(cine), "--out", str(out)]) == 1
     said = capsys.readouterr().err
-    assert "there is no sequence of ultrasound regions" in said
-    assert "--crop 0,0,79,59 (a proposal), or --keep-whole-image" in said
+    assert "ultrasound regions" in said
+    assert "--crop 0,0,79,59 (a proposal)" in said
     assert not list(out.parent.iterdir())
     assert main(["import", str(cine), "--out", str(out), "--keep-whole-image"]) == 0
 
@@ -94,10 +94,10 @@ def test_without_regions_a_person_decides(cine, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("edges", "kind", "doubt"),
     [
-        ((0, 0, 90, 59), (1, 1), "reaches to 90,59 in an image of 80 × 60"),
-        ((50, 0, 40, 59), (1, 1), "holds no pixel"),
-        ((0, 0, None, 59), (1, 1), "has no edges"),
-        ((0, 0, 79, 59), (3, 3), "no region is a two-dimensional image"),
+        ((0, 0, 90, 59), (1, 1), "90,59 .* 80 × 60"),
+        ((50, 0, 40, 59), (1, 1), "no pixel"),
+        ((0, 0, None, 59), (1, 1), "no edges"),
+        ((0, 0, 79, 59), (3, 3), "two-dimensional"),
     ],
 )
 def test_regions_that_cannot_be_true_are_not_believed(tmp_path, edges, kind, doubt):
@@ -189,10 +189,8 @@ def test_nothing_is_promised_that_was_not_looked_at(tmp_path):
     ],
 )
 def test_the_size_of_pixels_is_what_the_header_or_a_person_says(tmp_path, values, options, size):
-    path, out = (
-        write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values)),
-        tmp_path / "a.mha",
-    )
+    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values))
+    out = tmp_path / "a.mha"
     made = import_files([path], out, ImportSettings(keep_whole_image=True, **options))
     assert sitk.ReadImage(str(out)).GetSpacing()[:2] == size
     stated = "Spacing" in " ".join(values)
@@ -232,10 +230,8 @@ def test_of_several_volumes_the_one_of_that_number_is_imported(tmp_path):
     assert (read_volume(tmp_path / "o.nrrd").intensities == 7).all()
 
 
-def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_data, tmp_path):
-    folder = shared_data / "foreign-files"
-    if not folder.exists():
-        pytest.skip(f"no {folder}")
+def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_file, tmp_path):
+    folder = shared_file("foreign-files")
     with pytest.raises(VolumeError, match="may be text"):
         import_files([folder / "burned_in_stack.nrrd"], tmp_path / "a.nrrd")
     whole = ImportSettings(keep_whole_image=True)
@@ -246,11 +242,11 @@ def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_data, tmp_p
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--spacing", "0"], "two or three numbers"),
-        (["--spacing", "1,1,1"], "two for 2D images"),
-        (["--crop", "0,0,80,59"], "last column is 79"),
-        (["--crop", "5,5,4,9"], "holds no pixel"),
-        (["--crop", "5;5;4;9"], "is no rectangle"),
+        (["--spacing", "0"], "three numbers"),
+        (["--spacing", "1,1,1"], "2D images"),
+        (["--crop", "0,0,80,59"], "79"),
+        (["--crop", "5,5,4,9"], "no pixel"),
+        (["--crop", "5;5;4;9"], "rectangle"),
         (["--crop", "0,0,9,9", "--keep-whole-image"], "keep one"),
         (["--volume", "0"], "volume"),
     ],
@@ -265,17 +261,17 @@ def test_wrong_options_are_refused(cine, tmp_path, more, message, capsys):
 
 @pytest.mark.parametrize("name", ["case", "a.nrrd", "a.nii.gz"])
 def test_a_cine_is_no_volume(cine, tmp_path, name):
-    with pytest.raises(VolumeError, match="cine of 4 images"):
+    with pytest.raises(VolumeError, match="4 images"):
         import_files([cine], tmp_path / name, ImportSettings(keep_whole_image=True))
     assert list(tmp_path.iterdir()) == [cine]
 
 
 def test_what_is_there_is_not_replaced_and_names_must_fit(volume, tmp_path):
     (tmp_path / "a.nrrd").write_text("mine")
-    with pytest.raises(VolumeError, match="exists already"):
+    with pytest.raises(VolumeError, match=r"a\.nrrd"):
         import_files([volume], tmp_path / "a.nrrd")
     assert (tmp_path / "a.nrrd").read_text() == "mine"
-    with pytest.raises(VolumeError, match="ends as no volume's does"):
+    with pytest.raises(VolumeError, match=r"a\.stl"):
         import_files([volume], tmp_path / "a.stl")
     with pytest.raises(UsSimError, match=r"cannot be (written|made)"):
         import_files([volume], Path("/proc/nowhere/a.nrrd"))
@@ -285,17 +281,15 @@ def test_files_that_do_not_go_together_are_refused(volume, tmp_path):
     other = tmp_path / "a.nrrd"
     sitk.WriteImage(sitk.Image([4, 4, 4], sitk.sitkUInt8), str(other))
     (tmp_path / "note.txt").write_text("hello")
+    (tmp_path / "empty").mkdir()
     for files, message in (
-        ([volume, other], "is no DICOM file"),
-        ([tmp_path / "note.txt"], "is no DICOM file"),
-        ([tmp_path / "nowhere.dcm"], "there is no such file"),
+        ([volume, other], "no DICOM"),
+        ([tmp_path / "note.txt"], "no DICOM"),
+        ([tmp_path / "empty"], "no DICOM"),
+        ([tmp_path / "nowhere.dcm"], "no such file"),
     ):
         with pytest.raises(VolumeError, match=message):
             look_at(files, None, ImportSettings())
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    with pytest.raises(VolumeError, match="has no DICOM files in it"):
-        look_at([empty], None, ImportSettings())
 
 
 def test_a_damaged_image_leaves_nothing_behind(tmp_path):
@@ -326,7 +320,7 @@ def test_the_report_is_printed_and_written_with_its_picture(cine, tmp_path, caps
     picture = cv2.imread(str(folder / "first_image.png"))
     assert picture.shape == (60, 80, 3)
     assert main(["import", str(cine), "--report", str(folder)]) == 1
-    assert "holds a report already" in capsys.readouterr().err
+    assert "a report already" in capsys.readouterr().err
     assert main(["import", str(cine)]) == 1
     assert "say where to" in capsys.readouterr().err
 
@@ -404,10 +398,8 @@ SEEN = {
 
 
 @pytest.mark.parametrize("name", SEEN)
-def test_words_in_real_images_are_found(shared_data, name):
-    path = shared_data / "dicom-us-2d" / f"{name}.dcm"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_words_in_real_images_are_found(shared_file, name):
+    path = shared_file(f"dicom-us-2d/{name}.dcm")
     image = next(GreyImages([open_dicom(path)]).images())
     covered = np.zeros(image.shape, bool)
     for line in find_text([image]):
@@ -416,10 +408,8 @@ def test_words_in_real_images_are_found(shared_data, name):
         assert covered[top:bottom, left:right].mean() > 0.25, word
 
 
-def test_a_sweep_without_text_has_none(shared_data):
-    folder = shared_data / "imfusion-liver-sweep"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_a_sweep_without_text_has_none(shared_file):
+    folder = shared_file("imfusion-liver-sweep")
     frames = list(read_sweep(folder / "liver_sweep.igs.mha").images(range(0, 140, 35)))
     assert find_text(frames) == []
     assert [find_text([frame]) for frame in frames[:2]] == [[], []]

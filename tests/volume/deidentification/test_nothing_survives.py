@@ -146,11 +146,9 @@ def test_of_every_file_that_comes_with_pydicom(tmp_path, own_words, monkeypatch)
 
 @pytest.mark.parametrize("number", range(6))
 def test_of_every_real_ultrasound_file(
-    shared_data, tmp_path, own_words, number, capsys, monkeypatch
+    shared_file, tmp_path, own_words, number, capsys, monkeypatch
 ):
-    folder = shared_data / "dicom-us-2d"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+    folder = shared_file("dicom-us-2d")
     monkeypatch.setattr(pixels, "decoded_frames", decoded_here)
     path = sorted(folder.glob("*.dcm"))[number]
     out = tmp_path / "out"

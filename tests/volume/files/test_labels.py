@@ -281,10 +281,8 @@ def test_no_name_of_a_patient_is_in_the_sentences(tmp_path):
     assert not re.search("Doe|Roe|Jane|Jim", f"{read.names} {read.remarks}")
 
 
-def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_data):
-    folder = shared_data / "foreign-files"
-    if not folder.exists():
-        pytest.skip(f"no {folder}")
+def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_file):
+    folder = shared_file("foreign-files")
     like = open_image(folder / "Segmentation.seg.nrrd")
     volume = Volume(np.zeros(like.shape, np.uint8), like.placement())
     read = read_labels(folder / "SegmentationOverlapping.seg.nrrd", volume)

@@ -150,10 +150,8 @@ def test_a_constant_image_is_dark_and_one_without_a_number_is_refused(tmp_path):
         read_volume(path)
 
 
-def test_the_real_liver_sweep(shared_data):
-    path = shared_data / "imfusion-liver-sweep" / "liver_sweep_compounded_1mm.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_the_real_liver_sweep(shared_file):
+    path = shared_file("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha")
     volume = read_volume(path)
     assert volume.shape == (237, 192, 154)
     np.testing.assert_allclose(
@@ -171,18 +169,14 @@ def test_the_real_liver_sweep(shared_data):
     assert volume.intensities.mean() == pytest.approx(stored.mean())
 
 
-def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_data):
-    path = shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_file):
+    path = shared_file("imfusion-liver-sweep/liver_sweep.igs.mha")
     with pytest.raises(VolumeError, match="tracked frames"):
         read_volume(path)
 
 
-def test_a_real_volume_in_which_plus_left_the_status_of_a_frame_is_a_volume(shared_data):
-    path = shared_data / "plus-spine-freehand" / "VolumeReconstructorTestNNMEANvolumeRef.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_a_real_volume_in_which_plus_left_the_status_of_a_frame_is_a_volume(shared_file):
+    path = shared_file("plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef.mha")
     assert b"Seq_Frame0000_ImageStatus" in path.open("rb").read(1000)
     volume = read_volume(path)
     assert volume.shape == (147, 106, 105)
@@ -583,10 +577,8 @@ def test_of_several_volumes_one_is_read_by_its_number(tmp_path):
         ("example_nifti2.nii.gz", (2.0, 2.0, 2.2), (-117.8551, 35.72294, -7.2488)),
     ],
 )
-def test_real_files_lie_where_other_programs_say(shared_data, name, spacing, origin):
-    path = shared_data / "foreign-files" / name
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_real_files_lie_where_other_programs_say(shared_file, name, spacing, origin):
+    path = shared_file(f"foreign-files/{name}")
     there = open_image(path).placement() * 1e3
     np.testing.assert_allclose(np.linalg.norm(there[:3, :3], axis=0), spacing, rtol=1e-6)
     np.testing.assert_allclose(there[:3, 3], origin, rtol=1e-5)

@@ -155,16 +155,16 @@ def test_a_mask_is_a_rectangle_and_a_fan():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"fan_origin": (1, 2)}, "fan_radius: is missing"),
-        ({"clip": (0, 0, 0, 5)}, "must have columns and rows"),
+        ({"fan_origin": (1, 2)}, "is missing"),
+        ({"clip": (0, 0, 0, 5)}, "columns and rows"),
         (
             {"fan_origin": (1, 2), "fan_radius": (5, 2), "fan_angles": (-1, 1)},
-            "fan_radius: 5 must be less than 2",
+            "less than 2",
         ),
     ],
 )
 def test_a_part_that_is_none_is_refused(values, message):
-    with pytest.raises(VolumeError, match=message.split(": ")[-1]):
+    with pytest.raises(VolumeError, match=message):
         ImagePart(**values)
 
 
@@ -180,9 +180,9 @@ def test_a_grid_that_is_too_large_is_refused_before_it_is_made(sweep, monkeypatc
     monkeypatch.setattr(grids, "free_memory", lambda: 1e5)
     for compounding in ("mean", "median"):
         how = dataclasses.replace(planned.compounding, compounding=compounding)
-        with pytest.raises(VolumeError, match="GB of memory"):
+        with pytest.raises(VolumeError, match="GB"):
             reconstruct(dataclasses.replace(planned, compounding=how))
-    with pytest.raises(VolumeError, match="smaller --spacing"):
+    with pytest.raises(VolumeError, match="--spacing"):
         grid_around(np.array([[0.0, 0, 0], [0.01, 0.01, 0.001]]), 0.005)
 
 
@@ -241,16 +241,16 @@ MATRIX = "0.1 0 0 5 0 0.1 0 0 0 0 0.1 0 0 0 0 1"
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.xml", "<a", "is not XML"),
-        ("a.xml", "<a/>", "holds no <Transform"),
-        ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a/>', "defines entities"),
-        ("a.xml", '<a><Transform From="I" To="P" Matrix="1 2"/></a>', "not 16 numbers"),
+        ("a.xml", "<a", "not XML"),
+        ("a.xml", "<a/>", "<Transform"),
+        ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a/>', "entities"),
+        ("a.xml", '<a><Transform From="I" To="P" Matrix="1 2"/></a>', "16 numbers"),
         ("a.xml", f'<a><Transform From="I" To="P" Matrix="{"0 " * 16}"/></a>', "singular"),
         (
             "a.xml",
             f'<a><Transform From="I" To="P" Matrix="{MATRIX}"/>'
             '<VolumeReconstruction FanAnglesDeg="4"/></a>',
-            "FanAnglesDeg is '4' where 2 numbers belong",
+            "FanAnglesDeg",
         ),
         (
             "a.xml",
@@ -258,11 +258,11 @@ MATRIX = "0.1 0 0 5 0 0.1 0 0 0 0 0.1 0 0 0 0 1"
             'FanAnglesDeg="-4 4" FanRadiusStartPixel="9" FanRadiusStopPixel="2"/></a>',
             "9 must be less than 2",
         ),
-        ("a.yaml", "position: [0, 0, 0]", "holds no image_to_body"),
-        ("a.yaml", "image_to_body: 3", "holds no image_to_body"),
-        ("a.yaml", "image_to_body: [[1, 2], [3, 4]]", "holds no image_to_body"),
-        ("a.yaml", "a: [", "neither XML nor YAML"),
-        ("a.yaml", None, "cannot be read: No such file"),
+        ("a.yaml", "position: [0, 0, 0]", "image_to_body"),
+        ("a.yaml", "image_to_body: 3", "image_to_body"),
+        ("a.yaml", "image_to_body: [[1, 2], [3, 4]]", "image_to_body"),
+        ("a.yaml", "a: [", "XML nor YAML"),
+        ("a.yaml", None, "No such file"),
     ],
 )
 def test_a_file_without_a_calibration_is_refused(tmp_path, name, text, message):
@@ -303,10 +303,8 @@ def within(made, reference, levels):
 
 
 @pytest.mark.parametrize("name", PLUS)
-def test_volumes_of_plus_come_out_as_plus_made_them(shared_data, name):
-    folder = shared_data / SPINE
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_volumes_of_plus_come_out_as_plus_made_them(shared_file, name):
+    folder = shared_file(SPINE)
     made, reference = of_plus(folder, name, plus_rounding=True)
     assert made.volume.shape == reference.shape
     # The file gives its place to six digits.
@@ -316,19 +314,15 @@ def test_volumes_of_plus_come_out_as_plus_made_them(shared_data, name):
         assert within(made, reference, 0) == 1.0
 
 
-def test_the_mean_is_two_levels_brighter_than_the_one_that_plus_rounds_down(shared_data):
-    folder = shared_data / SPINE
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_the_mean_is_two_levels_brighter_than_the_one_that_plus_rounds_down(shared_file):
+    folder = shared_file(SPINE)
     made, reference = of_plus(folder, "NNMEAN", compounding="mean")
     difference = made.volume.intensities.astype(int) - reference.intensities
     assert difference[made.covered].mean() == pytest.approx(2.4, abs=0.3)  # as its source says
 
 
-def test_the_liver_sweep_comes_out_as_others_compounded_it(shared_data):
-    folder = shared_data / LIVER
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_the_liver_sweep_comes_out_as_others_compounded_it(shared_file):
+    folder = shared_file(LIVER)
     reference = read_volume(folder / "liver_sweep_compounded_1mm.mha")
     sweep = read_sweep(folder / "liver_sweep.igs.mha")
     fan = ImagePart(

@@ -193,10 +193,8 @@ def test_the_curved_array_of_a_real_sweep_is_found_in_its_images(shared_data):
     assert np.linalg.norm(places - middle[:3], axis=1).min() < 2e-3
 
 
-def test_the_linear_array_of_a_real_sweep_is_found_in_its_images(shared_data):
-    folder = shared_data / "plus-spine-freehand"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+def test_the_linear_array_of_a_real_sweep_is_found_in_its_images(shared_file):
+    folder = shared_file("plus-spine-freehand")
     file = folder / "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml"
     calibration = read_calibration(file, "Probe")
     sequence = read_sequence(folder / "SpinePhantomFreehand.igs.mha")

@@ -147,10 +147,8 @@ def test_a_flat_sequence_of_two_dimensions_is_that_of_three(tmp_path):
     np.testing.assert_array_equal(list(read_sweep(path).images()), GREY[:, :, ::-1])
 
 
-def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_data):
-    path = shared_data / "foreign-files" / "NwirePhantomFreehand.igs.nrrd"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_file):
+    path = shared_file("foreign-files/NwirePhantomFreehand.igs.nrrd")
     sequence = read_sequence(path)
     assert (sequence.columns, sequence.rows, len(sequence)) == (820, 616, 97)
     stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))  # (row, column, frame)
@@ -174,10 +172,8 @@ def test_plus_rule_for_names():
         assert split_transform_name(name) == ends, name
 
 
-def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says(shared_data):
-    path = shared_data / "plus-spine-freehand" / "SpinePhantomFreehand.igs.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says(shared_file):
+    path = shared_file("plus-spine-freehand/SpinePhantomFreehand.igs.mha")
     sequence = read_sequence(path)
     calibration = np.diag([0.08, 0.08, 0.08, 1.0])
     calibration[:3, 3] = (15.4, 49.6, -8.6)  # mm
@@ -202,12 +198,12 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kinds": "list domain domain domain"}, "along another axis than the last"),
+        ({"kinds": "list domain domain domain"}, "another axis"),
         ({"kinds": "domain domain domain domain"}, "is a volume"),
-        ({"sizes": "5 4 2 3"}, "is a sequence of volumes"),
-        ({"sizes": "5 4 1 4000000"}, "says it holds 4000000 frames"),
-        ({"sizes": "5 4 1 8"}, "holds 60 bytes of image data where its header says 160"),
-        ({"sizes": "5 four 1 3"}, "where a sequence has columns, rows and frames"),
+        ({"sizes": "5 4 2 3"}, "of volumes"),
+        ({"sizes": "5 4 1 4000000"}, "4000000 frames"),
+        ({"sizes": "5 4 1 8"}, "60 bytes .* 160"),
+        ({"sizes": "5 four 1 3"}, "four"),
     ],
 )
 def test_an_nrrd_file_of_another_kind_is_refused(tmp_path, change, message):
@@ -353,9 +349,9 @@ def test_a_sequence_without_frames_in_its_name_is_in_ras(tmp_path):
 @pytest.mark.parametrize(
     ("file", "times", "said"),
     [
-        ("../outside.mrb", "s1:0", "does not lie beside it"),
+        ("../outside.mrb", "s1:0", "beside it"),
         ("none.mrb", "s1:0", "No such file"),
-        ("probe.seq.mrb", "s1:never", "cannot be understood"),
+        ("probe.seq.mrb", "s1:never", "never"),
         ("probe.seq.mrb", "other:1", "no sequence"),
         ("probe.seq.mrb", "s1:1", "is damaged"),
     ],

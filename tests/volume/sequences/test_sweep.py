@@ -69,28 +69,19 @@ def test_images_may_lie_in_a_file_beside_the_header(tmp_path):
         read_sweep(tmp_path / "a.mhd")
 
 
+UNUSABLE = "a transform that is singular or not finite"
+
+
 @pytest.mark.parametrize(
     ("broken", "reason"),
     [
         ({"ImageToReferenceTransform": None}, "no ImageToReferenceTransform"),
         ({"ImageToReferenceTransform": "1 0 0"}, "a transform that is not 16 numbers"),
         ({"ImageToReferenceTransform": "1 0 x " + "0 " * 13}, "a transform that is not 16 numbers"),
-        (
-            {"ImageToReferenceTransform": " ".join("0" * 16)},
-            "a transform that is singular or not finite",
-        ),
-        (
-            {"ImageToReferenceTransform": MATRIX.format(x="nan")},
-            "a transform that is singular or not finite",
-        ),
-        (
-            {"ImageToReferenceTransform": MATRIX.format(x="inf")},
-            "a transform that is singular or not finite",
-        ),
-        (
-            {"ImageToReferenceTransform": "1 1 0 0 1 1 0 0 0 0 1 0 0 0 0 1"},
-            "a transform that is singular or not finite",
-        ),
+        ({"ImageToReferenceTransform": " ".join("0" * 16)}, UNUSABLE),
+        ({"ImageToReferenceTransform": MATRIX.format(x="nan")}, UNUSABLE),
+        ({"ImageToReferenceTransform": MATRIX.format(x="inf")}, UNUSABLE),
+        ({"ImageToReferenceTransform": "1 1 0 0 1 1 0 0 0 0 1 0 0 0 0 1"}, UNUSABLE),
         (
             {"ImageToReferenceTransformStatus": "INVALID"},
             "ImageToReferenceTransformStatus is not OK",
@@ -125,17 +116,17 @@ def test_frames_that_the_header_does_not_describe_are_counted(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"DimSize": None}, "DimSize is ''"),
-        ({"DimSize": "5 4"}, "columns, rows and frames"),
-        ({"DimSize": "5 four 3"}, "columns, rows and frames"),
-        ({"DimSize": "5 4 4"}, "holds 60 bytes of image data where its header says 80"),
-        ({"DimSize": "0 0 3"}, "poses without images"),
-        ({"DimSize": "5 -4 3"}, "poses without images"),
+        ({"DimSize": None}, "DimSize"),
+        ({"DimSize": "5 4"}, "DimSize"),
+        ({"DimSize": "5 four 3"}, "DimSize"),
+        ({"DimSize": "5 4 4"}, "60 bytes .* 80"),
+        ({"DimSize": "0 0 3"}, "without images"),
+        ({"DimSize": "5 -4 3"}, "without images"),
         ({"DimSize": "5 2 2 3"}, "sequence of volumes"),
-        ({"ElementType": "MET_SHORT"}, "holds 60 bytes of image data where its header says 120"),
-        ({"ElementType": None}, "no ElementType"),
-        ({"ElementNumberOfChannels": "2"}, "holds 2 numbers per pixel"),
-        ({"UltrasoundImageOrientation": "AMF"}, "in the orientation 'AMF'"),
+        ({"ElementType": "MET_SHORT"}, "60 bytes .* 120"),
+        ({"ElementType": None}, "ElementType"),
+        ({"ElementNumberOfChannels": "2"}, "2 numbers"),
+        ({"UltrasoundImageOrientation": "AMF"}, "'AMF'"),
     ],
 )
 def test_a_sequence_of_another_kind_is_refused(tmp_path, fields, message):
@@ -149,8 +140,7 @@ def test_a_sequence_of_another_kind_is_refused(tmp_path, fields, message):
 def test_a_sequence_whose_images_are_not_calibrated_is_refused(tmp_path):
     fields = {"ImageToReferenceTransform": None, "ProbeToTrackerTransform": MATRIX.format(x=0)}
     path = _sequence(tmp_path / "a.mha", frames=dict.fromkeys(range(FRAMES), fields))
-    message = "from Image to Reference; the known ones are ProbeToTracker: .*calibration"
-    with pytest.raises(VolumeError, match=message):
+    with pytest.raises(VolumeError, match=r"Image to Reference.* ProbeToTracker: .*calibration"):
         read_sweep(path)
 
 
@@ -159,12 +149,12 @@ def test_damaged_compression_is_noticed_where_the_images_are_read(tmp_path):
     fields = {"CompressedData": "True", "CompressedDataSize": str(len(data))}
     data[20:40] = bytes(20)
     sweep = read_sweep(_sequence(tmp_path / "a.mha", bytes(data), **fields))
-    with pytest.raises(VolumeError, match="compression is broken"):
+    with pytest.raises(VolumeError, match="compression"):
         list(sweep.images())
     short = zlib.compress(GREY[:2].tobytes())
     fields["CompressedDataSize"] = str(len(short))
     sweep = read_sweep(_sequence(tmp_path / "b.mha", short, **fields))
-    with pytest.raises(VolumeError, match="holds 40 bytes"):
+    with pytest.raises(VolumeError, match="40 bytes"):
         list(sweep.images())
 
 
@@ -174,16 +164,13 @@ def test_what_is_no_sequence_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(VolumeError, match="give a sequence"):
             read_sweep(path)
-    with pytest.raises(VolumeError, match="there is no such file"):
-        read_sweep(tmp_path / "nowhere.mha")
-    with pytest.raises(VolumeError, match="there is no such file"):
-        read_sweep(tmp_path)
+    for path in (tmp_path / "nowhere.mha", tmp_path):
+        with pytest.raises(VolumeError, match="no such file"):
+            read_sweep(path)
 
 
-def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_data):
-    path = shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_file):
+    path = shared_file("imfusion-liver-sweep/liver_sweep.igs.mha")
     sweep = read_sweep(path)
     assert (sweep.columns, sweep.rows, len(sweep.numbers)) == (739, 593, 140)
     assert (sweep.times[0], sweep.times[-1]) == (0.0, 6.084)
@@ -201,17 +188,14 @@ def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_data):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("plus-spine-freehand/SpinePhantomFreehand.igs.mha", "known ones are ProbeToTracker, Ref"),
-        ("plus-tracker-recordings/ReferenceToRASCalibration.igs.mha", "poses without images"),
-        (
-            "plus-tracker-recordings/TransformInterpolationTest.igs.mha",
-            "known ones are ProbeToTracker, Ref",
-        ),
+        ("plus-spine-freehand/SpinePhantomFreehand.igs.mha", "ProbeToTracker, Ref"),
+        ("plus-tracker-recordings/ReferenceToRASCalibration.igs.mha", "without images"),
+        ("plus-tracker-recordings/TransformInterpolationTest.igs.mha", "ProbeToTracker, Ref"),
         (
             "plus-tracker-recordings/WaterTankBottomTranslationVideoBuffer.igs.mha",
             "no transforms",
         ),
-        ("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha", "holds no tracked frames"),
+        ("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha", "tracked frames"),
         ("plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef.mha", "is a volume"),
     ],
 )
@@ -225,9 +209,9 @@ def test_real_files_of_other_kinds_are_refused(shared_data, name, message):
 @pytest.mark.parametrize(
     ("size", "message"),
     [
-        ("100000 100000 3", "says it holds 3 images of 100000 × 100000 pixels"),
-        ("5 4 9000000000", "says it holds 9000000000 frames"),
-        (":5 4 3", "where a sequence has columns, rows and frames"),
+        ("100000 100000 3", "100000 × 100000"),
+        ("5 4 9000000000", "9000000000 frames"),
+        (":5 4 3", "DimSize"),
     ],
 )
 def test_a_sequence_that_says_it_is_vast_is_refused(tmp_path, size, message):

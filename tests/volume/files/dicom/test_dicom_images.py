@@ -26,11 +26,8 @@ def images(path):
 
 
 @pytest.fixture
-def real(shared_data):
-    folder = shared_data / "dicom-us-2d"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
-    return folder
+def real(shared_file):
+    return shared_file("dicom-us-2d")
 
 
 def test_a_real_palette_of_16_bits_is_as_pydicom_makes_it(real):
@@ -193,10 +190,8 @@ def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
         ("HTJ2K_08_RGB", (275, 635), (207, 193, 171)),
     ],
 )
-def test_jpeg_of_12_bits_and_htj2k_are_decoded(shared_data, name, at, value):
-    path = shared_data / "foreign-files" / f"{name}.dcm"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+def test_jpeg_of_12_bits_and_htj2k_are_decoded(shared_file, name, at, value):
+    path = shared_file(f"foreign-files/{name}.dcm")
     file = open_dicom(path)
     (stored,) = stored_frames(file, image_format(file), [0])
     np.testing.assert_array_equal(stored[at], value)

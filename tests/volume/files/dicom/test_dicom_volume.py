@@ -75,7 +75,7 @@ def test_each_volume_in_time_can_be_had(tmp_path):
     for time in (1, 2, 3):
         voxels = placed_images([path], volume=time).voxels()
         np.testing.assert_array_equal(voxels, VOXELS + np.uint8(time - 1))
-    with pytest.raises(VolumeError, match="holds 3 volumes in time; number 4"):
+    with pytest.raises(VolumeError, match=r"3 volumes .*4"):
         placed_images([path], volume=4)
 
 
@@ -211,12 +211,12 @@ def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path, tag, creator, 
     made = header(VOXELS[:, :, :1].transpose(2, 1, 0).copy(), US_IMAGE)
     made.add_new(tag, "LO", creator)
     path = write(tmp_path / "a.dcm", made)
-    with pytest.raises(VolumeError, match=f"private data of .*{remedy}"):
+    with pytest.raises(VolumeError, match=remedy):
         read_volume(path)
     del made.PixelData
     path = tmp_path / "b.dcm"
     made.save_as(path, enforce_file_format=True)
-    with pytest.raises(VolumeError, match=f"holds no image, but .*{remedy}"):
+    with pytest.raises(VolumeError, match=f"no image.*{remedy}"):
         read_volume(path)
 
 
@@ -224,9 +224,9 @@ def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path, tag, creator, 
     ("change", "message"),
     [
         (lambda g: g.pop(2), "not a volume"),
-        (lambda g: place(g[2], 0, 0.7), "apart, which is not even"),
-        (lambda g: place(g[2], 1, 3.0), "shifted against each other"),
-        (lambda g: g.__setitem__(2, g[1]), "not at every place as many"),
+        (lambda g: place(g[2], 0, 0.7), "not even"),
+        (lambda g: place(g[2], 1, 3.0), "shifted"),
+        (lambda g: g.__setitem__(2, g[1]), "every place"),
         (lambda g: place(g[4], 0, np.nan), "not a volume"),
     ],
 )
@@ -251,28 +251,26 @@ def test_directions_that_are_not_at_right_angles_are_refused(tmp_path):
     made = enhanced(VOXELS, PLACED)
     shared = made.SharedFunctionalGroupsSequence[0]
     shared.PlaneOrientationVolumeSequence[0].ImageOrientationVolume = [1, 0, 0, 0.5, 1, 0]
-    with pytest.raises(VolumeError, match="not at right angles"):
+    with pytest.raises(VolumeError, match="right angles"):
         read_volume(write(tmp_path / "a.dcm", made))
 
 
 def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
     paths = single_files(tmp_path)
-    with pytest.raises(VolumeError, match="is one slice of a volume"):
+    with pytest.raises(VolumeError, match="one slice"):
         read_volume(paths[0])
     made = pydicom.dcmread(paths[0])
     made.SeriesInstanceUID = pydicom.uid.generate_uid()
     made.save_as(paths[0])
-    with pytest.raises(VolumeError, match="of several series"):
+    with pytest.raises(VolumeError, match="several series"):
         placed_images(paths)
 
 
-def test_a_two_dimensional_file_says_what_to_do(shared_data):
-    folder = shared_data / "dicom-us-2d"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
-    with pytest.raises(VolumeError, match="cine of 30 images"):
+def test_a_two_dimensional_file_says_what_to_do(shared_file):
+    folder = shared_file("dicom-us-2d")
+    with pytest.raises(VolumeError, match="30 images"):
         read_volume(folder / "examples_ybr_color.dcm")
-    with pytest.raises(VolumeError, match=r"is a 2D image, not a volume"):
+    with pytest.raises(VolumeError, match="2D image"):
         read_volume(folder / "US1_UNCR.dcm")
 
 
@@ -315,11 +313,9 @@ def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
     np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, placed[:3, 3])
 
 
-@pytest.mark.parametrize(("name", "message"), [("MOVEKNEE.dcm", "19 images at one place")])
-def test_real_files_are_called_what_they_are(shared_data, name, message):
-    path = shared_data / "foreign-files" / name
-    if not path.exists():
-        pytest.skip(f"no {path}")
+@pytest.mark.parametrize(("name", "message"), [("MOVEKNEE.dcm", "19 images")])
+def test_real_files_are_called_what_they_are(shared_file, name, message):
+    path = shared_file(f"foreign-files/{name}")
     with pytest.raises(VolumeError, match=message):
         placed_images([path])
 
