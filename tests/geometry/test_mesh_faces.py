@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from us_sim.geometry.triangles import connected_parts
+from us_sim.geometry.mesh_faces import connected_parts
 
 
 @pytest.mark.parametrize("edges", [0, 5, 700, 1000, 3000])

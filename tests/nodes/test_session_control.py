@@ -8,12 +8,12 @@ from rclpy.parameter import Parameter
 
 from us_sim.errors import SceneError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.session_control import SessionControl
 from us_sim.nodes.session_monitor import TOLD, SessionMonitor
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.session import NOT_THERE, ViewerSession
+from us_sim.viewer.stream import Posted
 
 
 class Simulation:

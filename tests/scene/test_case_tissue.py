@@ -30,7 +30,7 @@ from us_sim.scene.case_tissue import keep_tissue, kept_tissue
 from us_sim.scene.conforming_tissue import conforming_tissue
 from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.settings.reading import Reader
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.tissue import read_tissue

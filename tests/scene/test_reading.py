@@ -16,7 +16,7 @@ from us_sim.scene.scene import ImagingSettings
 from us_sim.share import shared_path
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import Strain
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.volume.sequences.sweep import read_sweep
 
 COMPLETE = yaml.safe_load(

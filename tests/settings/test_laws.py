@@ -20,7 +20,7 @@ from us_sim.settings.choice import Choice
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 
 for choice in vars(registry).values():
     if isinstance(choice, Choice) and choice is not registry.PHANTOMS:

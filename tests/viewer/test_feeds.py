@@ -31,7 +31,6 @@ from us_sim.nodes.messages import (
     transducer_markers,
     wrench_message,
 )
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.feeds import (
@@ -42,7 +41,7 @@ from us_sim.viewer.feeds import (
     TissueFeeds,
     image_feeds,
 )
-from us_sim.viewer.stream import Feed, Packet
+from us_sim.viewer.stream import Feed, Packet, Posted
 
 
 class Watcher(GuardedNode):

@@ -20,12 +20,11 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.viewer.remote_parameters import RemoteParameters
 from us_sim.viewer.session import ViewerSession
 from us_sim.viewer.status import StatusListener
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import Posted, Simulator
 
 EVIL = " ".join(
     (

@@ -15,9 +15,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.posted import Posted
 from us_sim.viewer.remote_parameters import RemoteParameters
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import Posted, Simulator
 
 NODE = "slice_interpolator"
 

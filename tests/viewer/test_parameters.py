@@ -18,13 +18,13 @@ from rclpy.parameter import Parameter as RosParameter
 from us_sim.errors import SettingsError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.settings import TissueDeformerSettings
 from us_sim.settings.quantity import Quantity, dial_unit, units_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.slicing.settings import ColourSettings, Imaging
 from us_sim.viewer.parameters import Kind, Parameter, State, in_words
 from us_sim.viewer.remote_parameters import RemoteParameters
+from us_sim.viewer.stream import Posted
 
 QUANTITIES = [
     Quantity("length", 1e-4, 0.4),

@@ -12,8 +12,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.posted import Posted
 from us_sim.viewer.status import GONE_S, Level, NodeStatus, StatusBoard, StatusListener
+from us_sim.viewer.stream import Posted
 
 VALUES = {
     "state": "fem",

@@ -24,7 +24,6 @@ from us_sim.nodes.messages import (
     pose_message,
     tetrahedra_message,
 )
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.qos import LATCHED
 from us_sim.skin.surface import bent_surface, plane_surface
@@ -33,7 +32,7 @@ from us_sim.viewer.feeds import RestMesh
 from us_sim.viewer.hand import ViewerHand, ViewerSurface
 from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
 from us_sim.viewer.session import SessionBoard, SessionState
-from us_sim.viewer.stream import Feed, Simulator
+from us_sim.viewer.stream import Feed, Posted, Simulator
 
 
 class Stander(GuardedNode):

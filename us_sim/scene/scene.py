@@ -29,7 +29,7 @@ from us_sim.slicing.settings import (
     Strain,
 )
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.mesh.settings import MeshSettings
+from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tracking.settings import GateSettings
 from us_sim.volume.settings import VolumeSettings
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
+from us_sim.geometry.mesh_faces import boundary_triangles
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.triangles import boundary_triangles
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation

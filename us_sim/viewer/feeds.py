@@ -39,11 +39,10 @@ from us_sim.nodes.messages import (
     vectors_from,
     wrench_from,
 )
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.slicing.settings import STRIPS
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.viewer.stream import Feed, Packet
+from us_sim.viewer.stream import Feed, Packet, Posted
 from us_sim.viewer.surfaces import (
     CarriedSurfaces,
     ColouredSurface,

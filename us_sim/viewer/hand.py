@@ -28,7 +28,6 @@ from us_sim.errors import MessageError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.settings.spelling import shown
@@ -36,7 +35,7 @@ from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance
 from us_sim.viewer.feeds import RestMesh, Subscriptions
 from us_sim.viewer.session import SessionState
-from us_sim.viewer.stream import Feed, Packet, Simulator
+from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
 
 HOME_PRESS = 1e-3
 """m: where the probe begins it touches, so that there is an image."""

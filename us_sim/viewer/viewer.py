@@ -11,7 +11,6 @@ import numpy as np
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.posted import Posted
 from us_sim.nodes.process import run_node
 from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.viewer.access import is_loopback
@@ -29,7 +28,7 @@ from us_sim.viewer.remote_parameters import RemoteParameters
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.session import CONTROL, ViewerSession
 from us_sim.viewer.status import StatusListener
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.stream import Posted, Simulator
 
 _IMAGED_WITH = ("gain", "dynamic_range", "focus")
 """Parameters of ``slice_interpolator`` that pages are told with each image."""

@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from us_sim.geometry.triangles import face_order
+from us_sim.geometry.mesh_faces import face_order
 from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.cut_polygons import (
     NO_OUTLINE,

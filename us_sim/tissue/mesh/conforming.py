@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError
-from us_sim.geometry.triangles import boundary_triangles, vertex_normals
+from us_sim.geometry.mesh_faces import boundary_triangles
+from us_sim.geometry.triangles import vertex_normals
 from us_sim.tissue.mesh import wild_mesher
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, repair, signed_volumes
 

@@ -12,7 +12,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import shown, unknown
 from us_sim.tissue.elasticity.material import KINDS, Material, kind_of
-from us_sim.tissue.mesh.settings import KINDS as KINDS_OF_MESH
+from us_sim.tissue.mesh.tetrahedral_mesh import KINDS as KINDS_OF_MESH
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
 AROUND = "tissue"
