@@ -203,8 +203,9 @@ def test_axe_finds_no_violation(opened: Open, size: tuple[int, int], touch: bool
         check(tab)
     page.get_by_role("button", name="probe_tracker").click()
     page.get_by_role("dialog", name="Parameters of probe_tracker").wait_for()
-    page.wait_for_function(
-        "document.querySelector('.q-dialog__inner').getAnimations().length === 0"
+    page.wait_for_function(  # faded in: until then its colours are those of both
+        "[...document.querySelectorAll('.q-dialog__inner')].every(each =>"
+        " !/-(enter|leave)-/.test(each.className) && !each.getAnimations({ subtree: true }).length)"
     )
     check("dialog of a node")
 
