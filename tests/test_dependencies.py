@@ -87,7 +87,7 @@ def test_the_installed_versions_have_all_that_is_used(folder):
                 missing.add((file.name, name))
             elif keywords and (known := parameters(name)) is not None:
                 missing |= {(file.name, name, each) for each in keywords - known}
-    either = {("video_source.py", f"cv2.utils.logging{end}") for end in ("", ".setLogLevel")}
+    either = {("source.py", f"cv2.utils.logging{end}") for end in ("", ".setLogLevel")}
     assert missing - either == set()
 
 
