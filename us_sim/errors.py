@@ -35,7 +35,7 @@ class UsSimError(Exception):
     key: str = ""
     """The setting that is wrong, where it is one: its path of keys below the section."""
     problem: str = ""
-    """What is wrong with it."""
+    """The fault of that key."""
 
     def __str__(self) -> str:
         """The sentence in one line, whatever the names in it are made of."""

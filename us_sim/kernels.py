@@ -50,7 +50,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     """
 
     def decorate(kernel: Callable[..., Any]) -> Any:
-        # What C could call is a second copy of the kernel, and nothing here is called from C.
+        # A wrapper for C is a second copy of the kernel, and nothing here is called from C.
         dispatcher = numba.njit(**{**options, "no_cfunc_wrapper": True})(kernel)
         if cache and isinstance(dispatcher, Dispatcher):
             dispatcher._cache = _KernelCache(kernel)  # type: ignore[attr-defined]

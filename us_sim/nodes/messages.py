@@ -219,7 +219,7 @@ def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> by
 
 
 _CONTACT_PARTS = (("stamp", 2), ("pose", 7), ("wrench", 6), ("stiffness", 36))
-"""What a model of the contact holds: seconds and nanoseconds; position and quaternion of the probe;
+"""Numbers of a contact model: seconds and nanoseconds; position and quaternion of the probe;
 force and torque; six rows of six."""
 
 
@@ -532,7 +532,7 @@ _MARKER_TAIL = struct.pack(
     "@II1siII1sI1sIII1sI1sI1sI?",
     *(0, *_EMPTY, 0, 0, *_EMPTY, *_EMPTY, 0, 0, *_EMPTY, *_EMPTY, *_EMPTY, 0, False),
 )
-"""What a Marker has after its points: colors, textures, text and meshes, all empty."""
+"""Fields of a Marker after its points: colors, textures, text and meshes, all empty."""
 
 
 def surface_marker(

@@ -48,7 +48,7 @@ def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
     before = os.environ.get(_RANGE)
     os.environ[_RANGE] = "OFF"
-    # What is wrong with the node is said when it is made in earnest.
+    # A fault of the node is reported when it is made in earnest.
     with contextlib.suppress(Exception):
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         create().destroy_node()

@@ -25,7 +25,7 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""What is published once, for those who come later too."""
+"""Topics published once, for later subscribers too."""
 
 CATALOGUE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,

@@ -20,7 +20,7 @@ from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
 _FLOWING = ("position", "fraction", "record_seconds", "record_bytes", "record_room_bytes")
-"""What changes all the time, and is told once a second."""
+"""Values that change all the time, and are published once a second."""
 
 
 class Controlled(Protocol):

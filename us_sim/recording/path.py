@@ -367,7 +367,7 @@ def _usable(bag: Bag, read: _Read) -> ProbePath:
             f"{bag.path} holds poses on {read.name} in the frames {', '.join(read.frames)}: a path "
             f"has one frame"
         )
-    # What geometry.pose.Pose refuses; a zero quaternion is what a tracker sends for a lost marker.
+    # As geometry.pose.Pose refuses it; trackers send a zero quaternion for a lost marker.
     with np.errstate(invalid="ignore"):
         has_orientation = np.linalg.norm(poses[:, 3:], axis=1) >= 1e-6
     usable = np.isfinite(poses).all(axis=1) & has_orientation

@@ -33,7 +33,7 @@ class SweepPicture:
     def __init__(
         self, rows: int, columns: int, sweep: float, scale: tuple[float, float, str]
     ) -> None:
-        #: What pictures have in common whose columns can stand side by side.
+        #: Properties that pictures share whose columns can stand side by side.
         self.layout = rows, columns, sweep, scale
         self._grey = np.zeros((rows, columns), np.uint8)
         self._duration = sweep / columns

@@ -21,10 +21,10 @@ HOPS = {
     "skin/nodes": PointCloud2,
     "ultrasound/image": Image,
 }
-"""What carries the stamp of the tracker's pose, in the order in which it is made."""
+"""Topics that carry the stamp of the tracker's pose, in the order of the graph."""
 
 EYE = {"tissue/structures": MarkerArray, "ultrasound/image_annotated": Image}
-"""What is computed only where somebody looks."""
+"""Topics that are computed only for subscribers."""
 
 _HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
 

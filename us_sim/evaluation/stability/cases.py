@@ -225,7 +225,7 @@ def _stiff(mesh: TetrahedralMesh, layout: str) -> NDArray[np.bool_]:
 
 
 SUPPORTS = ("bottom", "walls", "three", "one piece", "nothing", "everything")
-"""What of a tissue is held."""
+"""Held parts of a tissue."""
 
 
 @lru_cache

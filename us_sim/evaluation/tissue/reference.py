@@ -288,7 +288,7 @@ def _trilinear(planes: Sequence[Array], points: Array) -> csr_array:
 _STRIDE = 0.005  # m, the least distance between the poses through which the last is approached
 
 _ARRAYS, _NUMBERS = ("displacement", "pressure", "force"), ("volume", "penetration")
-"""What is kept of a solution."""
+"""Arrays of a solution that are kept."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -220,7 +220,7 @@ class Browser:
 
 
 STREAMED = ("image", "skin_mesh", "skin", "structures_mesh", "structures", "probe", "hand")
-"""What the page shows when it is opened."""
+"""Contents of the page when it is opened."""
 COMMAND_RATE = 60.0
 """Commands a second of a hand that moves."""
 PRESS, PRESS_PERIOD = 0.006, 2.0

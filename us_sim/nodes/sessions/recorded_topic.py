@@ -133,7 +133,7 @@ def _adopted(offered: Iterable[QosProfile]) -> QoSProfile:
 
 
 _MESSAGE_TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
-"""What a message type of ROS 2 is called."""
+"""Pattern of a message type's name in ROS 2."""
 
 
 def message_type(name: str) -> Any:

@@ -35,7 +35,7 @@ class TrackerInput:
     """
 
     Settings: ClassVar[type[Settings]] = Settings
-    """What a scene can say of this source, under the source's own name in ``tracker``."""
+    """Settings of this source in a scene, under its own name in ``tracker``."""
 
     def __init__(self, device: Device, settings: Any) -> None:
         self._device = device

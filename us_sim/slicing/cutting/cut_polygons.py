@@ -361,7 +361,7 @@ def _cut(nodes, triangles, to_pixel, columns, rows, place, outlines, points, tur
             left = min(left, outline[k, 0])
             top = min(top, outline[k, 1])
             bottom = max(bottom, outline[k, 1])
-        # What lies left of the image winds around its pixels too.
+        # Parts left of the image wind around its pixels too.
         if bottom < -1.0 or top > rows or left > columns:
             continue
         points[count] = number

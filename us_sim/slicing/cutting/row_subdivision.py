@@ -97,7 +97,7 @@ def subdivide_rows(barycentric, starts, members, band, cell, first_row, end_row,
         elements: (rows, columns) int32, set to the tetrahedron of each pixel, E outside all.
         outside: (rows,) bool, set where a pixel of the row is outside.
     """
-    # What is one kind of number everywhere has `_locate` compiled once.
+    # One kind of number everywhere, so that `_locate` is compiled once.
     none = np.int32(len(barycentric))
     left = np.int64(0)
     columns = elements.shape[1]

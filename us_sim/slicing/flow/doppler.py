@@ -227,7 +227,7 @@ def _turn(velocity, nyquist, wall, turned):
             turned[row, column, 0] = 0.0
             turned[row, column, 1] = 0.0
             if not np.isnan(v):
-                # What the filter sees is aliased, too.
+                # The filter's input is aliased, too.
                 seen = v - 2.0 * nyquist * np.round(v / (2.0 * nyquist))
                 fast = seen**4
                 weight = fast / (fast + wall**4) if fast > 0.0 else 0.0

@@ -338,7 +338,7 @@ def compiled_solver(
         SolverError: as `create_solver`.
     """
     if elsewhere:
-        # What was made until then is let go before the other process makes it.
+        # The partial solver is released before the other process makes one.
         with (
             contextlib.suppress(_ColdError),
             event.install_listener("numba:compile", _Listener(_refuse)),

@@ -83,7 +83,7 @@ class Tuning:
 
     # Time and iterations of a frame (`us_sim.tissue.solvers.frame_budget`)
     newton_step_cost: int = 8
-    """What a Newton step costs besides its iterations, in iterations. Half: no change; twice: 1 %
+    """Cost of a Newton step besides its iterations, in iterations. Half: no change; twice: 1 %
     of the frames ended above 0.01, at up to 0.034."""
     overtime: float = 3.0
     """How many times its time a live frame may take that is not in balance: tissue that is left

@@ -176,7 +176,7 @@ def _homography(plane, rays, homography):
         trace += squares[a, a]
     if not solve_definite(squares, right):
         return False
-    # What is left of the diagonal by Cholesky's factor tells whether the points are enough.
+    # The rest of the diagonal by Cholesky's factor tells whether the points are enough.
     for a in range(8):
         if not squares[a, a] * squares[a, a] > 1e-10 * trace:
             return False

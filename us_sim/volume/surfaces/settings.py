@@ -9,7 +9,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
 SURFACE_FORMATS = ("stl", "ply", "vtp", "obj")
-"""What surfaces may be written as."""
+"""File formats of surfaces."""
 
 
 @dataclass(frozen=True)
