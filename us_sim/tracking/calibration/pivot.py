@@ -30,7 +30,7 @@ _PARTS = 12
 """Clusters at least, where features are divided."""
 
 _OWN = 1e-6
-"""The remainder of an error in a direction that a cluster alone determines; its residual is zero."""
+"""The rest of an error in a direction that a cluster alone determines; its residual is zero."""
 
 
 def cluster_numbers(features: Sequence[str]) -> NDArray[np.intp]:
