@@ -157,6 +157,7 @@ def test_methods_take_turns():
     timing, other = timed_together([contender("a"), contender("b")], [None], 0.0)
     assert order == (["a"] * 5 + ["b"] * 5) * 3
     assert timing["images"] == 15
+    assert 0.0 <= timing["ms_median"] <= timing["ms_p99"]
     assert other["filter_ms"] == 1.0
     assert other["sampling_ms"] == np.median([range(6, 11), range(16, 21), range(26, 31)])
 

@@ -21,6 +21,7 @@ from us_sim.evaluation.report import (
     filled,
     key_beside,
     markdown_table,
+    method_keys,
     number,
     picture,
     plain,
@@ -89,7 +90,10 @@ def evaluate_slice(out: Path, quick: bool, recorded: RecordedSweep | None = None
     probe_rows = [(name, f"{ms:.2f}", f"{100 * shown[name]:.0f} %") for name, ms in probes.items()]
     default = next(iter(settings.values()), 0.0)
     setting_rows = [(name, f"{ms:.2f}", f"{ms - default:+.2f}") for name, ms in settings.items()]
-    folder.write_report(
+    if not is_installed():
+        print(HOW_TO_GET)
+    return folder.finish(
+        table,
         failures(points),
         ("numpy", "scipy", "numba", "vtk"),
         without_vtk="" if any(p.method == "vtk" for p in points) else HOW_TO_GET + ".",
@@ -106,9 +110,6 @@ def evaluate_slice(out: Path, quick: bool, recorded: RecordedSweep | None = None
         settings=markdown_table(("imaging", "CPU ms", "more than at the defaults"), setting_rows),
         recorded=comparison.markdown() if comparison else "",
     )
-    if not is_installed():
-        print(HOW_TO_GET)
-    return folder.finish(table, failures(points))
 
 
 def _compared(recorded: RecordedSweep | None, out: Path, quick: bool) -> RecordedComparison | None:
@@ -325,11 +326,7 @@ def _times(panel: Axes, points: Sequence[Point], across: Callable[[Point], float
 
 
 def _keys(panel: Axes, known: set[str], two_threads: bool = True) -> None:
-    keys = [
-        Line2D([], [], color=method.colour, marker=method.mark, label=name)
-        for name, method in SLICING_METHODS.items()
-        if name in known
-    ]
+    keys = method_keys({name: SLICING_METHODS[name] for name in SLICING_METHODS if name in known})
     if two_threads:
         words = "two threads, wall clock"
         keys.append(Line2D([], [], color="0.4", ls="", marker="o", mfc="white", label=words))
