@@ -328,7 +328,7 @@ class ReportFolder:
         write_rows(self._out / f"{name}.csv", rows)
 
     def finish(
-        self, table: str, failures: Sequence[str], libraries: Sequence[str], **values: str
+        self, table: str, failures: Sequence[str], libraries: Sequence[str], /, **values: str
     ) -> int:
         """Write the report; print a table, the files, and the failures.
 

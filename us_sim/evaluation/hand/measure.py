@@ -153,6 +153,16 @@ class Motion:
         """The frame after the approach."""
         return round(APPROACH * RATE)
 
+    @property
+    def speeds(self) -> tuple[_Array, _Array]:
+        """m/s and rad/s, from each frame that counts to the next."""
+        poses = self.poses[self.begins :]
+        places = np.array([pose.position for pose in poses])
+        turns = np.array([pose.orientation for pose in poses])
+        cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
+        moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        return np.asarray(RATE * moved), np.asarray(RATE * 2 * np.arccos(cosine))
+
 
 def motions(quick: bool, seed: int) -> list[Motion]:
     """All motions that are measured, in order: a tissue's motions stand together.
@@ -411,12 +421,7 @@ def measure(
     frames = following.every_pose(progress)
     held = following.held()
     live = following.live()
-    poses = motion.poses[motion.begins :]
-    places = np.array([pose.position for pose in poses])
-    turns = np.array([pose.orientation for pose in poses])
-    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
-    speed = RATE * float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
-    turning = RATE * float(np.median(2 * np.arccos(cosine)))
+    speed, turning = (float(np.median(each)) for each in motion.speeds)
     return Point(motion, solver.name, speed, turning, frames, live, held)
 
 

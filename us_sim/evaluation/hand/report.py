@@ -252,20 +252,16 @@ def _plot_time(
 
 
 def _draw_motion(depth: Axes, speed: Axes, motion: Motion, answer: Converged) -> None:
-    poses = motion.poses[motion.begins :]
-    time = np.arange(len(poses)) / RATE
-    places = np.array([pose.position for pose in poses])
-    turns = np.array([pose.orientation for pose in poses])
+    depths = np.array([pose.position[2] for pose in motion.poses[motion.begins :]])
+    time = np.arange(len(depths)) / RATE
     depth.axhline(0.0, color="0.6", lw=1, label="skin")
-    depth.plot(time, 1e3 * places[:, 2], color="0.2", lw=1.3, label="middle of the probe's face")
+    depth.plot(time, 1e3 * depths, color="0.2", lw=1.3, label="middle of the probe's face")
     touching = answer.pressed[motion.begins :].tolist()
     look = {"color": "0.93", "zorder": 0, "label": "touching"}
     depth.fill_between(time, *depth.get_ylim(), where=touching, **look)  # type: ignore[arg-type]
-    moved = 1e3 * RATE * np.linalg.norm(np.diff(places, axis=0), axis=1)
-    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
-    speed.plot(time[1:], moved, color="0.2", lw=1.3, label="mm/s")
-    turned = np.degrees(RATE * 2 * np.arccos(cosine))
-    speed.plot(time[1:], turned, color="0.2", lw=1.0, ls="--", label="degrees/s")
+    moved, turned = motion.speeds
+    speed.plot(time[1:], 1e3 * moved, color="0.2", lw=1.3, label="mm/s")
+    speed.plot(time[1:], np.degrees(turned), color="0.2", lw=1.0, ls="--", label="degrees/s")
 
 
 def _plot_errors(points: Sequence[Point], chosen: Sequence[Motion], file: Path) -> None:
