@@ -142,7 +142,7 @@ class Motion:
 
     @cached_property
     def poses(self) -> list[Pose]:
-        """One a frame, select of the approach first."""
+        """One pose a frame, those of the approach first."""
         room = TISSUES[self.tissue].room
         return hand_motion(
             self.kind, self.haste, self.seed, self.duration, room, approach=APPROACH
@@ -305,7 +305,7 @@ class Live:
 
     @property
     def skipped(self) -> float:
-        """Fraction of the poses."""
+        """Fraction of the poses without a frame."""
         return 1.0 - len(self.frames.number) / self.poses if self.poses else math.nan
 
 
@@ -313,7 +313,7 @@ class Live:
 class Held:
     """Frames after the probe has stopped."""
 
-    residual: _Array = field(default_factory=_unknown)  # (K,), of the last frame before them first
+    residual: _Array = field(default_factory=_unknown)  # (K,), that of the frame before them first
     inverted: int = 0  # tetrahedra in the last of them
 
     def frames_to(self, residual: float) -> float:
@@ -551,7 +551,7 @@ class _Bench:
         self._broken: dict[Motion, str] = {}
 
     def answer(self, motion: Motion, progress: Callable[[int], None]) -> Converged:
-        """The converged answer; where it breaks, one of no frame."""
+        """The converged answer; where it fails, one that no frame is compared with."""
         try:
             return converged(TISSUES[motion.tissue].model, motion.poses, progress)
         # Whatever breaks on one tissue must not take the others' results along.

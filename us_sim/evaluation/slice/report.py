@@ -35,10 +35,10 @@ from us_sim.evaluation.slice.measure import (
     SLICING_METHODS,
     Bench,
     Point,
-    contender,
     costs,
     is_installed,
     methods,
+    slicer_of,
     wrong_pixels,
 )
 from us_sim.evaluation.slice.recorded import RecordedComparison, compare_with_recorded
@@ -351,7 +351,8 @@ def _draw_differences(volume: Volume, names: Sequence[str], file: Path) -> None:
             line[0].imshow(np.rint(exact.grey), cmap="gray", vmin=0, vmax=255)
             line[0].set_ylabel(f"{case.deformation}\n{PLANES[case.plane].words}", fontsize=8)
             for panel, name in zip(line[1:], names, strict=True):
-                rest = contender(volume, case, name, 1).rest_coordinates(frame)
+                slicer = slicer_of(name, 1, volume, mesh)
+                rest = slicer.rest_coordinates(frame.nodes, frame.plane)
                 tissue_only = SLICING_METHODS[name].tissue_only
                 right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
                 distance = np.where(right, voxel_distance(volume, rest, expected), np.nan)
