@@ -1,8 +1,6 @@
 """Progress through cases, times of functions that take turns, and frames until a tissue settles.
 
->>> from us_sim.evaluation.timing import frames_until, timed_cases
->>> timed_cases("halves", {1: 0.01, 0: 0.01}, lambda case, _: 1 / case, lambda _, words: words)
-[1.0, 'ZeroDivisionError: division by zero']
+>>> from us_sim.evaluation.timing import frames_until
 >>> frames_until([1.0, 1e-4, 0.5, 9e-4, 1e-6], 1e-3), frames_until([1.0], 1e-3)
 (3, None)
 """
@@ -16,11 +14,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import words_of
+from us_sim.evaluation.report import ReportFolder, Row, words_of
 from us_sim.progress import Progress
+from us_sim.run.live import prepare_volume
+from us_sim.run.processes import keep_on_this_host
+from us_sim.scene.reading import load_scene
 
 C = TypeVar("C")
-P = TypeVar("P")
 
 Tell = Callable[[float, str], None]
 """Takes how many s of a case are over, and the present activity."""
@@ -37,34 +37,37 @@ def steps(
         progress.update(len(work))
 
 
-def timed_cases(
-    subject: str,
-    seconds: Mapping[C, float],
-    run: Callable[[C, Tell], P],
-    failed: Callable[[C, str], P],
-) -> list[P]:
-    """Result of each case, run one after another with a bar; one that breaks leaves the rest.
+def live_cases(
+    folder: ReportFolder,
+    cases: Sequence[Any],
+    run: Callable[[Any, Tell], Row],
+    row: Callable[..., Row],
+) -> list[Any]:
+    """Rows of the running arm, one case after another with a bar, also written to the folder.
 
     Args:
-        subject: that is evaluated.
-        seconds: how long each case takes, s.
-        run: runs one.
-        failed: result of one that broke, from the words of its error.
+        folder: of the subject.
+        cases: each with the ``seconds`` that it takes; one that breaks leaves the rest.
+        run: runs one, on this host only.
+        row: makes the row of one that broke, from the case and its ``failure`` in words.
     """
-    points: list[P] = []
+    keep_on_this_host(network=False)
+    prepare_volume(load_scene("upper_arm"))
+    points: list[Any] = []
     done = 0.0
-    with Progress(subject, sum(seconds.values()), "s") as progress:
-        for case, most in seconds.items():
+    with Progress(folder.subject, sum(case.seconds for case in cases), "s") as progress:
+        for case in cases:
 
-            def tell(passed: float, words: str, case: C = case, before: float = done) -> None:
-                progress.update(before + min(passed, seconds[case]), f"{case}: {words}")
+            def tell(passed: float, words: str, case: Any = case, before: float = done) -> None:
+                progress.update(before + min(passed, case.seconds), f"{case}: {words}")
 
             try:
                 points.append(run(case, tell))
             except Exception as error:
-                points.append(failed(case, words_of(error)))
-            done += most
+                points.append(row(case, failure=words_of(error)))
+            done += case.seconds
             progress.update(done)
+    folder.write_rows(folder.subject, points)
     return points
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import UsSimError
+from us_sim.evaluation import timing
 from us_sim.evaluation.latency import report as latency
 from us_sim.evaluation.latency.measure import (
     COARSE,
@@ -154,7 +155,7 @@ def test_a_report_has_every_case_and_says_what_failed(tmp_path, monkeypatch, cap
         return Point(case, heard(), recorded=101, usage={"tissue_deformer": growing(0.5)})
 
     monkeypatch.setattr(latency, "run_case", run)
-    monkeypatch.setattr(latency, "prepare_volume", lambda _: None)
+    monkeypatch.setattr(timing, "prepare_volume", lambda _: None)
     assert evaluate_latency(tmp_path, quick=False) == 1
     report = (tmp_path / "latency.md").read_text()
     assert "cores busy: UsSimError: the tissue has ended" in report
@@ -162,7 +163,11 @@ def test_a_report_has_every_case_and_says_what_failed(tmp_path, monkeypatch, cap
     for name in ("hops", "usage", "time"):
         assert (tmp_path / f"latency_{name}.png").stat().st_size > 10_000
     with (tmp_path / "latency.csv").open() as file:
-        assert len(list(csv.reader(file))) == 1 + len(cases(quick=False))
+        head, *rows = csv.reader(file)
+    assert len(rows) == len(cases(quick=False))
+    # Also of a case of which nothing was heard, each number is below its name.
+    assert {len(row) for row in rows} == {len(head)}
+    assert {row[head.index("images_a_second")] for row in rows} == {"62.5", "123", ""}
     assert "failed: " in capsys.readouterr().out
 
 

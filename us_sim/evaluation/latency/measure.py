@@ -64,7 +64,7 @@ class Case:
 
     @property
     def nodes(self) -> int:
-        """How many the mesh has."""
+        """Number of nodes of the mesh."""
         x, y, z = self.mesh
         return x * y * z
 
@@ -86,7 +86,7 @@ DEMO = Case("fem_nonlinear")
 
 
 def cases(quick: bool) -> list[Case]:
-    """Those of a run; of a quick one a few, for some seconds each."""
+    """Cases of a run; a quick one has a few, of some seconds each."""
     base = Case()
     if quick:
         chosen = [base, LIVE, DEMO, *_beside(DEMO), replace(base, placed=PLACED[1])]
@@ -111,13 +111,13 @@ def cases(quick: bool) -> list[Case]:
 
 
 def _beside(case: Case) -> list[Case]:
-    """The case beside something else that keeps every core busy, before it or not."""
+    """The case while other programs keep every core busy, with realtime priority and without."""
     busy = replace(case, busy=True)
     return [busy, replace(busy, realtime=False)]
 
 
 HAND = 0.1
-"""m/s of a hand, with which a time becomes a way."""
+"""m/s of a hand, by which a delay becomes a distance."""
 
 Heard = Sequence[tuple[int, int]]
 """Stamps and times of arrival, ns."""
@@ -175,7 +175,7 @@ class Point(Row):
 
     @property
     def images(self) -> Heard:
-        """Those that came."""
+        """Stamps and arrivals of the images."""
         return self.heard.get("ultrasound/image", ())
 
     @property
@@ -210,7 +210,7 @@ class Point(Row):
         return np.array([1e-6 * (came - stamp) for stamp, came in self.heard.get(topic, ())])
 
     def latency(self, topic: str, percent: float) -> float:
-        """Percentile of these, ms; NaN where none came."""
+        """Percentile of the ages of a topic, ms; NaN where nothing came."""
         return percentile(self.ages(topic), percent)
 
 
@@ -295,10 +295,7 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
             time.sleep(0.5)
         ended_ns = time.time_ns()
         time.sleep(1.5)  # for messages under way to arrive, and to be recorded
-        heard = {
-            topic: [each for each in arrivals.heard(topic) if began_ns <= each[0] < ended_ns]
-            for topic in arrivals.topics
-        }
+        heard = arrivals.heard_between(began_ns, ended_ns)
     recorded = _recorded(file, {s for s, _ in heard["ultrasound/image"]}) if case.recorder else None
     return Point(case, heard, recorded, usage.uses, scheduling)
 
