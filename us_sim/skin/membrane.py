@@ -265,7 +265,8 @@ class SkinDeformation:
     vertices: NDArray[np.float64]  # (N, 3), m, frame patient
     normals: NDArray[np.float64]  # (N, 3), unit, out of the body
     residual: float  # unbalanced force over the force that the anchors bear; 0 at rest
-    action: str  # remark on masses or steps changed for stability, else ''
+    action: str  # remark on a failed frame, or on masses or steps changed for stability, else ''
+    has_failed: bool = False  # the forces were not finite, so the latest shape was kept
 
 
 class SkinMembrane:
@@ -383,6 +384,7 @@ class SkinMembrane:
                 self._latest.normals,
                 self._latest.residual,
                 "the springs' forces are not finite: kept the latest shape and stopped its motion",
+                has_failed=True,
             )
         self._settled = moved < _SETTLED
         if self._settled:

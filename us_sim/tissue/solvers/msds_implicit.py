@@ -171,9 +171,13 @@ class MsdsImplicit(SpringTissue):
         contact = self._contact
         untouched = self._settled and not contact.touched.any()
         if self.model.fixed.all() or (untouched and contact.is_consistent(pose, self._surface())):
-            residual = self._last.residual
             return Deformation(
-                self._positions.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), residual
+                self._positions.copy(),
+                np.empty(0, np.int32),
+                np.zeros(3),
+                np.zeros(3),
+                self._last.residual,
+                inverted=self._last.inverted,
             )
         if self._taken_over and pose is not None:
             contact.adopt(pose, self._surface())
@@ -272,7 +276,7 @@ class MsdsImplicit(SpringTissue):
     def _outcome(self, pose: Pose | None, kinetic: float, initial: float) -> Deformation:
         contact, touchable = self._contact, self._touchable
         is_touched = bool(contact.touched.any())
-        words, interventions = self._untangle(is_touched)
+        inverted, words, interventions = self._untangle(is_touched)
         energy, elastic = self._potential.elastic(self._positions)
         self._limit_speed(kinetic, initial, energy)
         elastic[self.model.fixed] = 0.0
@@ -300,6 +304,7 @@ class MsdsImplicit(SpringTissue):
             torque,
             residual,
             words,
+            inverted,
             interventions=interventions,
         )
 
