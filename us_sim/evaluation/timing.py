@@ -1,4 +1,4 @@
-"""Progress through cases, times of functions that take turns, and frames until a tissue settles.
+"""Progress through pieces of work, times of functions in turn, and frames until a tissue settles.
 
 >>> from us_sim.evaluation.timing import frames_until
 >>> frames_until([1.0, 1e-4, 0.5, 9e-4, 1e-6], 1e-3), frames_until([1.0], 1e-3)
@@ -14,11 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import ReportFolder, Row, words_of
 from us_sim.progress import Progress
-from us_sim.run.live import prepare_volume
-from us_sim.run.processes import keep_on_this_host
-from us_sim.scene.reading import load_scene
 
 C = TypeVar("C")
 
@@ -35,40 +31,6 @@ def steps(
             progress.update(done, name(piece))
             yield piece
         progress.update(len(work))
-
-
-def live_cases(
-    folder: ReportFolder,
-    cases: Sequence[Any],
-    run: Callable[[Any, Tell], Row],
-    row: Callable[..., Row],
-) -> list[Any]:
-    """Rows of the running arm, one case after another with a bar, also written to the folder.
-
-    Args:
-        folder: of the subject.
-        cases: each with the ``seconds`` that it takes; one that breaks leaves the rest.
-        run: runs one, on this host only.
-        row: makes the row of one that broke, from the case and its ``failure`` in words.
-    """
-    keep_on_this_host(network=False)
-    prepare_volume(load_scene("upper_arm"))
-    points: list[Any] = []
-    done = 0.0
-    with Progress(folder.subject, sum(case.seconds for case in cases), "s") as progress:
-        for case in cases:
-
-            def tell(passed: float, words: str, case: Any = case, before: float = done) -> None:
-                progress.update(before + min(passed, case.seconds), f"{case}: {words}")
-
-            try:
-                points.append(run(case, tell))
-            except Exception as error:
-                points.append(row(case, failure=words_of(error)))
-            done += case.seconds
-            progress.update(done)
-    folder.write_rows(folder.subject, points)
-    return points
 
 
 def medians_in_turn(

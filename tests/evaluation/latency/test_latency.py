@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation import timing
 from us_sim.evaluation.latency import report as latency
 from us_sim.evaluation.latency.measure import (
     COARSE,
@@ -155,7 +154,7 @@ def test_a_report_has_every_case_and_says_what_failed(tmp_path, monkeypatch, cap
         return Point(case, heard(), recorded=101, usage={"tissue_deformer": growing(0.5)})
 
     monkeypatch.setattr(latency, "run_case", run)
-    monkeypatch.setattr(timing, "prepare_volume", lambda _: None)
+    monkeypatch.setattr("us_sim.evaluation.latency.measure.prepare_volume", lambda _: None)
     assert evaluate_latency(tmp_path, quick=False) == 1
     report = (tmp_path / "latency.md").read_text()
     assert "cores busy: UsSimError: the tissue has ended" in report

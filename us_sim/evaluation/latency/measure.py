@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -25,12 +25,14 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, start_program
-from us_sim.evaluation.report import Row, percentile
+from us_sim.evaluation.report import ReportFolder, Row, percentile, words_of
 from us_sim.evaluation.timing import Tell
+from us_sim.progress import Progress
 from us_sim.recording.reader import read_bag
+from us_sim.run.live import prepare_volume
 from us_sim.run.lockstep import render
 from us_sim.run.plan import NodeProcess, player_settings, recorder_of, simulation_nodes
-from us_sim.run.processes import ProcessGroup
+from us_sim.run.processes import ProcessGroup, keep_on_this_host
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -212,6 +214,40 @@ class Point(Row):
     def latency(self, topic: str, percent: float) -> float:
         """Percentile of the ages of a topic, ms; NaN where nothing came."""
         return percentile(self.ages(topic), percent)
+
+
+def live_cases(
+    folder: ReportFolder,
+    cases: Sequence[Any],
+    run: Callable[[Any, Tell], Row],
+    row: Callable[..., Row],
+) -> list[Any]:
+    """Rows of the running arm, one case after another with a bar, also written to the folder.
+
+    Args:
+        folder: of the subject.
+        cases: each with the ``seconds`` that it takes; one that breaks leaves the rest.
+        run: runs one, on this host only.
+        row: makes the row of one that broke, from the case and its ``failure`` in words.
+    """
+    keep_on_this_host(network=False)
+    prepare_volume(load_scene("upper_arm"))
+    points: list[Any] = []
+    done = 0.0
+    with Progress(folder.subject, sum(case.seconds for case in cases), "s") as progress:
+        for case in cases:
+
+            def tell(passed: float, words: str, case: Any = case, before: float = done) -> None:
+                progress.update(before + min(passed, case.seconds), f"{case}: {words}")
+
+            try:
+                points.append(run(case, tell))
+            except Exception as error:
+                points.append(row(case, failure=words_of(error)))
+            done += case.seconds
+            progress.update(done)
+    folder.write_rows(folder.subject, points)
+    return points
 
 
 def write_scene(case: Case, folder: Path) -> Path:

@@ -9,7 +9,17 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from us_sim.evaluation.latency.measure import DEMO, HAND, LIVE, RATE, Case, Point, cases, run_case
+from us_sim.evaluation.latency.measure import (
+    DEMO,
+    HAND,
+    LIVE,
+    RATE,
+    Case,
+    Point,
+    cases,
+    live_cases,
+    run_case,
+)
 from us_sim.evaluation.report import (
     ReportFolder,
     Target,
@@ -22,7 +32,6 @@ from us_sim.evaluation.report import (
     plain_bars,
     target_table,
 )
-from us_sim.evaluation.timing import live_cases
 
 _IMAGE = "ultrasound/image"
 _HEAD = (

@@ -420,7 +420,7 @@ def _actions(tried: Sequence[Tried]) -> list[str]:
     for one in tried:
         if not one.trial.refused:
             parts = (part for action in one.trial.actions for part in action.split("; "))
-            counted.update({_without_numbers(part) for part in parts})
+            counted.update(dict.fromkeys(map(_without_numbers, parts), 1))
     if not counted:
         return []
     lines = [f"- {number}: {said}" for said, number in counted.most_common(12)]

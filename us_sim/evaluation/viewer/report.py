@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from us_sim.evaluation.latency.measure import live_cases
 from us_sim.evaluation.report import (
     ReportFolder,
     Target,
@@ -19,7 +20,6 @@ from us_sim.evaluation.report import (
     plain_bars,
     target_table,
 )
-from us_sim.evaluation.timing import live_cases
 from us_sim.evaluation.viewer.measure import Point, cases, run_case
 
 _HEAD = (
