@@ -365,7 +365,7 @@ def run_case(case: Case, tell: Tell) -> Point:
 
 
 class _Pages:
-    """Pages of both kinds."""
+    """The pages of a case: those in a browser, and those that only take."""
 
     def __init__(self, case: Case, command: _Command) -> None:
         self._case = case
