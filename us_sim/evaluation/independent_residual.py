@@ -121,9 +121,10 @@ class IndependentResidual:
         return residual_norm / self._scale, rounding
 
     def _update_depth(self, deformation: Deformation, pose: Pose | None) -> None:
-        """From 0.35 of half its smallest width the probe may push in other directions than its own.
+        """Note whether the probe is so deep in the tissue that it may push in unknown directions.
 
-        A solver may take it to be so from half of that, with tissue that has moved on the way.
+        That is 0.35 of half its smallest width. A solver may assume it from half that depth on, for
+        the tissue moves on the way.
         """
         (nodes, before), self._last = self._last, (deformation.nodes, pose)
         if pose is None:

@@ -297,7 +297,7 @@ class Frames:
 
 @dataclass(frozen=True, eq=False)
 class Live:
-    """A motion of which only those poses are seen for which there is time."""
+    """A motion in which a frame that takes long costs poses."""
 
     poses: int = 0  # that came
     frames: Frames = field(default_factory=Frames)  # that were made

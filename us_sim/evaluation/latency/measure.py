@@ -47,7 +47,7 @@ COARSE, FINE = (20, 10, 10), (32, 16, 16)
 """Nodes of the meshes in x, y and z."""
 
 PLACED = ("processes", "one process", "lockstep")
-"""A process a node; all nodes in one, each with a thread; or there one pose after another."""
+"""One process for each node; all nodes in one process, each in a thread; or one pose at a time."""
 
 
 @dataclass(frozen=True)

@@ -365,7 +365,7 @@ def run_case(case: Case, tell: Tell) -> Point:
 
 
 class _Pages:
-    """Pages of both kinds."""
+    """The pages of a case: those in a browser, and those that only take."""
 
     def __init__(self, case: Case, command: _Command) -> None:
         self._case = case
@@ -433,7 +433,8 @@ class _Command:
     def check(self) -> None:
         """Raise UsSimError when it has ended."""
         if self.process.poll() is not None:
-            raise UsSimError(f"us-sim has ended: {self.said().strip().splitlines()[-1:]}")
+            lines = self.said().strip().splitlines()
+            raise UsSimError(f"us-sim has ended{': ' if lines else ''}{''.join(lines[-1:])}")
 
     def address(self) -> str:
         """Address of the page, once it is printed."""
