@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.latency import report as latency
@@ -121,10 +122,8 @@ def test_memory_that_a_family_of_processes_shares_is_counted_once():
 def test_a_process_has_the_name_of_its_node(node):
     waits = [sys.executable, "-c", "input()", "-m", module_of(node)]
     with subprocess.Popen(waits, stdin=subprocess.PIPE) as process:
-        while (name := started_by(os.getpid()).get(process.pid)) == "gone":
-            pass
+        until(lambda: started_by(os.getpid())[process.pid] == node, f"the name {node}")
         process.communicate(b"\n")
-    assert name == node
 
 
 def test_limits_are_judged_by_the_case_they_are_for():
