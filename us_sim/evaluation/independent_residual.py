@@ -28,13 +28,12 @@ from scipy.optimize import nnls
 
 from us_sim.evaluation.independent_forces import rounding_of_forces, spring_forces, volume_forces
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.geometry.se3 import interpolate
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import fitted_springs, springs_of, volume_term
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.solver import same_pose
 
 Array = NDArray[np.float64]
 

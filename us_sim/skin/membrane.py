@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import offset_box_distance, signed_distance
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.geometry.triangles import TriangleParts, part_size, vertex_normals
 from us_sim.kernels import njit
 from us_sim.skin.settings import MembraneSettings
@@ -366,7 +366,7 @@ class SkinMembrane:
 
         With an unmoved probe and a settled membrane, this is the latest result unchanged.
         """
-        if self._settled and _same(pose, self._pose):
+        if self._settled and same_pose(pose, self._pose):
             return self._latest
         start, steps, note = self._approach(pose)
         vertices, velocity = self._vertices.copy(), self._velocity.copy()
@@ -434,12 +434,6 @@ class SkinMembrane:
             if distance.min() >= 0.0:
                 break
         return lifted
-
-
-def _same(a: Pose | None, b: Pose | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
 
 
 def _placement(pose: Pose | None) -> NDArray[np.float64]:

@@ -24,7 +24,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
@@ -45,7 +45,6 @@ from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,
     Progress,
-    same_pose,
 )
 
 _SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
