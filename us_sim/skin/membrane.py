@@ -406,7 +406,7 @@ class SkinMembrane:
         return self._latest
 
     def _approach(self, pose: Pose | None) -> tuple[Pose | None, int, str]:
-        """Where the probe comes from, the number of steps that it takes, and a note on them.
+        """The pose that the probe comes from, its number of steps, and a remark on them.
 
         A probe that appears inside the skin would push particles out on its far side. So it comes
         along its axis from where it touches nothing, in steps that are short against its body.

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.latency import report as latency
@@ -25,7 +26,8 @@ from us_sim.evaluation.latency.measure import (
     write_scene,
 )
 from us_sim.evaluation.latency.report import evaluate_latency, targets
-from us_sim.evaluation.processes import Usage, UsageOverTime, usage_of
+from us_sim.evaluation.processes import Usage, UsageOverTime, started_by, usage_of
+from us_sim.run.plan import module_of
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 
@@ -113,6 +115,15 @@ def test_memory_that_a_family_of_processes_shares_is_counted_once():
     process.communicate("")
     assert len(uses) == 4
     assert 80e6 < sum(use.memory for use in uses) < 160e6
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
+@pytest.mark.parametrize("node", ["tissue_deformer", "viewer"])
+def test_a_process_has_the_name_of_its_node(node):
+    waits = [sys.executable, "-c", "input()", "-m", module_of(node)]
+    with subprocess.Popen(waits, stdin=subprocess.PIPE) as process:
+        until(lambda: started_by(os.getpid())[process.pid] == node, f"the name {node}")
+        process.communicate(b"\n")
 
 
 def test_limits_are_judged_by_the_case_they_are_for():

@@ -94,7 +94,7 @@ class PenaltyContact:
         self.clear()
 
     def clear(self) -> None:
-        """No probe is near."""
+        """Take the probe away."""
         count = len(self.stiffness)
         self._pose: Pose | None = None
         self.near = np.zeros(0, dtype=np.int64)  # points that may come to touch
@@ -344,7 +344,7 @@ class PenaltyFriction(PenaltyContact):
         super().__init__(probe, stiffness, greatest_force, stiffening)
 
     def clear(self) -> None:
-        """No probe is near."""
+        """Take the probe away."""
         super().clear()
         shape = self.normal.shape
         self._attached = np.zeros(len(self.gap), bool)  # (P,) points on springs along the surface

@@ -9,7 +9,7 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -295,14 +295,12 @@ class Msds(SpringTissue):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         if self._settled and not self._contact.touched.any() and not self._entered(pose):
-            return Deformation(
-                self._positions.copy(),
-                np.empty(0, np.int32),
-                np.zeros(3),
-                np.zeros(3),
-                self._last.residual,
-                self._action,
-                self._last.inverted,
+            return replace(
+                self._resting(),
+                nodes=self._positions.copy(),
+                residual=self._last.residual,
+                action=self._action,
+                inverted=self._last.inverted,
             )
         probe = ProbeMotion(self.model.collider.offset_box, self._forward, *self._path(pose))
         self._contact.touched[:] = False

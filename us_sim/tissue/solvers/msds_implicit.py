@@ -18,7 +18,7 @@ that no energy comes from nowhere and no time step is too long.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -170,12 +170,10 @@ class MsdsImplicit(SpringTissue):
         contact = self._contact
         untouched = self._settled and not contact.touched.any()
         if self.model.fixed.all() or (untouched and contact.is_consistent(pose, self._surface())):
-            return Deformation(
-                self._positions.copy(),
-                np.empty(0, np.int32),
-                np.zeros(3),
-                np.zeros(3),
-                self._last.residual,
+            return replace(
+                self._resting(),
+                nodes=self._positions.copy(),
+                residual=self._last.residual,
                 inverted=self._last.inverted,
             )
         if self._taken_over and pose is not None:

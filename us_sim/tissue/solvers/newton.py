@@ -340,8 +340,9 @@ class Newton:
         directions: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> Preconditioner:
-        """Of the tangent, whose blocks are (6, N) N/m, with springs: a factor where one is needed,
-        there is time to make it, and it can be made.
+        """The preconditioner of the tangent, whose blocks are (6, N) N/m, with springs.
+
+        A factor where one is needed, there is time for it, and it can be made.
         """
         if self._needs_factor and self.may_factor:
             if self._factored is None:
