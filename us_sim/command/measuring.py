@@ -15,7 +15,7 @@ from us_sim.settings.spelling import counted
 
 
 def evaluate_options(parser: argparse.ArgumentParser) -> None:
-    subjects = parser.add_subparsers(required=True, metavar="SUBJECT")
+    subjects = parser.add_subparsers(required=True, metavar="MEASUREMENT")
     for name, option in EVALUATIONS.options.items():
         package = importlib.import_module(option.target.partition(":")[0].rpartition(".")[0])
         subjects.add_parser(name, help=package.__doc__, add_options=partial(_subject_options, name))
