@@ -72,9 +72,9 @@ def test_a_change_takes_the_place_of_the_case_only_when_all_of_it_is_right(make_
             .read_bytes()
             .replace(b"space origin: (-30", b"space origin: (-31")
         )
-    with pytest.raises(VolumeError, match=rf"^{folder}: .*volume.nrrd: "):
-        with changed_case(folder) as partial:
-            (partial / "volume.nrrd").write_bytes(b"NRRD0004\n")
+    of_file = rf"^{folder}: .*volume.nrrd: "
+    with pytest.raises(VolumeError, match=of_file), changed_case(folder) as partial:
+        (partial / "volume.nrrd").write_bytes(b"NRRD0004\n")
     assert not read_case(folder).has_labels
     assert sorted(folder.parent.iterdir()) == [folder]
 

@@ -29,6 +29,10 @@ from us_sim.geometry.se3 import rotation_between
 from us_sim.kernels import njit
 from us_sim.tracking.camera.model import CameraModel, project_points
 
+_TURN = cv2.Rodrigues(np.array([0.3, 0.5, 0.7]))[0]
+"""Turns points before OpenCV sees them: its rotation vectors fail at half a turn, which every
+marker that faces the camera has."""
+
 
 def plane_poses(
     points: NDArray[np.float64], rays: NDArray[np.float64]
@@ -45,17 +49,17 @@ def plane_poses(
         Two, that with the lesser error first; none where the points do not determine them, or
         the plane would be behind the camera.
     """
-    points, rays = np.ascontiguousarray(points), np.ascontiguousarray(rays)  # as OpenCV needs
+    middle = points.mean(axis=0)
+    turned = np.ascontiguousarray(points @ _TURN.T)
     try:
         _, turns, shifts, _ = cv2.solvePnPGeneric(
-            points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            turned, np.ascontiguousarray(rays), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
         )
     except cv2.error:  # the points are in a line, or at one place
         return []
-    middle = points.mean(axis=0)
     found = []
     for turn, shift in zip(turns, shifts, strict=True):
-        rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+        rotation = np.asarray(cv2.Rodrigues(turn)[0] @ _TURN, dtype=np.float64)
         position = np.asarray(shift, dtype=np.float64).ravel()
         if rotation[2] @ middle + position[2] > 0 and np.isfinite(rotation).all():
             found.append((rotation, position))
