@@ -294,7 +294,7 @@ def test_no_settings_make_it_diverge(
     pressed = skin.energy()
     for _ in range(50):
         found = skin.deform(None)
-        assert "not finite" not in found.action
+        assert not found.has_failed
     # Euler conserves an energy of its own, which differs from this one where damping is slight;
     # 500 steps beyond the limit would raise it by many powers of ten.
     assert skin.energy() <= 3.0 * pressed
@@ -347,7 +347,8 @@ def test_forces_that_overflow_leave_the_latest_shape_and_say_so():
     skin._stiffness = 1e308  # beyond any that settings allow
     before = skin.deform(None).vertices
     found = skin.deform(Pose([0, 0, 0.01]))
-    assert "not finite" in found.action
+    assert found.has_failed
+    assert found.action
     np.testing.assert_array_equal(found.vertices, before)
     assert not skin.velocity.any()
 

@@ -134,3 +134,15 @@ def test_what_cannot_be_known_of_a_frame_is_said(scanner):
     for nodes in (None, MESH.nodes):
         with pytest.raises(VolumeError, match="has no labels"):
             _ = bare.frame(POSE, nodes).labels
+
+
+@pytest.mark.parametrize("method", [*SLICERS])
+def test_labels_follow_nodes_that_were_written_to_after_an_image(method):
+    plane, nodes = LINEAR.plane(POSE), MESH.nodes.copy()
+    slicer = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra)
+    slicer.image(nodes, plane)
+    before = slicer.labels(nodes, plane)
+    nodes[:] = pressed(nodes)
+    expected = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra).labels(nodes, plane)
+    assert (expected != before).any()
+    np.testing.assert_array_equal(slicer.labels(nodes, plane), expected)

@@ -1,5 +1,7 @@
 """The estimate against images whose motion is known, and its parts against NumPy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,7 @@ from us_sim.errors import ProbeError
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import Strain
 from us_sim.slicing.strain import compression
-from us_sim.slicing.strain_estimate import estimate_strain, slope, track
+from us_sim.slicing.strain_estimate import Earlier, estimate_strain, slope, track
 
 LINEAR = LinearProbe(aperture=0.03, depth=0.04, columns=150, rows=400, lines=128, samples=400)
 PROBES = (
@@ -149,3 +151,16 @@ def test_what_cannot_be_tracked_is_said(shape, window, sentence):
 def test_settings_out_of_range_are_refused(given, sentence):
     with pytest.raises(ProbeError, match=sentence):
         Strain(**given)
+
+
+def test_an_image_is_compared_with_the_one_so_many_before_of_the_same_probe_and_mesh():
+    earlier = Earlier(lambda frame: frame.pixels)
+
+    def before(number, probe="linear", mesh=None):
+        frame = SimpleNamespace(number=number, probe=probe, mesh=mesh, pixels=10 * number)
+        return earlier.before(frame, 2)
+
+    assert [before(number) for number in (0, 1, 2, 3, 3)] == [None, None, 0, 10, 10]
+    assert [before(number) for number in (6, 7, 8)] == [None, None, 60]  # 4 and 5 were missed
+    assert [before(number, mesh="another") for number in (9, 10, 11)] == [None, None, 90]
+    assert before(12, probe="another", mesh="another") is None

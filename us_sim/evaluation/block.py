@@ -68,7 +68,7 @@ def conjugate_gradients(
         matrix: (N, N), or a ``LinearOperator``, as ``inverse``.
         right: (N,).
         tolerance: of the residual, relative to ``right``.
-        inverse: roughly that of the matrix, the preconditioner.
+        inverse: the preconditioner, roughly the inverse of the matrix.
         limit: of iterations.
 
     Raises:

@@ -26,7 +26,7 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 Array = NDArray[np.float64]
 
 _ELEMENT_BULK = 5.0
-"""(lambda + mu) / mu that tetrahedra keep themselves; the rest is of nodal averages."""
+"""Greatest (lambda + mu) / mu within tetrahedra; the rest acts on averages around nodes."""
 
 _YIELD = 1.5
 """Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""

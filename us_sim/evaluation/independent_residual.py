@@ -28,13 +28,12 @@ from scipy.optimize import nnls
 
 from us_sim.evaluation.independent_forces import rounding_of_forces, spring_forces, volume_forces
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.geometry.se3 import interpolate
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import fitted_springs, springs_of, volume_term
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.solver import same_pose
 
 Array = NDArray[np.float64]
 
@@ -122,9 +121,10 @@ class IndependentResidual:
         return residual_norm / self._scale, rounding
 
     def _update_depth(self, deformation: Deformation, pose: Pose | None) -> None:
-        """From 0.35 of half its smallest width the probe may push in other directions than its own.
+        """Note whether the probe is so deep in the tissue that it may push in unknown directions.
 
-        A solver may take it to be so from half of that, with tissue that has moved on the way.
+        That is 0.35 of half its smallest width. A solver may assume it from half that depth on, for
+        the tissue moves on the way.
         """
         (nodes, before), self._last = self._last, (deformation.nodes, pose)
         if pose is None:

@@ -143,8 +143,8 @@ def _name(pid: int) -> str:
     except OSError:
         return "gone"
     for word in words:
-        if word.startswith("us_sim.nodes."):
-            return word.removeprefix("us_sim.nodes.")
+        if word.startswith(("us_sim.nodes.", "us_sim.viewer.viewer")):
+            return word.rpartition(".")[2]
     return "browser" if "chrom" in words[0] else Path(words[0]).name
 
 

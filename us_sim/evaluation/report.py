@@ -43,6 +43,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from us_sim.errors import UsSimError
@@ -102,11 +103,12 @@ def words_of(error: Exception) -> str:
 
 
 def write_rows(file: Path, rows: Sequence[Row]) -> None:
-    """Write a CSV file whose first line names its columns."""
+    """Write a CSV file whose first line names the columns of all rows."""
     with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(rows[0].values)
-        writer.writerows(row.cells for row in rows)
+        columns = list(dict.fromkeys(name for row in rows for name in row.values))
+        writer = csv.DictWriter(stream, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(dict(zip(row.values, row.cells, strict=True)) for row in rows)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -231,6 +233,14 @@ def plain_bars(panel: Axes) -> None:
     panel.tick_params(labelsize=8.5)
 
 
+def method_keys(methods: Mapping[str, Any], **look: Any) -> list[Line2D]:
+    """Entries of a key: the methods, by name, with their colours and marks."""
+    return [
+        Line2D([], [], color=method.colour, marker=method.mark, label=name, **look)
+        for name, method in methods.items()
+    ]
+
+
 def key_beside(panel: Axes, handles: list | None = None) -> None:  # type: ignore[type-arg]
     """Key of colours and marks to the right of a panel; none where it has nothing with a label."""
     if handles is not None or panel.get_legend_handles_labels()[0]:
@@ -317,13 +327,17 @@ class ReportFolder:
         self._tables.append(f"[{name}.csv]({name}.csv)")
         write_rows(self._out / f"{name}.csv", rows)
 
-    def write_report(
-        self, failures: Sequence[str], libraries: Sequence[str], **values: str
-    ) -> None:
-        """Fill the subject's template ``report``, and list the first sixty failures below.
+    def finish(
+        self, table: str, failures: Sequence[str], libraries: Sequence[str], /, **values: str
+    ) -> int:
+        """Write the report; print a table, the files, and the failures.
 
-        The place ``$opening`` says how long the run took, on which machine with which versions of
+        The subject's template ``report`` is filled, with the first sixty failures below. Its place
+        ``$opening`` says how long the run took, on which machine with which versions of
         ``libraries``, and where its rows are.
+
+        Returns:
+            1 if there are failures, else 0.
         """
         command = f"us-sim evaluate {self.subject}{' --quick' if self.quick else ''}"
         seconds = time.perf_counter() - self._begun
@@ -337,9 +351,6 @@ class ReportFolder:
             text += "\n\n## Failed\n\n"
             text += "\n".join(f"- {failure}" for failure in [*failures[:60], *more])
         self.report.write_text(text + "\n", encoding="utf-8")
-
-    def finish(self, table: str, failures: Sequence[str]) -> int:
-        """Print a table, the files, and the failures; return 1 if there are any, else 0."""
         print(table)
         print(f"Report: {self.report}; pictures: {', '.join(map(str, self._pictures))}")
         for failure in failures[:10]:

@@ -1,8 +1,6 @@
-"""Progress through cases, times of functions that take turns, and frames until a tissue settles.
+"""Progress through pieces of work, times of functions in turn, and frames until a tissue settles.
 
->>> from us_sim.evaluation.timing import frames_until, timed_cases
->>> timed_cases("halves", {1: 0.01, 0: 0.01}, lambda case, _: 1 / case, lambda _, words: words)
-[1.0, 'ZeroDivisionError: division by zero']
+>>> from us_sim.evaluation.timing import frames_until
 >>> frames_until([1.0, 1e-4, 0.5, 9e-4, 1e-6], 1e-3), frames_until([1.0], 1e-3)
 (3, None)
 """
@@ -16,11 +14,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import words_of
 from us_sim.progress import Progress
 
 C = TypeVar("C")
-P = TypeVar("P")
 
 Tell = Callable[[float, str], None]
 """Takes how many s of a case are over, and the present activity."""
@@ -35,37 +31,6 @@ def steps(
             progress.update(done, name(piece))
             yield piece
         progress.update(len(work))
-
-
-def timed_cases(
-    subject: str,
-    seconds: Mapping[C, float],
-    run: Callable[[C, Tell], P],
-    failed: Callable[[C, str], P],
-) -> list[P]:
-    """Result of each case, run one after another with a bar; one that breaks leaves the rest.
-
-    Args:
-        subject: that is evaluated.
-        seconds: how long each case takes, s.
-        run: runs one.
-        failed: result of one that broke, from the words of its error.
-    """
-    points: list[P] = []
-    done = 0.0
-    with Progress(subject, sum(seconds.values()), "s") as progress:
-        for case, most in seconds.items():
-
-            def tell(passed: float, words: str, case: C = case, before: float = done) -> None:
-                progress.update(before + min(passed, seconds[case]), f"{case}: {words}")
-
-            try:
-                points.append(run(case, tell))
-            except Exception as error:
-                points.append(failed(case, words_of(error)))
-            done += most
-            progress.update(done)
-    return points
 
 
 def medians_in_turn(

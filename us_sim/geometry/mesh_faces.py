@@ -44,6 +44,9 @@ def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
 def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.int64]:
     """(``count``,) the part of each vertex, from 0 in the order of their first vertices.
 
+    Each vertex points to one with a lower number, and edges and pointers are followed together
+    until nothing changes (Shiloach and Vishkin, An O(log n) parallel connectivity algorithm, 1982).
+
     Args:
         one, other: (E,) the vertices that each edge joins.
     """

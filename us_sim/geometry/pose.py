@@ -129,6 +129,13 @@ class Pose:
         return Pose(self.rotation @ other.position + self.position, np.array(product))
 
 
+def same_pose(a: Pose | None, b: Pose | None) -> bool:
+    """Whether two poses are the same, to the last bit."""
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
+
+
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978)."""
     trace = np.trace(rotation)

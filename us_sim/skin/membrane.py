@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
 from us_sim.geometry.collider_distance import offset_box_distance, signed_distance
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.geometry.triangles import TriangleParts, part_size, vertex_normals
 from us_sim.kernels import njit
 from us_sim.skin.settings import MembraneSettings
@@ -265,7 +265,8 @@ class SkinDeformation:
     vertices: NDArray[np.float64]  # (N, 3), m, frame patient
     normals: NDArray[np.float64]  # (N, 3), unit, out of the body
     residual: float  # unbalanced force over the force that the anchors bear; 0 at rest
-    action: str  # remark on masses or steps changed for stability, else ''
+    action: str  # remark on a failed frame, or on masses or steps changed for stability, else ''
+    has_failed: bool = False  # the forces were not finite, so the latest shape was kept
 
 
 class SkinMembrane:
@@ -365,7 +366,7 @@ class SkinMembrane:
 
         With an unmoved probe and a settled membrane, this is the latest result unchanged.
         """
-        if self._settled and _same(pose, self._pose):
+        if self._settled and same_pose(pose, self._pose):
             return self._latest
         start, steps, note = self._approach(pose)
         vertices, velocity = self._vertices.copy(), self._velocity.copy()
@@ -383,6 +384,7 @@ class SkinMembrane:
                 self._latest.normals,
                 self._latest.residual,
                 "the springs' forces are not finite: kept the latest shape and stopped its motion",
+                has_failed=True,
             )
         self._settled = moved < _SETTLED
         if self._settled:
@@ -404,7 +406,7 @@ class SkinMembrane:
         return self._latest
 
     def _approach(self, pose: Pose | None) -> tuple[Pose | None, int, str]:
-        """Where the probe comes from, the number of steps that it takes, and a note on them.
+        """The pose that the probe comes from, its number of steps, and a remark on them.
 
         A probe that appears inside the skin would push particles out on its far side. So it comes
         along its axis from where it touches nothing, in steps that are short against its body.
@@ -432,12 +434,6 @@ class SkinMembrane:
             if distance.min() >= 0.0:
                 break
         return lifted
-
-
-def _same(a: Pose | None, b: Pose | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
 
 
 def _placement(pose: Pose | None) -> NDArray[np.float64]:

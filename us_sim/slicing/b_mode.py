@@ -191,11 +191,22 @@ class BMode:
         )
 
     def image(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
-        """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`."""
+        """The B-mode image (rows, columns) with the probe at ``pose``: `Frame.pixels`.
+
+        Args:
+            nodes: (N, 3) m, where the carrying mesh is; None for the volume as it is.
+
+        Raises:
+            MeshError, ProbeError, VolumeError: as for `Frame`.
+        """
         return self.frame(pose, nodes).pixels
 
     def labels(self, pose: Pose, nodes: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
-        """The volume's label at each pixel (rows, columns): `Frame.labels`."""
+        """The volume's label at each pixel (rows, columns), 0 where there is nothing.
+
+        Raises:
+            MeshError, ProbeError, VolumeError: as for `Frame.labels`.
+        """
         return self.frame(pose, nodes).labels
 
     def beyond(self, pose: Pose) -> float:

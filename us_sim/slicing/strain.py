@@ -275,7 +275,7 @@ class AxialStrain:
 
     @classmethod
     def of(cls, frame: Frame, *, sharp: bool = False) -> AxialStrain:
-        """Of the mesh that carries the volume in a frame.
+        """The strain of the mesh that carries the volume in a frame.
 
         Args:
             sharp: average nothing over borders of the volume's labels, as far as the mesh follows
@@ -393,7 +393,7 @@ def _strain(maps, elements, directions, first_row, end_row, values):
 
 
 class Compression(NamedTuple):
-    """Of all tissue in a strain image."""
+    """Mean strain and evenness of all tissue in a strain image."""
 
     mean: float  # strain, negative where the tissue got shorter; 0 without tissue
     quality: float
@@ -407,7 +407,7 @@ class Compression(NamedTuple):
 
 
 def compression(strain: NDArray[np.floating]) -> Compression:
-    """Of an image (any shape) of strain, NaN where there is no tissue."""
+    """The compression of an image (any shape) of strain, NaN where there is no tissue."""
     there = strain[np.isfinite(strain)].astype(np.float64)
     if not there.size:
         return Compression(0.0, 0.0)
@@ -440,6 +440,6 @@ class FollowingEnd:
 
 
 def strain_scale(name: str, most: float) -> ColourScale:
-    """From -most to most, in percent at the bar; red and blue differ to colour-blind eyes, too."""
+    """Colours from -most to most, in percent; red and blue differ to colour-blind eyes, too."""
     title = name.replace("_", " ")
     return ColourScale(title, -most, most, "%", factor=100.0, colours=_COLOURS)

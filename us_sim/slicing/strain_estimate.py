@@ -138,7 +138,7 @@ def _ends(moved: Field, correlation: Field, half: int, search: int) -> tuple[int
 
 
 def _search(first: Field, later: Window, size: tuple[int, int], most: int) -> tuple[Field, Field]:
-    """Where in the image as it is the correlation is largest, and how large it is."""
+    """Lag in samples at which the correlation is largest, and that correlation."""
     around = cv2.copyMakeBorder(first, most + 1, most + 1, 0, 0, cv2.BORDER_REFLECT_101)
     earlier = around, *_moments(around, size)
     best = np.full_like(first, -np.inf)
@@ -205,7 +205,7 @@ def _correlation(one: Window, other: Window, size: tuple[int, int]) -> Field:
 
 
 def _tip(before: Field, middle: Field, after: Field, most: float) -> Field:
-    """Where a parabola through three values a sample apart is largest, from the middle one on."""
+    """Peak of a parabola through three values a sample apart, counted from the middle one."""
     bend = np.minimum(before - 2.0 * middle + after, np.float32(-1e-6))
     return np.asarray(np.clip(0.5 * (before - after) / bend, -most, most), dtype=np.float32)
 
@@ -220,7 +220,7 @@ def _moments(image: Field, size: tuple[int, int]) -> tuple[Field, Field]:
 
 
 def _smoothed(moved: Field, correlation: Field, size: tuple[int, int]) -> Field:
-    """Without single windows that were found elsewhere: the median, then a mean by correlation.
+    """Smooth displacements: a median against outliers, then a mean weighted by correlation.
 
     Windows that the image's ends cut off go on as the whole ones beside them do.
     """
@@ -349,7 +349,7 @@ class Earlier:
 
 @cache
 def warm_up() -> None:
-    """So that the first image is not late; once in a process."""
+    """Compile every kernel of displacement and strain, or load it; once in a process."""
     voxels = np.zeros((2, 2, 2), dtype=np.uint8)
     nodes = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]]) - 2e-4
     scanner = BMode(

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.latency import report as latency
@@ -25,7 +26,8 @@ from us_sim.evaluation.latency.measure import (
     write_scene,
 )
 from us_sim.evaluation.latency.report import evaluate_latency, targets
-from us_sim.evaluation.processes import Usage, UsageOverTime, usage_of
+from us_sim.evaluation.processes import Usage, UsageOverTime, started_by, usage_of
+from us_sim.run.plan import module_of
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 
@@ -115,6 +117,15 @@ def test_memory_that_a_family_of_processes_shares_is_counted_once():
     assert 80e6 < sum(use.memory for use in uses) < 160e6
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
+@pytest.mark.parametrize("node", ["tissue_deformer", "viewer"])
+def test_a_process_has_the_name_of_its_node(node):
+    waits = [sys.executable, "-c", "input()", "-m", module_of(node)]
+    with subprocess.Popen(waits, stdin=subprocess.PIPE) as process:
+        until(lambda: started_by(os.getpid())[process.pid] == node, f"the name {node}")
+        process.communicate(b"\n")
+
+
 def test_limits_are_judged_by_the_case_they_are_for():
     good = Point(LIVE, heard(), recorded=101, usage={"tissue_deformer": growing(0.5)})
     slow = Point(replace(DEMO, busy=True), heard(image=60.0), recorded=101)
@@ -154,7 +165,7 @@ def test_a_report_has_every_case_and_says_what_failed(tmp_path, monkeypatch, cap
         return Point(case, heard(), recorded=101, usage={"tissue_deformer": growing(0.5)})
 
     monkeypatch.setattr(latency, "run_case", run)
-    monkeypatch.setattr(latency, "prepare_volume", lambda _: None)
+    monkeypatch.setattr("us_sim.evaluation.latency.measure.prepare_volume", lambda _: None)
     assert evaluate_latency(tmp_path, quick=False) == 1
     report = (tmp_path / "latency.md").read_text()
     assert "cores busy: UsSimError: the tissue has ended" in report
@@ -162,7 +173,11 @@ def test_a_report_has_every_case_and_says_what_failed(tmp_path, monkeypatch, cap
     for name in ("hops", "usage", "time"):
         assert (tmp_path / f"latency_{name}.png").stat().st_size > 10_000
     with (tmp_path / "latency.csv").open() as file:
-        assert len(list(csv.reader(file))) == 1 + len(cases(quick=False))
+        head, *rows = csv.reader(file)
+    assert len(rows) == len(cases(quick=False))
+    # Also of a case of which nothing was heard, each number is below its name.
+    assert {len(row) for row in rows} == {len(head)}
+    assert {row[head.index("images_a_second")] for row in rows} == {"62.5", "123", ""}
     assert "failed: " in capsys.readouterr().out
 
 

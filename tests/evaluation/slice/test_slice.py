@@ -21,6 +21,7 @@ from us_sim.evaluation.slice.cases import (
     PLANES,
     SIZES,
     Case,
+    Frame,
     black_and_white,
     cases,
     dented,
@@ -31,7 +32,6 @@ from us_sim.evaluation.slice.cases import (
 )
 from us_sim.evaluation.slice.measure import (
     SLICING_METHODS,
-    Contender,
     Point,
     VtkSlicer,
     compare,
@@ -151,12 +151,25 @@ def test_the_evaluated_methods_are_those_of_the_package_and_vtk():
 def test_methods_take_turns():
     order = []
 
-    def contender(name):
-        return Contender(name, 1, lambda _: order.append(name), None, lambda: (1.0, len(order)))
+    class Ours:
+        def image(self, *_):
+            order.append("a")
 
-    timing, other = timed_together([contender("a"), contender("b")], [None], 0.0)
+    class Theirs(VtkSlicer):
+        filter_ms = 1.0
+
+        def __init__(self):
+            pass
+
+        def image(self, *_):
+            order.append("b")
+            self.sampling_ms = len(order)
+
+    frame = Frame(None, None)
+    timing, other = timed_together([Ours(), Theirs()], [frame], 0.0)
     assert order == (["a"] * 5 + ["b"] * 5) * 3
     assert timing["images"] == 15
+    assert 0.0 <= timing["ms_median"] <= timing["ms_p99"]
     assert other["filter_ms"] == 1.0
     assert other["sampling_ms"] == np.median([range(6, 11), range(16, 21), range(26, 31)])
 

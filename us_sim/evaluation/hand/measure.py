@@ -142,7 +142,7 @@ class Motion:
 
     @cached_property
     def poses(self) -> list[Pose]:
-        """One a frame, select of the approach first."""
+        """One pose a frame, those of the approach first."""
         room = TISSUES[self.tissue].room
         return hand_motion(
             self.kind, self.haste, self.seed, self.duration, room, approach=APPROACH
@@ -152,6 +152,16 @@ class Motion:
     def begins(self) -> int:
         """The frame after the approach."""
         return round(APPROACH * RATE)
+
+    @property
+    def speeds(self) -> tuple[_Array, _Array]:
+        """m/s and rad/s, from each frame that counts to the next."""
+        poses = self.poses[self.begins :]
+        places = np.array([pose.position for pose in poses])
+        turns = np.array([pose.orientation for pose in poses])
+        cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
+        moved = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        return np.asarray(RATE * moved), np.asarray(RATE * 2 * np.arccos(cosine))
 
 
 def motions(quick: bool, seed: int) -> list[Motion]:
@@ -287,7 +297,7 @@ class Frames:
 
 @dataclass(frozen=True, eq=False)
 class Live:
-    """A motion of which only those poses are seen for which there is time."""
+    """A motion in which a frame that takes long costs poses."""
 
     poses: int = 0  # that came
     frames: Frames = field(default_factory=Frames)  # that were made
@@ -295,7 +305,7 @@ class Live:
 
     @property
     def skipped(self) -> float:
-        """Fraction of the poses."""
+        """Fraction of the poses without a frame."""
         return 1.0 - len(self.frames.number) / self.poses if self.poses else math.nan
 
 
@@ -303,7 +313,7 @@ class Live:
 class Held:
     """Frames after the probe has stopped."""
 
-    residual: _Array = field(default_factory=_unknown)  # (K,), of the last frame before them first
+    residual: _Array = field(default_factory=_unknown)  # (K,), that of the frame before them first
     inverted: int = 0  # tetrahedra in the last of them
 
     def frames_to(self, residual: float) -> float:
@@ -411,12 +421,7 @@ def measure(
     frames = following.every_pose(progress)
     held = following.held()
     live = following.live()
-    poses = motion.poses[motion.begins :]
-    places = np.array([pose.position for pose in poses])
-    turns = np.array([pose.orientation for pose in poses])
-    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
-    speed = RATE * float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1)))
-    turning = RATE * float(np.median(2 * np.arccos(cosine)))
+    speed, turning = (float(np.median(each)) for each in motion.speeds)
     return Point(motion, solver.name, speed, turning, frames, live, held)
 
 
@@ -546,7 +551,7 @@ class _Bench:
         self._broken: dict[Motion, str] = {}
 
     def answer(self, motion: Motion, progress: Callable[[int], None]) -> Converged:
-        """The converged answer; where it breaks, one of no frame."""
+        """The converged answer; where it fails, one that no frame is compared with."""
         try:
             return converged(TISSUES[motion.tissue].model, motion.poses, progress)
         # Whatever breaks on one tissue must not take the others' results along.

@@ -35,6 +35,7 @@ from us_sim.evaluation.report import (
     failures,
     key_beside,
     markdown_table,
+    method_keys,
     number,
     panel_grid,
     percentile,
@@ -76,8 +77,41 @@ def evaluate_hand(out: Path, quick: bool, settings: HandSettings | None = None) 
         progress.update(runs)
     folder.write_rows("hand", points)
     table = target_table(targets(points))
-    _write_report(folder, points, answers, table)
-    return folder.finish(table, failures(points))
+    free = [motion for motion in answers if motion.kind == "free"]
+    others = [motion for motion in answers if motion.kind != "free"]
+    main = [motion for motion in free if motion.tissue == MAIN_TISSUE]
+    rest = [motion for motion in (*free, *others) if motion not in main]
+    rest.sort(key=lambda motion: motion.tissue == MAIN_TISSUE)  # one of another tissue first
+    _plot_time(points, [*main, *rest][:3], answers, folder.picture("time"))
+    _plot_errors(points, list(answers) if folder.quick else free, folder.picture("error"))
+    _plot_faults(points, folder.picture("faults"))
+    _plot_hold(points, folder.picture("hold"))
+    hastes = "; ".join(
+        f"{name}: {1e3 * asked.speed:.0f} mm/s and {np.degrees(asked.turning):.0f}°/s"
+        for name, asked in HASTES.items()
+    )
+    return folder.finish(
+        table,
+        failures(points),
+        ("numpy", "scipy", "numba"),
+        hastes=hastes,
+        seeds=", ".join(dict.fromkeys(str(motion.seed) for motion in answers)),
+        rate=f"{RATE:.0f}",
+        judged=JUDGED,
+        targets=table,
+        motions=_by_motion(select(points, kind=None if folder.quick else "free")),
+        live=_live(select(points)),
+        hold=f"{HOLD}",
+        tissues="\n".join(f"- `{name}`: {tissue.words}" for name, tissue in TISSUES.items()),
+        kinds="\n".join(f"- {name}: {kind.words}" for name, kind in KINDS.items()),
+        answers=_answers(answers),
+        converged=f"{CONVERGED:g}",
+        trusted=f"{TRUSTED:g}",
+        held=f"{1e3 * HELD:g}",
+        few=f"{100 * (1 - ENOUGH):.0f}",
+        own_every=f"{OWN_EVERY}",
+        approach=f"{APPROACH:g}",
+    )
 
 
 def targets(points: Sequence[Point]) -> list[Target]:
@@ -178,45 +212,6 @@ def _together(points: Sequence[Point], values: Callable[[Point], NDArray]) -> ND
     return np.concatenate([values(p) for p in points]) if points else np.empty(0)
 
 
-def _write_report(
-    folder: ReportFolder, points: Sequence[Point], answers: Mapping[Motion, Converged], table: str
-) -> None:
-    free = [motion for motion in answers if motion.kind == "free"]
-    others = [motion for motion in answers if motion.kind != "free"]
-    main = [motion for motion in free if motion.tissue == MAIN_TISSUE]
-    rest = [motion for motion in (*free, *others) if motion not in main]
-    rest.sort(key=lambda motion: motion.tissue == MAIN_TISSUE)  # one of another tissue first
-    _plot_time(points, [*main, *rest][:3], answers, folder.picture("time"))
-    _plot_errors(points, list(answers) if folder.quick else free, folder.picture("error"))
-    _plot_faults(points, folder.picture("faults"))
-    _plot_hold(points, folder.picture("hold"))
-    hastes = "; ".join(
-        f"{name}: {1e3 * asked.speed:.0f} mm/s and {np.degrees(asked.turning):.0f}°/s"
-        for name, asked in HASTES.items()
-    )
-    folder.write_report(
-        failures(points),
-        ("numpy", "scipy", "numba"),
-        hastes=hastes,
-        seeds=", ".join(dict.fromkeys(str(motion.seed) for motion in answers)),
-        rate=f"{RATE:.0f}",
-        judged=JUDGED,
-        targets=table,
-        motions=_by_motion(select(points, kind=None if folder.quick else "free")),
-        live=_live(select(points)),
-        hold=f"{HOLD}",
-        tissues="\n".join(f"- `{name}`: {tissue.words}" for name, tissue in TISSUES.items()),
-        kinds="\n".join(f"- {name}: {kind.words}" for name, kind in KINDS.items()),
-        answers=_answers(answers),
-        converged=f"{CONVERGED:g}",
-        trusted=f"{TRUSTED:g}",
-        held=f"{1e3 * HELD:g}",
-        few=f"{100 * (1 - ENOUGH):.0f}",
-        own_every=f"{OWN_EVERY}",
-        approach=f"{APPROACH:g}",
-    )
-
-
 def _plot_time(
     points: Sequence[Point],
     chosen: Sequence[Motion],
@@ -257,20 +252,16 @@ def _plot_time(
 
 
 def _draw_motion(depth: Axes, speed: Axes, motion: Motion, answer: Converged) -> None:
-    poses = motion.poses[motion.begins :]
-    time = np.arange(len(poses)) / RATE
-    places = np.array([pose.position for pose in poses])
-    turns = np.array([pose.orientation for pose in poses])
+    depths = np.array([pose.position[2] for pose in motion.poses[motion.begins :]])
+    time = np.arange(len(depths)) / RATE
     depth.axhline(0.0, color="0.6", lw=1, label="skin")
-    depth.plot(time, 1e3 * places[:, 2], color="0.2", lw=1.3, label="middle of the probe's face")
+    depth.plot(time, 1e3 * depths, color="0.2", lw=1.3, label="middle of the probe's face")
     touching = answer.pressed[motion.begins :].tolist()
     look = {"color": "0.93", "zorder": 0, "label": "touching"}
     depth.fill_between(time, *depth.get_ylim(), where=touching, **look)  # type: ignore[arg-type]
-    moved = 1e3 * RATE * np.linalg.norm(np.diff(places, axis=0), axis=1)
-    cosine = np.abs((turns[1:] * turns[:-1]).sum(axis=1)).clip(0.0, 1.0)
-    speed.plot(time[1:], moved, color="0.2", lw=1.3, label="mm/s")
-    turned = np.degrees(RATE * 2 * np.arccos(cosine))
-    speed.plot(time[1:], turned, color="0.2", lw=1.0, ls="--", label="degrees/s")
+    moved, turned = motion.speeds
+    speed.plot(time[1:], 1e3 * moved, color="0.2", lw=1.3, label="mm/s")
+    speed.plot(time[1:], np.degrees(turned), color="0.2", lw=1.0, ls="--", label="degrees/s")
 
 
 def _plot_errors(points: Sequence[Point], chosen: Sequence[Motion], file: Path) -> None:
@@ -293,10 +284,7 @@ def _plot_errors(points: Sequence[Point], chosen: Sequence[Motion], file: Path) 
             panel.set(xscale="log", yscale="log")
             panel.axvline(1e3 / RATE, color="0.6", lw=1, ls=":", zorder=0)
             plain(panel)
-        key = [
-            Line2D([], [], color=look.colour, marker=look.mark, lw=1.2, label=name)
-            for name, look in TISSUE_METHODS.items()
-        ]
+        key = method_keys(TISSUE_METHODS, lw=1.2)
         key_beside(panels[columns - 1], [*key, _line("16.7 ms: 60 Hz", "0.6", ":")])
 
 

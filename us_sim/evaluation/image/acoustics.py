@@ -52,6 +52,25 @@ _LOW, _HIGH = (-6e-3, 14e-3), (5.2e-3, 18e-3)  # m, x and z of a block of bone
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)
 
 
+def _acoustics(
+    frequency: float,
+    compensation: float,
+    tissues: dict[str, TissueAcoustics],
+    *,
+    surfaces: bool = False,
+    anisotropy: bool = True,
+) -> Acoustics:
+    """Live loss (Hz, dB/cm/MHz) in tissues by their labels, without echoes of surfaces."""
+    return Acoustics(
+        artefacts="live",
+        frequency=frequency,
+        compensation=compensation,
+        surfaces=surfaces,
+        anisotropy=anisotropy,
+        tissues=tissues,
+    )
+
+
 class Attenuation(Artefact):
     """Images of layers of one grey, whose levels are the loss alone (Beer and Lambert)."""
 
@@ -61,13 +80,7 @@ class Attenuation(Artefact):
         volume = layered_volume()
         found = []
         for name, frequency in (("linear", 7e6), ("convex", 3.5e6), ("sector", 3e6)):
-            acoustics = Acoustics(
-                artefacts="live",
-                frequency=frequency,
-                compensation=0.5,
-                surfaces=False,
-                tissues={layer.name: layer.tissue for layer in LAYERS},
-            )
+            acoustics = _acoustics(frequency, 0.5, {layer.name: layer.tissue for layer in LAYERS})
             probe = PROBES[name]
             scanner = BMode(volume, probe, acoustics=acoustics)
             for degrees in (0.0, 40.0) if quick else (0.0, 10.0, 20.0, 30.0, 40.0):
@@ -154,17 +167,11 @@ class Enhancement(Artefact):
         del quick
         frequency, muscle, fluid = 8e6, (0.57, 1.645e6), (0.14, 1.679e6)
         volume = dataclasses.replace(_bone_volume(), label_names={1: "muscle", 2: "blood"})
-        acoustics = Acoustics(
-            artefacts="live",
-            frequency=frequency,
-            compensation=0.57,
-            surfaces=False,
-            tissues={
-                name: TissueAcoustics(attenuation=attenuation, impedance=impedance)
-                for name, (attenuation, impedance) in (("muscle", muscle), ("blood", fluid))
-            },
-        )
-        scanner = BMode(volume, _PROBE, acoustics=acoustics)
+        tissues = {
+            name: TissueAcoustics(attenuation=attenuation, impedance=impedance)
+            for name, (attenuation, impedance) in (("muscle", muscle), ("blood", fluid))
+        }
+        scanner = BMode(volume, _PROBE, acoustics=_acoustics(frequency, 0.57, tissues))
         found = []
         for degrees in (0.0, 5.0, 10.0):
             image = scanner.image(Pose(np.zeros(3), tilted(degrees).orientation))
@@ -257,14 +264,7 @@ class Shadow(Artefact):
             "sector": (SectorProbe(aperture=0.02, opening_angle=np.radians(70), depth=0.06), 3e6),
         }
         for name, (probe, frequency) in probes.items():
-            acoustics = Acoustics(
-                artefacts="live",
-                frequency=frequency,
-                compensation=0.57,
-                surfaces=False,
-                tissues=tissues,
-            )
-            scanner = BMode(volume, probe, acoustics=acoustics)
+            scanner = BMode(volume, probe, acoustics=_acoustics(frequency, 0.57, tissues))
             scanner.carry(carrier.nodes, carrier.tetrahedra)
             for degrees in (0.0, 15.0) if quick else (-20.0, -10.0, 0.0, 10.0, 20.0):
                 for state_name, state in STATES.items():
@@ -361,9 +361,7 @@ class Surfaces(Artefact):
             "above": TissueAcoustics(attenuation=0.5, impedance=above),
             "below": TissueAcoustics(attenuation=0.5, impedance=below),
         }
-        acoustics = Acoustics(
-            artefacts="live", frequency=6e6, compensation=0.5, anisotropy=False, tissues=media
-        )
+        acoustics = _acoustics(6e6, 0.5, media, surfaces=True, anisotropy=False)
         scanner = BMode(volume, _PROBE, acoustics=acoustics)
         ratio = (below - above) / (below + above)
         found = []
@@ -406,13 +404,7 @@ class Fibres(Artefact):
             half_angle=0.3,
         )
         labels = np.ones(_BOX, dtype=np.uint8)
-        acoustics = Acoustics(
-            artefacts="live",
-            frequency=6e6,
-            compensation=0.57,
-            surfaces=False,
-            tissues={"muscle": muscle},
-        )
+        acoustics = _acoustics(6e6, 0.57, {"muscle": muscle})
         volume = Volume(np.full(_BOX, grey, np.uint8), _box_placed(), labels, {1: "muscle"})
         scanner = BMode(volume, _PROBE, acoustics=acoustics)
         sides = ((-0.05, 0.05), (-0.04, 0.04), (-0.03, 0.06))

@@ -46,8 +46,8 @@ def evaluate_image(out: Path, quick: bool) -> int:
         if artefact in whole:
             parts.append(artefact.report(whole[artefact], folder))
     libraries = ("numpy", "numba", "opencv-python-headless", "opencv-python")
-    folder.write_report(failures(points), libraries, targets=table, parts="\n\n".join(parts))
-    return folder.finish(table, failures(points))
+    text = "\n\n".join(parts)
+    return folder.finish(table, failures(points), libraries, targets=table, parts=text)
 
 
 def _points(artefact: Artefact, quick: bool) -> list[Point]:

@@ -271,10 +271,7 @@ def pressed_by_plate(solver: TissueSolver, depth: float) -> Array:
 
 def labelled(ball: Ball | None) -> Volume:
     """The block without echoes in voxels of 1 mm: label 2 in the ball, 1 elsewhere."""
-    low, high = np.array(EXTENT).T
-    counts = np.rint((high - low) / 1e-3).astype(int)
-    to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
-    to_patient[:3, 3] = low + 0.5e-3
+    counts, to_patient = voxel_grid(EXTENT, 3 * [1e-3])
     labels = np.ones(counts, dtype=np.uint8)
     if ball is not None:
         places = np.moveaxis(np.indices(counts), 0, -1) * 1e-3 + to_patient[:3, 3]
@@ -447,14 +444,8 @@ def speckled(ball: Ball, seed: int = 1) -> Volume:
 @cache
 def _estimated(ball: Ball) -> tuple[Frame, NDArray[np.float32], Estimate, float]:
     """The second frame, the strain between both, the estimate, and its ms."""
-    mesh = ball_mesh(ball)
-    probe = PROBES["linear"]
-    scanner = BMode(speckled(ball), probe)
-    scanner.carry(mesh.nodes, mesh.tetrahedra)
-    first, second = (
-        scanner.frame(Pose(np.array([0.0, 0.0, depth])), ball_nodes(ball, depth))
-        for depth in (0.001, 0.002)  # m, of the plate
-    )
+    probe, volume = PROBES["linear"], speckled(ball)
+    first, second = (ball_frame(ball, volume, depth) for depth in (0.001, 0.002))  # m
     strain = AxialStrain.of(second).image(second, first.nodes)
     taken = []
     for _ in range(5):

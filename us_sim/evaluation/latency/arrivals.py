@@ -45,14 +45,16 @@ class Arrivals(GuardedNode):
             for topic, kind in EYE.items():
                 self.create_subscription(kind, topic, lambda _: None, EVERY, raw=True)
 
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Topics whose arrivals are noted, in the order in which they are made."""
-        return tuple(self._heard)
-
     def heard(self, topic: str) -> Sequence[tuple[int, int]]:
         """Stamp and time of arrival of every message so far, ns."""
         return list(self._heard[topic])
+
+    def heard_between(self, began: int, ended: int) -> dict[str, list[tuple[int, int]]]:
+        """The same by topic, in the order of the graph, of stamps in a time, ns."""
+        return {
+            topic: [each for each in self.heard(topic) if began <= each[0] < ended]
+            for topic in self._heard
+        }
 
     @staticmethod
     def _noted(heard: list[tuple[int, int]]) -> Callable[[bytes], None]:

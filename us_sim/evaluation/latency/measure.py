@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -25,12 +25,14 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, start_program
-from us_sim.evaluation.report import Row, percentile
+from us_sim.evaluation.report import ReportFolder, Row, percentile, words_of
 from us_sim.evaluation.timing import Tell
+from us_sim.progress import Progress
 from us_sim.recording.reader import read_bag
+from us_sim.run.live import prepare_volume
 from us_sim.run.lockstep import render
 from us_sim.run.plan import NodeProcess, player_settings, recorder_of, simulation_nodes
-from us_sim.run.processes import ProcessGroup
+from us_sim.run.processes import ProcessGroup, keep_on_this_host
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -45,7 +47,7 @@ COARSE, FINE = (20, 10, 10), (32, 16, 16)
 """Nodes of the meshes in x, y and z."""
 
 PLACED = ("processes", "one process", "lockstep")
-"""A process a node; all nodes in one, each with a thread; or there one pose after another."""
+"""One process for each node; all nodes in one process, each in a thread; or one pose at a time."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Case:
 
     @property
     def nodes(self) -> int:
-        """How many the mesh has."""
+        """Number of nodes of the mesh."""
         x, y, z = self.mesh
         return x * y * z
 
@@ -86,7 +88,7 @@ DEMO = Case("fem_nonlinear")
 
 
 def cases(quick: bool) -> list[Case]:
-    """Those of a run; of a quick one a few, for some seconds each."""
+    """Cases of a run; a quick one has a few, of some seconds each."""
     base = Case()
     if quick:
         chosen = [base, LIVE, DEMO, *_beside(DEMO), replace(base, placed=PLACED[1])]
@@ -111,13 +113,13 @@ def cases(quick: bool) -> list[Case]:
 
 
 def _beside(case: Case) -> list[Case]:
-    """The case beside something else that keeps every core busy, before it or not."""
+    """The case while other programs keep every core busy, with realtime priority and without."""
     busy = replace(case, busy=True)
     return [busy, replace(busy, realtime=False)]
 
 
 HAND = 0.1
-"""m/s of a hand, with which a time becomes a way."""
+"""m/s of a hand, by which a delay becomes a distance."""
 
 Heard = Sequence[tuple[int, int]]
 """Stamps and times of arrival, ns."""
@@ -175,7 +177,7 @@ class Point(Row):
 
     @property
     def images(self) -> Heard:
-        """Those that came."""
+        """Stamps and arrivals of the images."""
         return self.heard.get("ultrasound/image", ())
 
     @property
@@ -210,8 +212,42 @@ class Point(Row):
         return np.array([1e-6 * (came - stamp) for stamp, came in self.heard.get(topic, ())])
 
     def latency(self, topic: str, percent: float) -> float:
-        """Percentile of these, ms; NaN where none came."""
+        """Percentile of the ages of a topic, ms; NaN where nothing came."""
         return percentile(self.ages(topic), percent)
+
+
+def live_cases(
+    folder: ReportFolder,
+    cases: Sequence[Any],
+    run: Callable[[Any, Tell], Row],
+    row: Callable[..., Row],
+) -> list[Any]:
+    """Rows of the running arm, one case after another with a bar, also written to the folder.
+
+    Args:
+        folder: of the subject.
+        cases: each with the ``seconds`` that it takes; one that breaks leaves the rest.
+        run: runs one, on this host only.
+        row: makes the row of one that broke, from the case and its ``failure`` in words.
+    """
+    keep_on_this_host(network=False)
+    prepare_volume(load_scene("upper_arm"))
+    points: list[Any] = []
+    done = 0.0
+    with Progress(folder.subject, sum(case.seconds for case in cases), "s") as progress:
+        for case in cases:
+
+            def tell(passed: float, words: str, case: Any = case, before: float = done) -> None:
+                progress.update(before + min(passed, case.seconds), f"{case}: {words}")
+
+            try:
+                points.append(run(case, tell))
+            except Exception as error:
+                points.append(row(case, failure=words_of(error)))
+            done += case.seconds
+            progress.update(done)
+    folder.write_rows(folder.subject, points)
+    return points
 
 
 def write_scene(case: Case, folder: Path) -> Path:
@@ -295,10 +331,7 @@ def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
             time.sleep(0.5)
         ended_ns = time.time_ns()
         time.sleep(1.5)  # for messages under way to arrive, and to be recorded
-        heard = {
-            topic: [each for each in arrivals.heard(topic) if began_ns <= each[0] < ended_ns]
-            for topic in arrivals.topics
-        }
+        heard = arrivals.heard_between(began_ns, ended_ns)
     recorded = _recorded(file, {s for s, _ in heard["ultrasound/image"]}) if case.recorder else None
     return Point(case, heard, recorded, usage.uses, scheduling)
 

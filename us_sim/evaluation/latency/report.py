@@ -9,7 +9,17 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from us_sim.evaluation.latency.measure import DEMO, HAND, LIVE, RATE, Case, Point, cases, run_case
+from us_sim.evaluation.latency.measure import (
+    DEMO,
+    HAND,
+    LIVE,
+    RATE,
+    Case,
+    Point,
+    cases,
+    live_cases,
+    run_case,
+)
 from us_sim.evaluation.report import (
     ReportFolder,
     Target,
@@ -22,10 +32,6 @@ from us_sim.evaluation.report import (
     plain_bars,
     target_table,
 )
-from us_sim.evaluation.timing import timed_cases
-from us_sim.run.live import prepare_volume
-from us_sim.run.processes import keep_on_this_host
-from us_sim.scene.reading import load_scene
 
 _IMAGE = "ultrasound/image"
 _HEAD = (
@@ -46,22 +52,14 @@ _NODES = {
 def evaluate_latency(out: Path, quick: bool) -> int:
     """Write latency.csv, the plots and latency.md, as `us_sim.evaluation` says."""
     folder = ReportFolder("latency", out, quick)
-    keep_on_this_host(network=False)
-    planned = cases(quick)
-    prepare_volume(load_scene("upper_arm"))
-    points = timed_cases(
-        "latency",
-        {case: case.seconds for case in planned},
-        run_case,
-        lambda case, words: Point(case, failure=words),
-    )
-    folder.write_rows("latency", points)
+    points = live_cases(folder, cases(quick), run_case, Point)
     table = target_table(targets(points))
     _plot_hops(points, folder.picture("hops"))
     _plot_usage(points, folder.picture("usage"))
     longest = max(points, key=lambda point: (bool(point.images), point.case.seconds))
     _plot_over_time(longest, folder.picture("time"))
-    folder.write_report(
+    return folder.finish(
+        table,
         failures(points),
         ("numpy", "numba"),
         targets=table,
@@ -70,7 +68,6 @@ def evaluate_latency(out: Path, quick: bool) -> int:
         longest=str(longest.case),
         rate=f"{RATE:.0f}",
     )
-    return folder.finish(table, failures(points))
 
 
 def targets(points: Sequence[Point]) -> list[Target]:

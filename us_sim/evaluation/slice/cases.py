@@ -83,7 +83,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """As on the screen."""
+        """The case in words, as on the screen."""
         counts = "x".join(map(str, self.counts))
         return f"{self.size} px, {counts} nodes, {self.deformation}, {self.plane}"
 

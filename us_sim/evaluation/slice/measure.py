@@ -32,12 +32,13 @@ from us_sim.evaluation.slice.cases import (
 )
 from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.cutting.slicer import create_slicer
+from us_sim.slicing.cutting.slicer import Slicer, create_slicer
 from us_sim.slicing.formation.coupling import ContactSurface
 from us_sim.slicing.formation.image_formation import ImageFormation
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
 from us_sim.slicing.settings import Imaging
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
 Array = NDArray[np.float64]
@@ -97,46 +98,25 @@ class Point(Row):
         return f"{self.method} on {self.size} px, {self.nodes} nodes"
 
 
-@dataclass(frozen=True)
-class Contender:
-    """A method ready to cut a case's images."""
-
-    method: str
-    threads: int
-    image: Callable[[Frame], NDArray[np.uint8]]
-    rest_coordinates: Callable[[Frame], Array]
-    parts: Callable[[], tuple[float, float]] | None = None  # ms of the latest image, where known
-
-
 def is_installed() -> bool:
     """Whether VTK can be imported."""
     return importlib.util.find_spec("vtkmodules") is not None
 
 
 def methods() -> list[SlicingMethod]:
-    """Those that can be evaluated here."""
+    """Methods that can be evaluated here."""
     return [method for name, method in SLICING_METHODS.items() if name != "vtk" or is_installed()]
 
 
-def contender(volume: Volume, case: Case, method: str, threads: int) -> Contender:
-    """A method that is about to cut a case's images of a volume.
+def slicer_of(method: str, threads: int, volume: Volume, mesh: TetrahedralMesh) -> AnySlicer:
+    """A method that is ready to cut a volume, carried by a mesh.
 
     Raises:
         ImportError: the method's module, or a library of it, cannot be imported.
     """
-    mesh = case.mesh()
-    slicer: Any
     if method == "vtk":
-        slicer = VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
-    else:
-        slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=threads)
-    return Contender(
-        method,
-        threads,
-        lambda frame: slicer.image(frame.nodes, frame.plane),
-        lambda frame: slicer.rest_coordinates(frame.nodes, frame.plane),
-        (lambda: (slicer.filter_ms, slicer.sampling_ms)) if method == "vtk" else None,
-    )
+        return VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
+    return create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=threads)
 
 
 class Bench:
@@ -157,7 +137,7 @@ class Bench:
         exact = exact_slice(self.volume, mesh.nodes, mesh.tetrahedra, first.nodes, first.plane)
         shown = sampled(self._contrast, exact.rest)
         seen: dict[str, NDArray[np.uint8]] = {}
-        contenders: list[Contender] = []
+        slicers: dict[tuple[str, int], AnySlicer] = {}
         points: dict[tuple[str, int], Point] = {}
         for method, threads in ((m, n) for m in methods() for n in m.threads):
             point = Point(
@@ -166,13 +146,13 @@ class Bench:
                 plane=case.plane,
             )
             try:
-                ready = contender(self.volume, case, method.name, threads)
+                slicer = slicer_of(method.name, threads, self.volume, mesh)
                 if method.name not in seen:
-                    other = contender(self._contrast, case, method.name, threads)
-                    seen[method.name] = other.image(first)
+                    other = slicer_of(method.name, threads, self._contrast, mesh)
+                    seen[method.name] = other.image(first.nodes, first.plane)
                 errors: Any = compare(
-                    *(self.volume, first, exact, ready.image(first)),
-                    ready.rest_coordinates(first),
+                    *(self.volume, first, exact, slicer.image(first.nodes, first.plane)),
+                    slicer.rest_coordinates(first.nodes, first.plane),
                     (shown, seen[method.name]),
                     tissue_only=method.tissue_only,
                 )
@@ -181,45 +161,44 @@ class Bench:
                 points[method.name, threads] = replace(point, failure=words_of(error))
                 continue
             points[method.name, threads] = replace(point, **errors)
-            contenders.append(ready)
-        times: Any = timed_together(contenders, frames, self._seconds[case != MAIN])
-        for ready, columns in zip(contenders, times, strict=True):
-            key = (ready.method, ready.threads)
+            slicers[method.name, threads] = slicer
+        times: Any = timed_together([*slicers.values()], frames, self._seconds[case != MAIN])
+        for key, columns in zip(slicers, times, strict=True):
             points[key] = replace(points[key], **columns)
         return list(points.values())
 
 
 def timed_together(
-    contenders: Sequence[Contender], frames: Sequence[Frame], seconds: float
+    slicers: Sequence[AnySlicer], frames: Sequence[Frame], seconds: float
 ) -> list[dict[str, float]]:
-    """Times of all contenders, by columns of `Point`, in turns on a noisy machine.
+    """Times of all slicers, by columns of `Point`, in turns on a noisy machine.
 
     The probe moves on from image to image. A turn has five images of a method that takes less than
     8 ms, one of another.
 
     Args:
-        contenders: to be timed; each has cut an image before, so that nothing is compiled now.
+        slicers: to be timed; each has cut an image before, so that nothing is compiled now.
         frames: that they cut, over and over.
         seconds: after which no further turn begins, if each has had three; methods slower than 150
             ms sit those out.
     """
-    found: list[list[float]] = [[] for _ in contenders]
-    processor: list[list[float]] = [[] for _ in contenders]
-    parts: list[list[tuple[float, float]]] = [[] for _ in contenders]
+    found: list[list[float]] = [[] for _ in slicers]
+    processor: list[list[float]] = [[] for _ in slicers]
+    parts: list[list[tuple[float, float]]] = [[] for _ in slicers]
     begin = time.perf_counter()
     turn = 0
     while turn < 3 or time.perf_counter() - begin < seconds:
-        for number, contender in enumerate(contenders):
+        for number, slicer in enumerate(slicers):
             if turn and min(found[number]) > 150.0 and time.perf_counter() - begin > seconds:
                 continue
             for image in range(5):
                 frame = frames[(turn + image) % len(frames)]
                 before, worked = time.perf_counter(), time.process_time()
-                contender.image(frame)
+                slicer.image(frame.nodes, frame.plane)
                 found[number].append((time.perf_counter() - before) * 1e3)
                 processor[number].append((time.process_time() - worked) * 1e3)
-                if contender.parts is not None:
-                    parts[number].append(contender.parts())
+                if isinstance(slicer, VtkSlicer):
+                    parts[number].append((slicer.filter_ms, slicer.sampling_ms))
                 if min(found[number]) > 8.0:
                     break
         turn += 1
@@ -459,3 +438,6 @@ class VtkSlicer:
         """(rows, columns): which pixels of the latest image lie in the mesh."""
         mask = self._finder.GetOutput().GetPointData().GetArray("vtkValidPointMask")
         return np.asarray(self._to_numpy(mask).reshape(plane.rows, plane.columns) > 0)
+
+
+AnySlicer = Slicer | VtkSlicer

@@ -36,6 +36,7 @@ from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import ConvexProbe, Probe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.files.readers import read_volume
+from us_sim.volume.reconstruction.reconstruction import correlation
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
 from us_sim.volume.volume import Volume
 
@@ -249,13 +250,9 @@ def normalised_cross_correlation(
     a: NDArray[np.generic], b: NDArray[np.generic], where: NDArray[np.bool_]
 ) -> float:
     """Pearson's correlation of two images over some of their pixels; NaN where one is constant."""
-    first, second = a[where].astype(np.float64), b[where].astype(np.float64)
-    if first.size < 2:
+    if np.count_nonzero(where) < 2:
         return math.nan
-    first -= first.mean()
-    second -= second.mean()
-    scale = math.sqrt(float(first @ first) * float(second @ second))
-    return float(first @ second) / scale if scale else math.nan
+    return correlation(a[where].astype(np.float64), b[where].astype(np.float64))
 
 
 def _draw_recorded(

@@ -21,6 +21,7 @@ from us_sim.evaluation.report import (
     filled,
     key_beside,
     markdown_table,
+    method_keys,
     number,
     picture,
     plain,
@@ -34,10 +35,10 @@ from us_sim.evaluation.slice.measure import (
     SLICING_METHODS,
     Bench,
     Point,
-    contender,
     costs,
     is_installed,
     methods,
+    slicer_of,
     wrong_pixels,
 )
 from us_sim.evaluation.slice.recorded import RecordedComparison, compare_with_recorded
@@ -89,7 +90,10 @@ def evaluate_slice(out: Path, quick: bool, recorded: RecordedSweep | None = None
     probe_rows = [(name, f"{ms:.2f}", f"{100 * shown[name]:.0f} %") for name, ms in probes.items()]
     default = next(iter(settings.values()), 0.0)
     setting_rows = [(name, f"{ms:.2f}", f"{ms - default:+.2f}") for name, ms in settings.items()]
-    folder.write_report(
+    if not is_installed():
+        print(HOW_TO_GET)
+    return folder.finish(
+        table,
         failures(points),
         ("numpy", "scipy", "numba", "vtk"),
         without_vtk="" if any(p.method == "vtk" for p in points) else HOW_TO_GET + ".",
@@ -106,9 +110,6 @@ def evaluate_slice(out: Path, quick: bool, recorded: RecordedSweep | None = None
         settings=markdown_table(("imaging", "CPU ms", "more than at the defaults"), setting_rows),
         recorded=comparison.markdown() if comparison else "",
     )
-    if not is_installed():
-        print(HOW_TO_GET)
-    return folder.finish(table, failures(points))
 
 
 def _compared(recorded: RecordedSweep | None, out: Path, quick: bool) -> RecordedComparison | None:
@@ -325,11 +326,7 @@ def _times(panel: Axes, points: Sequence[Point], across: Callable[[Point], float
 
 
 def _keys(panel: Axes, known: set[str], two_threads: bool = True) -> None:
-    keys = [
-        Line2D([], [], color=method.colour, marker=method.mark, label=name)
-        for name, method in SLICING_METHODS.items()
-        if name in known
-    ]
+    keys = method_keys({name: SLICING_METHODS[name] for name in SLICING_METHODS if name in known})
     if two_threads:
         words = "two threads, wall clock"
         keys.append(Line2D([], [], color="0.4", ls="", marker="o", mfc="white", label=words))
@@ -354,7 +351,8 @@ def _draw_differences(volume: Volume, names: Sequence[str], file: Path) -> None:
             line[0].imshow(np.rint(exact.grey), cmap="gray", vmin=0, vmax=255)
             line[0].set_ylabel(f"{case.deformation}\n{PLANES[case.plane].words}", fontsize=8)
             for panel, name in zip(line[1:], names, strict=True):
-                rest = contender(volume, case, name, 1).rest_coordinates(frame)
+                slicer = slicer_of(name, 1, volume, mesh)
+                rest = slicer.rest_coordinates(frame.nodes, frame.plane)
                 tissue_only = SLICING_METHODS[name].tissue_only
                 right, wrong, expected = wrong_pixels(volume, frame, exact, rest, tissue_only)
                 distance = np.where(right, voxel_distance(volume, rest, expected), np.nan)

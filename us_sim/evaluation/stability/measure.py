@@ -62,7 +62,7 @@ class Trial:
     recovery_frames: int | None = None  # until it was near rest; None when it never was
     residual_reported: float = math.nan  # in the last frame with a probe, or the first untrue one
     residual_checked: float = math.nan  # in the same frame
-    held: list[float] = field(default_factory=list)  # residuals, that when the probe stopped first
+    held: list[float] = field(default_factory=list)  # residuals since the probe stopped
     held_inverted: int = 0  # tetrahedra, at the end of the hold
     step_limit_predicted: float = math.nan  # s
     step_limit_observed: float = math.nan  # s

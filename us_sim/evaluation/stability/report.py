@@ -88,9 +88,30 @@ def evaluate_stability(out: Path, quick: bool) -> int:
     folder.write_rows("stability", tried)
     numbers = markdown_table(_HEAD, [_numbers(method, tried) for method in _methods(tried)])
     limits = _step_limits(tried)
-    _write_report(folder, tried, numbers, limits)
     lines = [f"step limit of {name}: {said}" for name, said in limits.items()]
-    return folder.finish("\n".join([numbers, *lines]), failures(tried))
+    limited, maps = [], []
+    for method, said in limits.items():
+        file = folder.picture(f"step_limit_{method}")
+        _draw_step_limits(method, _with_step_limit(method, tried), file)
+        limited += [f"## Step limit of {method}", f"{said}."]
+        limited += [f"![predicted and observed]({file.name})"]
+    for method in _methods(tried):
+        mine = [one for one in tried if one.method == method]
+        file = folder.picture(method)
+        _draw_map(method, mine, file)
+        maps += [f"## {method}", f"![map]({file.name})", *_worst(mine), *_actions(mine)]
+    failed = failures(tried)
+    return folder.finish(
+        "\n".join([numbers, *lines]),
+        failed,
+        ("numpy", "scipy", "numba"),
+        numbers=numbers,
+        none_failed="" if failed else "No case failed.",
+        held=_held(tried),
+        step_limits="\n\n".join(limited),
+        methods="\n\n".join(maps),
+        refusals=_refusals(tried),
+    )
 
 
 def _tasks(quick: bool) -> Iterator[_Task]:
@@ -164,34 +185,6 @@ def _try(task: _Task) -> Trial:
                     f"predicts a step limit of {predicted:.4g} s, but it is {observed:.4g} s"
                 )
     return trial
-
-
-def _write_report(
-    folder: ReportFolder, tried: Sequence[Tried], numbers: str, limits: dict[str, str]
-) -> None:
-    """Draw the maps and write stability.md."""
-    limited, maps = [], []
-    for method, said in limits.items():
-        file = folder.picture(f"step_limit_{method}")
-        _draw_step_limits(method, _with_step_limit(method, tried), file)
-        limited += [f"## Step limit of {method}", f"{said}."]
-        limited += [f"![predicted and observed]({file.name})"]
-    for method in _methods(tried):
-        mine = [one for one in tried if one.method == method]
-        file = folder.picture(method)
-        _draw_map(method, mine, file)
-        maps += [f"## {method}", f"![map]({file.name})", *_worst(mine), *_actions(mine)]
-    failed = failures(tried)
-    folder.write_report(
-        failed,
-        ("numpy", "scipy", "numba"),
-        numbers=numbers,
-        none_failed="" if failed else "No case failed.",
-        held=_held(tried),
-        step_limits="\n\n".join(limited),
-        methods="\n\n".join(maps),
-        refusals=_refusals(tried),
-    )
 
 
 @dataclass(frozen=True)
@@ -427,7 +420,7 @@ def _actions(tried: Sequence[Tried]) -> list[str]:
     for one in tried:
         if not one.trial.refused:
             parts = (part for action in one.trial.actions for part in action.split("; "))
-            counted.update({_without_numbers(part) for part in parts})
+            counted.update(dict.fromkeys(map(_without_numbers, parts), 1))
     if not counted:
         return []
     lines = [f"- {number}: {said}" for said, number in counted.most_common(12)]

@@ -39,6 +39,7 @@ try:
         ElementTetP1,
         ElementVector,
         FacetBasis,
+        LinearForm,
         MeshHex,
         MeshTet,
     )
@@ -180,8 +181,17 @@ class NeoHookeanHexahedra:
         mesh = MeshHex.init_tensor(*self.planes)
         basis = Basis(mesh, ElementHex2(), intorder=5)
         self.nodes = basis.doflocs.T.copy()  # (N, 3) m
-        self.corners = Basis(mesh, ElementHex1()).doflocs.T.copy()  # (C, 3) m
         self.elements = basis.element_dofs.T.copy()  # (M, 27)
+        linear = Basis(mesh, ElementHex1())
+        self.corners = linear.doflocs.T.copy()  # (C, 3) m
+        # In the unit cube a node of a quadratic element is between the corners of its element.
+        places = ElementHex2.doflocs.T
+        weights = np.stack([linear.elem.lbasis(places, i)[0] for i in range(8)], axis=1)
+        element, node = np.divmod(np.unique(self.elements, return_index=True)[1], 27)
+        entries, columns = weights[node].ravel(), linear.element_dofs.T[element].ravel()
+        #: (N, C), interpolation from the corners to the nodes.
+        self.from_corners = csr_array((entries, columns, np.arange(0, len(entries) + 1, 8)))
+        self.from_corners.eliminate_zeros()
         self._weights = basis.dx  # (M, Q) m3
         # (M, 27, Q, 3) 1/m
         self._gradients = np.ascontiguousarray(
@@ -354,6 +364,16 @@ def _elasticity(u, v, w):  # type: ignore[no-untyped-def]
     return 2 * w["shear"] * ddot(sym_grad(u), sym_grad(v)) + w["rest"] * div(u) * div(v)
 
 
+@BilinearForm
+def _divergence(u, v, _):  # type: ignore[no-untyped-def]
+    return div(u) * v
+
+
+@LinearForm
+def _volume(v, _):  # type: ignore[no-untyped-def]
+    return v
+
+
 class LinearEquations:
     """Hooke's law on linear tetrahedra, with the part of the bulk stiffness that acts at nodes.
 
@@ -365,22 +385,12 @@ class LinearEquations:
         mesh = MeshTet(*map(np.ascontiguousarray, (model.mesh.nodes.T, model.mesh.tetrahedra.T)))
         split = volumetric_split(model.materials)
         shear, element = float(split.shear[0]), float(split.element[0])
-        vectors = Basis(mesh, ElementVector(ElementTetP1()))
+        vectors = Basis(mesh, ElementVector(ElementTetP1()), intorder=2)
+        scalars = vectors.with_element(ElementTetP1())
         self._matrix = _elasticity.assemble(vectors, shear=shear, rest=element - shear).tocsr()
-
-        count, size = len(model.mesh.nodes), len(model.mesh.tetrahedra)
-        scalars = Basis(mesh, ElementTetP1())
-        gradients = np.stack([field[0].grad[:, :, 0] for field in scalars.basis])  # (4, 3, M)
-        columns = 3 * mesh.t[:, None] + np.arange(3)[None, :, None]
-        entries, places = (x.transpose(2, 0, 1).ravel() for x in (gradients, columns))
-        starts = np.arange(0, 12 * size + 1, 12)
-        divergence = csr_array((entries, places, starts), shape=(size, 3 * count))
-        # A quarter of each tetrahedron belongs to each of its nodes.
-        quarter = np.repeat(scalars.dx.sum(axis=1) / 4, 4)
-        around = csr_array((quarter, (mesh.t.T.ravel(), np.repeat(np.arange(size), 4))))
-        volume = around.sum(axis=1)
+        volume = _volume.assemble(scalars)  # m3, of a quarter of each tetrahedron around a node
         each = dia_array((1 / volume[None], [0]), shape=2 * volume.shape)
-        self._average = (each @ around @ divergence).tocsr()
+        self._average = (each @ _divergence.assemble(vectors, scalars)).tocsr()
         self._spread = self._average.T.tocsr()
         self._nodal = float(split.nodal[0]) * volume  # (N,) Pa m3
 

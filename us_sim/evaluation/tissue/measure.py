@@ -84,7 +84,7 @@ class Outcome:
         )
 
 
-def compare(found: Outcome, exact: Outcome, rest_volume: float) -> dict[str, float]:
+def compare(found: Outcome, exact: Outcome, rest_volume: float) -> dict[str, Any]:
     """Errors of ``found``, by their columns of `Point`."""
     difference = found.displacement - exact.displacement
     return {
@@ -184,11 +184,11 @@ class Bench:
         if trial.own:
             try:
                 exact, words = self._own_solution(trial, model, last)
-                yield replace(done, **compare(found, exact, rest), reference=words, own=True)  # type: ignore[arg-type]
+                yield replace(done, **compare(found, exact, rest), reference=words, own=True)
             except Exception as error:
                 yield self._failed(done, error)
         exact, words = self._nonlinear(trial, model)
-        yield replace(done, **compare(found, exact, rest), reference=words)  # type: ignore[arg-type]
+        yield replace(done, **compare(found, exact, rest), reference=words)
 
     @staticmethod
     def _failed(point: Point, error: Exception) -> Point:

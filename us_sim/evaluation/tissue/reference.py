@@ -145,9 +145,8 @@ class _Search:
         self.displacement = np.zeros_like(block.nodes)
         self.push = np.zeros(len(block.surface_points))  # Pa, multipliers
         self.free = _movable(block, block.nodes)
-        grid = np.stack(np.meshgrid(*block.planes, indexing="ij"), axis=-1).reshape(-1, 3)
-        coarse = np.flatnonzero(_movable(block, grid).ravel())
-        spread = csr_array(kron(_trilinear(block.planes, block.nodes), np.eye(3)))
+        coarse = np.flatnonzero(_movable(block, block.corners).ravel())
+        spread = csr_array(kron(block.from_corners, np.eye(3)))
         self._mask = _diagonal(self.free.ravel().astype(float))
         self._prolongation = (self._mask @ spread).tocsr()[:, coarse]
 
@@ -256,33 +255,6 @@ def _movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
     free[np.isclose(points[:, 1], block.planes[1][0]), 1] = False
     free[np.isclose(points[:, 2], block.planes[2][-1])] = False
     return free
-
-
-def _trilinear(planes: Sequence[Array], points: Array) -> csr_array:
-    """(P, K), interpolation from the grid's K nodes, the last axis fastest, to points (P, 3)."""
-    shape = tuple(len(coordinates) for coordinates in planes)
-    cells, fractions = [], []
-    for axis, coordinates in enumerate(planes):
-        cell = np.searchsorted(coordinates, points[:, axis], side="right") - 1
-        cell = np.clip(cell, 0, len(coordinates) - 2)
-        cells.append(cell)
-        fractions.append((points[:, axis] - coordinates[cell]) / np.diff(coordinates)[cell])
-    columns, weights = [], []
-    for corner in np.ndindex(2, 2, 2):
-        place = [cell + offset for cell, offset in zip(cells, corner, strict=True)]
-        columns.append(np.ravel_multi_index(place, shape))
-        near = [f if offset else 1.0 - f for f, offset in zip(fractions, corner, strict=True)]
-        weights.append(np.prod(near, axis=0))
-    matrix = csr_array(
-        (
-            np.stack(weights, axis=1).ravel(),
-            np.stack(columns, axis=1).ravel(),
-            np.arange(0, 8 * len(points) + 1, 8),
-        ),
-        shape=(len(points), int(np.prod(shape))),
-    )
-    matrix.eliminate_zeros()
-    return matrix
 
 
 _STRIDE = 0.005  # m, the least distance between the poses through which the last is approached

@@ -50,9 +50,7 @@ def evaluate_tissue(out: Path, quick: bool) -> int:
     bench = Bench(references)
     points = [p for trial in steps("errors and times", trials, "points") for p in bench.run(trial)]
     folder.write_rows("tissue", points)
-    _write_report(folder, points, references)
-    shown = markdown_table(_DEFAULTS, [_default_cells(p) for p in _defaults(points)])
-    return folder.finish(shown, failures(points))
+    return _report(folder, points, references)
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -80,9 +78,7 @@ def _references(scenes: Iterable[Scene], quick: bool) -> dict[str, Reference]:
     return found
 
 
-def _write_report(
-    folder: ReportFolder, points: Sequence[Point], references: dict[str, Reference]
-) -> None:
+def _report(folder: ReportFolder, points: Sequence[Point], references: dict[str, Reference]) -> int:
     """Pictures and tissue.md.
 
     Results on one mesh are those on the paper's finest, or else on the finest there is; those of
@@ -117,7 +113,8 @@ def _write_report(
         _plot_errors({k: v for k, v in panels.items() if v}, title, folder.picture(name))
     _plot_sizes(by_size, f"Cost against size, {SCENES[scene].words}", folder.picture("size"))
     defaults = [(*_default_cells(p), _number(p.smallest_volume_ratio)) for p in _defaults(points)]
-    folder.write_report(
+    return folder.finish(
+        markdown_table(_DEFAULTS, [_default_cells(p) for p in _defaults(points)]),
         failures(points),
         ("numpy", "scipy", "numba", "scikit-fem"),
         references=_reference_table(references),

@@ -63,7 +63,7 @@ class Marker:
 
     @cached_property
     def body(self) -> RigidBody:
-        """Made once."""
+        """The body, made once."""
         return self.make()
 
     @cached_property

@@ -102,7 +102,7 @@ class Point(Row):
 
     @property
     def found(self) -> list[View]:
-        """Views in which the body was."""
+        """Views in which the body was found."""
         return [view for view in self.views if view.detected]
 
     @property
@@ -131,7 +131,7 @@ def select(points: Sequence[Point], **case: object) -> list[Point]:
 
 
 def views_of(points: Sequence[Point], **case: object) -> list[View]:
-    """All views of these."""
+    """All views of the points that `select` finds."""
     return [view for point in select(points, **case) for view in point.views]
 
 

@@ -79,8 +79,27 @@ def evaluate_tracking(out: Path, quick: bool) -> int:
     folder.write_rows("small_markers", small)
     folder.write_rows("filters", filters)
     table = target_table([*targets(points), _small_marker_target(small)])
-    _write_report(folder, points, small, filters, table)
-    return folder.finish(table, failures(points))
+    _draw_views(folder.picture("views"))
+    _plot_views(points, folder.picture("error"))
+    _plot_run_time(points, folder.picture("run_time"))
+    _plot_conditions(points, folder.picture("conditions"))
+    _plot_filters(filters, folder.picture("filters"))
+    return folder.finish(
+        table,
+        failures(points),
+        ("numpy", "numba", "opencv-python-headless", "opencv-python"),
+        count=f"{sum(len(point.views) for point in points):,}",
+        targets=table,
+        markers="\n".join(f"- `{name}`: {kind.words}" for name, kind in MARKERS.items()),
+        conditions_in_words="\n".join(f"- {name}: {s}" for name, (_, s) in CONDITIONS.items()),
+        bodies=_bodies(points),
+        times=_times(points),
+        conditions=_conditions(points),
+        small=_small(small),
+        covariance=_covariance(points),
+        filters=_filters(filters),
+        frames=f"{FRAMES}",
+    )
 
 
 def _point(bench: Bench, case: Case, quick: bool) -> Point:
@@ -144,35 +163,6 @@ def _small_marker_target(points: Sequence[SmallMarkerPoint]) -> Target:
     found, kept = (sum(getattr(p, name) for p in points) for name in ("found_by_opencv", "kept"))
     said = f"markers of 14 to 44 pixels: kept of {found} that OpenCV finds"
     return Target(said, "all", f"{kept}", kept == found if found else None)
-
-
-def _write_report(
-    folder: ReportFolder,
-    points: Sequence[Point],
-    small: Sequence[SmallMarkerPoint],
-    filters: Sequence[FilterPoint],
-    table: str,
-) -> None:
-    _draw_views(folder.picture("views"))
-    _plot_views(points, folder.picture("error"))
-    _plot_run_time(points, folder.picture("run_time"))
-    _plot_conditions(points, folder.picture("conditions"))
-    _plot_filters(filters, folder.picture("filters"))
-    folder.write_report(
-        failures(points),
-        ("numpy", "numba", "opencv-python-headless", "opencv-python"),
-        count=f"{sum(len(point.views) for point in points):,}",
-        targets=table,
-        markers="\n".join(f"- `{name}`: {kind.words}" for name, kind in MARKERS.items()),
-        conditions_in_words="\n".join(f"- {name}: {s}" for name, (_, s) in CONDITIONS.items()),
-        bodies=_bodies(points),
-        times=_times(points),
-        conditions=_conditions(points),
-        small=_small(small),
-        covariance=_covariance(points),
-        filters=_filters(filters),
-        frames=f"{FRAMES}",
-    )
 
 
 def _draw_views(file: Path) -> None:

@@ -54,7 +54,7 @@ class Case:
 
 
 def cases(quick: bool) -> list[Case]:
-    """Those of a run; of a quick one for some seconds each."""
+    """Cases of a run; in a quick one each takes some seconds."""
     chosen = [
         Case(viewer=False),
         Case(),
@@ -167,7 +167,7 @@ class Browser:
         pages: how many.
 
     Raises:
-        UsSimError: there is none here.
+        UsSimError: Chromium or playwright is not installed.
     """
 
     def __init__(self, address: str, pages: int) -> None:
@@ -214,7 +214,7 @@ class Browser:
         return {name: float(found.get(name) or math.nan) for name in ("median", "p99", "count")}
 
     def close(self) -> None:
-        """End it."""
+        """Close the browser."""
         self._browser.close()
         self._tool.stop()
 
@@ -267,7 +267,7 @@ class Taker:
             thread.start()
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection, and end the threads."""
         self._open = False
         self._stack.close()
         for thread in self._threads:
@@ -346,10 +346,7 @@ def run_case(case: Case, tell: Tell) -> Point:
             median, p99, count = pages.delays()
         finally:
             pages.close()
-        heard = {
-            topic: [each for each in arrivals.heard(topic) if began_ns <= each[0] < ended_ns]
-            for topic in ("tracker/pose", "ultrasound/image")
-        }
+        heard = arrivals.heard_between(began_ns, ended_ns)
     images = {stamp for stamp, _ in heard["ultrasound/image"]}
     poses = {stamp for stamp, _ in heard["tracker/pose"]}
     return Point(
@@ -368,7 +365,7 @@ def run_case(case: Case, tell: Tell) -> Point:
 
 
 class _Pages:
-    """Pages of both kinds."""
+    """The pages of a case: those in a browser, and those that only take."""
 
     def __init__(self, case: Case, command: _Command) -> None:
         self._case = case
@@ -390,7 +387,7 @@ class _Pages:
             self.started = time.monotonic() - command.began
 
     def images(self) -> list[int]:
-        """Number of images of each."""
+        """Number of images of each page."""
         drawn = self._browser.images() if self._browser else []
         return [*drawn, *(len(taker.images) for taker in self._takers)]
 
@@ -402,7 +399,7 @@ class _Pages:
             time.sleep(max(seconds, 0.0))
 
     def delays(self) -> Sequence[float]:
-        """Median, 99th percentile, and number of those that were measured."""
+        """Median and 99th percentile of the delays, ms, and their number."""
         if self._browser:
             found = self._browser.delays()
             return found["median"], found["p99"], found["count"]
@@ -410,7 +407,7 @@ class _Pages:
         return percentile(delays, 50), percentile(delays, 99), len(delays) or np.nan
 
     def close(self) -> None:
-        """Close them."""
+        """Close all pages."""
         for taker in self._takers:
             taker.close()
         if self._browser:
@@ -430,16 +427,17 @@ class _Command:
         return self.process.pid
 
     def said(self) -> str:
-        """All that it has written."""
+        """Output so far."""
         return Path(self.output.name).read_text(encoding="utf-8", errors="replace")
 
     def check(self) -> None:
         """Raise UsSimError when it has ended."""
         if self.process.poll() is not None:
-            raise UsSimError(f"us-sim has ended: {self.said().strip().splitlines()[-1:]}")
+            lines = self.said().strip().splitlines()
+            raise UsSimError(f"us-sim has ended{': ' if lines else ''}{''.join(lines[-1:])}")
 
     def address(self) -> str:
-        """That it has printed."""
+        """Address of the page, once it is printed."""
         while not (found := _ADDRESS.search(self.said())):
             self.check()
             if time.monotonic() - self.began > 300.0:

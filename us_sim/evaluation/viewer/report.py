@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from us_sim.evaluation.latency.measure import live_cases
 from us_sim.evaluation.report import (
     ReportFolder,
     Target,
@@ -19,11 +20,7 @@ from us_sim.evaluation.report import (
     plain_bars,
     target_table,
 )
-from us_sim.evaluation.timing import timed_cases
 from us_sim.evaluation.viewer.measure import Point, cases, run_case
-from us_sim.run.live import prepare_volume
-from us_sim.run.processes import keep_on_this_host
-from us_sim.scene.reading import load_scene
 
 _HEAD = (
     *("", "s", "images/s made", "poses skipped %", "age ms p50", "p99", "images/s shown"),
@@ -34,28 +31,19 @@ _HEAD = (
 def evaluate_viewer(out: Path, quick: bool) -> int:
     """Write viewer.csv, the plots and viewer.md, as `us_sim.evaluation` says."""
     folder = ReportFolder("viewer", out, quick)
-    keep_on_this_host(network=False)
-    planned = cases(quick)
-    prepare_volume(load_scene("upper_arm"))
-    points = timed_cases(
-        "viewer",
-        {case: case.seconds for case in planned},
-        run_case,
-        lambda case, words: Point(case, failure=words),
-    )
-    folder.write_rows("viewer", points)
+    points = live_cases(folder, cases(quick), run_case, Point)
     table = target_table(targets(points))
     _plot_rates(points, folder.picture("rates"))
     longest = max(points, key=lambda point: (bool(point.usage), point.case.seconds))
     _plot_memory(longest, folder.picture("memory"))
-    folder.write_report(
+    return folder.finish(
+        table,
         failures(points),
         ("nicegui", "playwright"),
         targets=table,
         rows=markdown_table(_HEAD, [_cells(point) for point in points]),
         longest=str(longest.case),
     )
-    return folder.finish(table, failures(points))
 
 
 def targets(points: Sequence[Point]) -> list[Target]:

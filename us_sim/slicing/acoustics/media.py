@@ -201,7 +201,7 @@ class BeamGrid:
         return np.ascontiguousarray((row * many + column).T, dtype=np.int32)
 
     def _pixel_places(self, probe: Probe) -> tuple[NDArray, NDArray]:
-        """Where each pixel lies among samples and beams, as `cv2.remap` takes it."""
+        """Sample and beam of each pixel, in the form that `cv2.remap` takes."""
         line, distance = probe.pixel_beams
         row, column = _nearest(~np.isnan(line))
         beam = (line[row, column] + 0.5) * (self.beams / probe.lines) - 0.5

@@ -51,7 +51,7 @@ class Media(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """Where beams enter another medium; of each array only the first entries are in use."""
+    """Places where beams enter another medium; only the first entries of each array are used."""
 
     beam: NDArray[np.int32]
     distance: NDArray[np.float32]  # in samples from the first one
@@ -462,7 +462,7 @@ def sharpen_edges(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _let_through(samples, one, dark, lit, blocked, blocker):
-    """Has a beam blocked as the dark one is, but for a part of its width."""
+    """Block beam ``one`` as the dark one is, but for the part ``lit`` of its width."""
     for s in range(samples):
         loss = blocked[s, dark]
         if loss > np.float32(0.0):

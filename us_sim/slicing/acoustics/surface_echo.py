@@ -237,7 +237,7 @@ _PARTS = 256  # of the weighted mean that are told apart
 
 
 class SurfaceNormals:
-    """Of a volume's labels (i, j, k)."""
+    """Normals of the borders between a volume's labels (i, j, k)."""
 
     def __init__(self, labels: NDArray[np.uint8]) -> None:
         shape = np.array(labels.shape, dtype=np.int64)

@@ -93,7 +93,7 @@ class PerPixel(Slicer):
     def _place(
         self, nodes: NDArray[np.float64], plane: SlicePlane
     ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.int32]]:
-        """Where each pixel lies at rest, (rows, columns, 3) m, NaN outside the mesh.
+        """Rest place of each pixel, (rows, columns, 3) m, NaN outside the mesh.
 
         Also the tetrahedra (E,) on the image, and which of them each pixel is in (rows, columns),
         -1 outside all.

@@ -135,7 +135,7 @@ def _evaluate(maps, elements, first_row, end_row, values):
 def sample_plane(volume: Volume, plane: SlicePlane, *, threads: int = 1) -> NDArray[np.uint8]:
     """The image (rows, columns) on a plane through the volume as it is, without tissue.
 
-    It does not depend on the number of threads.
+    Values are those of `span_sampling`, and do not depend on the number of threads.
 
     Raises:
         VolumeError: the volume has too many voxels.

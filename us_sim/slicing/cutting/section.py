@@ -389,7 +389,7 @@ def _near(nodes, to_pixel, columns, rows, tetrahedra, starts, members, sides, ne
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _find_sides(nodes, to_pixel, right, bottom, sides):
-    """Which sides of the image each node is beyond; returns whether all nodes are finite."""
+    """Fill the sides of the image that each node is beyond; returns whether all are finite."""
     cx, cy, cz, c0 = to_pixel[0, 0], to_pixel[0, 1], to_pixel[0, 2], to_pixel[0, 3]
     rx, ry, rz, r0 = to_pixel[1, 0], to_pixel[1, 1], to_pixel[1, 2], to_pixel[1, 3]
     hx, hy, hz, h0 = to_pixel[2, 0], to_pixel[2, 1], to_pixel[2, 2], to_pixel[2, 3]

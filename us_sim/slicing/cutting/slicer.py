@@ -101,7 +101,11 @@ class Slicer(ABC):
             MeshError: as for `image`.
         """
         label_voxels(self._volume)  # refuses before the work
-        return self.labels_at(self.locate(nodes, plane))
+        return self.labels_at(self._locate_anew(nodes, plane))
+
+    def _locate_anew(self, nodes: ArrayLike, plane: SlicePlane) -> Located:
+        """As `locate`, though nodes may have been written to since an image of them."""
+        return self.locate(np.asarray(nodes).view(), plane)
 
     def labels_at(self, located: Located) -> NDArray[np.uint8]:
         """The label image (rows, columns) of pixels that `locate` has found.
@@ -128,7 +132,7 @@ class Slicer(ABC):
             MeshError: as for `image`.
         """
         to_patient = self._volume.index_to_patient
-        index = self.locate(nodes, plane).rest_index()
+        index = self._locate_anew(nodes, plane).rest_index()
         return np.asarray(index @ to_patient[:3, :3].T + to_patient[:3, 3])
 
 

@@ -102,7 +102,7 @@ def sample_spans(
 def fill_elements(
     spans, used, runs, rigid, black, outlines, points, turns, outline_number, elements
 ):
-    """Which map holds at each pixel: fills ``elements`` (rows, columns) int32.
+    """Fill ``elements`` (rows, columns) int32 with the number of each pixel's map.
 
     Args:
         rigid: the number of the map outside the mesh. black: the number for no map.

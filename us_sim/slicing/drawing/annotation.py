@@ -216,7 +216,7 @@ class Annotation:
                 taken.append(box)
 
     def _beside(self, label: Label, outline: Box) -> list[Box]:
-        """Where a name may stand: above the outline, below, right, left, or in its middle."""
+        """Boxes for a name: above the outline, below, right, left, and in its middle."""
         left, top, right, bottom = outline
         column = max(0, min((left + right - label.width) // 2, self._columns - label.width))
         row = max(0, min((top + bottom - label.height) // 2, self._rows - label.height))

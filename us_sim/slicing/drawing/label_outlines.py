@@ -19,16 +19,16 @@ from us_sim.slicing.frame import Frame
 from us_sim.volume.volume import Volume
 
 Settle = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
-"""Moves points (P, 2) of a label's outline, see `us_sim.slicing.drawing.label_outlines`."""
+"""Moves points (P, 2) of a label's outline to where it runs between voxels."""
 
 _MOST = 64  # most outlines of one label; the longest are taken
+_LEAST = 6.0  # pixels that an outline must enclose
 
 
 def label_outlines(
     labels: NDArray[np.uint8],
     label: int,
     *,
-    least: float = 6.0,
     smoothing: float = 1.0,
     settle: Settle | None = None,
 ) -> list[NDArray[np.float64]]:
@@ -36,7 +36,6 @@ def label_outlines(
 
     Args:
         labels: (rows, columns).
-        least: pixels that an outline must enclose.
         smoothing: pixels, about the length of the steps between pixels that are smoothed away.
         settle: moves points of a label's outline to where it runs between voxels.
 
@@ -50,7 +49,9 @@ def label_outlines(
         return []
     around = mask[top : top + height, left : left + width]
     found, _ = cv2.findContours(around, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=(left, top))
-    enclosing = [chain[:, 0] for chain in found if cv2.contourArea(chain) + len(chain) / 2 >= least]
+    enclosing = [
+        chain[:, 0] for chain in found if cv2.contourArea(chain) + len(chain) / 2 >= _LEAST
+    ]
     enclosing.sort(key=len, reverse=True)
     outlines = [_smooth(chain, smoothing) for chain in enclosing[:_MOST]]
     return outlines if settle is None else [settle(label, outline) for outline in outlines]

@@ -97,7 +97,7 @@ def _cropped(text: str, large: int, scale: float) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class ColourScale:
-    """Which colour a value has: those evenly spaced from ``low`` to ``high``, blended between."""
+    """Colours of values: evenly spaced from ``low`` to ``high``, blended between."""
 
     title: str
     low: float

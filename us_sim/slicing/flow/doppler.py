@@ -178,7 +178,7 @@ class ColourDoppler:
         return Window(self._probe, beam_angles(self._probe, fraction, self.settings.steering))
 
     def _lean(self, depth: NDArray[np.float64] | NDArray[np.float32]) -> NDArray[np.float64]:
-        """By how much a steered beam has moved across, as a fraction, from the box's middle."""
+        """Shift of a steered beam from its place at the box's middle depth, as a fraction."""
         if not isinstance(self._probe, LinearProbe):
             return np.zeros_like(depth)
         slope = math.tan(self.settings.steering) / self._probe.aperture
@@ -409,7 +409,7 @@ _REACH = 8e-3  # m around the nearest place of a vessel, which may cross the ima
 def nearest_vessel(
     blood: Blood, frame: Frame, lateral: float, depth: float, steering: float = 0.0
 ) -> tuple[float, float] | None:
-    """Where the middle is, in the image, of the lumen nearest to a place; None without any.
+    """The centre in the image of the lumen nearest to a place; None without any.
 
     Args:
         lateral, depth: of the place, fraction of the face and m, as of `pixels_of`.

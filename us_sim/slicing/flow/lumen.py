@@ -128,7 +128,7 @@ def lumen_of(lumen: NDArray[np.bool_], index_to_patient: NDArray[np.float64]) ->
 
 
 class _Walls:
-    """Where the wall of a lumen is, as seen from a point within.
+    """The wall of a lumen as seen from a point within.
 
     Args:
         lumen: (i, j, k). low, high: (3,) the box of voxels around it.
@@ -247,7 +247,7 @@ def _extended(points: NDArray[np.float64], walls: _Walls, spacing: float) -> NDA
 
 
 def _without_caps(lumen: Lumen) -> Lumen:
-    """Without the stations at its ends where it closes."""
+    """The lumen without the stations at its ends where it closes."""
     wide = np.flatnonzero(lumen.areas > 0.5 * np.median(lumen.areas))
     kept = slice(int(wide[0]), int(wide[-1]) + 1)
     return Lumen(lumen.centres[kept], lumen.tangents[kept], lumen.across[kept], lumen.radii[kept])

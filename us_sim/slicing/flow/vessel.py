@@ -226,7 +226,7 @@ class Vessel:
 
     @property
     def settings(self) -> FlowSettings:
-        """Of its flow."""
+        """The settings of its flow."""
         return self._settings
 
     @property

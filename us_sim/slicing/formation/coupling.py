@@ -144,7 +144,7 @@ def _smooth(ramp: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet(nodes, rest, triangles, rotation, position, starts, directions, gap, press):
-    """Where each beam enters the surface: last before the face if that is inside, else first after.
+    """Entry of each beam into the surface: last before a face that is inside, else first after.
 
     Folds of a surface that was pushed hard overlap. So the face is inside if the beam entered the
     surface more often than it left it, whatever it did last.

@@ -172,7 +172,7 @@ _LEVELS = _levels()
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _spread_across(image, powers, weights, reach, out):
-    """Rows of grey values (rows, lines), as power spread along the row, to ``out``."""
+    """Spread the power of grey values (rows, lines) along each row, into ``out``."""
     rows, lines = image.shape
     padded = np.empty(lines + 2 * weights.shape[1], dtype=np.float32)
     for row in range(rows):

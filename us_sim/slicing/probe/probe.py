@@ -430,14 +430,12 @@ class SectorProbe(Probe):
         return starts, np.column_stack([np.sin(angle), np.cos(angle)])
 
 
-OUTLINE_POINTS = 33  # of each of the two arcs that an outline has
+def image_outline(probe: Probe) -> NDArray[np.float64]:
+    """(66, 3) m in frame ``probe``: along the face, then back where the image ends.
 
-
-def image_outline(probe: Probe, points: int = OUTLINE_POINTS) -> NDArray[np.float64]:
-    """(2 points, 3) m in frame ``probe``: along the face, then back where the image ends.
-
-    So the beam of point k ends at the point 2 points - 1 - k.
+    So the beam of point k ends at the point 65 - k.
     """
+    points = 33
     starts, directions = probe.rays(np.linspace(0.0, 1.0, points))
     ends = starts + probe.depth * directions
     outline = np.zeros((2 * points, 3))

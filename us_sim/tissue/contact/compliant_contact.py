@@ -79,7 +79,7 @@ _TURN = 1e-8
 
 
 class CompliantContact:
-    """Which surface nodes a frictionless probe pushes, and how hard.
+    """Forces of a frictionless probe on surface nodes.
 
     Args:
         collider: the probe's shape.
@@ -181,7 +181,7 @@ class CompliantContact:
 
 
 class FrictionalContact(CompliantContact):
-    """Which nodes the probe pushes, drags and lets slip.
+    """Forces of a probe on surface nodes that stick to it or slip.
 
     Args:
         collider, rest, spacing, compliance: as for `CompliantContact`.

@@ -94,7 +94,7 @@ class PenaltyContact:
         self.clear()
 
     def clear(self) -> None:
-        """No probe is near."""
+        """Take the probe away."""
         count = len(self.stiffness)
         self._pose: Pose | None = None
         self.near = np.zeros(0, dtype=np.int64)  # points that may come to touch
@@ -344,16 +344,16 @@ class PenaltyFriction(PenaltyContact):
         super().__init__(probe, stiffness, greatest_force, stiffening)
 
     def clear(self) -> None:
-        """No probe is near."""
+        """Take the probe away."""
         super().clear()
         shape = self.normal.shape
         self._attached = np.zeros(len(self.gap), bool)  # (P,) points on springs along the surface
-        self._anchor = np.zeros(shape)  # (P, 3) m, where these hang
-        self._positions = np.zeros(shape)  # (P, 3) m, of the points when last looked at
+        self._anchor = np.zeros(shape)  # (P, 3) m, on the probe, of their springs
+        self._positions = np.zeros(shape)  # (P, 3) m, of the points at the last update
         self._attach(np.zeros(len(self.gap)))
 
     def set_pose(self, pose: Pose, positions: NDArray[np.float64]) -> None:
-        """As `PenaltyContact.set_pose`; the places where points hang go where the probe went."""
+        """As `PenaltyContact.set_pose`; anchors go where the probe went."""
         self._return_map()
         before, push = self._pose, self.normal_force
         super().set_pose(pose, positions)
@@ -391,7 +391,7 @@ class PenaltyFriction(PenaltyContact):
         return float(changed.max(initial=0.0))
 
     def _return_map(self) -> None:
-        """Let the places of points that slipped follow these."""
+        """Let the anchors of points that slipped follow them."""
         trial = self._trial_force(self._positions)
         size = np.linalg.norm(trial, axis=1)
         slipped = size > self._bound
@@ -466,11 +466,7 @@ class PenaltyFriction(PenaltyContact):
         sticks, turns = kept == 1.0, kept > 0.0
         points = np.concatenate([pushed, self._points[sticks], self._points[turns]])
         directions = np.concatenate([normal, along[sticks], across[turns]])
-        along_surface = [
-            self._shear[sticks],
-            (self._shear * kept)[turns],
-        ]
-        stiffness = np.concatenate([stiffness, *along_surface])
+        stiffness = np.concatenate([stiffness, self._shear[sticks], (self._shear * kept)[turns]])
         return points, directions, stiffness
 
 

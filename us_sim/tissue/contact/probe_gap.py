@@ -52,7 +52,7 @@ def only_forward(collider: Collider, spacing: float) -> bool:
     by one they would slide off it sideways and the probe would sink in between them, which a
     continuous skin prevents.
     """
-    return bool(collider.offset_box[3] < 2 * spacing)
+    return bool(collider.offset_box[3] < _RESOLVED * spacing)
 
 
 def push_out(

@@ -207,7 +207,15 @@ _ELEMENT_LIMIT = 5.0
 
 @dataclass(frozen=True, eq=False)
 class VolumetricSplit:
-    """Shear modulus mu, and lambda + mu in two parts, of each tetrahedron."""
+    """Shear modulus mu, and lambda + mu in two parts, of each tetrahedron.
+
+    A mesh has about five times as many linear tetrahedra as nodes: were each to keep its volume,
+    nothing could move. So the bulk stiffness beyond a moderate one resists only the average change
+    of volume around each node (J. Bonet and A. J. Burton, A simple average nodal pressure
+    tetrahedral element, Commun. Numer. Meth. Engng. 14, 1998); the moderate part stabilises the
+    pressures (M. A. Puso and J. Solberg, A stabilized nodally integrated tetrahedral, Int. J.
+    Numer. Meth. Engng. 67, 2006).
+    """
 
     shear: NDArray[np.float64]  # (M,), Pa
     element: NDArray[np.float64]  # (M,), Pa, resists the tetrahedron's own change of volume

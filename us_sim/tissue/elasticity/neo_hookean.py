@@ -76,7 +76,7 @@ ROWS = OUT + 24  # Number of rows of a buffer
 
 @njit(**INLINED)
 def gather(field, nodes, lanes):
-    """Rows 3 b + axis of lanes: the field (3, N) at the b-th node of each tetrahedron."""
+    """Fill rows 3 b + axis with the field (3, N) at the b-th node of each tetrahedron."""
     for axis in range(3):
         values = field[axis]
         for corner in range(4):
@@ -89,7 +89,7 @@ def gather(field, nodes, lanes):
 
 @njit(**INLINED)
 def gather_scalar(values, nodes, lanes):
-    """Rows from SUMS on of lanes: the values (N,) at the nodes of each tetrahedron."""
+    """Fill rows from SUMS on with the values (N,) at the nodes of each tetrahedron."""
     for w in range(4 * LANES):
         lanes[SUMS * LANES + w] = values[nodes[w]]
 
@@ -154,7 +154,7 @@ def _put_row(px, py, pz, constants, w, lanes, row):
 
 @njit(**INLINED)
 def put_forces(p, constants, w, lanes):
-    """Rows 3 b + axis from OUT on: the force of the stress p, times volume, at the b-th node."""
+    """Fill rows OUT + 3 b + axis with the force of the stress p, times volume, at node b."""
     _put_row(p[0], p[1], p[2], constants, w, lanes, OUT)
     _put_row(p[3], p[4], p[5], constants, w, lanes, OUT + 1)
     _put_row(p[6], p[7], p[8], constants, w, lanes, OUT + 2)
@@ -426,7 +426,7 @@ class NeoHookean:
         )
 
     def linearise(self, displacement: NDArray) -> None:
-        """Let `tangent_product` and `diagonal_blocks` be those at this displacement."""
+        """Set the displacement (3, N) m of `tangent_product` and `diagonal_blocks`."""
         self._require(displacement)
         sums = self._sums
         if self._averaged:

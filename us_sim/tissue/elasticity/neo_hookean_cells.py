@@ -63,7 +63,7 @@ SCALAR, _VECTOR, SYMMETRIC = np.int64(1), np.int64(3), np.int64(6)
 
 @njit(**INLINED)
 def copy_in(values, grid, first, rows, lanes, row, step):
-    """Rows row + step * corner of lanes: the values (N,) at the corners 4 x + 2 y + z of cells.
+    """Fill rows row + step * corner with the values (N,) at the corners 4 x + 2 y + z of cells.
 
     The cells are those from ``first`` on, seen mirrored along x where their width is negative.
     """
@@ -104,7 +104,7 @@ def add_out(lanes, row, step, grid, first, rows, values):
 
 @njit(**LOOP)
 def copy_field(field, grid, first, rows, lanes):
-    """Rows 3 corner + axis of lanes: the field (3, N) at the corners of cells."""
+    """Fill rows 3 corner + axis with the field (3, N) at the corners of cells."""
     for axis in range(3):
         copy_in(field[axis], grid, first, rows, lanes, FIELD + axis, _VECTOR)
 
@@ -199,7 +199,7 @@ def _corner_forces(px, py, pz, qx, qy, qz, rx, ry, rz, sx, sy, sz, tx, ty, tz, g
 
 @njit(**INLINED)
 def _put_eight(values, lanes, row, step, w):
-    """Rows row + step * corner."""
+    """Fill rows row + step * corner."""
     v, d = row * LANES + w, step * LANES
     lanes[v] = values[0]
     lanes[v + d] = values[1]
@@ -213,7 +213,7 @@ def _put_eight(values, lanes, row, step, w):
 
 @njit(**INLINED)
 def put_forces(p, q, r, s, t, rows, w, lanes):
-    """Rows 3 corner + axis from OUT on: the forces of five stresses times volumes."""
+    """Fill rows OUT + 3 corner + axis with the forces of five stresses times volumes."""
     g = three(rows, PER_WIDTH, w)
     x = _corner_forces(
         p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2], s[0], s[1], s[2], t[0], t[1], t[2], g
@@ -231,7 +231,7 @@ def put_forces(p, q, r, s, t, rows, w, lanes):
 
 @njit(**INLINED)
 def put_volumes(p, q, r, s, t, w, lanes):
-    """Rows corner from OUT on: the five tetrahedra's contributions to each corner, summed."""
+    """Fill rows OUT + corner with the sum of the five tetrahedra's contributions."""
     at_one, at_two, at_four = (p + t) + (r + s), (p + t) + (q + s), (p + t) + (q + r)
     corners = (p, at_one, at_two, s, at_four, r, q, t + (q + r + s))
     _put_eight(corners, lanes, OUT, SCALAR, w)
@@ -278,7 +278,7 @@ def add_lumens(field, rows, lumen, entry, row, lanes):
 
 @njit(**LOOP)
 def _nodal_pressures(nodal, grid, first, rows, lanes):
-    """Rows from PRESSURES on: each tetrahedron's nodal weight times its nodes' sum."""
+    """Fill rows from PRESSURES on: each tetrahedron's nodal weight times its nodes' sum."""
     copy_in(nodal, grid, first, rows, lanes, SUMS, SCALAR)
     for w in range(LANES):
         v = SUMS * LANES + w

@@ -169,7 +169,7 @@ def barrier_from(change, onset):
 
 @njit(**INLINED)
 def barrier_term(change):
-    """That of a solid."""
+    """The barrier of solid tissue, and its first and second slope by the change of volume."""
     return barrier_from(change, _BARRIER_ONSET)
 
 

@@ -21,7 +21,6 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
-from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm, area_vectors
 from us_sim.tissue.model import TissueModel
 
@@ -154,8 +153,8 @@ class InversionWatch:
         """Begin anew, since the tissue was put elsewhere."""
         self._frames_free = 0
 
-    def check(self, positions: NDArray[np.float64], touched: bool) -> tuple[str, bool]:
-        """Remark at the end of a frame, and whether the tissue is to be put back to rest.
+    def check(self, positions: NDArray[np.float64], touched: bool) -> tuple[int, bool]:
+        """How many are inside out after a frame, and whether to put the tissue back to rest.
 
         Args:
             positions: (N, 3) m.
@@ -163,15 +162,8 @@ class InversionWatch:
         """
         self._frames_free = 0 if touched else self._frames_free + 1
         inverted = count_inverted(positions, self._tetrahedra)
-        if inverted == 0:
-            return "", False
-        if self._frames_free < _FRAMES_TO_UNTANGLE or not self._held:
-            return f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out", False
-        return (
-            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
-            f"was put back to rest",
-            True,
-        )
+        released = self._held and self._frames_free >= _FRAMES_TO_UNTANGLE
+        return inverted, inverted > 0 and released
 
 
 def watched_tetrahedra(model: TissueModel) -> NDArray[np.int32]:

@@ -250,7 +250,7 @@ _LIKE = 0.3  # Share of a modulus' slope that another one must explain to be nam
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """Which of P moduli are determined, and how well."""
+    """Moduli that are determined, of P, and how well."""
 
     half_widths: NDArray[np.float64]  # (P,) of the intervals of their logarithms, the rest given
     determined: NDArray[np.bool_]  # (P,)
@@ -312,7 +312,7 @@ def _deviations(clear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _alike(clear: NDArray[np.float64], which: int, kept: NDArray[np.intp]) -> list[int]:
-    """Those of the kept whose slopes together make up that of one, the largest parts first."""
+    """Kept moduli whose slopes together make up that of one, the largest parts first."""
     if len(kept) == 0:
         return []
     column = clear[:, which]

@@ -209,7 +209,7 @@ class CarriedPoints:
 
     @classmethod
     def none(cls) -> CarriedPoints:
-        """No point."""
+        """Without a point."""
         return cls(
             np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 4), np.int32), np.zeros((0, 4))
         )

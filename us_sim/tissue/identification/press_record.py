@@ -45,11 +45,11 @@ class PressRecord:
     unpaired: int  # poses without a wrench near them
 
     def pose(self, index: int) -> Pose:
-        """One of them."""
+        """One pose of the probe."""
         return Pose(self.positions[index], self.orientations[index])
 
     def at(self, chosen: NDArray[np.integer]) -> PressRecord:
-        """Some of them."""
+        """The record at some (K,) poses."""
         names = ("times", "positions", "orientations", "wrenches", "rates")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 

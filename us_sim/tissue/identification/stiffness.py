@@ -302,7 +302,7 @@ class Tissue:
 
 @dataclass(frozen=True)
 class Interval:
-    """Of a modulus, in Pa."""
+    """Confidence interval of a modulus, Pa."""
 
     lower: float
     upper: float

@@ -240,7 +240,7 @@ def _padded(count: int) -> int:
 
 
 def _starts(lengths: ArrayLike) -> NDArray[np.int64]:
-    """Where things of these lengths begin, one after another, and where the last ends."""
+    """Starts of consecutive pieces of these lengths, and the end of the last."""
     return np.append(0, np.cumsum(lengths)).astype(np.int64)
 
 

@@ -69,7 +69,6 @@ def conforming_mesh(
     tolerance: float,
     *,
     coarsen: bool = False,
-    seconds: float = _SECONDS,
 ) -> TetrahedralMesh:
     """Tetrahedra that fill a box, none of which crosses a surface by more than the tolerance.
 
@@ -79,7 +78,6 @@ def conforming_mesh(
         edges: lengths that are aimed at.
         tolerance: m, how far faces may lie from a surface.
         coarsen: whether tetrahedra are joined wherever their shape allows it, for the fewest nodes.
-        seconds: after which it is given up.
 
     Raises:
         MeshError: pytetwild is missing, or fTetWild fails, or takes longer.
@@ -103,13 +101,12 @@ def conforming_mesh(
             "size_nodes": edges.mesh.nodes,
             "size_tetrahedra": edges.mesh.tetrahedra,
             "sizes": np.minimum(edges.lengths, diagonal / _LONGEST),
-        },
-        seconds,
+        }
     )
     return _within(box, nodes, tetrahedra, tolerance)
 
 
-def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _run(arrays: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder).resolve()
         given, made = place / "given.npz", place / "made.npz"
@@ -119,11 +116,11 @@ def _run(arrays: dict[str, Any], seconds: float) -> tuple[NDArray[np.float64], N
         try:
             # fTetWild leaves files of its own where it runs.
             done = subprocess.run(
-                command, capture_output=True, timeout=seconds, check=False, cwd=place
+                command, capture_output=True, timeout=_SECONDS, check=False, cwd=place
             )
         except subprocess.TimeoutExpired as error:
             raise MeshError(
-                f"fTetWild made no mesh of these structures in {seconds:g} s: allow fewer nodes, "
+                f"fTetWild made no mesh of these structures in {_SECONDS:g} s: allow fewer nodes, "
                 f"smooth their labels, or say {_GRID}"
             ) from error
         if done.returncode != 0 or not made.is_file():

@@ -168,7 +168,7 @@ def _nearest_triangle(points, faces, sides, middles, radii):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance_to_triangle(p, a, ab, ac):
-    """By the region of the triangle's plane that p projects to (Ericson 2005, 5.1.5)."""
+    """Distance, by the region of the triangle's plane that p projects to (Ericson 2005, 5.1.5)."""
     d1 = 0.0
     d2 = 0.0
     bb = 0.0

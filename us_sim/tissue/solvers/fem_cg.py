@@ -23,7 +23,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
@@ -37,7 +37,6 @@ from us_sim.tissue.solvers.solver import (
     Progress,
     SolverSettings,
     TissueSolver,
-    same_pose,
 )
 
 _REFINEMENT = 1e-2
@@ -129,7 +128,7 @@ class FemCg(TissueSolver):
         self._contact.clear()
         self._renew_equations()
         # N, norm of the contact forces that the residual refers to, and the largest since rest.
-        self._reference = self._heaviest = 0.0
+        self._reference = self._largest_load = 0.0
         self._taken_over = bool(self._displacement.any())
 
     def _renew_equations(self) -> None:
@@ -182,7 +181,7 @@ class FemCg(TissueSolver):
                 self._refine_at = _REFINEMENT * before
             contact.set_forces(product_rows(*self._matrix, displacement, self._touchable))
             load = float(np.linalg.norm(np.maximum(contact.normal_force, 0.0)))
-            self._reference = load or self._heaviest
+            self._reference = load or self._largest_load
         return self._outcome(pose)
 
     def _outcome(self, pose: Pose | None) -> Deformation:
@@ -193,13 +192,12 @@ class FemCg(TissueSolver):
         holding = np.einsum("ij,ij->i", unbalanced[self._touchable], normal)
         push = np.where(contact.touched, np.maximum(holding, 0.0), 0.0)[:, None] * normal
         unbalanced[self._touchable] -= push
-        imbalance = float(np.linalg.norm(unbalanced))
+        residual_norm = float(np.linalg.norm(unbalanced))
         load = float(np.linalg.norm(push))
-        self._heaviest = (
-            max(self._heaviest, load) or imbalance
-        )  # a state taken over without contact
-        self._reference = load or self._heaviest
-        residual = imbalance / self._reference if self._reference else 0.0
+        # The latter for a state taken over without contact.
+        self._largest_load = max(self._largest_load, load) or residual_norm
+        self._reference = load or self._largest_load
+        residual = residual_norm / self._reference if self._reference else 0.0
         balanced = residual <= self._tolerance
         self._settled = balanced and contact.is_consistent(pose, displacement[self._touchable])
         nodes = self.model.mesh.nodes.copy()
@@ -208,7 +206,7 @@ class FemCg(TissueSolver):
         if resting and not contact.touched.any():
             # Without a load the exact solution is the rest state.
             nodes, displacement[:] = self.model.mesh.nodes.copy(), 0.0
-            self._heaviest = self._reference = residual = 0.0
+            self._largest_load = self._reference = residual = 0.0
             self._slope = -1.0
         elif not balanced and self._slope == 0.0:
             # The updated residual has drifted from the true one.

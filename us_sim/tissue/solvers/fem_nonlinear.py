@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.geometry.se3 import interpolate
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
@@ -48,7 +48,6 @@ from us_sim.tissue.solvers.solver import (
     Progress,
     SolverSettings,
     TissueSolver,
-    same_pose,
 )
 from us_sim.tissue.solvers.tuning import TUNING
 

@@ -9,7 +9,7 @@ masses scaled 159 to 198 times: unscaled, steps beyond 0.18 ms are unstable
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
+from us_sim.settings.spelling import counted
 from us_sim.tissue.contact.probe_gap import only_forward, push_out, pushing_gap
 from us_sim.tissue.elasticity.springs import (
     SpringNetwork,
@@ -176,15 +177,24 @@ class SpringTissue(TissueSolver):
         self._residual_norm.reset()
         self._inversion.reset()
 
-    def _untangle(self, touched: bool) -> tuple[str, Intervention]:
-        """Put tissue to rest that stayed inside out without a probe; return the finding."""
-        words, hopeless = self._inversion.check(self._positions, touched)
+    def _untangle(self, touched: bool) -> tuple[int, str, Intervention]:
+        """Put tissue to rest that stayed inside out without a probe.
+
+        Returns:
+            How many tetrahedra are inside out now, a remark, and the same as a code.
+        """
+        inverted, hopeless = self._inversion.check(self._positions, touched)
         if not hopeless:
-            return words, Intervention.NONE
+            words = f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out"
+            return inverted, words if inverted else "", Intervention.NONE
         self._positions[:] = self.model.mesh.nodes
         self._velocity[:] = 0.0
         self._residual_norm.reset()
-        return words, Intervention.PUT_TO_REST
+        words = (
+            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
+            f"was put back to rest"
+        )
+        return 0, words, Intervention.PUT_TO_REST
 
     def _stop(self, touched: bool) -> bool:
         """End the motion of settled tissue; returns whether it was put to rest entirely."""
@@ -285,13 +295,12 @@ class Msds(SpringTissue):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         if self._settled and not self._contact.touched.any() and not self._entered(pose):
-            return Deformation(
-                self._positions.copy(),
-                np.empty(0, np.int32),
-                np.zeros(3),
-                np.zeros(3),
-                self._last.residual,
-                self._action,
+            return replace(
+                self._resting(),
+                nodes=self._positions.copy(),
+                residual=self._last.residual,
+                action=self._action,
+                inverted=self._last.inverted,
             )
         probe = ProbeMotion(self.model.collider.offset_box, self._forward, *self._path(pose))
         self._contact.touched[:] = False
@@ -344,7 +353,7 @@ class Msds(SpringTissue):
         self, pose: Pose | None, force: NDArray[np.float64], torque: NDArray[np.float64]
     ) -> Deformation:
         is_touched = bool(self._contact.touched.any())
-        words, interventions = self._untangle(is_touched)
+        inverted, words, interventions = self._untangle(is_touched)
         still = np.zeros_like(self._velocity)
         elastic = self._springs.forces(self._positions, still)
         elastic += self._volume.forces(self._positions, still)
@@ -373,6 +382,7 @@ class Msds(SpringTissue):
             torque,
             residual,
             action,
+            inverted,
             interventions=interventions,
         )
 

@@ -18,13 +18,13 @@ that no energy comes from nowhere and no time step is too long.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.active_set import ActiveSet
@@ -45,7 +45,6 @@ from us_sim.tissue.solvers.solver import (
     COUNT,
     TOLERANCE,
     Progress,
-    same_pose,
 )
 
 _SPRING_WEIGHT, _VOLUME_WEIGHT = 0.4, 0.3
@@ -171,9 +170,11 @@ class MsdsImplicit(SpringTissue):
         contact = self._contact
         untouched = self._settled and not contact.touched.any()
         if self.model.fixed.all() or (untouched and contact.is_consistent(pose, self._surface())):
-            residual = self._last.residual
-            return Deformation(
-                self._positions.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), residual
+            return replace(
+                self._resting(),
+                nodes=self._positions.copy(),
+                residual=self._last.residual,
+                inverted=self._last.inverted,
             )
         if self._taken_over and pose is not None:
             contact.adopt(pose, self._surface())
@@ -272,7 +273,7 @@ class MsdsImplicit(SpringTissue):
     def _outcome(self, pose: Pose | None, kinetic: float, initial: float) -> Deformation:
         contact, touchable = self._contact, self._touchable
         is_touched = bool(contact.touched.any())
-        words, interventions = self._untangle(is_touched)
+        inverted, words, interventions = self._untangle(is_touched)
         energy, elastic = self._potential.elastic(self._positions)
         self._limit_speed(kinetic, initial, energy)
         elastic[self.model.fixed] = 0.0
@@ -300,6 +301,7 @@ class MsdsImplicit(SpringTissue):
             torque,
             residual,
             words,
+            inverted,
             interventions=interventions,
         )
 

@@ -167,7 +167,7 @@ class Newton:
         self.contact.update_gaps(self._positions)
 
     def _assemble(self, energy: float | None = None) -> None:
-        """Energy, unless `_evaluate` has just been asked for it, and residual."""
+        """Find energy, unless `_evaluate` has just returned it, and residual."""
         self.energy = self._evaluate() if energy is None else energy
         if self.overstress is not None:
             self.overstress.add_forces(self.displacement, self._tissue_forces)
@@ -252,9 +252,9 @@ class Newton:
         # Just hit, points are pushed far more than they will be.
         force = np.minimum(contact.normal_force, self._carried_force)
         turned, turn = contact.geometric_stiffness(self._positions, force)
-        bend = points.nodes[turned], points.weights[turned], -turn
+        geometric = points.nodes[turned], points.weights[turned], -turn
 
-        def elastic(change: NDArray, image: NDArray) -> None:
+        def tangent_product(change: NDArray, image: NDArray) -> None:
             """The tangent without springs, of which there are more or fewer as points touch."""
             tangent.tangent_product(change, image)
             if damping > 0.0:
@@ -262,7 +262,7 @@ class Newton:
             if overstress is not None:
                 overstress.add_product(change, image)
             if len(turned):
-                add_turns(*bend, change, image)
+                add_turns(*geometric, change, image)
 
         step: NDArray[np.float64] = np.zeros_like(self.displacement)
         image: NDArray[np.float64] = np.zeros_like(step)  # of the step
@@ -270,7 +270,7 @@ class Newton:
             step = start.copy()
             scale = float(np.abs(step).max()) or 1.0
             product = np.empty(step.shape, self._dtype)
-            elastic((step / scale).astype(self._dtype), product)
+            tangent_product((step / scale).astype(self._dtype), product)
             image = scale * product.astype(np.float64)
             self.iterations += 1
             none = np.zeros_like(contact.normal)
@@ -281,55 +281,55 @@ class Newton:
         interval = TUNING.contact_interval
         while True:
             moved = points.moved(step, contact.near)
-            left = -self._tissue_forces - image
-            points.add(contact.force_after(moved), left, contact.near)
-            clear_nodes(left, self._fixed)
-            size = float(np.linalg.norm(left))
+            residual = -self._tissue_forces - image
+            points.add(contact.force_after(moved), residual, contact.near)
+            clear_nodes(residual, self._fixed)
+            norm = float(np.linalg.norm(residual))
             if tolerance is None:
-                begun = max(size, self.residual_norm * (start is None))
+                first_norm = max(norm, self.residual_norm * (start is None))
                 # Just hit, the forces are far more than they will be.
-                begun = min(begun, self._carried_norm or begun)
-                tolerance = max(TUNING.forcing_term * begun, TUNING.goal_fraction * goal)
-            if size <= tolerance or self.iterations >= iterations:
+                first_norm = min(first_norm, self._carried_norm or first_norm)
+                tolerance = max(TUNING.forcing_term * first_norm, TUNING.goal_fraction * goal)
+            if norm <= tolerance or self.iterations >= iterations:
                 return step, False
             active, directions, stiffness = contact.springs_after(moved)
             springs = points.nodes[active], points.weights[active], directions, stiffness
 
-            def pressed(change: NDArray, image: NDArray, springs: tuple = springs) -> None:
+            def contact_product(change: NDArray, image: NDArray, springs: tuple = springs) -> None:
                 """The springs' forces, added."""
                 add_springs(*springs, change, image)
 
             solved = conjugate_gradients(
-                elastic,
+                tangent_product,
                 self._preconditioner(blocks, *points.lumped(active, directions, stiffness)),
-                (left / size).astype(self._dtype),
+                (residual / norm).astype(self._dtype),
                 min(iterations - self.iterations, interval),
-                tolerance / size,
-                pressed,
+                tolerance / norm,
+                contact_product,
             )
             self.iterations += solved.iterations
             interval *= 2
-            change = size * solved.solution.astype(np.float64)
-            bent = size * solved.image.astype(np.float64)
-            length = self._best_length(moved, change, bent, image)
-            change, bent = length * change, length * bent
+            change = norm * solved.solution.astype(np.float64)
+            change_image = norm * solved.image.astype(np.float64)
+            length = self._best_length(moved, change, change_image, image)
+            change, change_image = length * change, length * change_image
             step += change
-            image += bent
+            image += change_image
             if solved.curved:
-                return (step if step.any() else size * solved.direction.astype(np.float64)), True
+                return (step if step.any() else norm * solved.direction.astype(np.float64)), True
 
     def _best_length(
         self,
         moved: NDArray[np.float64],
         change: NDArray[np.float64],
-        bent: NDArray[np.float64],
+        change_image: NDArray[np.float64],
         image: NDArray[np.float64],
     ) -> float:
         """How much of a change (3, N) m lowers the model's energy most, the points having moved by
         (P, 3) m; the tangent's products with the change and before it are (3, N) N.
         """
         pull = -float(np.vdot(change, self._tissue_forces + image))
-        curvature = float(np.vdot(change, bent))
+        curvature = float(np.vdot(change, change_image))
         along = self.points.moved(change, self.contact.near)
         return self.contact.length_along(moved, along, pull, curvature)
 
@@ -340,8 +340,9 @@ class Newton:
         directions: NDArray[np.float64],
         stiffness: NDArray[np.float64],
     ) -> Preconditioner:
-        """Of the tangent, whose blocks are (6, N) N/m, with springs: a factor where one is needed,
-        there is time to make it, and it can be made.
+        """The preconditioner of the tangent, whose blocks are (6, N) N/m, with springs.
+
+        A factor where one is needed, there is time for it, and it can be made.
         """
         if self._needs_factor and self.may_factor:
             if self._factored is None:
@@ -352,7 +353,7 @@ class Newton:
         return self._two_level
 
     def _search(self, change: NDArray[np.float64]) -> float:
-        """Move by the largest fraction of the change that lowers the energy; returns it."""
+        """Backtracking line search along a change (3, N) m; returns the fraction taken."""
         start, energy, residual_norm = self.displacement, self.energy, self.residual_norm
         rounding = TUNING.energy_rounding * abs(energy)
         length = 1.0

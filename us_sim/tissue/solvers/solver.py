@@ -11,7 +11,6 @@ True
 
 A tissue as small as can be, on which a solver calls the same kernels as on another.
 
->>> from us_sim.tissue.model import TissueModel
 >>> from us_sim.tissue.solvers.solver import rehearsal_model
 >>> len(rehearsal_model(TissueModel.block()).mesh.tetrahedra)
 40
@@ -29,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import SolverError
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, same_pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SOLVERS
@@ -176,8 +175,7 @@ class TissueSolver(ABC):
     def warm_up(self) -> None:
         """Compile the kernels on a tissue of eight cells; this solver's own state is not touched.
 
-        See `us_sim.tissue.solvers.solver`, and `us_sim.tissue.solvers.switching` for doing it
-        in another process.
+        `us_sim.tissue.solvers.switching.compiled_solver` does it in another process.
         """
         self.rehearse(rehearsal_model(self.model), self.settings)
 
@@ -257,13 +255,6 @@ def create_solver(
         settings = Reader(f"solver {name}", error=SolverError).read(solver.Settings, values)
     made: TissueSolver = solver(model, settings, progress)
     return made
-
-
-def same_pose(a: Pose | None, b: Pose | None) -> bool:
-    """Whether two poses are the same, to the last bit."""
-    if a is None or b is None:
-        return a is b
-    return np.array_equal(a.position, b.position) and np.array_equal(a.orientation, b.orientation)
 
 
 def rehearsal_model(model: TissueModel) -> TissueModel:

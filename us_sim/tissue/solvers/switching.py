@@ -62,9 +62,7 @@ class Plan:
     solver: str  # name of the method
     compared: str = ""  # name of a second method that runs beside it, '' for none
     settings: Mapping[str, SolverSettings] = field(default_factory=dict)  # of methods by name
-    model: Callable[[], TissueModel] | None = (
-        None  # makes a new model; None to go on with the present one
-    )
+    model: Callable[[], TissueModel] | None = None  # makes a new one; None keeps the present one
     reason: str = ""  # what was changed, for a person
 
 
