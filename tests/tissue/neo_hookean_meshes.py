@@ -46,7 +46,7 @@ def assert_cells_are_tetrahedra(materials: TissueMaterials, size: float, seed: i
     cells, tetrahedra = (NeoHookean(mesh, materials, np.float64) for mesh in (CELLS, TETRAHEDRA))
 
     def near(got, expected):
-        assert abs(got - expected).max() <= 1e-12 * abs(expected).max() + 1e-18
+        assert abs(got - expected).max() <= 1e-12 * abs(expected).max() + 1e-20
 
     near(cells.forces(displacement), tetrahedra.forces(displacement))
     assert cells.energy(displacement) == pytest.approx(tetrahedra.energy(displacement), rel=1e-11)

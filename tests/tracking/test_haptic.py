@@ -453,7 +453,7 @@ def test_a_new_answer_makes_no_step():
     assert np.abs(np.diff(felt)).max() == pytest.approx(COUPLING * 0.005 / 30, rel=1e-6)
 
 
-def test_betweenanswers_the_force_goes_on_as_the_tissue_would():
+def test_between_answers_the_force_goes_on_as_the_tissue_would():
     """Pressed steadily into tissue that answers late, next to the same that answers at once."""
     slow, quick = Bench(Tissue("fem")), Bench(Tissue("fem"), delay=(1, 2))
     ways = np.linspace(-0.002, 0.012, 1400)  # 10 mm/s
