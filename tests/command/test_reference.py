@@ -76,10 +76,13 @@ def test_a_part_is_printed_by_its_name(capsys):
     assert "### tracker.gate" not in text
 
 
-@pytest.mark.parametrize("name", ["tisue", "tissue.mehs"])
-def test_a_part_that_is_not_there_is_said(name, capsys):
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("tisue", "tissue"), ("tissue.mehs", "tissue.mesh"), ("tissue.setting", "tissue.settings")],
+)
+def test_a_part_that_is_not_there_is_said(name, meant, capsys):
     assert main(["reference", name]) == 1
-    assert "did you mean 'tissue'?" in capsys.readouterr().err
+    assert f"did you mean '{meant}'?" in capsys.readouterr().err
 
 
 def test_the_page_is_written_to_a_file(tmp_path):

@@ -330,11 +330,12 @@ def test_parameters_of_the_command_line_have_units(scene, node, given, checked):
         ("slice_interpolator", {"contact": "3"}, "contact: .*3"),
         ("slice_interpolator", {"gain": "[1"}, r"gain=\[1: .*YAML"),
         ("slice_interpolator", {"time_gain": "3"}, "time_gain: .*list"),
-        ("slice_interpolator", {"lines": "3"}, "lines' "),  # not while it runs
+        ("slice_interpolator", {"lines": "3"}, "lines: .*reference"),  # not while it runs
         ("slice_interpolator", {"gain": "2001-99-99"}, "gain=2001-99-99: .*YAML"),
         ("tissue_deformer", {"solver": "fme"}, "solver: 'fme' .*'fem'"),
         ("tissue_deformer", {"fem_cg.iterations": "-3"}, "iterations: -3 .* 1 to 10000"),
         ("tissue_deformer", {"materials.fta.density": "3"}, "'materials.fat.density'"),
+        ("tissue_deformer", {"young": "1"}, "young: .{,80}`us-sim reference tissue_deformer`"),
         ("path_player", {"rate": "0"}, "rate: 0 .* 0.01 to 100"),
     ],
 )

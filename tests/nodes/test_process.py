@@ -102,6 +102,8 @@ UNUSED = [
     ("us_sim.nodes.probe_tracker", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.session_recorder", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.path_player", {"numba", "scipy", "cv2"}),
+    ("us_sim.nodes.session_player, us_sim.nodes.session_control", {"numba", "scipy", "cv2"}),
+    ("us_sim.run.live, us_sim.run.lockstep", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.tissue_deformer", {"scipy.ndimage", "scipy.spatial", "cv2"}),
     (
         "us_sim.nodes.slice_interpolator, us_sim.slicing.acoustics.beam_acoustics, "

@@ -110,6 +110,25 @@ def test_a_press_shorter_than_a_heartbeat_has_a_picture_of_its_own(session, scen
     assert list(colour_pictures(session, scene)) == ["touched", "full press", "let go"]
 
 
+def test_no_moment_is_of_a_probe_in_the_air(session, scene):
+    """It touches and is let go for 0.2 s only, and then is lifted off."""
+    air = Pose([0.0, 0.0, -0.01])
+    for k, stamp in enumerate(session.poses):
+        if not (11 <= k < 13 or 20 <= k < 62):
+            session.poses[stamp] = air
+    seen = []
+    original = ColourDoppler.estimate
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            ColourDoppler,
+            "estimate",
+            lambda self, blood, frame: seen.append(frame.time) or original(self, blood, frame),
+        )
+        assert len(colour_pictures(session, scene)) == 3
+    depths = [session.poses[round(1e9 * time)].position[2] for time in seen]
+    assert min(depths) >= 0.0
+
+
 def test_moments_are_of_images_that_show_the_vessel_whole(session, scene):
     """It is out of the image at first, at the deepest, and at the end."""
     deepest = min(session.poses) + int(2.5e9)

@@ -15,7 +15,7 @@ from us_sim.settings.spelling import counted
 
 
 def evaluate_options(parser: argparse.ArgumentParser) -> None:
-    subjects = parser.add_subparsers(required=True, metavar="|".join(EVALUATIONS))
+    subjects = parser.add_subparsers(required=True, metavar="MEASUREMENT")
     for name, option in EVALUATIONS.options.items():
         package = importlib.import_module(option.target.partition(":")[0].rpartition(".")[0])
         subjects.add_parser(name, help=package.__doc__, add_options=partial(_subject_options, name))
@@ -40,7 +40,7 @@ def _evaluate(name: str, args: argparse.Namespace) -> int:
 
 
 def calibrate_options(parser: argparse.ArgumentParser) -> None:
-    calibrations = parser.add_subparsers(required=True, metavar="|".join(CALIBRATIONS))
+    calibrations = parser.add_subparsers(required=True, metavar="CALIBRATION")
     for name in CALIBRATIONS:
         settings = CALIBRATIONS.settings(name)
         calibration = calibrations.add_parser(name, help=settings.__doc__)

@@ -11,7 +11,7 @@ keyword-only; a field with one is an option, and a flag where it is a truth.
 >>> read_settings(args, ClockSettings)
 Traceback (most recent call last):
 ...
-us_sim.errors.CalibrationError: --largest: '2 min' is not a time: its units are s, ms, us, µs
+us_sim.errors.CalibrationError: --largest: '2 min' is not a time in s, ms, us or µs
 """
 
 from __future__ import annotations

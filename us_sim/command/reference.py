@@ -13,7 +13,7 @@ from pathlib import Path
 from us_sim.errors import UsSimError
 from us_sim.settings.registry import PROBES
 from us_sim.settings.setting import Settings, kinds_of, rules_of
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import nearest, unknown
 from us_sim.settings.tables import (
     Section,
     anchor,
@@ -108,8 +108,10 @@ def _part(name: str) -> str:
     if not found:  # what stands within another, such as a solver or a kind of probe
         found = [each for each in sections if f".{name}." in f"{each[1].path}."]
     if not found:
-        known = dict.fromkeys(section.path.split(".")[0] for _, section in sections)
-        raise UsSimError(f"reference: {unknown(name, [key for key in known if key])}")
+        known = list(filter(None, (section.path for _, section in sections)))
+        if nearest(name, known) is None:
+            known = list(dict.fromkeys(path.split(".")[0] for path in known))
+        raise UsSimError(f"reference: {unknown(name, known)}")
     return "\n".join(_written(*each) for each in found)
 
 

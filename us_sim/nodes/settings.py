@@ -19,7 +19,7 @@ from us_sim.scene.scene import Scene
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import nearest, unknown
 from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
@@ -465,6 +465,8 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
 _ROS_OWN = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 """Parameters that rclpy itself declares, or prefixes of them."""
 
+_MOST_LISTED = 25  # parameters that a sentence names
+
 
 def is_live(settings: type[Settings], name: str) -> bool:
     """Whether a setting may change while the node runs."""
@@ -526,7 +528,12 @@ def checked_parameters(
 
 def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
     if name not in known and not name.startswith(_ROS_OWN):
-        raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
+        if len(known) <= _MOST_LISTED or nearest(name, known):
+            raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
+        raise UsSimError(
+            f"--param {node}.{name}: is none of its {len(known)} parameters; "
+            f"`us-sim reference {node}` lists them"
+        )
     try:
         return load_yaml(text)
     except YamlError as error:

@@ -25,7 +25,6 @@ from us_sim.errors import BagError, UsSimError
 from us_sim.recording.metadata import read_metadata
 from us_sim.run.fork_server import end_with_parent, package_on_path
 from us_sim.scene.building import volume_of
-from us_sim.scene.case_tissue import keep_tissue
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
 from us_sim.scene.reading import load_scene
 from us_sim.share import full_path, shared_roots
@@ -94,6 +93,8 @@ def _tell(**said: Any) -> None:
 
 def make_scene(name: str, volume: str = "") -> None:
     """Make the volume and the tissue; a phantom and a case's tissue are kept."""
+    from us_sim.scene.case_tissue import keep_tissue  # needs numba, which supervision does not
+
     try:
         scene = load_scene(name, volume=volume or None)
         text = f"making {scene.volume.name}" if scene.volume.phantom else "reading the volume"

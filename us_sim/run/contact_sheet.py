@@ -223,10 +223,11 @@ def _flow_moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[
     pulse = max(pulses, key=lambda each: float(each.max()))
     beat = 1.0 / max(flow.settings.heart_rate for flow in blood.vessels)
     found = {}
+    touches = depth >= 0.0  # in the air there is no image that could show blood
     for title, begin, lasts in (
-        ("touched", int(np.argmax(depth >= 0.0)), depth < 0.9 * deepest),
+        ("touched", int(np.argmax(depth >= 0.0)), touches & (depth < 0.9 * deepest)),
         ("full press", full, depth >= 0.9 * deepest),
-        ("let go", let_go, depth < 0.9 * deepest),
+        ("let go", let_go, touches & (depth < 0.9 * deepest)),
     ):
         within = (times >= times[begin]) & (times < times[begin] + beat)
         over = within & ~lasts & (times > times[begin])

@@ -158,7 +158,7 @@ def _status(plan: Plan, monitor: Monitored) -> str:
         )
     return (
         f"{again}{count} images, {slicer.get('rate_hz', '?')}/s, "
-        f"p99 {slicer.get('latency_p99_ms', '?')} ms"
+        f"sent within {slicer.get('latency_p99_ms', '?')} ms (p99)"
     )
 
 
@@ -474,7 +474,7 @@ def _report(
         f"{summary['poses_in']} {'poses' if video is None else 'camera images'} in, "
         f"{summary['images_out']} images out, "
         f"{summary['dropped']} dropped, {summary['images_per_second']:.1f} images/s, "
-        f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+        f"latency to the recorder p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     )
     if tracked is not None:
         print(tracked)

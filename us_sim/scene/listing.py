@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from us_sim.cache import cache_folder
@@ -146,6 +145,8 @@ def _key(scene: Scene) -> str:
 
 def _jpeg(scene: Scene) -> bytes:
     """The image at rest, with all of the probe's face on the skin, in its true shape on black."""
+    import cv2  # no process of a simulation that only reads the list loads it
+
     scene = dataclasses.replace(scene, imaging=dataclasses.replace(scene.imaging, contact=False))
     scanner = scanner_of(scene, volume_of(scene))
     sides = np.array([scanner.probe.width, scanner.probe.height])

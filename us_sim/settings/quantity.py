@@ -113,11 +113,11 @@ class Quantity:
         return f"{self.minimum:g} to {self.maximum:g}{unit}"
 
     def _misfit(self, value: object) -> str:
-        """That a value is none of this dimension, and in which units one is written."""
+        """That a value is none of this dimension in one of the units that can be written."""
         article = "an" if self.dimension[0] in "aeiou" else "a"
         units = list(_UNITS[self.dimension])
         if units:
-            hint = f": its unit{'s are' if units[1:] else ' is'} {', '.join(units)}"
+            hint = f" in {' or '.join(filter(None, [', '.join(units[:-1]), units[-1]]))}"
         else:
             hint = ": it has no unit" if isinstance(value, str) and _NUMBER.match(value) else ""
         return f"{shown(value)} is not {article} {self.dimension}{hint}"

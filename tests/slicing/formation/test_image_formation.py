@@ -116,7 +116,7 @@ def test_black_stays_black():
     ("change", "words"),
     [
         ({"gain": 61}, r"imaging.gain: 61 dB is outside -60 to 60 dB"),
-        ({"gain": "6 mm"}, "imaging.gain: '6 mm' is not a level: its unit is dB"),
+        ({"gain": "6 mm"}, "imaging.gain: '6 mm' is not a level in dB"),
         ({"gain": float("nan")}, "imaging.gain: nan is not finite"),
         ({"time_gain": 3.0}, "imaging.time_gain: must be a list, not 3.0"),
         ({"time_gain": [0, 99]}, r"imaging.time_gain\[1\]: 99 dB is outside"),

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from us_sim.errors import CaseError, MaterialError
+from us_sim.errors import CaseError, MaterialError, VolumeError
 from us_sim.volume.cases.case import read_case
 from us_sim.volume.cases.provenance import Source, Step, add_step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
@@ -65,12 +65,16 @@ def test_a_change_takes_the_place_of_the_case_only_when_all_of_it_is_right(make_
         (partial / "labels.nrrd").unlink()
         assert read_case(folder).settings.name == "block"  # not yet
     assert read_case(folder).settings.name == "other"
-    with pytest.raises(CaseError, match="another grid"), changed_case(folder) as partial:
+    elsewhere = rf"^{folder}/labels.nrrd: .*another grid"
+    with pytest.raises(CaseError, match=elsewhere), changed_case(folder) as partial:
         (partial / "labels.nrrd").write_bytes(
             (folder / "volume.nrrd")
             .read_bytes()
             .replace(b"space origin: (-30", b"space origin: (-31")
         )
+    of_file = rf"^{folder}: .*volume.nrrd: "
+    with pytest.raises(VolumeError, match=of_file), changed_case(folder) as partial:
+        (partial / "volume.nrrd").write_bytes(b"NRRD0004\n")
     assert not read_case(folder).has_labels
     assert sorted(folder.parent.iterdir()) == [folder]
 

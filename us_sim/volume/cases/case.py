@@ -46,6 +46,7 @@ class Case:
     folder: Path
     settings: CaseSettings
     steps: tuple[Step, ...]  # how it was made
+    shown: Path  # the folder that errors name
 
     @property
     def has_labels(self) -> bool:
@@ -59,7 +60,7 @@ class Case:
         if not folder.is_dir():
             return {}
         for file in folder.iterdir():
-            _check_inside(self.folder, f"{SURFACES}/{file.name}")
+            _check_inside(self.folder, f"{SURFACES}/{file.name}", self.shown)
         return {file.stem: file for file in sorted(folder.iterdir()) if file.is_file()}
 
     @property
@@ -94,13 +95,13 @@ class Case:
         for label in np.flatnonzero(there):
             if int(label) not in names:
                 raise CaseError(
-                    f"{self.folder / LABELS}: has the label {label}, which is no structure in "
+                    f"{self.shown / LABELS}: has the label {label}, which is no structure in "
                     f"{CASE}: name it there"
                 )
         for name, structure in self.settings.structures.items():
             if not there[structure.label]:
                 raise CaseError(
-                    f"{self.folder / CASE}: structures.{name}: label {structure.label} occurs "
+                    f"{self.shown / CASE}: structures.{name}: label {structure.label} occurs "
                     f"nowhere in {LABELS}: segment it, or remove the structure"
                 )
         return dataclasses.replace(volume, labels=labels, label_names=names)
@@ -116,7 +117,7 @@ class Case:
         of_labels, other = _placement(self.folder / LABELS)
         if open_image(self.folder / LABELS).voxels.type.itemsize != 1:
             raise CaseError(
-                f"{self.folder / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
+                f"{self.shown / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
                 f"as unsigned char"
             )
         last = np.array([*(np.array(shape) - 1.0), 1.0])
@@ -124,7 +125,7 @@ class Case:
         apart = np.abs((placement - of_labels) @ corners.T).max()  # m
         if shape != other or apart > 1e-6:
             raise CaseError(
-                f"{self.folder / LABELS}: is on another grid than {VOLUME} "
+                f"{self.shown / LABELS}: is on another grid than {VOLUME} "
                 f"({' × '.join(map(str, other))} voxels, {' × '.join(map(str, shape))} there, up "
                 f"to {apart * 1e3:.3g} mm apart): segment this volume, or resample the labels"
             )
@@ -135,8 +136,12 @@ def is_case(folder: str | os.PathLike[str]) -> bool:
     return os.path.isfile(Path(folder) / CASE)
 
 
-def read_case(folder: str | os.PathLike[str]) -> Case:
+def read_case(folder: str | os.PathLike[str], shown: Path | None = None) -> Case:
     """The case in a folder; its volume is not opened.
+
+    Args:
+        folder: of the case.
+        shown: the folder that errors name, where the case is about to be moved there.
 
     Raises:
         CaseError: there is none, a file of it leads out of the folder or in a circle, or its
@@ -154,14 +159,15 @@ def read_case(folder: str | os.PathLike[str]) -> Case:
             f"{folder}: cannot be opened; its links may lead in a circle: "
             f"{getattr(error, 'strerror', None) or error}"
         ) from error
+    shown = shown or folder
     for name in (CASE, VOLUME, LABELS, SURFACES, TISSUE, PROVENANCE):
-        _check_inside(folder, name)
+        _check_inside(folder, name, shown)
     for name in (CASE, VOLUME):
         if not (folder / name).is_file():
-            raise CaseError(f"{folder}: is no case, as it has no {name}; `us-sim cases` lists some")
-    path = folder / CASE
+            raise CaseError(f"{shown}: is no case, as it has no {name}; `us-sim cases` lists some")
+    path = shown / CASE
     try:
-        document = load_yaml(read_text(path))
+        document = load_yaml(read_text(folder / CASE))
     except (OSError, UnicodeDecodeError) as error:
         raise CaseError(f"{path}: cannot be read: {error}") from error
     except YamlError as error:
@@ -169,10 +175,10 @@ def read_case(folder: str | os.PathLike[str]) -> Case:
     if document is None:
         raise CaseError(f"{path}: is empty; a case has at least a name")
     settings = Reader(str(path), None, CaseError).read(CaseSettings, document)
-    return Case(folder, settings, read_steps(folder))
+    return Case(folder, settings, read_steps(folder), shown)
 
 
-def _check_inside(folder: Path, name: str) -> None:
+def _check_inside(folder: Path, name: str, shown: Path) -> None:
     """Refuse a link that leads elsewhere: a case may come from a stranger."""
     path = folder / name
     if not path.is_symlink():
@@ -183,8 +189,8 @@ def _check_inside(folder: Path, name: str) -> None:
         inside = False
     if not inside:
         raise CaseError(
-            f"{path}: is a link that leads out of the case, nowhere, or in a circle: put the file "
-            f"itself there"
+            f"{shown / name}: is a link that leads out of the case, nowhere, or in a circle: put "
+            f"the file itself there"
         )
 
 

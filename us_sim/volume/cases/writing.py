@@ -147,15 +147,15 @@ def _finish(folder: Path, partial: Path) -> None:
     Errors name the place that it was meant for.
     """
     try:
-        case = read_case(partial)
+        case = read_case(partial, shown=folder)
         case.placement()
         if case.has_labels:
             case.check_grids()
         start = case.settings.start
         if start is None or start.proposed or case.settings.probe is None:
             write_case_settings(partial, with_proposal(case.settings, case.volume()))
-    except (CaseError, VolumeError) as error:
-        raise type(error)(str(error).replace(str(partial.resolve()), str(folder))) from error
+    except VolumeError as error:  # of a file that cannot be read, which it names
+        raise VolumeError(f"{folder}: is not written: {error}") from error
 
 
 @contextmanager

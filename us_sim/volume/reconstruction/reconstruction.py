@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.grid import (
@@ -224,6 +223,8 @@ def _pair(
     planned: Plan, made: Reconstruction, k: int, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """The used pixels of a frame whose eight voxels are covered, their prediction, and how many."""
+    from scipy import ndimage  # which live reconstruction does not need
+
     to_index = planned.grid.reference_to_index
     index = (planned.points(k) @ to_index[:3, :3].T + to_index[:3, 3]).T
     size = np.array(planned.grid.shape)[:, None]

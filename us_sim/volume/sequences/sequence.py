@@ -273,11 +273,12 @@ def _metaimage(path: Path) -> SequenceFile:
         raise VolumeError(
             f"{path}: ends within its header, so it is cut; copy it again, or {_GIVE}"
         )
-    sizes = _whole_numbers(path, "DimSize", header.get("DimSize", ""))
+    stated = header.get("DimSize", "")
+    sizes = _whole_numbers(path, "DimSize", stated)
     (channels,) = _whole_numbers(path, "channels", header.get("ElementNumberOfChannels", "1"))
     return SequenceFile(
         path,
-        *_size(path, "DimSize", sizes, channels),
+        *_size(path, "DimSize", stated, sizes, channels),
         _orientation(header),
         _frames(path, header.get("Kinds", ""), header),
         lambda: metaimage_voxels(path, header, header_bytes),
@@ -293,13 +294,16 @@ def _nrrd(path: Path) -> SequenceFile:
             f"export it as Plus does: domain domain domain list"
         )
     frames = _frames(path, " ".join(kinds), pairs)
-    sizes = _whole_numbers(path, "sizes", fields.get("sizes", ""))
-    channels, count = 1, len(kinds) or len(sizes)
+    stated = fields.get("sizes", "")
+    sizes = _whole_numbers(path, "sizes", stated)
+    if kinds and len(kinds) != len(sizes):
+        raise _no_size(path, "sizes", stated)
+    channels = 1
     if kinds and kinds[0] in ("vector", "rgb-color", "3-color", "list"):
-        channels, sizes, count = sizes[0], sizes[1:], count - 1
+        channels, *sizes = sizes
     return SequenceFile(
         path,
-        *_size(path, "sizes", sizes if len(sizes) == count else [], channels),
+        *_size(path, "sizes", stated, sizes, channels),
         _orientation(pairs),
         frames,
         lambda: nrrd_voxels(path),
@@ -322,11 +326,13 @@ def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[s
     return frames
 
 
-def _size(path: Path, key: str, sizes: Sequence[int], channels: int) -> tuple[int, int, int, int]:
+def _size(
+    path: Path, key: str, stated: str, sizes: Sequence[int], channels: int
+) -> tuple[int, int, int, int]:
     """Columns, rows, channels and frames that can be."""
     # Newer versions of Plus write a depth of 1 before the number of frames.
     if len(sizes) not in (3, 4):
-        raise _no_size(path, key, " ".join(map(str, sizes)))
+        raise _no_size(path, key, stated)
     columns, rows, *between, count = sizes
     if any(depth > 1 for depth in between):
         raise VolumeError(f"{path}: is a sequence of volumes; give one of flat images")

@@ -217,7 +217,8 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
         if isinstance(error, OSError) and error.errno is not None:
             raise  # the file cannot be read at all
         raise VolumeError(
-            f"{path}: cannot be read as DICOM: its header is damaged or cut short; export it again"
+            f"{path}: cannot be read as DICOM: its header is damaged or cut short; copy or export "
+            f"it again"
         ) from error
 
 

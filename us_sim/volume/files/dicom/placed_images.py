@@ -147,8 +147,11 @@ def _in_time(
     path: Path, here: Sequence[int], planes: Sequence[Plane], times: Sequence[float]
 ) -> list[list[int]]:
     """The images of each volume, by their times, or where these are alike as they follow."""
-    if len({times[n] for n in here}) > 1:
-        return [[n for n in here if times[n] == time] for time in sorted({times[n] for n in here})]
+    at_time: dict[float, list[int]] = {}
+    for n in here:
+        at_time.setdefault(times[n], []).append(n)
+    if len(at_time) > 1:
+        return [at_time[time] for time in sorted(at_time)]
     places = Counter(planes[n].position for n in here)
     count = max(places.values())
     if set(places.values()) != {count}:
