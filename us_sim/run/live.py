@@ -100,13 +100,19 @@ def follow(
         return supervisor.outcome(startup)
 
 
+_LONG_START_S = 15.0  # longer than a start takes whose kernels are all kept
+
+
 def _await_all(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
     count = len(supervisor.plan.nodes)
-    with Progress("starting (the first run compiles)", count, "nodes") as bar:
+    began = time.monotonic()
+    with Progress("starting", count, "nodes") as bar:
         while waiting := supervisor.waiting:
             update()
             monitor.refuse_earlier_run()
             more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
+            if time.monotonic() - began > _LONG_START_S:
+                more += "; the first run compiles, for minutes"
             bar.update(count - len(waiting), ", ".join(waiting[:2]) + more)
             failed = supervisor.failed()
             if failed:

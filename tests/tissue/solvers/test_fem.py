@@ -230,6 +230,27 @@ def test_what_takes_long_is_kept_and_mended(cache, monkeypatch, caplog):
     assert np.linalg.norm(twice.force) == pytest.approx(2 * np.linalg.norm(made.force))
 
 
+@pytest.mark.parametrize("contact", ["frictionless", "coulomb", "sticking"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_compliance_from_the_cache_gives_the_same_bytes(contact, compressed, monkeypatch):
+    if compressed:
+        monkeypatch.setattr(compliance_module, "_COMPRESSED", 0)
+    poses = [
+        Pose([0.002 * k - 0.01, 0.001 * k, 0.012], [0.02 * k, 0.0, 0.0, 1.0]) for k in range(6)
+    ]
+
+    def dragged():
+        solver = Fem(block((9, 5, 5)), FemSettings(contact=contact))
+        return b"".join(solver.deform(pose).nodes.tobytes() for pose in poses)
+
+    in_memory = dragged()
+    assert not cache_folder().exists()
+    monkeypatch.setattr(compliance_module, "_KEPT", 0)
+    assert dragged() == in_memory  # computed and kept
+    assert any(path.is_dir() for path in cache_folder().iterdir())
+    assert dragged() == in_memory
+
+
 def test_without_a_place_to_keep_it_there_is_a_warning(tmp_path, monkeypatch, caplog):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path / "file" / "cache"))

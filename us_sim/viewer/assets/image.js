@@ -20,10 +20,12 @@ const canvas = Object.assign(document.createElement("canvas"), { className: "us-
 const scale = Object.assign(document.createElement("canvas"), { className: "us-scale" });
 const waiting = Object.assign(document.createElement("p"), {
   className: "us-waiting",
-  textContent:
-    "Waiting for the first image …\n" +
-    "The first start after an installation takes some minutes: the program is compiled once.",
+  textContent: "Waiting for the first image …",
 });
+setTimeout(() => {
+  waiting.textContent +=
+    "\nThe first start after an installation takes some minutes: the program is compiled once.";
+}, 15000); // a start whose kernels are all kept is over by then
 const badge = Object.assign(document.createElement("p"), { className: "us-stale", hidden: true });
 badge.setAttribute("role", "status");
 /** On the side where the mark of the probe is: its -x. */
