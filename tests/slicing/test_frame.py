@@ -44,7 +44,7 @@ def scanner():
 @pytest.mark.parametrize("first", ["pixels", "labels", "located"])
 def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, monkeypatch):
     scanner.use(probe, Imaging())
-    slicer = scanner._slicer
+    slicer = scanner.frame(POSE, MESH.nodes).slicer
     nodes = pressed(MESH.nodes)
     plane = probe.plane(POSE)
     image, labels = slicer.image(nodes, plane), slicer.labels(nodes, plane)

@@ -77,5 +77,5 @@ def test_without_a_time_to_coast_it_is_lost_at_once():
     ("coast_for", "lost_after"), [(0.0, 1.0), (2.0, 1.0), (float("nan"), 1.0), (0.3, float("inf"))]
 )
 def test_times_that_make_no_sense_are_refused(coast_for, lost_after):
-    with pytest.raises(TrackingError, match="the first must be positive and the second no less"):
+    with pytest.raises(TrackingError, match="positive"):
         TrackingClock(coast_for=coast_for, lost_after=lost_after)

@@ -14,7 +14,13 @@ from us_sim.tracking.calibration.transform_file import write_transform
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction import grid as grids
 from us_sim.volume.reconstruction.calibration_file import read_calibration
-from us_sim.volume.reconstruction.grid import Grid, axes_of_smallest_box, grid_around, image_mask
+from us_sim.volume.reconstruction.grid import (
+    Grid,
+    axes_of_smallest_box,
+    grid_around,
+    image_mask,
+    proposed_spacing,
+)
 from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
 from us_sim.volume.reconstruction.reconstruction import leave_one_out, plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
@@ -92,6 +98,15 @@ def test_the_smallest_box_holds_the_same_tissue_in_fewer_voxels(sweep):
     axes = turned.grid.index_to_reference[:3, :3] / 0.5e-3
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("size", [(0.2, 0.2, 0.2), (0.31, 0.07, 0.9)])
+def test_a_proposed_spacing_is_the_pixel_or_just_keeps_below_the_most_voxels(size):
+    corners = np.array([np.zeros(3), size])
+    assert proposed_spacing(corners, 1e-2) == 1e-2
+    spacing = proposed_spacing(corners, 1e-5)
+    assert 0.9 < np.prod(np.array(size) / spacing) / 2**27 < 1.0
+    assert spacing * 1e5 == pytest.approx(round(spacing * 1e5))
 
 
 def test_what_is_compounded_is_what_its_name_says():

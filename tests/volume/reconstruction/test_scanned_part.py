@@ -124,6 +124,26 @@ def test_the_poses_are_of_the_middle_of_the_face(tmp_path):
     assert pose.rotation[0, 0] < -0.99  # along the columns
 
 
+def test_the_poses_are_evenly_spread_along_the_way_of_the_middle_of_the_image(tmp_path):
+    mask = np.zeros((ROWS, COLUMNS), bool)
+    mask[10:250, 100:200] = True
+    sliding, turning = np.linspace(0.0, 0.03, 41), np.linspace(0.0, 0.5, 41)[1:]  # m, rad
+    angles = np.concatenate([np.zeros(41), turning])  # about the face, 0.06 m above the middle
+    places = np.tile(np.eye(4), (81, 1, 1))
+    places[:, 0, 0], places[:, 1, 1], places[:, 2, 2] = -1.0, -np.cos(angles), np.cos(angles)
+    places[:, 1, 2] = places[:, 2, 1] = np.sin(angles)
+    places[:, 1, 3] = np.concatenate([sliding, np.full(40, sliding[-1])])
+    into_image = np.array(
+        [[SIDE[0], 0, 0, 0], [0, 0, 1, 0], [0, SIDE[1], 0, -0.00475], [0, 0, 0, 1]]
+    )
+    images = np.broadcast_to((mask * 90).astype(np.uint8), (81, ROWS, COLUMNS))
+    sweep = read_sweep(write_sweep(tmp_path / "s.igs.mha", images, places @ into_image))
+    found = scanning_probe(sweep, ImagePart(), np.ones_like(mask))
+    turned = [abs(each.pose.rotation[1, 2]) > 1e-6 for each in found.poses]
+    assert len(turned) == 33
+    assert sum(turned) == 16
+
+
 def test_a_fan_that_is_named_is_the_probes(tmp_path):
     fan = {"fan_origin": [200, -60], "fan_radius": [80, 220], "fan_angles": ["-30 deg", "30 deg"]}
     part = ImagePart(**fan)
