@@ -29,7 +29,7 @@ def test_dictionaries_are_known_by_opencvs_names():
     assert family("APRILTAG_36h11") == "APRILTAG_36h11"
     small, large = dictionary("5X5_50").bytesList, dictionary("5X5_1000").bytesList
     assert np.array_equal(small, large[:50])
-    with pytest.raises(TrackingError, match="8X8_50.* 4X4_50"):
+    with pytest.raises(TrackingError, match=r"8X8_50.* 4X4_50"):
         RigidBody.single("8X8_50", 0, 0.04)
 
 
@@ -53,7 +53,7 @@ def test_an_impossible_body_is_refused(body, sentence):
 
 def test_corners_out_of_order_or_plane_are_refused():
     corners = RigidBody.single("4X4_50", 1, 0.04).corners[0]
-    with pytest.raises(TrackingError, match="marker 1: .*convex"):
+    with pytest.raises(TrackingError, match=r"marker 1: .*convex"):
         RigidBody("4X4_50", np.array([1]), corners[[0, 2, 1, 3]][None])
     bent = corners.copy()
     bent[[0, 2], 2] = 0.01

@@ -200,7 +200,7 @@ def test_too_few_markers_are_refused(image):
 
 def test_an_image_of_another_camera_is_refused(image):
     source = CameraSource(WEBCAM, MARKER)
-    with pytest.raises(TrackingError, match="320 × 240.* 640 × 480"):
+    with pytest.raises(TrackingError, match=r"320 × 240.* 640 × 480"):
         source.measure(image[:240, :320], 0)
     with pytest.raises(TrackingError, match="must be grey uint8"):
         source.measure(image.astype(np.float32), 0)
