@@ -275,10 +275,7 @@ class HapticRendering:
         self._not_before: int | None = None  # ns, the next model's stamp must be later
         self._anchor = Pose()  # of the handle, when the model was made
         self._begun: int | None = None  # ns, when the ramp began
-        self._left_over, self._since = (
-            np.zeros(6),
-            0,
-        )  # wrench of earlier models, and since when, ns
+        self._left_over, self._since = np.zeros(6), 0  # wrench of earlier models, since when (ns)
         self._felt = np.zeros(6)
         self._motion = np.zeros(6)  # m, rad, of the handle since the last tick
         self._motions: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
@@ -559,10 +556,8 @@ class HapticDevice:
         self.is_held = held
 
     def _body(self, pose: Pose) -> Pose:
-        return Pose(
-            self._scale * pose.position + self._offset,
-            se3.product(pose.orientation, self._regrip),
-        )
+        turned = se3.product(pose.orientation, self._regrip)
+        return Pose(self._scale * pose.position + self._offset, turned)
 
     def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> NDArray[np.float64]:
         """How the probe moves with the handle, whatever the clutch did earlier.

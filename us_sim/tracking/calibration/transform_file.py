@@ -36,8 +36,6 @@ from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
 from us_sim.volume.sequences.transforms import split_transform_name
 
-_KEYS = ("from", "to", "position", "orientation")
-
 
 @dataclass(frozen=True)
 class _Written(Settings):
@@ -92,11 +90,10 @@ def read_transform_file(path: str | Path) -> TransformFile:
         pose = Pose(np.array(place.position), np.array(place.orientation))
     except PoseError as error:
         raise CalibrationError(f"{path}: {error}") from error
-    known = {*_KEYS, "method", "date", "residuals"}
-    keys = ("from", "to", "method", "date")
-    from_frame, to_frame, method, date = (str(document.get(key, "")) for key in keys)
+    stated = ("from", "to", "method", "date")
+    known = {*stated, *written, "residuals"}
     more = {key: value for key, value in document.items() if key not in known}
-    return TransformFile(pose, from_frame, to_frame, method, date, residuals, more)
+    return TransformFile(pose, *(str(document.get(key, "")) for key in stated), residuals, more)
 
 
 def _of_slicer(path: Path) -> TransformFile:
