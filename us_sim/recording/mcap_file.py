@@ -59,8 +59,7 @@ _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and it
 _TIME = struct.Struct("<Q8x")  # log time, place in its chunk
 _CHANNEL = struct.Struct("<H4x")  # and the length of the table that follows
 
-_LARGEST_OVERLAP = 1 << 30
-"""Bytes of messages that wait until no earlier one can come."""
+_LARGEST_OVERLAP = 1 << 30  # bytes of messages that wait until no earlier one can come
 _PLACES_TOLD = 3
 
 
@@ -81,11 +80,7 @@ class _Place(NamedTuple):
 
 
 class McapFile:
-    """One MCAP file as a Storage.
-
-    Args:
-        path: the file.
-        label: its name in errors.
+    """One MCAP file as a Storage; errors call it by the label.
 
     Raises:
         BagError: the file is empty, no MCAP, or of a topic with two types.
@@ -114,14 +109,7 @@ class McapFile:
         self.topics = self._topics()
 
     def attachments(self, damage: list[Fault] | None) -> Iterator[BagAttachment]:
-        """The files within this one.
-
-        Args:
-            damage: takes a fault for each that is damaged, which is then left out.
-
-        Raises:
-            BagError: one is damaged, and ``damage`` is None.
-        """
+        """The files within this one; ``damage`` and errors are as in `Bag.attachments`."""
         for place in self._attachments:
             try:
                 record = attachment(self._content(place))

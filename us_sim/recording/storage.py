@@ -36,11 +36,7 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 class SqliteFile:
-    """One SQLite file as a Storage.
-
-    Args:
-        path: the file.
-        label: its name in errors.
+    """One SQLite file as a Storage; errors call it by the label.
 
     Raises:
         BagError: the file is damaged, or without the tables of rosbag2.

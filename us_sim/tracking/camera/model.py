@@ -311,11 +311,7 @@ def write_camera_info(
 ) -> None:
     """Write the file that `read_camera_info` and ROS's drivers read.
 
-    Args:
-        path: of the new file.
-        camera: what it says.
-        name: the camera's.
-        notes: further keys, which readers pass over: how it was calibrated, and how well.
+    The notes are further keys, which readers pass over: how it was calibrated, and how well.
 
     Raises:
         TrackingError: the file exists.

@@ -175,9 +175,7 @@ def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
     return bool(aligned >= 0.7 and width > 1.5 * height)
 
 
-_MARGIN = 3
-"""Pixels around text that are blanked with it: shadows and blurred edges."""
-
+_MARGIN = 3  # pixels around text that are blanked with it: shadows and blurred edges
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 

@@ -27,9 +27,7 @@ from us_sim.volume.surfaces.label_surface import structure_name, voxel_surface
 from us_sim.volume.surfaces.settings import SurfaceSettings
 from us_sim.volume.volume import Volume
 
-_TRIALS = 6
-"""Of decimation; each halves the logarithm of the range in which the answer lies."""
-
+_TRIALS = 6  # of decimation; each halves the logarithm of the range in which the answer lies
 _NO_GAIN = 0.9  # of the triangles; a surface that keeps more stays as it is
 
 
