@@ -509,7 +509,7 @@ class HapticDevice:
         self.is_held = False
 
     def take(self, pose: Pose, stamp: int) -> Measurement:
-        """The body that carries the probe, from the handle's pose in the arm's frame; stamp in ns."""
+        """The body that carries the probe, from the handle's pose, both in the arm's frame."""
         self._last = pose
         body = self._held or self._body(pose)
         if self.is_held:

@@ -208,9 +208,9 @@ class RenderedView:
             side = start + finger * (number + 0.5)
             for width, grey in ((1.0, 0.6 * _SKIN), (0.85, _SKIN)):
                 ends = (end * reach + side * across, (end - far) * reach + side * across)
-                points = [tuple(round(16 * float(value)) for value in point) for point in ends]
+                one, other = (tuple(round(16 * float(n)) for n in point) for point in ends)
                 thickness = max(1, int(width * finger))
-                cv2.line(image, *points, grey, thickness, lineType=cv2.LINE_8, shift=4)
+                cv2.line(image, one, other, grey, thickness, lineType=cv2.LINE_8, shift=4)
 
     def _gradient(self, loss: float, random: np.random.Generator) -> NDArray[np.float32]:
         """(rows, columns) fraction of the light, 1 at one side of the image."""
