@@ -274,12 +274,7 @@ def is_tracker_recording(path: str | Path) -> bool:
 
 
 def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> None:
-    """Writes a path as a bag of its one topic, compressed.
-
-    Args:
-        file: as ``BagWriter`` takes it.
-        path: recorded at its log times.
-        sidecar: False leaves ``metadata.yaml`` away.
+    """Writes a path as a bag of its one topic, compressed; ``sidecar`` is as for `BagWriter`.
 
     Raises:
         BagError: the file exists or cannot be written.

@@ -239,11 +239,7 @@ class BagWriter:
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Puts a file into each of the bag's, such as the scene that is recorded.
 
-        Args:
-            name: of the file.
-            media_type: such as ``text/plain``.
-            data: its content.
-            time_ns: ns since the epoch, when it was as it is.
+        The time in ns since the epoch is when it was as it is.
 
         Raises:
             BagError: the bag is closed, or the disk is full.

@@ -73,10 +73,8 @@ class StoredImages:
     orientation: str
 
     def read(self, wanted: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """Grey images (rows, columns) turned to ``MF``, one in memory at a time.
-
-        Args:
-            wanted: numbers of frames, ascending.
+        """Grey images (rows, columns) turned to ``MF``, one in memory at a time, of frames whose
+        numbers ascend.
 
         Raises:
             VolumeError: there are fewer than promised, or they are damaged.

@@ -82,10 +82,6 @@ def voxel_surface(volume: Volume, label: int) -> tuple[ClosedSurface, float]:
 
     A structure that leaves the volume ends there in a flat cap.
 
-    Args:
-        volume: with labels.
-        label: its number.
-
     Returns:
         The surface in ``patient``, and the volume of the label's voxels in m³.
 
