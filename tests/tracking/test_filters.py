@@ -315,25 +315,29 @@ def test_errors_go_on_as_the_predicted_pose_says_by_differences():
     """Turning by 1.5 rad within the step, where the rotation's errors turn too."""
     rng = np.random.default_rng(9)
     quiet = KalmanSettings(acceleration=1e-6, angular_acceleration=1e-6)
-    stamp, later, step = 10**9, 13 * 10**8, 1e-6
-    place = (rng.normal(size=3), Pose(orientation=rng.normal(size=4)).orientation)
-    velocity = np.array([0.1, -0.2, 0.3, 3.0, -3.5, 2.0])
-    root = rng.normal(size=(12, 12))
+    stamps, step = (0, 10**9, 11 * 10**8, 18 * 10**8), 1e-6  # ns: two measured, two predicted
+    start = Pose(rng.normal(size=3), rng.normal(size=4))
+    covariances = [random_covariance(rng, 0.1, 0.1), random_covariance(rng, 0.01, 0.01)]
+    way = np.array([0.1, -0.2, 0.3, 1.1, -1.3, 0.8])
 
-    def predicted(error):
+    def measured(error):
         kalman = ConstantVelocityKalman(quiet)
-        kalman._stamp, kalman._velocity = stamp, velocity + error[6:]
-        moved = displaced(Pose(*place), error[:6])
-        kalman._place, kalman._covariance = (moved.position, moved.orientation), root @ root.T
-        there, covariance = kalman.predicted(later)
-        return Pose(*there), covariance
+        poses = displaced(start, error[:6]), displaced(displaced(start, way), error[6:])
+        for stamp, pose, covariance in zip(stamps, poses, covariances, strict=False):
+            kalman.update(Measurement(stamp, pose, covariance))
+        return kalman, *(Pose(*kalman.predicted(stamp)[0]) for stamp in stamps[1:])
 
-    transition = np.eye(12)
+    now, later = np.zeros((12, 12)), np.zeros((6, 12))
     for k, error in enumerate(step * np.eye(12)):
-        behind, ahead = (predicted(sign * error)[0] for sign in (-1, 1))
-        transition[:6, k] = difference(behind, ahead) / (2 * step)
-    expected = transition @ root @ root.T @ transition.T
-    np.testing.assert_allclose(predicted(np.zeros(12))[1], expected, atol=1e-7)
+        behind, ahead = (measured(sign * error)[1:] for sign in (-1, 1))
+        now[:6, k] = difference(behind[0], ahead[0])
+        now[6:, k] = (difference(*ahead[:2]) - difference(*behind[:2])) / 0.1  # of the velocity
+        later[:, k] = difference(behind[2], ahead[2])
+    kalman = measured(np.zeros(12))[0]
+    transition = np.eye(12)
+    transition[:6] = later @ np.linalg.inv(now)
+    expected = transition @ kalman.predicted(stamps[1])[1] @ transition.T
+    np.testing.assert_allclose(kalman.predicted(stamps[3])[1], expected, atol=1e-9)
 
 
 def test_before_the_first_measurement_it_predicts_nothing():

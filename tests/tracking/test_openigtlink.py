@@ -2,6 +2,7 @@
 
 import socket
 import struct
+import threading
 import time
 from types import SimpleNamespace
 
@@ -342,14 +343,18 @@ def test_a_port_in_use_says_so():
 
 
 def test_closing_waits_for_a_thread_that_has_ended_already(monkeypatch):
+    """What wakes the thread is sent once more when the thread has ended."""
+
+    class Late(socket.socket):
+        def send(self, data):
+            super().send(data)
+            thread.join(20.0)
+            return super().send(data)
+
+    pair = socket.socketpair
+    monkeypatch.setattr(socket, "socketpair", lambda: [Late(fileno=s.detach()) for s in pair()])
+    before = set(threading.enumerate())
     server = OpenIGTLinkServer("127.0.0.1", 0)
-    ring, thread = server._ring, server._thread
-
-    def late():
-        ring()
-        thread.join()
-        ring()
-
-    monkeypatch.setattr(server, "_ring", late)
+    (thread,) = set(threading.enumerate()) - before
     server.close()
     assert not thread.is_alive()
