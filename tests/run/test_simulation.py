@@ -56,9 +56,6 @@ class Control:
         self.values = SessionControlSettings()
         self.told, self.to_player = [], []
 
-    def obey(self, _, settings):
-        self.values = settings
-
     def show(self, settings):
         self.values = settings
 
@@ -74,7 +71,8 @@ def running(small_scene):
     """A simulation of the small scene that is ready, its supervisor and its control."""
     request = Request(load_scene(small_scene), by_hand=True)
     supervisor, control = Supervisor(plan_of(request)), Control()
-    monitor = SimpleNamespace(control=lambda: control, node=SimpleNamespace(reports={}))
+    made = lambda _, settings: control.show(settings) or control  # noqa: E731
+    monitor = SimpleNamespace(control=made, node=SimpleNamespace(reports={}))
     simulation = Simulation(request, supervisor, monitor)
     simulation.update()
     yield simulation, supervisor, control

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from us_sim.errors import UsSimError
+from us_sim.nodes import INTERRUPTED
 from us_sim.run.plan import NodeProcess, Plan, Request, goes_on, plan_of
-from us_sim.run.processes import INTERRUPTED
 from us_sim.run.supervision import Supervisor
 from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene

@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import CompressedImage
 
-from us_sim.errors import SettingsError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import changed, declared, parameters_with
 from us_sim.nodes.qos import CATALOGUE, LATCHED, overridable
@@ -38,11 +38,17 @@ class SessionControl(GuardedNode):
 
     Its parameters are those of `SessionControlSettings`. What becomes of a change is in its
     report on ``diagnostics``: `state`, and `fraction` while something is loaded.
+
+    Args:
+        controlled: does as the parameters say.
+        settings: that it follows now.
     """
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(
+        self, controlled: Controlled, settings: SessionControlSettings, **kwargs: Any
+    ) -> None:
         super().__init__("session_control", **kwargs)
-        self._controlled: Controlled | None = None
+        self._controlled = controlled
         self._values = declared(self, SessionControlSettings())
         self._is_showing = False
         self._told: tuple[object, ...] = ()
@@ -60,15 +66,6 @@ class SessionControl(GuardedNode):
         )
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._take)
-
-    def obey(self, controlled: Controlled, settings: SessionControlSettings) -> None:
-        """Hand changes on from now on.
-
-        Args:
-            controlled: does as the parameters say.
-            settings: what it does now.
-        """
-        self._controlled = controlled
         self.show(settings)
 
     def show(self, settings: SessionControlSettings) -> None:
@@ -164,8 +161,6 @@ class SessionControl(GuardedNode):
             return SetParametersResult(successful=True)
         try:
             wanted = self._wanted(parameters)
-            if self._controlled is None:
-                raise SettingsError("the simulation has not begun yet")
             self._controlled.check(wanted, {each.name for each in parameters})
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -177,5 +172,4 @@ class SessionControl(GuardedNode):
             return
         self._values = self._wanted(parameters)
         self.show(self._values)
-        if self._controlled is not None:
-            self._controlled.take(self._values, {each.name for each in parameters})
+        self._controlled.take(self._values, {each.name for each in parameters})

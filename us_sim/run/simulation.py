@@ -61,8 +61,7 @@ class Simulation:
         self._kept: dict[tuple[str, str | None], Kept] = {}  # by scenes and their volumes
         self._lost = ""  # what was set and is not any more
         self._lost_until = math.inf  # s, monotonic: when that has been said for long enough
-        self._control = monitor.control()
-        self._control.obey(self, self._shown())
+        self._control = monitor.control(self, self._shown())
 
     def update(self) -> None:
         """Update as `Supervisor.update`, and continue pending requests.

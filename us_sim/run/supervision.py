@@ -10,19 +10,19 @@ from dataclasses import replace
 from tqdm import tqdm
 
 from us_sim.errors import printable
-from us_sim.run.losses import Loss, Outcome, Recordings, images_in
+from us_sim.nodes import INTERRUPTED
+from us_sim.run.fork_server import SLOW
+from us_sim.run.losses import IMAGES, Loss, Outcome, Recordings, images_in
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import PLAYERS, RECORDER, VIEWER, NodeProcess, Plan, goes_on, recorder_of
-from us_sim.run.processes import INTERRUPTED, ProcessGroup, ending
+from us_sim.run.processes import ProcessGroup, ending
 from us_sim.run.watch import START_LIMIT_S, Restarts, SupervisionSettings, Watch
 
-SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
-"""Nodes that take long to start, and hold no device that a second process could not have."""
 LIVES_S = 10.0
 """How long a node that was started again lives if what was set of it is not why it ended."""
 Kept = dict[str, dict[str, object]]
 """Parameters that were set while nodes ran: values by names, by node."""
-IMAGER, IMAGES = "slice_interpolator", "ultrasound/image"
+IMAGER = "slice_interpolator"
 
 
 class Supervisor:

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import shortest_path
 from us_sim.errors import CalibrationError, TrackingError, VolumeError
 from us_sim.recording.path import read_path
 from us_sim.recording.plus_recording import read_tracker_recording
-from us_sim.tracking.calibration.transform_file import read_transform_file
+from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.slicer_transforms import read_slicer_sequences, read_slicer_transform
 from us_sim.volume.sequences.sweep import read_sweep, sweep_of
@@ -479,12 +479,11 @@ def transform_file(path, angle=0.3, shift=(10.0, 20.0, 30.0)):
 
 @pytest.mark.parametrize("ending", ["h5", "tfm"])
 def test_a_scene_takes_a_transform_of_slicer_as_registration(tmp_path, ending):
-    found = read_transform_file(transform_file(tmp_path / f"NdiToPatient.{ending}"))
-    assert (found.from_frame, found.to_frame) == ("Ndi", "Patient")
+    found = read_transform(transform_file(tmp_path / f"NdiToPatient.{ending}"))
     c, s = np.cos(0.3), np.sin(0.3)
     lps = -np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ [10, 20, 30]  # of the inverse
-    np.testing.assert_allclose(1e3 * found.pose.position, lps * [-1, -1, 1], atol=1e-9)
-    np.testing.assert_allclose(found.pose.rotation[:2, :2], [[c, s], [-s, c]], atol=1e-12)
+    np.testing.assert_allclose(1e3 * found.position, lps * [-1, -1, 1], atol=1e-9)
+    np.testing.assert_allclose(found.rotation[:2, :2], [[c, s], [-s, c]], atol=1e-12)
 
 
 def test_what_is_no_rigid_transform_is_refused(tmp_path):
@@ -493,13 +492,13 @@ def test_what_is_no_rigid_transform_is_refused(tmp_path):
     for made, name, said in ((scaled, "a.tfm", "not rigid"), (bent, "b.tfm", "not linear")):
         sitk.WriteTransform(made, str(tmp_path / name))
         with pytest.raises(CalibrationError, match=said):
-            read_transform_file(tmp_path / name)
+            read_transform(tmp_path / name)
     whole = transform_file(tmp_path / "whole.h5").read_bytes()
     (tmp_path / "cut.h5").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(CalibrationError, match=r"cut\.h5: is damaged"):
-        read_transform_file(tmp_path / "cut.h5")
+        read_transform(tmp_path / "cut.h5")
     with pytest.raises(CalibrationError, match="No such file"):
-        read_transform_file(tmp_path / "none.h5")
+        read_transform(tmp_path / "none.h5")
 
 
 def scene(tmp_path, transforms, times="s1:0;s2:0.5", file="../outside.mrb"):
