@@ -300,7 +300,7 @@ def attachment(content: memoryview) -> records.Attachment:
 
 
 def _may_be_a_record(head: bytes) -> bool:
-    """Whether these may be a record's first bytes: its lengths agree, those of most bytes do not."""
+    """Whether these may be a record's first bytes: its lengths agree, as those of few bytes do."""
     try:
         opcode, length = HEADER.unpack_from(head)
         if opcode == Opcode.CHUNK:
