@@ -24,22 +24,9 @@ from sensor_msgs.msg import CompressedImage
 
 from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
+from us_sim.scene.listing import ListedScene
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
-
-
-@dataclass(frozen=True)
-class LoadableScene:
-    """A scene or a case."""
-
-    name: str
-    origin: str  # what loads it
-    kind: str = "scene"  # or case
-    description: str = ""
-    region: str = ""  # of the body
-    structures: tuple[str, ...] = ()
-    tracker: str = ""  # where its poses come from, unless the probe is moved by hand
-    problem: str = ""  # why it cannot be loaded
 
 
 @dataclass(frozen=True)
@@ -97,7 +84,7 @@ class SessionBoard:
         self._lock = threading.Lock()
         self._pages = 0
         self.state = SessionState()
-        self.scenes: tuple[LoadableScene, ...] = ()  # another object whenever it changes
+        self.scenes: tuple[ListedScene, ...] = ()  # another object whenever it changes
         self.thumbnails: dict[str, bytes] = {}  # JPEG of the image of a scene, by origins
         self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
@@ -258,17 +245,18 @@ def _tell(told: Future[str], answer: Any) -> None:
         told.set_result(f"{CONTROL} cannot be asked: {error}")
 
 
-def _scene_of(status: DiagnosticStatus) -> LoadableScene:
+def _scene_of(status: DiagnosticStatus) -> ListedScene:
     about = {each.key: shown(each.value) for each in status.values}
     is_wrong = status.level != DiagnosticStatus.OK
     said = shown(status.message)
-    return LoadableScene(
+    return ListedScene(
         shown(status.name),
         status.hardware_id,
         about.get("kind", "scene"),
         "" if is_wrong else said,
         about.get("region", ""),
         _names(about.get("structures", "")),
+        about.get("probe", ""),
         about.get("tracker", ""),
         said if is_wrong else "",
     )
