@@ -71,15 +71,13 @@ class Monitor:
         self.problems = {}
         self.set = {}
         self.node.take_set = lambda: self.set
+        self.node.follow = lambda _: None
 
     def spin(self, _=0.1):
         for node, pid in self.group.pids.items():
             if node not in self.silent:
                 self.node.heard[node, pid] = self.node.heard.get((node, pid), 0) + 1
                 self.node.reports.setdefault(node, {})["pid"] = str(pid)
-
-    def follow(self, nodes):
-        self.nodes = nodes
 
     def waiting(self, pids):
         return [node for node, pid in pids.items() if (node, pid) not in self.node.heard]

@@ -78,7 +78,7 @@ class Supervisor:
         self._restarts = Restarts(self._settings)
         self._changed = time.monotonic()
         self._changes += 1
-        self._monitor.follow(plan.nodes)
+        self._monitor.node.follow(plan.nodes)
         self._start_due()
 
     @property
