@@ -83,24 +83,15 @@ class TrackerRecording:
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """A body's poses in a reference frame (K, 4, 4) m, and which are valid (K,); nan elsewhere.
 
-        Args:
-            name: as in :meth:`chain`.
-            reference: as in :meth:`chain`.
-
-        Raises:
-            TrackingError: see :meth:`chain`.
+        Arguments and errors are those of :meth:`chain`.
         """
         found = along(self.transforms, self.chain(name, reference))
         return found.matrices, found.valid
 
     def probe_path(self, name: str | None = None, reference: str | None = None) -> ProbePath:
-        """The valid poses of a body as a path in the reference's frame.
+        """The valid poses of a body as a path in the reference's frame, by the recorder's clock.
 
-        Its stamps are the recorder's clock.
-
-        Args:
-            name: as in :meth:`chain`; by default the recording's only transform.
-            reference: as in :meth:`chain`.
+        Arguments are as for :meth:`chain`; without a name it is the recording's only transform.
 
         Raises:
             TrackingError: see :meth:`chain`; or the name is missing, or no pose is valid.

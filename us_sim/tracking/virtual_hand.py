@@ -97,9 +97,7 @@ class RestSurface:
     ) -> RestSurface:
         """The part of a closed surface that faces -z, on which a probe can stand.
 
-        Args:
-            vertices: (N, 3) m, frame ``patient``.
-            triangles: (T, 3) indices into them, anticlockwise as seen from outside the body.
+        Arguments are as for the class itself.
 
         Raises:
             MeshError: as the class itself; nothing of it faces -z.
@@ -292,8 +290,7 @@ def _norm(vector: NDArray[np.float64]) -> float:
     return math.sqrt(float(vector @ vector))
 
 
-_AT_REST, _ALIGNED = 2e-6, 1e-4
-"""m and rad from the goal: it is reached, for a pixel is some 80 µm."""
+_AT_REST, _ALIGNED = 2e-6, 1e-4  # m and rad from the goal: it is reached, for a pixel is some 80 µm
 
 
 @dataclass(frozen=True)
@@ -420,11 +417,8 @@ class Stance:
 
     @classmethod
     def home(cls, surface: RestSurface, press: float) -> Stance:
-        """Upright above the origin of ``patient``, or on the middle of a surface that is not there.
-
-        Args:
-            surface: to stand on.
-            press: m.
+        """Upright above the origin of ``patient``, or on the middle of a surface that is not there;
+        ``press`` in m.
         """
         middle = 0.5 * (surface.lower + surface.upper)
         inside = (surface.lower[:2] <= 0.0).all() and (surface.upper[:2] >= 0.0).all()
