@@ -1,7 +1,5 @@
 """`us-sim calibrate` from end to end: a file that reads back, one line, and refusals."""
 
-import csv
-
 import cv2
 import numpy as np
 import pytest
@@ -74,10 +72,18 @@ def test_pivot_refuses_one_axis_and_an_existing_file(tmp_path, capsys):
 POINTS = {"a": [0, 0, 0], "b": [0.1, 0, 0], "c": [0.1, 0.08, 0], "d": [0, 0.05, 0.03]}
 
 
-def table(file, points):
-    rows = [f"{name},{x},{y},{z}" for name, (x, y, z) in points.items()]
-    file.write_text("\n".join(["name,x,y,z", *rows]))
+POSED = "feature,column,row,x,y,z,qx,qy,qz,qw"
+
+
+def sheet(file, header, rows):
+    """A CSV file of numbers and names."""
+    lines = [",".join(map(str, row)) for row in rows]
+    file.write_text("\n".join([header, *lines]))
     return file
+
+
+def table(file, points):
+    return sheet(file, "name,x,y,z", [[name, *point] for name, point in points.items()])
 
 
 def test_landmarks_are_matched_by_name(tmp_path, capsys):
@@ -161,32 +167,16 @@ def test_probe_from_times_and_from_poses(tmp_path, capsys):
     positions = pin - turns.apply(body)
     recording = bag(tmp_path / "probe.mcap", times, positions, turns)
     chosen = [*range(0, 395, 5), 399]  # the first pose and the last among them
-    with (tmp_path / "timed.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["feature", "column", "row", "time"])
-        rows.writerows(["pin", *pixels[k], f"{1_700_000_000 + times[k]:.3f}"] for k in chosen)
-    with (tmp_path / "posed.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["feature", "column", "row", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        rows.writerows(["pin", *pixels[k], *positions[k], *turns[k].as_quat()] for k in chosen)
+    stamped = [["pin", *pixels[k], f"{1_700_000_000 + times[k]:.3f}"] for k in chosen]
+    timed = sheet(tmp_path / "timed.csv", "feature,column,row,time", stamped)
+    placed = [["pin", *pixels[k], *positions[k], *turns[k].as_quat()] for k in chosen]
+    posed = sheet(tmp_path / "posed.csv", POSED, placed)
     phantom = table(tmp_path / "phantom.csv", {"pin": pin})
     first, second = tmp_path / "timed.yaml", tmp_path / "posed.yaml"
     origin = ("--origin", 250, 0)
-    assert (
-        calibrate(
-            "probe",
-            tmp_path / "timed.csv",
-            "--recording",
-            recording,
-            "--phantom",
-            phantom,
-            *origin,
-            "--out",
-            first,
-        )
-        == 0
-    )
-    assert calibrate("probe", tmp_path / "posed.csv", *origin, "--out", second) == 0
+    known = ("--recording", recording, "--phantom", phantom)
+    assert calibrate("probe", timed, *known, *origin, "--out", first) == 0
+    assert calibrate("probe", posed, *origin, "--out", second) == 0
     assert "pixels of 0.2000 × 0.2000 mm" in capsys.readouterr().out
     expected = np.add(corner, [250 * spacing, 0.0, 0.0])
     # Stamps of seconds since 1970 are held to a quarter of a microsecond.
@@ -195,9 +185,7 @@ def test_probe_from_times_and_from_poses(tmp_path, capsys):
     np.testing.assert_allclose(read_transform(second).position, expected, atol=1e-9)
     np.testing.assert_allclose(yaml.safe_load(second.read_text())["points"]["pin"], pin, atol=1e-9)
     other = table(tmp_path / "other.csv", {"wire": pin})
-    said = refusal(
-        capsys, "probe", tmp_path / "posed.csv", "--phantom", other, *origin, "--out", "x.yaml"
-    )
+    said = refusal(capsys, "probe", posed, "--phantom", other, *origin, "--out", "x.yaml")
     assert "has no pin, which" in said
 
 
@@ -214,24 +202,20 @@ def test_sightings_without_a_pose_are_refused(tmp_path, capsys, time):
 def test_probe_that_hardly_turned_over_few_wires_is_remarked_on(tmp_path, capsys):
     rng = np.random.default_rng(3)
     wires = {f"w{k}": [0.02 * k, 0, 0.01 * k**2, 0.02 * (k + 1), 0.04, 0.01] for k in range(4)}
-    with (tmp_path / "wires.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["name", "x1", "y1", "z1", "x2", "y2", "z2"])
-        rows.writerows([name, *ends] for name, ends in wires.items())
-    with (tmp_path / "seen.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["feature", "column", "row", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        for k in range(80):
-            name = f"w{k % 4}"
-            ends = np.reshape(wires[name], (2, 3))
-            place = ends[0] + rng.uniform(0.1, 0.9) * (ends[1] - ends[0])
-            pixel = rng.uniform(50, 450, 2)
-            turn = Rotation.from_rotvec(np.radians(3.0) * rng.uniform(-0.5, 0.5, 3))
-            body = turn.apply([0.01 + 2e-4 * pixel[0], 0.02, 0.06 + 2e-4 * pixel[1]])
-            rows.writerow([name, *pixel, *(place - body), *turn.as_quat()])
+    ends_of = [[name, *ends] for name, ends in wires.items()]
+    phantom = sheet(tmp_path / "wires.csv", "name,x1,y1,z1,x2,y2,z2", ends_of)
+    rows = []
+    for k in range(80):
+        name = f"w{k % 4}"
+        ends = np.reshape(wires[name], (2, 3))
+        place = ends[0] + rng.uniform(0.1, 0.9) * (ends[1] - ends[0])
+        pixel = rng.uniform(50, 450, 2)
+        turn = Rotation.from_rotvec(np.radians(3.0) * rng.uniform(-0.5, 0.5, 3))
+        body = turn.apply([0.01 + 2e-4 * pixel[0], 0.02, 0.06 + 2e-4 * pixel[1]])
+        rows.append([name, *pixel, *(place - body), *turn.as_quat()])
     out = tmp_path / "probe.yaml"
-    chosen = ("--phantom", tmp_path / "wires.csv", "--origin", 250, 0, "--out", out)
-    assert calibrate("probe", tmp_path / "seen.csv", *chosen) == 0
+    chosen = ("--phantom", phantom, "--origin", 250, 0, "--out", out)
+    assert calibrate("probe", sheet(tmp_path / "seen.csv", POSED, rows), *chosen) == 0
     said = capsys.readouterr().out
     assert "the probe turned by only 4°, which determines little" in said
     assert "4 features are too few" in said
