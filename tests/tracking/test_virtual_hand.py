@@ -22,7 +22,6 @@ from us_sim.tracking.virtual_hand import (
     DEEPEST,
     STEEPEST,
     Approach,
-    HandSpeed,
     Motion,
     RestSurface,
     Stance,
@@ -302,11 +301,10 @@ def test_poses_do_not_depend_on_the_steps(press, rotation, fan, steps):
 
 
 def test_a_press_takes_as_long_as_its_speed_says():
-    speed = HandSpeed(press=0.1, time_constant=0.02)
-    motion = Motion(Stance(press=-0.05), speed)
+    motion = Motion(Stance(press=-0.05))
     motion.aim(Stance(press=0.02))
-    motion.advance(0.4)  # 40 mm further, less the lag of a time constant
-    assert motion.stance.press == pytest.approx(-0.05 + 0.1 * (0.4 - 0.02), abs=1e-9)
+    motion.advance(0.4)  # 60 mm further at 0.15 m/s, less the lag of a time constant of 20 ms
+    assert motion.stance.press == pytest.approx(-0.05 + 0.15 * (0.4 - 0.02), abs=1e-9)
 
 
 def test_rotation_takes_the_shorter_way():

@@ -129,7 +129,7 @@ class PathPlayer(GuardedNode):
             "duration": f"{1e-9 * self._ages[-1]:.3f}",
         }
 
-    def _use(self, _: object = None) -> None:
+    def _use(self, _: object) -> None:
         if self._ticking is not None and self._settings.rate != self._playhead.rate:
             self._tick_at_its_pace()
         self._playback.use()

@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile
 from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
-from us_sim.nodes.settings import SceneNodeSettings
+from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -123,7 +123,6 @@ class SceneNode(GuardedNode):
 
 
 LEAD_TOPIC = "tracker/pose"
-VIEWER = "viewer"
 NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
 
 
