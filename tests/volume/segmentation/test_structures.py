@@ -120,7 +120,7 @@ def test_of_structures_that_overlap_the_one_of_higher_priority_stays(two_tubes):
     assert overlap(made.labels == 2, tube) > 0.95
     assert (made.labels[other] == 1).mean() > 0.98
     assert any("of fluid are in vein and stay there" in remark for remark in made.remarks)
-    with pytest.raises(VolumeError, match=r"vein: all of it is in structures"):
+    with pytest.raises(VolumeError, match="vein: all of it"):
         found(volume, fluid=all_dark, vein=left)
 
 
@@ -172,7 +172,7 @@ DARK = {"method": "growing", "upper": 50}
         (DARK, "growing needs seeds"),
         (DARK | {"seeds_mm": [[0, 0, 0]]}, r"vein\.seeds_mm\[0\].*outside the volume.*spans"),
         (DARK | {"seeds_voxel": [[99, 0, 0]]}, r"vein\.seeds_voxel\[0\].*60 × 60 × 30"),
-        (DARK | {"seeds_voxel": [[5, 30, 15]]}, "seed 1 has the grey value .*outside 0 to 50"),
+        (DARK | {"seeds_voxel": [[5, 30, 15]]}, "seed 1 .*outside 0 to 50"),
         (DARK | {"seeds_voxel": [[20, 30, 15]], "open": "9 mm"}, "nothing is left of it"),
         (DARK | {"seeds_voxel": [[20, 30, 15]], "upper": 5, "lower": 9}, "swap them"),
         (DARK | {"reach": "3 mm"}, "there are none"),
