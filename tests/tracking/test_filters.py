@@ -71,9 +71,9 @@ def scalar_one_euro(times, values, minimum, beta, derivative_cutoff):
     return np.array(filtered)
 
 
-def run(one_euro, times, poses):
+def run(pose_filter, times, poses):
     return [
-        one_euro.update(Measurement(round(1e9 * t), pose)).pose
+        pose_filter.update(Measurement(round(1e9 * t), pose)).pose
         for t, pose in zip(times, poses, strict=True)
     ]
 
@@ -349,11 +349,9 @@ def test_before_the_first_measurement_it_predicts_nothing():
 def test_not_behind_a_uniform_motion(rate):
     kalman = ConstantVelocityKalman(KALMAN)
     speed, turning = np.array([0.1, -0.05, 0.02]), np.array([0.3, 1.0, -0.4])
-    for k in range(round(3 * rate)):
-        time = k / rate
-        pose = Pose(time * speed, se3.rotation_exp(time * turning))
-        filtered = kalman.update(Measurement(round(1e9 * time), pose)).pose
-    behind = difference(filtered, pose)
+    times = np.arange(round(3 * rate)) / rate
+    poses = [Pose(time * speed, se3.rotation_exp(time * turning)) for time in times]
+    behind = difference(run(kalman, times, poses)[-1], poses[-1])
     assert kalman.lag == 0.0
     assert np.linalg.norm(behind[:3]) / np.linalg.norm(speed) < 1e-6  # s
     assert np.linalg.norm(behind[3:]) / np.linalg.norm(turning) < 1e-6
@@ -374,12 +372,7 @@ def test_kalman_is_behind_a_sway_as_an_alpha_beta_tracker_is(rate, frequency):
     kalman = ConstantVelocityKalman(KalmanSettings(acceleration=0.05, position_deviation=2e-3))
     times = np.arange(round(12 * rate)) / rate
     way = 0.01 * np.sin(2 * np.pi * frequency * times)
-    out = np.array(
-        [
-            kalman.update(Measurement(round(1e9 * t), Pose([w, 0, 0]))).pose.position[0]
-            for t, w in zip(times, way, strict=True)
-        ]
-    )
+    out = np.array([p.position[0] for p in run(kalman, times, [Pose([w, 0, 0]) for w in way])])
     late = times >= 4.0  # 8 s: whole periods
     measured = delay(times[late], out[late], frequency)
     before, a = steady_state(1 / rate, 2e-3, 0.05)

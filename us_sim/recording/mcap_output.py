@@ -134,7 +134,8 @@ class McapOutput:
     def place(self) -> Place:
         """Whether somebody else has taken the file away, or a part of it, since it was made."""
         if not self._tells_place or self._is_at_path:
-            return Place.CUT if self._was_cut or self._is_short else Place.HERE
+            is_short = os.fstat(self._file.fileno()).st_size < self._size
+            return Place.CUT if self._was_cut or is_short else Place.HERE
         return Place.MOVED if os.fstat(self._file.fileno()).st_nlink else Place.REMOVED
 
     @property
@@ -328,10 +329,6 @@ class McapOutput:
         channel = self._channels[topic]
         schema = next(each for each in self._schemas.values() if each.id == channel.schema_id)
         return _bytes_of(schema) + _bytes_of(channel)
-
-    @property
-    def _is_short(self) -> bool:
-        return os.fstat(self._file.fileno()).st_size < self._size
 
     def _notice_cut(self) -> None:
         """Where another process has cut the file: go on after the last record that is whole."""

@@ -54,7 +54,7 @@ AFTER_THE_DATA = frozenset(
         *(Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER),
     )
 )
-"""Kinds of records of which no message comes any more."""
+"""Records that come only after the last message."""
 
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: records.Header,
@@ -145,9 +145,9 @@ def record_at(stream: BinaryIO, offset: int, size: int) -> Record | None:
 
 
 def next_sound(stream: BinaryIO, offset: int, size: int) -> int | None:
-    """Where sound records go on after one that is not, which begins there; None if nowhere.
+    """Where records are sound again after a damaged one that begins there; None if nowhere.
 
-    Records that are parts of chunks are not meant: they have no checksum of their own.
+    Records within chunks do not count: they have no checksum of their own.
     """
     stream.seek(offset)
     head = stream.read(HEADER.size)
@@ -300,7 +300,7 @@ def attachment(content: memoryview) -> records.Attachment:
 
 
 def _may_be_a_record(head: bytes) -> bool:
-    """Whether lengths in the first bytes of a record agree: most bytes are none."""
+    """Whether these may be a record's first bytes: its lengths agree, as those of few bytes do."""
     try:
         opcode, length = HEADER.unpack_from(head)
         if opcode == Opcode.CHUNK:

@@ -61,7 +61,7 @@ class TrackerRecording:
         body, end = split_transform_name(name) or (name, None)
         if reference is None and end and name not in self.transforms:
             reference = end
-        own = [key for key in self.transforms if _body(key) == body]
+        own = [key for key in self.transforms if (split_transform_name(key) or ("",))[0] == body]
         if reference is None and name in self.transforms:
             own = [name]
         chain = None
@@ -189,7 +189,3 @@ def _rigid(series: FrameTransforms, which: NDArray[np.intp]) -> FrameTransforms:
         else:
             matrices[k, :3, :3] = rotation
     return FrameTransforms(matrices, tuple(faults))
-
-
-def _body(name: str) -> str:
-    return (split_transform_name(name) or ("", ""))[0]

@@ -477,12 +477,8 @@ class HapticDevice:
     """The coupling of a haptic arm's handle and the probe.
 
     The handle's translation is scaled, its rotation is not. While the clutch is held the probe
-    stays; then it goes on from there, with the handle wherever it is.
-
-    Args:
-        settings: the scales.
-        registration: the arm's base in ``patient``.
-        calibration: the probe in the handle's frame.
+    stays; then it goes on from there, with the handle wherever it is. The registration is the pose
+    of the arm's base in ``patient``, the calibration that of the probe in the handle's frame.
     """
 
     def __init__(

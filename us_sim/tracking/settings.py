@@ -1,5 +1,8 @@
 """Settings of the tracker sources and filters, each class a section of a scene's `tracker`.
 
+A value that is out of range is a TrackingError with its name and the range, as are two that do not
+go together.
+
 >>> from us_sim.tracking.settings import CameraSettings, OneEuroSettings
 >>> CameraSettings(size="25 mm").size
 0.025
@@ -39,11 +42,7 @@ MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 @dataclass(frozen=True)
 class CameraSettings(Settings):
-    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
-    """
+    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``."""
 
     section = "camera"
     error = TrackingError
@@ -104,9 +103,6 @@ class OneEuroSettings(Settings):
 
     The defaults suit a hand-held probe: at rest the filter takes away most of what trembles above
     1.5 Hz, and in a sweep of 0.1 m/s it lags by 8 ms.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
     """
 
     section = "filter"
@@ -130,11 +126,7 @@ class OneEuroSettings(Settings):
 
 @dataclass(frozen=True)
 class KalmanSettings(Settings):
-    """The settings of the constant-velocity Kalman filter; each is a key of ``tracker.filter``.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
-    """
+    """The settings of the constant-velocity Kalman filter; each is a key of ``tracker.filter``."""
 
     section = "filter"
     error = TrackingError
@@ -165,11 +157,7 @@ class KalmanSettings(Settings):
 
 @dataclass(frozen=True)
 class GateSettings(Settings):
-    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
-    """
+    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``."""
 
     section = "gate"
     error = TrackingError
@@ -207,9 +195,6 @@ class HapticSettings(Settings):
     """The settings of a haptic arm; each is a key of a scene's ``tracker.haptic:``.
 
     The defaults suit a small desktop arm that gives 3 N at most and no torque.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
     """
 
     section = "haptic"
@@ -291,9 +276,6 @@ class SixDofMouseSettings(Settings):
 
     A full deflection is 1. The signs of the defaults turn the axes of REP 103, in which mice
     report (x forward, y left, z up), about x: so the probe goes down when the cap is pushed down.
-
-    Raises:
-        TrackingError: a value is out of range, or two do not go together.
     """
 
     section = "six_dof_mouse"
@@ -395,9 +377,6 @@ class OpenIGTLinkSettings(Settings):
     """The settings of the connection; each is a key of a scene's ``tracker.openigtlink:``.
 
     Which of the server's devices is the probe is the scene's ``tracker.body``.
-
-    Raises:
-        TrackingError: a value is out of range.
     """
 
     section = "openigtlink"

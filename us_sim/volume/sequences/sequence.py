@@ -194,7 +194,7 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
 
 
 def _stored_images(file: _Header) -> StoredImages | VolumeError:
-    """The images, or why they cannot be read, which matters to who wants them only."""
+    """The images, or the error for whoever asks for them."""
     path = file.path
     if not file.columns:
         return VolumeError(
