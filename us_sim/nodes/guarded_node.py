@@ -21,13 +21,14 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Nodetype
 
 from us_sim.errors import MessageError, UsSimError, printable
 from us_sim.nodes.messages import nanoseconds_of, require_stamp
-from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.recording.schemas import jazzy_definitions
 
 
@@ -145,6 +146,14 @@ class GuardedNode(Node):
                 return otherwise(*arguments)
 
         return call
+
+    def stream(self, message_type: Any, topic: str, qos: QoSProfile = STREAM) -> Publisher:
+        """Create a publisher whose quality of service may be overridden by parameters."""
+        return self.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
+
+    def latched(self, message_type: Any, topic: str) -> Publisher:
+        """Likewise, of messages that are kept for later subscribers."""
+        return self.stream(message_type, topic, LATCHED)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any

@@ -55,10 +55,7 @@ class PathPlayer(GuardedNode):
         self._sent_at = 0.0  # s, of the monotonic clock
         self.finished = Future()
         self.health = Health(self, str(path))
-        qos = EVERY if lockstep else STREAM
-        self._poses = self.create_publisher(
-            PoseStamped, "tracker/pose", qos, qos_overriding_options=overridable()
-        )
+        self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else STREAM)
         if lockstep:
             self.create_subscription(
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()

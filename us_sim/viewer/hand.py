@@ -28,7 +28,7 @@ from us_sim.errors import MessageError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.nodes.settings import PLAYERS
 from us_sim.settings.spelling import shown
@@ -493,9 +493,7 @@ class ViewerHand:
             self._elsewhere = None
         elif self._motion is None:
             self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
-        self._publisher = self._node.create_publisher(
-            PoseStamped, LEAD_TOPIC, STREAM, qos_overriding_options=overridable()
-        )
+        self._publisher = self._node.stream(PoseStamped, LEAD_TOPIC)
         self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:
