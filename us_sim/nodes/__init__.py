@@ -18,11 +18,15 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
+STANDBY = "US_SIM_STANDBY"  # set in the environment of a node's process that is to wait
+STANDING_BY = "standing by"  # said by such a process once it is ready
+
 
 def end_at_once_when_interrupted() -> None:
     """Do so from now on, where this process is a node and was not told to ignore Ctrl-C."""
     if is_node(sys.orig_argv) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
 
 
 def is_node(command: list[str]) -> bool:

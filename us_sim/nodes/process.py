@@ -20,10 +20,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from us_sim.errors import UsSimError, memory_limit
+from us_sim.nodes import INTERRUPTED, STANDBY, STANDING_BY
 from us_sim.nodes.guarded_node import GuardedNode
-
-STANDBY = "US_SIM_STANDBY"  # set in the environment of a process that is to wait
-STANDING_BY = "standing by"  # what it says when it is ready
 
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
@@ -99,8 +97,6 @@ def scheduling_of(pid: int) -> str:
     policy &= ~getattr(os, "SCHED_RESET_ON_FORK", 0)
     return "realtime" if policy == os.SCHED_RR else "ordinary"
 
-
-INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
 
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""

@@ -12,10 +12,10 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import CompressedImage
 
-from us_sim.errors import SettingsError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import changed, declared, parameters_with
-from us_sim.nodes.qos import CATALOGUE, LATCHED, overridable
+from us_sim.nodes.qos import CATALOGUE
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
@@ -38,37 +38,28 @@ class SessionControl(GuardedNode):
 
     Its parameters are those of `SessionControlSettings`. What becomes of a change is in its
     report on ``diagnostics``: `state`, and `fraction` while something is loaded.
+
+    Args:
+        controlled: does as the parameters say.
+        settings: that it follows now.
     """
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(
+        self, controlled: Controlled, settings: SessionControlSettings, **kwargs: Any
+    ) -> None:
         super().__init__("session_control", **kwargs)
-        self._controlled: Controlled | None = None
+        self._controlled = controlled
         self._values = declared(self, SessionControlSettings())
         self._is_showing = False
         self._told: tuple[object, ...] = ()
         self._player_clients: dict[str, AsyncParameterClient] = {}
         self._untold: tuple[str, Mapping[str, Any]] = ("", {})  # node, and parameters for it
         self.health = Health(self, "")
-        self._scenes = self.create_publisher(
-            DiagnosticArray, "session/scenes", LATCHED, qos_overriding_options=overridable()
-        )
-        self._thumbnails = self.create_publisher(
-            CompressedImage, "session/thumbnails", CATALOGUE, qos_overriding_options=overridable()
-        )
-        self._bags = self.create_publisher(
-            DiagnosticArray, "session/bags", LATCHED, qos_overriding_options=overridable()
-        )
+        self._scenes = self.latched(DiagnosticArray, "session/scenes")
+        self._thumbnails = self.stream(CompressedImage, "session/thumbnails", CATALOGUE)
+        self._bags = self.latched(DiagnosticArray, "session/bags")
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._take)
-
-    def obey(self, controlled: Controlled, settings: SessionControlSettings) -> None:
-        """Hand changes on from now on.
-
-        Args:
-            controlled: does as the parameters say.
-            settings: what it does now.
-        """
-        self._controlled = controlled
         self.show(settings)
 
     def show(self, settings: SessionControlSettings) -> None:
@@ -164,8 +155,6 @@ class SessionControl(GuardedNode):
             return SetParametersResult(successful=True)
         try:
             wanted = self._wanted(parameters)
-            if self._controlled is None:
-                raise SettingsError("the simulation has not begun yet")
             self._controlled.check(wanted, {each.name for each in parameters})
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -177,5 +166,4 @@ class SessionControl(GuardedNode):
             return
         self._values = self._wanted(parameters)
         self.show(self._values)
-        if self._controlled is not None:
-            self._controlled.take(self._values, {each.name for each in parameters})
+        self._controlled.take(self._values, {each.name for each in parameters})

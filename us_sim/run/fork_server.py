@@ -41,6 +41,8 @@ EVERY_NODE = ("us_sim.nodes", "us_sim.nodes.process", "us_sim.nodes.scene_node")
 """Modules that every node imports; the first provides rclpy."""
 COMPUTING = ("us_sim.kernels", "scipy.sparse", "scipy.sparse.linalg", "scipy.sparse.csgraph")
 """Modules that the nodes with kernels import."""
+SLOW = ("tissue_deformer", "slice_interpolator", "skin_deformer")
+"""Those nodes. They take long to start, and hold no device that a second process could not have."""
 _ANSWER_S = 60.0  # for a forked process to report: the modules may have to be imported first
 _POLL_S = 0.05
 
@@ -283,7 +285,7 @@ def _serve(control: socket.socket) -> _Asked | None:
         if not data or len(os.listdir("/proc/self/task")) > 1:
             return None
         asked = _Asked(**json.loads(data), files=files)
-        if asked.node in ("tissue_deformer", "slice_interpolator", "skin_deformer"):
+        if asked.node in SLOW:
             while waiting:
                 _import_next(waiting)
         if _forked(asked):
@@ -338,8 +340,7 @@ def _become(asked: _Asked, between: int) -> None:
     os.environ.update(asked.environment)
     sys.orig_argv = asked.command
     end_at_once_when_interrupted()
-    program = Path(__file__).parents[1] / "nodes" / f"{asked.node}.py"
-    sys.argv = [str(program), *asked.command[asked.command.index("--ros-args") :]]
+    sys.argv[1:] = asked.command[asked.command.index("--ros-args") :]  # runpy sets the first
     _show_command(asked.command)
     os.write(ready, str(os.getpid()).encode())
     for file in asked.files:

@@ -6,15 +6,17 @@ import csv
 import importlib
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.settings import RECORDER
 from us_sim.progress import Progress
 from us_sim.run.live import prepare_volume
-from us_sim.run.monitored import refuse_unknown
+from us_sim.run.monitored import refuse_unknown, ros_context
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
@@ -39,7 +41,6 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
     Raises:
         UsSimError: a parameter is refused, or what the node itself refuses.
     """
-    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
     from rclpy.exceptions import ParameterException
     from rclpy.parameter import Parameter
 
@@ -147,32 +148,16 @@ def render(
     Raises:
         UsSimError: bad input, or an output that cannot be written.
     """
-    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
-    import rclpy
-    from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.signals import SignalHandlerOptions
 
-    context = Context()
-    domain = None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100
-    try:
-        rclpy.init(
-            args=[],
-            context=context,
-            domain_id=domain,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-    except Exception as error:  # what rcl raises differs between its versions
-        raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
+    context = ros_context(None if "ROS_DOMAIN_ID" in os.environ else 1 + os.getpid() % 100)
     executor = SingleThreadedExecutor(context=context)
     nodes: list[Any] = []
     try:
-        for name, settings in _nodes(scene, path, topic, out, parameters or {}, truth or {}):
-            nodes.append(node_in_process(name, settings, context))
+        for process in _processes(scene, path, topic, out, parameters or {}, truth or {}):
+            nodes.append(node_in_process(process.node, process.all_parameters, context))
             executor.add_node(nodes[-1])
-        for process in simulation_nodes(scene, parameters, played=True):
-            (node,) = (node for node in nodes if node.get_name() == process.node)
-            refuse_unknown(process, node.list_parameters([], 0).names)
+            refuse_unknown(process, nodes[-1].list_parameters([], 0).names)
         return _spin(executor, nodes, progress, [*(truth or {})])
     finally:
         for node in reversed(nodes):
@@ -182,17 +167,17 @@ def render(
         context.try_shutdown()
 
 
-def _nodes(
+def _processes(
     scene: Scene,
     path: Path,
     topic: str,
     out: Path,
     parameters: Parameters,
     truth: Mapping[str, Path],
-) -> list[tuple[str, dict[str, object]]]:
-    """Name and parameters of each node: listeners first, the player last."""
-    common: dict[str, object] = {"lockstep": True}
-    writer = {what: str(folder) for what, folder in truth.items()}
+) -> list[NodeProcess]:
+    """The nodes and their parameters: listeners first, the player last."""
+    nodes = simulation_nodes(scene, parameters, played=True)
+    folders = {"folder": out / "images", **truth}
     recorder: dict[str, object] = {
         "file": str(out / "session.mcap"),
         "compression": "zstd",
@@ -200,18 +185,15 @@ def _nodes(
         "max_cache_size": 0,  # lose nothing, wait for the disk
         **scene_settings(scene),
         "path": str(full_path(path)),
-        "parameters": parameters_file(simulation_nodes(scene, parameters, played=True)),
+        "parameters": parameters_file(nodes),
     }
-    recording = NodeProcess("session_recorder", recorder)
-    player = player_settings(scene, path, recorder_of([recording]), topic) | {"lockstep": True}
+    recording = NodeProcess(RECORDER, recorder)
+    player = player_settings(scene, path, recorder_of([recording]), topic)
     return [
-        (recording.node, recorder),
-        ("image_writer", {"folder": str(out / "images"), **writer}),
-        *(
-            (process.node, {**common, **process.all_parameters})
-            for process in simulation_nodes(scene, parameters, played=True)
-        ),
-        ("path_player", player),
+        recording,
+        NodeProcess("image_writer", {what: str(folder) for what, folder in folders.items()}),
+        *(replace(node, parameters={"lockstep": True, **node.parameters}) for node in nodes),
+        NodeProcess("path_player", player | {"lockstep": True}),
     ]
 
 

@@ -15,7 +15,7 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.run.plan import NodeProcess
 
-IMAGES = "/ultrasound/image"
+IMAGES = "ultrasound/image"
 TOLD = 4  # losses that are told one by one in a sentence
 
 
@@ -109,7 +109,7 @@ def images_in(files: Sequence[Path]) -> int:
             topics = read_bag(file).topics
         except BagError:
             continue
-        count += sum(topic.message_count for topic in topics if topic.name == IMAGES)
+        count += sum(topic.message_count for topic in topics if topic.name == f"/{IMAGES}")
     return count
 
 
@@ -117,28 +117,26 @@ class Recordings:
     """Finds the files of each recorder that was started, without those that were there before."""
 
     def __init__(self) -> None:
-        self._older: dict[Path, set[Path]] = {}  # by the file that was asked for
-        self._begun: dict[Path, float] = {}  # likewise, s, monotonic
+        # By the file asked for: those that were there, and when it was begun (s, monotonic).
+        self._begun: dict[Path, tuple[set[Path], float]] = {}
 
     def begin(self, recorder: NodeProcess) -> None:
         """A recorder is about to be started for the first time."""
         file = Path(str(recorder.all_parameters["file"]))
-        self._older.setdefault(file, set(files_of(file)))
-        self._begun.setdefault(file, time.monotonic())
+        self._begun.setdefault(file, (set(files_of(file)), time.monotonic()))
 
     def progress(self, file: Path) -> dict[str, str]:
         """Age and size of a recording and the room that is left, as values of diagnostics."""
         if file not in self._begun:
             return {}
+        older, begun = self._begun[file]
         try:
-            sizes = [
-                each.stat().st_size for each in files_of(file) if each not in self._older[file]
-            ]
+            sizes = [each.stat().st_size for each in files_of(file) if each not in older]
             room = shutil.disk_usage(file.parent).free
         except OSError:  # the folder was taken away; the recorder says so
             return {}
         return {
-            "record_seconds": f"{time.monotonic() - self._begun[file]:.0f}",
+            "record_seconds": f"{time.monotonic() - begun:.0f}",
             "record_bytes": str(sum(sizes)),
             "record_room_bytes": str(room),
         }
@@ -147,7 +145,7 @@ class Recordings:
         """The files that are there by now, in the order in which they were begun."""
         return [
             found
-            for file, older in self._older.items()
+            for file, (older, _) in self._begun.items()
             for found in files_of(file)
             if found not in older
         ]

@@ -19,8 +19,11 @@ from us_sim.errors import UsSimError
 from us_sim.run.plan import NodeProcess
 
 if TYPE_CHECKING:
-    from us_sim.nodes.session_control import SessionControl
+    from rclpy.context import Context
+
+    from us_sim.nodes.session_control import Controlled, SessionControl
     from us_sim.nodes.session_monitor import SessionMonitor
+    from us_sim.nodes.settings import SessionControlSettings
 
 
 def domain() -> str:
@@ -83,6 +86,27 @@ def _taken(by: str) -> UsSimError:
     )
 
 
+def ros_context(number: int | None = None) -> Context:
+    """A context that handles no signals.
+
+    Args:
+        number: of the ROS domain; None is the environment's.
+
+    Raises:
+        UsSimError: ROS cannot be used.
+    """
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.signals import SignalHandlerOptions
+
+    context, silent = Context(), SignalHandlerOptions.NO
+    try:
+        rclpy.init(args=[], context=context, domain_id=number, signal_handler_options=silent)
+    except Exception as error:  # what rcl raises differs between its versions
+        raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
+    return context
+
+
 DISCOVERY_S = 0.4  # to discover whether another simulation is on this ROS domain
 ANSWER_S = 5.0  # for a node to say which parameters it has
 
@@ -97,21 +121,11 @@ class Monitored:
     """
 
     def __init__(self, nodes: list[str], *, supervised: bool = False, namespace: str = "") -> None:
-        import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
-        import rclpy
-        from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
-        from rclpy.signals import SignalHandlerOptions
 
         from us_sim.nodes.session_monitor import SessionMonitor
 
-        self._context = Context()
-        try:
-            rclpy.init(
-                args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO
-            )
-        except Exception as error:  # what rcl raises differs between its versions
-            raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
+        self._context = ros_context()
         # The first part decides which of two simulations goes on: that which began first.
         self.run = (
             f"{time.time_ns():020} {socket.gethostname()} {os.getpid()}" if supervised else ""
@@ -124,18 +138,15 @@ class Monitored:
         self._namespace = namespace
         self._control: SessionControl | None = None
 
-    def control(self) -> SessionControl:
-        """The node by which the simulation is controlled, in this process, too."""
+    def control(self, controlled: Controlled, settings: SessionControlSettings) -> SessionControl:
+        """Make the node by which a simulation with these settings is controlled."""
         from us_sim.nodes.session_control import SessionControl
 
-        if self._control is None:
-            self._control = SessionControl(context=self._context, namespace=self._namespace)
-            self._executor.add_node(self._control)
+        self._control = SessionControl(
+            controlled, settings, context=self._context, namespace=self._namespace
+        )
+        self._executor.add_node(self._control)
         return self._control
-
-    def follow(self, nodes: Sequence[str]) -> None:
-        """Follow these nodes from now on."""
-        self.node.follow(nodes)
 
     def spin(self, seconds: float = 0.1) -> None:
         """Take the next message, waiting at most so long."""

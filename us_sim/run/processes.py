@@ -17,12 +17,10 @@ from typing import IO
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError, memory_limit, printable
+from us_sim.nodes import INTERRUPTED, STANDBY, STANDING_BY
+from us_sim.nodes.settings import RECORDER, VIEWER
 from us_sim.run.fork_server import ForkedProcess, ForkServer, end_with_parent, package_on_path
-from us_sim.run.plan import (
-    RECORDER,
-    VIEWER,
-    NodeProcess,
-)
+from us_sim.run.plan import NodeProcess
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -54,8 +52,6 @@ def deferred_signals() -> Iterator[None]:
 
 COMPLAINT = "us_sim: "  # with which a node begins to say why it cannot work
 STOP_S = 0.8  # how long nodes may take to end before the recorder is told to
-# Of `us_sim.nodes.process`, which needs rclpy.
-STANDBY, STANDING_BY = "US_SIM_STANDBY", "standing by"
 
 
 class RunningNode:
@@ -148,8 +144,6 @@ class RunningNode:
         return True
 
 
-# Of `us_sim.nodes.process`, which needs rclpy.
-INTERRUPTED = 130
 RECORDER_STOP_S = 10.0  # how long the recorder may take to write what it still holds
 HUNG_STOP_S = 2.0  # how long a node that hangs may take to end by itself, before it is killed
 

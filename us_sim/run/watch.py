@@ -12,13 +12,13 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from us_sim.run.fork_server import ProcessState, process_state
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
+from us_sim.settings.spelling import counted
 
 
 @dataclass(frozen=True)
@@ -147,23 +147,16 @@ class Restarts:
         self, settings: SupervisionSettings, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._settings, self._clock = settings, clock
-        self._times: dict[str, deque[float]] = {}
-        self._counts: dict[str, int] = {}
+        self._times: dict[str, list[float]] = {}  # of all restarts, by node
 
     def refused(self, node: str) -> str:
         """Why the node is not started again, for a person; empty, and counted, when it is."""
         now, settings = self._clock(), self._settings
-        times = self._times.setdefault(node, deque())
-        while times and now - times[0] > MINUTE_S:
-            times.popleft()
-        if self._counts.get(node, 0) >= settings.restarts:
-            return f"is not started again after {_times(settings.restarts)}"
-        if len(times) >= settings.restarts_per_minute:
-            return f"is not started again after {_times(len(times))} within a minute"
+        times = self._times.setdefault(node, [])
+        recent = sum(now - each <= MINUTE_S for each in times)
+        if len(times) >= settings.restarts:
+            return f"is not started again after {counted(len(times), 'restart')}"
+        if recent >= settings.restarts_per_minute:
+            return f"is not started again after {counted(recent, 'restart')} within a minute"
         times.append(now)
-        self._counts[node] = self._counts.get(node, 0) + 1
         return ""
-
-
-def _times(count: int) -> str:
-    return f"{count} restart{'' if count == 1 else 's'}"

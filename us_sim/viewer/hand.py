@@ -26,14 +26,15 @@ from shape_msgs.msg import Mesh
 
 from us_sim.errors import MessageError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
+from us_sim.nodes.settings import PLAYERS
 from us_sim.settings.spelling import shown
 from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance
-from us_sim.viewer.feeds import RestMesh, Subscriptions
+from us_sim.viewer.feeds import RestMesh
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
 
@@ -191,7 +192,7 @@ def _stance_numbers(stance: Stance) -> dict[str, float]:
     }
 
 
-_KEPT = 512  # poses
+_KEPT = 512  # poses, until their images are made
 _MOVES_S = 2.0  # after its last wish a page holds the probe, and moves it no more
 
 
@@ -208,7 +209,7 @@ class AskedPoses:
         """The page that acted last; nothing if none has, or once it has gone."""
         self._connection = 0
         self._last: tuple[str, int] | None = None
-        self._by_stamp: dict[int, tuple[str, int]] = {}
+        self._by_stamp: dict[int, tuple[float, tuple[str, int] | None]] = {}
 
     @property
     def is_moving(self) -> bool:
@@ -230,21 +231,19 @@ class AskedPoses:
         if connection == self._connection:
             self.holder = ""
 
-    def published(self, stamp: int) -> None:
-        """The pose of a stamp (ns) contains all that has been asked until now."""
-        if self._last is None:
-            return
-        self._by_stamp[stamp] = self._last
+    def published(self, stamp: int, press: float) -> None:
+        """The pose of a stamp (ns), pressed so deep (m), contains all wishes until now."""
+        self._by_stamp[stamp] = press, self._last
         if len(self._by_stamp) > _KEPT:
             del self._by_stamp[next(iter(self._by_stamp))]
 
     def by(self, stamp: int) -> tuple[str, int] | None:
         """The page, and the number of its last wish, that the pose of a stamp (ns) contains."""
-        return self._by_stamp.get(stamp)
+        return self._by_stamp.get(stamp, (0.0, None))[1]
 
-
-PLAYERS = ("path_player", "session_player")
-"""Nodes that `session_control` starts and ends."""
+    def press(self, stamp: int) -> float | None:
+        """How deep (m) the pose of a stamp (ns) is pressed; None for poses of others."""
+        return self._by_stamp.get(stamp, (None, None))[0]
 
 
 @dataclass(frozen=True)
@@ -280,7 +279,7 @@ def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool)
     hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
     if "probe_tracker" in hearers:
         return Lead("hand")
-    if node.count_publishers(node.resolve_topic_name("probe/pose")):
+    if _is_offered(node, "probe/pose"):
         return Lead(
             "tracker",
             "the probe follows the scene's own tracker: start without --tracker, or with --param "
@@ -289,53 +288,9 @@ def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool)
     return Lead("nobody", "no simulator with a probe runs yet")
 
 
-class ProbeWhereabouts:
-    """Each pose of ``probe/pose``, and the last one, which is in the latched ``probe/status``.
-
-    Args:
-        node: that listens.
-        moved: called with each pose that comes, in frame ``patient``.
-        rested: called when no more poses come, with the last and its stamp in ns; with None while
-            there never was one.
-        goes_on: called when poses come.
-    """
-
-    def __init__(
-        self,
-        node: GuardedNode,
-        moved: Callable[[Pose], None],
-        rested: Callable[[Pose | None, int], None],
-        goes_on: Callable[[], None],
-    ) -> None:
-        self._node, self._moved, self._rested, self._goes_on = node, moved, rested, goes_on
-        self._subscriptions = Subscriptions(
-            node,
-            (PoseStamped, "probe/pose", self._follow, STREAM, False),
-            (DiagnosticStatus, "probe/status", self._find, LATCHED, False),
-        )
-        self._subscriptions.keep(True)
-
-    @property
-    def is_told(self) -> bool:
-        """Whether anybody publishes it."""
-        return self._node.count_publishers(self._node.resolve_topic_name("probe/status")) > 0
-
-    def close(self) -> None:
-        """Listen no more."""
-        self._subscriptions.keep(False)
-
-    def _follow(self, message: PoseStamped) -> None:
-        self._moved(pose_from(message, PATIENT))
-
-    def _find(self, status: DiagnosticStatus) -> None:
-        said = {each.key: each.value for each in status.values}
-        if "pose" in said:
-            stamp = said.get("stamp", "")
-            self._rested(pose_from_text(said["pose"]), int(stamp) if stamp.isdecimal() else 0)
-        elif status.message == TrackingState.WAITING.value:
-            self._rested(None, 0)
-        else:
-            self._goes_on()
+def _is_offered(node: GuardedNode, topic: str) -> bool:
+    """Whether anybody publishes a topic."""
+    return node.count_publishers(node.resolve_topic_name(topic)) > 0
 
 
 class ViewerSurface:
@@ -359,20 +314,18 @@ class ViewerSurface:
     @property
     def best(self) -> RestSurface | None:
         """The surface; None while one is still awaited."""
-        if self._skin is not None and (self._tissue is None or self._is_offered("skin/mesh")):
+        is_skin_offered = _is_offered(self._node, "skin/mesh")
+        if self._skin is not None and (self._tissue is None or is_skin_offered):
             return self._skin
         if self._tissue is not None:
             return self._tissue
-        is_awaited = self._is_offered("skin/mesh") or self._is_offered("tissue/rest")
+        is_awaited = is_skin_offered or _is_offered(self._node, "tissue/rest")
         return None if is_awaited else self._plane
 
     def close(self) -> None:
         """Hear no more."""
         self._node.destroy_subscription(self._heard)
         self._rest.watch(self._make_tissue, is_wanted=False)
-
-    def _is_offered(self, topic: str) -> bool:
-        return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
 
     def _take_skin(self, message: Mesh) -> None:
         self._skin = RestSurface(*mesh_from(message))
@@ -394,8 +347,6 @@ STREAMING, LATEST = 3.0, 1.45
 pose just before it would hold up the command's own."""
 LONGEST_STEP = 0.05
 """s of movement at most between two poses: were the node held up, the probe would leap."""
-KEPT = 512
-"""Poses whose press is remembered until their image is made."""
 UNANSWERED = 3.0
 """s without a pose of the tracked probe, after which it is said that nobody answers."""
 ASTRAY, SETTLED = 3e-3, 1.0
@@ -422,7 +373,7 @@ class ViewerHand:
     ) -> None:
         self._node, self._post, self._rest = node, post, rest
         # To a person's eye sliders follow at 10 Hz, and more would take time from the image.
-        self.feed = Feed("hand", self._watched, 10.0)
+        self.feed = Feed("hand", lambda _: post(self._watch), 10.0)
         self._simulator = simulator
         simulator.add(self.feed)
         simulator.commands["hand"] = self._command
@@ -434,12 +385,15 @@ class ViewerHand:
         self._standing: RestSurface | None = None  # the surface that the motion is on
         self._motion: Motion | None = None
         self._publisher: Any = None
-        self._whereabouts: ProbeWhereabouts | None = None
+        self._subscriptions = Subscriptions(
+            node,
+            (PoseStamped, "probe/pose", self._follow, STREAM, False),
+            (DiagnosticStatus, "probe/status", self._find, LATCHED, False),
+        )
         self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
         self._elsewhere: Pose | None = None  # where somebody else has the probe
         self._last_stamp = 0  # ns, of the last pose
         self.asked = AskedPoses()
-        self._presses: dict[int, float] = {}  # m, by stamp, ns
         self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
         self._warning = ""
         self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
@@ -455,7 +409,7 @@ class ViewerHand:
             stamp: ns, of its pose.
             position: (3,) m, where it is, for poses of others.
         """
-        known, surface = self._presses.get(stamp), self._standing
+        known, surface = self.asked.press(stamp), self._standing
         if known is not None or surface is None or position is None:
             return known
         return surface.under(np.asarray(position, dtype=np.float64))[1]
@@ -471,26 +425,20 @@ class ViewerHand:
         self._post(lambda: self._obey(asked, page))
         return None
 
-    def _watched(self, _: bool) -> None:
-        self._post(self._watch)
-
     def _watch(self) -> None:
         """Begin with the first page, and leave everything when the last has gone."""
         if self.feed.is_watched and self._surface is None:
             self._surface = ViewerSurface(self._node, self._rest, self._stand)
             self._session.watch()
             self._is_found = False
-            self._whereabouts = ProbeWhereabouts(
-                self._node, self._follow, self._find, self._be_elsewhere
-            )
+            self._subscriptions.keep(True)
             self._resting_timer.reset()
             self._update()
         elif not self.feed.is_watched and self._surface is not None:
             self._let_go()
             self._surface.close()
             self._surface = None
-            if self._whereabouts is not None:
-                self._whereabouts.close()
+            self._subscriptions.keep(False)
             self._session.unwatch()
             self._resting_timer.cancel()
 
@@ -533,7 +481,7 @@ class ViewerHand:
             return lead
         if self._standing is None:
             return Lead("nobody", "the patient's surface is awaited")
-        if not self._is_found and self._whereabouts is not None and self._whereabouts.is_told:
+        if not self._is_found and _is_offered(self._node, "probe/status"):
             return Lead("nobody", "the viewer finds out where the probe is")
         return lead
 
@@ -545,9 +493,7 @@ class ViewerHand:
             self._elsewhere = None
         elif self._motion is None:
             self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
-        self._publisher = self._node.create_publisher(
-            PoseStamped, LEAD_TOPIC, STREAM, qos_overriding_options=overridable()
-        )
+        self._publisher = self._node.stream(PoseStamped, LEAD_TOPIC)
         self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:
@@ -569,18 +515,22 @@ class ViewerHand:
             self._post(lambda: self.asked.hold(value, page))
         return None
 
-    def _find(self, pose: Pose | None, stamp: int) -> None:
+    def _find(self, status: DiagnosticStatus) -> None:
         """Where the probe was when poses ended; there it is unless this hand has had it."""
+        said = {each.key: each.value for each in status.values}
+        if "pose" in said:
+            pose, stamp = pose_from_text(said["pose"]), said.get("stamp", "")
+            if self._publisher is None and stamp != str(self._last_stamp):
+                self._elsewhere = pose
+        elif status.message != TrackingState.WAITING.value:  # poses come
+            self._is_found |= self._motion is not None
+            return
         self._is_found = True
-        if self._publisher is None and pose is not None and stamp != self._last_stamp:
-            self._elsewhere = pose
         self._update()
 
-    def _be_elsewhere(self) -> None:
-        self._is_found |= self._motion is not None
-
-    def _follow(self, pose: Pose) -> None:
+    def _follow(self, message: PoseStamped) -> None:
         """Where the probe is: there somebody else has it, or there it should not be."""
+        pose = pose_from(message, PATIENT)
         self._followed_at = time.monotonic()
         if self._publisher is None or self._motion is None or self._standing is None:
             self._elsewhere, self._is_found = pose, True
@@ -637,10 +587,8 @@ class ViewerHand:
         self._last_stamp = stamp.nanoseconds
         stance = self._motion.stance
         pose = stance.pose(self._standing)
-        self._presses[stamp.nanoseconds] = stance.press
-        if len(self._presses) > KEPT:
-            del self._presses[next(iter(self._presses))]
-        self.asked.published(stamp.nanoseconds)  # said first: its image may be there at once
+        # Said first: its image may be there at once.
+        self.asked.published(stamp.nanoseconds, stance.press)
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()
         self._node.health.published(LEAD_TOPIC)

@@ -91,29 +91,24 @@ def test_a_third_of_wrong_poses_is_left_out_and_counted():
     np.testing.assert_allclose(found.tip, TIP, atol=2e-4)
 
 
-def test_a_stylus_turned_about_its_own_axis_only_is_refused():
-    spins = Rotation.from_euler("z", np.linspace(0, 5, 50)[:, None]) * Rotation.from_rotvec(
-        [0.4, 1, 0]
-    )
-    with pytest.raises(CalibrationError, match="about one axis only"):
-        calibrate_pivot(pivoting(spins))
+SPUN = Rotation.from_euler("z", np.linspace(0, 5, 50)[:, None])  # about the stylus' own axis
+ROCKED = Rotation.from_euler("x", np.linspace(-0.6, 0.6, 50)[:, None])  # in one plane, and shaken
+SHAKEN = Rotation.from_rotvec(np.random.default_rng(1).normal(0, 1e-3, (50, 3)))
 
 
-def test_a_stylus_rocked_in_one_plane_is_refused():
-    rocked = Rotation.from_euler("x", np.linspace(-0.6, 0.6, 50)[:, None])
-    shaken = rocked * Rotation.from_rotvec(np.random.default_rng(1).normal(0, 1e-3, (50, 3)))
-    with pytest.raises(CalibrationError, match="about one axis only"):
-        calibrate_pivot(pivoting(shaken))
-
-
-def test_a_stylus_that_stood_still_is_refused():
-    with pytest.raises(CalibrationError, match="about one axis only"):
-        calibrate_pivot(pivoting(Rotation.identity(30)))
-
-
-def test_too_few_poses_are_refused():
-    with pytest.raises(CalibrationError, match="at least 10 poses, not 9"):
-        calibrate_pivot(pivoting(tilts(np.random.default_rng(0), 9)))
+@pytest.mark.parametrize(
+    ("rotations", "problem"),
+    [
+        (SPUN * Rotation.from_rotvec([0.4, 1, 0]), "one axis"),
+        (ROCKED * SHAKEN, "one axis"),
+        (Rotation.identity(30), "one axis"),
+        (tilts(np.random.default_rng(0), 9), "10 poses, not 9"),
+    ],
+    ids=["spun", "rocked", "still", "too few"],
+)
+def test_poses_that_do_not_determine_the_tip_are_refused(rotations, problem):
+    with pytest.raises(CalibrationError, match=problem):
+        calibrate_pivot(pivoting(rotations))
 
 
 def fitted(design, observed):

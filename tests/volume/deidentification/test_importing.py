@@ -111,11 +111,17 @@ def test_regions_that_cannot_be_true_are_not_believed(tmp_path, edges, kind, dou
         import_files([write(tmp_path / "a.dcm", made)], tmp_path / "a.igs.mha")
 
 
-def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
-    frames = np.random.default_rng(4).integers(20, 90, (5, 200, 300), dtype=np.uint8)
+def written_on(shape):
+    """Images (images, rows, columns) with a name on the black above each."""
+    frames = np.random.default_rng(4).integers(20, 90, shape, dtype=np.uint8)
     frames[:, :60] = 0
     for frame in frames:
         cv2.putText(frame, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
+    return frames
+
+
+def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
+    frames = written_on((5, 200, 300))
     path = write(tmp_path / "a.dcm", header(frames, US_MULTI_FRAME))
     found = look_at([path], None, ImportSettings())
     (line,) = found.imported.text
@@ -127,28 +133,16 @@ def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
     assert (picture == (60, 60, 255)).all(axis=-1).sum() > 200  # the red box
     kept = look_at([path], tmp_path / "b.igs.mha", ImportSettings(keep_whole_image=True))
     assert "1 would go on" in report_text(kept.imported)
-    import_files(
-        [path], tmp_path / "c.igs.mha", ImportSettings(keep_whole_image=True, blank_text=True)
-    )
+    blank = ImportSettings(keep_whole_image=True, blank_text=True)
+    import_files([path], tmp_path / "c.igs.mha", blank)
     (first, *_) = read_sweep(tmp_path / "c.igs.mha", tracked=False).images()
     assert not first[:60].any()
     assert np.array_equal(first[80:], frames[0, 80:])
 
 
-def written_on(shape=(140, 300, 6)):
-    """Voxels (rows, columns, images) with a name in every image."""
-    voxels = np.random.default_rng(4).integers(20, 90, shape, dtype=np.uint8)
-    voxels[:60] = 0
-    for k in range(shape[2]):
-        image = np.ascontiguousarray(voxels[:, :, k])
-        cv2.putText(image, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
-        voxels[:, :, k] = image
-    return voxels
-
-
 @pytest.mark.parametrize("kind", [".nrrd", ".mha", ".nii.gz", ".dcm", "turned.nrrd"])
 def test_what_may_be_text_wants_a_decision_in_files_of_every_kind(tmp_path, kind):
-    voxels = written_on().transpose(1, 0, 2)  # (i, j, k)
+    voxels = written_on((6, 140, 300)).T  # (i, j, k)
     path, out = tmp_path / f"a{kind}", tmp_path / "o.nrrd"
     if kind == ".dcm":
         write(path, enhanced(voxels, turned()))
