@@ -4,6 +4,8 @@ import importlib
 import json
 import math
 import threading
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +15,13 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.settings import NODES, checked_parameters, is_live, parameters_of
+from us_sim.nodes.settings import (
+    NODES,
+    SessionControlSettings,
+    checked_parameters,
+    is_live,
+    parameters_of,
+)
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.run.plan import module_of
 from us_sim.scene.reading import load_scene
@@ -55,7 +63,11 @@ def made(bench, node: str, scene: Any, folder: Any) -> Any:
     """A node by its name."""
     module = importlib.import_module(module_of(node))
     name = next(n for n in vars(module) if n.lower() == node.replace("_", ""))
-    return bench.make(getattr(module, name), **given_to(node, scene, folder))
+    node_class = getattr(module, name)
+    if node == "session_control":
+        simulation = SimpleNamespace(check=lambda *_: None, take=lambda *_: None)
+        node_class = partial(node_class, simulation, SessionControlSettings())
+    return bench.make(node_class, **given_to(node, scene, folder))
 
 
 def settings_of(node: str, scene: Any) -> list[tuple[str, type[Settings], str]]:

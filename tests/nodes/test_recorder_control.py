@@ -130,7 +130,7 @@ def test_stop_and_record(bench, quiet, tmp_path):
         "a recording is running: stop it first"
     )
     call(bench, srv.Stop, "stop")
-    assert read_bag(file).complete
+    assert not read_bag(file).note
     say(bench, recorder, note, "nobody records")
     for taken in (str(file), "/", ".", "a\0b", f"{'a' * 5000}.mcap"):
         answer = call(bench, srv.Record, "record", uri=taken)
@@ -222,7 +222,7 @@ def test_the_bag_that_was_played_is_attached_whole(bench, tmp_path, small_scene,
     kept = tmp_path / "again" / (played or "own")
     assert again.path == again.tracker.file == str(kept)
     assert list(read_bag(kept).messages()) == list(read_bag(other if played else own).messages())
-    assert read_bag(kept).complete
+    assert not read_bag(kept).note
     session = bag_of(tmp_path / "probe", "patient", 0.03, "/probe/pose")
     assert path_of(again, session).frame_id == "patient"  # the probe's own
     elsewhere = bag_of(tmp_path / "elsewhere", "moon")
@@ -386,7 +386,7 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     recorder = bench.make(SessionRecorder, file=str(file), if_exists="further")
     end(bench, recorder)
     assert file.read_bytes() == b"precious"
-    assert read_bag(tmp_path / "session_1.mcap").complete
+    assert not read_bag(tmp_path / "session_1.mcap").note
 
 
 def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):

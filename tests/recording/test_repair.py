@@ -58,7 +58,7 @@ def test_a_cut_recording_is_made_whole(session, tmp_path):
     assert len(made.faults) == 1
     assert "was not ended properly" in made.faults[0].text
     whole = read_bag(tmp_path / "whole")
-    assert whole.complete
+    assert not whole.note
     assert list(whole.messages()) == list(read_bag(cut).messages())
     assert made.message_count == whole.message_count == 11  # the first chunk's
     assert whole.topic("/note").qos == (QosProfile(depth=3),)
@@ -79,6 +79,18 @@ def test_a_damaged_chunk_is_left_out_and_said(session, tmp_path):
     ]
     assert "is damaged in its chunk" in made.faults[0].text
     assert made.faults[0].messages == 11
+
+
+@pytest.mark.parametrize("at", [1, 5, 9, 25, 33, 37, 41, 60])
+def test_without_an_index_it_goes_on_at_the_next_sound_chunk(session, tmp_path, at):
+    with session.open("rb") as stream:
+        first, *_ = make_reader(stream).get_summary().chunk_indexes
+    content = bytearray(session.read_bytes())
+    content[first.chunk_start_offset + at] ^= 16
+    session.write_bytes(content[: content.rindex(b"\x0f\x04")])
+    made = repair(session, tmp_path / "whole")
+    lost = sum(fault.messages for fault in made.faults)
+    assert (made.message_count, lost) == ((9, 11) if at in (33, 37, 60) else (20, 0))
 
 
 def test_an_attached_recording_that_is_cut_is_not_taken_for_the_recording(session, tmp_path):

@@ -84,7 +84,8 @@ def test_a_real_bag_of_another_storage_keeps_its_topics(shared_data, tmp_path, n
 def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
     file = tmp_path / "session.mcap"
     latched = QosProfile(depth=1, durability="transient_local")
-    with BagWriter(file, compression=compression, custom_data={"scene": "upper_arm"}) as bag:
+    with BagWriter(file, compression=compression) as bag:
+        bag.custom_data["scene"] = "upper_arm"
         bag.add_topic("/a", STRING, [QosProfile()])
         bag.add_topic("/b", STRING, [latched, QosProfile(reliability="best_effort")])
         bag.add_topic("/silent", "geometry_msgs/msg/PoseStamped")
@@ -136,7 +137,7 @@ def test_round_trip_in_the_order_of_log_times(tmp_path_factory, messages, chunk_
     expected = sorted(messages, key=lambda message: message[2])
     got = [(m.topic, m.data, m.log_time, m.publish_time) for m in read.messages()]
     assert got == expected
-    assert read.complete
+    assert not read.note
     assert read.start == (expected[0][2] if expected else None)
     assert read.end == (expected[-1][2] if expected else None)
 
@@ -150,7 +151,7 @@ def test_flush_makes_everything_readable_before_the_bag_is_closed(tmp_path):
     half = read_bag(tmp_path / "session.mcap")
     assert [half.deserialize(message).data for message in half.messages()] == ["hi"]
     bag.close()
-    assert read_bag(tmp_path).complete
+    assert not read_bag(tmp_path).note
 
 
 @pytest.mark.parametrize("name", ["session.mcap", "bag"])
@@ -190,7 +191,7 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_flushed(tmp_path):
         bag.write("/note", HI, EPOCH)
     assert bag.lost == {"/note": 11}  # ten in the chunk that did not fit, and the last
     read = read_bag(tmp_path / "session.mcap")
-    assert read.complete
+    assert not read.note
     assert read.message_count == bag.message_count == 91
     assert bag.resume()
     bag.write("/note", HI, EPOCH + 10**12)
@@ -203,7 +204,7 @@ def test_an_empty_bag_is_a_bag(tmp_path):
     with BagWriter(tmp_path / "quiet") as bag:
         bag.add_topic("/note", STRING)
     read = read_bag(tmp_path / "quiet")
-    assert read.complete
+    assert not read.note
     assert (read.start, read.end, list(read.messages())) == (None, None, [])
     assert [topic.name for topic in read.topics] == ["/note"]
     with AnyReader([tmp_path / "quiet"]) as reader:
@@ -357,7 +358,7 @@ def test_a_file_that_was_removed_is_said_to_be_lost(bag, tmp_path):
     bag.write("/note", HI, EPOCH + 2)
     bag.close()
     further = read_bag(tmp_path / "here" / "session_1.mcap")
-    assert (further.complete, further.message_count, bag.message_count) == (True, 1, 1)
+    assert (further.note, further.message_count, bag.message_count) == ("", 1, 1)
     assert read_bag(tmp_path / "here").message_count == 1  # metadata.yaml speaks of what is there
 
 
@@ -366,7 +367,7 @@ def test_a_file_that_was_moved_is_complete_where_it_is(bag, tmp_path):
     bag.write("/note", HI, EPOCH + 1)
     with pytest.raises(BagError, match=r"moved away .* 2 messages.*_1.mcap"):
         bag.split()
-    assert read_bag(tmp_path / "kept.mcap").complete
+    assert not read_bag(tmp_path / "kept.mcap").note
     assert read_bag(tmp_path / "kept.mcap").message_count == 2
     assert not bag.lost
     bag.close()

@@ -22,7 +22,7 @@ class Supervisor:
 
     def __init__(self, plan):
         self.plan, self.why, self.waiting, self.kept = plan, "", [], {}
-        self.set, self.dropped = {}, {}
+        self.player_kept = {}
         self.recordings = Recordings()
         self.started = set(plan.nodes)
         self.plans = [plan]
@@ -30,6 +30,7 @@ class Supervisor:
     def change(self, plan, anew=()):
         assert set(anew) <= set(self.plan.nodes)
         self.plan = plan
+        self.kept = {process.node: process.kept for process in plan.processes}
         self.started = set(plan.nodes)
         self.plans.append(plan)
 
@@ -42,11 +43,7 @@ class Supervisor:
         return ""
 
     def keep(self, node, values):
-        self.kept[node] = values
-
-    def take_set(self):
-        taken, self.set, self.dropped = (self.set, self.dropped), {}, {}
-        return taken
+        self.player_kept[node] = values
 
 
 class Control:
@@ -112,7 +109,7 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     assert control.to_player[-1] == ("path_player", {"time": 3.0})
     ask(simulation, control, replay_paused=True)
     assert control.to_player[-1] == ("path_player", {"paused": True})
-    assert supervisor.kept["path_player"] == {"paused": True}
+    assert supervisor.player_kept["path_player"] == {"paused": True}
     simulation.update()
     assert control.told[-1][1]["replay"] == PATH
     ask(simulation, control, record=None, replay=None)
@@ -138,7 +135,7 @@ def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
     simulation, supervisor, control = running
     of = lambda: {each.node: each.kept for each in supervisor.plan.processes if each.kept}  # noqa: E731
     problem = lambda: (simulation.update(), control.told[-1][2])[1]  # noqa: E731
-    supervisor.set = SET
+    supervisor.kept = SET
     assert problem() == ""
     # All as recorded takes the nodes' place, and they come back.
     ask(simulation, control, replay=PATH, replay_as="recording")
@@ -152,9 +149,9 @@ def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
         assert of() == kept
         assert ("is not set in upper_arm" in problem()) is not bool(kept)
     # What a node cannot run with is kept no longer; to load the scene anew leaves nothing.
-    supervisor.dropped = SET
+    supervisor.kept["tissue_deformer"] = {}
     assert "ended twice" in problem()
-    supervisor.set = {"slice_interpolator": {"gain": 3.0}}
+    supervisor.kept["slice_interpolator"] = {"gain": 3.0}
     simulation.update()
     assert simulation._kept_here == {"slice_interpolator": {"gain": 3.0}}
     simulation._begin("")

@@ -10,12 +10,13 @@ from scipy.spatial import Delaunay
 
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.plane import SlicePlane
-from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
 KINDS = ("box", "cloud", "tangled", "squashed", "aligned", "through_nodes", "coarse", "fan")
 SIZE = np.array([0.06, 0.04, 0.05])
 """m, of the box meshes: from (-x/2, -y/2, 0) to (x/2, y/2, z)."""
+LOW, HIGH = -SIZE / [2, 2, 1] * [1, 1, 0], SIZE / [2, 2, 1]
 
 
 class Case(NamedTuple):
@@ -36,6 +37,27 @@ def noise_volume(shape, steps, corner, turn=None, seed=0):
         to_patient = turn.matrix @ to_patient
     voxels = np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
     return Volume(voxels, to_patient, voxels // 64, {1: "a", 2: "b", 3: "c"})
+
+
+def box(counts):
+    """The box mesh with so many planes along x, y and z."""
+    return box_mesh(*(uniform_planes(*ends) for ends in zip(LOW, HIGH, counts, strict=True)))
+
+
+def around_the_box(seed=0):
+    """A volume larger than the box on all sides."""
+    return noise_volume((44, 34, 40), (2e-3, 2e-3, 2e-3), (-0.044, -0.034, -0.015), seed=seed)
+
+
+def plane_of_nodes(mesh, axis, layer):
+    """Pixels on the nodes of a layer of a box mesh, and on its edges and faces."""
+    planes = [np.unique(mesh.nodes[:, a]) for a in range(3)]
+    u, v = (a for a in range(3) if a != axis)
+    origin = np.array([p[0] for p in planes])
+    origin[axis] = planes[axis][layer]
+    steps = [np.eye(3)[a] * (planes[a][1] - planes[a][0]) / 4 for a in (u, v)]
+    columns, rows = (4 * (len(planes[a]) - 1) + 1 for a in (u, v))
+    return SlicePlane(origin, *steps, columns=columns, rows=rows)
 
 
 def checkers(volume):
@@ -85,7 +107,7 @@ def random_case(kind: str, seed: int) -> Case:
 def _box(rng):
     """A box mesh with irregular planes."""
     planes = []
-    for low, high in zip(-SIZE / 2 * [1, 1, 0], SIZE / [2, 2, 1], strict=True):
+    for low, high in zip(LOW, HIGH, strict=True):
         inner = low + (high - low) * rng.uniform(0.03, 0.97, rng.integers(0, 4))
         planes.append(np.unique(np.round([low, *inner, high], 5)))
     mesh = box_mesh(*planes)
@@ -94,7 +116,7 @@ def _box(rng):
 
 def _cloud(rng):
     """A Delaunay tetrahedralisation of random points, without its flat tetrahedra."""
-    points = rng.uniform(-SIZE / 2 * [1, 1, 0], SIZE / [2, 2, 1], (rng.integers(6, 40), 3))
+    points = rng.uniform(LOW, HIGH, (rng.integers(6, 40), 3))
     tetrahedra = Delaunay(points).simplices.astype(np.int32)
     edges = points[tetrahedra][:, 1:] - points[tetrahedra][:, :1]
     size = np.abs(np.linalg.det(edges)) / np.linalg.norm(edges, axis=2).max(axis=1) ** 3

@@ -527,47 +527,30 @@ def test_the_handle_is_never_pulled_into_the_tissue():
     assert bench.rendering.stops == 0
 
 
+def in_the_wall(x=0.0, turn=0.0):
+    return Pose([x, 0.0, 0.005], se3.rotation_exp(np.array([0.0, turn, 0.0])))
+
+
 @pytest.mark.parametrize(
-    ("disturb", "sentence"),
+    ("poses", "how", "sentence"),
     [
-        (lambda b: b.move(Pose([0.02, 0.0, 0.005])), "20.0 mm"),
-        (
-            lambda b: b.move(Pose([0, 0, 0.005], se3.rotation_exp(np.array([0, 0.5, 0])))),
-            "29°",
-        ),
-        (lambda b: [b.move(Pose([0, 0, 0.005]), poses=False) for _ in range(60)], "no pose"),
-        (
-            lambda b: [b.move(Pose([0, 0, 0.005]), models=False) for _ in range(340)],
-            "no model",
-        ),
-        (
-            lambda b: [b.move(Pose([1e-3 * k, 0, 0.005]), models=False) for k in range(22)],
-            "mm from",
-        ),
-        (
-            lambda b: [
-                b.move(
-                    Pose([0, 0, 0.005], se3.rotation_exp(np.array([0, 0.1 * k, 0]))), models=False
-                )
-                for k in range(7)
-            ],
-            "° from",
-        ),
-        (
-            lambda b: (b.rendering.distrust("the pose is not finite"), b.move(Pose([0, 0, 0.005]))),
-            "the pose is not finite",
-        ),
-        (lambda b: (b.rendering.clutch(True), b.move(Pose([0, 0, 0.005]))), "the clutch is held"),
-        (
-            lambda b: (setattr(b, "tick", b.tick - 3000), b.move(Pose([0, 0, 0.005]))),
-            "jumped back",
-        ),
+        ([in_the_wall(0.02)], {}, "20.0 mm"),
+        ([in_the_wall(turn=0.5)], {}, "29°"),
+        ([in_the_wall()] * 60, {"poses": False}, "no pose"),
+        ([in_the_wall()] * 340, {"models": False}, "no model"),
+        ([in_the_wall(1e-3 * k) for k in range(22)], {"models": False}, "mm from"),
+        ([in_the_wall(turn=0.1 * k) for k in range(7)], {"models": False}, "° from"),
+        ([in_the_wall()], {"first": lambda b: b.rendering.distrust("not finite")}, "not finite"),
+        ([in_the_wall()], {"first": lambda b: b.rendering.clutch(True)}, "the clutch is held"),
+        ([in_the_wall()], {"first": lambda b: setattr(b, "tick", b.tick - 3000)}, "jumped back"),
     ],
 )
-def test_at_any_doubt_nothing_is_felt_and_then_again(disturb, sentence):
+def test_at_any_doubt_nothing_is_felt_and_then_again(poses, how, sentence):
     bench = wall()
     assert press(bench, 0.005)[2] == pytest.approx(-COUPLING * 0.005)
-    disturb(bench)
+    how.get("first", lambda _: None)(bench)
+    for pose in poses:
+        bench.move(pose, **{key: given for key, given in how.items() if key != "first"})
     assert sentence in bench.rendering.stopped
     assert not bench.felt.any()
     assert bench.rendering.stops == 1

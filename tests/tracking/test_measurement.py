@@ -24,7 +24,7 @@ def test_a_covariance_that_is_symmetric_but_for_rounding_is_taken():
     [np.eye(3), np.full((6, 6), np.nan), np.inf * np.ones((6, 6)), np.triu(np.ones((6, 6)))],
 )
 def test_what_is_no_covariance_is_refused(covariance):
-    with pytest.raises(TrackingError, match=r"finite symmetric \(6, 6\) matrix"):
+    with pytest.raises(TrackingError, match="finite symmetric"):
         Measurement(0, Pose(), covariance)
 
 

@@ -165,11 +165,11 @@ def test_axes_are_put_in_any_order():
 @pytest.mark.parametrize(
     ("bad", "sentence"),
     [
-        ([0.0] * 5, "the message has 5 axes, but axis 5 is used"),
+        ([0.0] * 5, "5 axes"),
         ([], "the message has 0 axes"),
         (axes(y=math.nan), "are not finite"),
         (axes(rz=-math.inf), "are not finite"),
-        (axes(rx=-1.4), "axis 3 is -1.4, beyond 1: set the driver's full scale"),
+        (axes(rx=-1.4), "axis 3 is -1.4"),
     ],
 )
 def test_a_message_that_cannot_be_used_changes_nothing(bad, sentence):
@@ -184,9 +184,9 @@ def test_a_message_that_cannot_be_used_changes_nothing(bad, sentence):
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ({"mode": "magic"}, "six_dof_mouse.mode: 'magic' is not one of rate, position"),
+        ({"mode": "magic"}, "six_dof_mouse.mode: .*rate, position"),
         ({"speed": (1, 2)}, "six_dof_mouse.speed"),
-        ({"reach": (0.1, 0.1)}, "six_dof_mouse.reach: needs 3 values, not 2"),
+        ({"reach": (0.1, 0.1)}, "six_dof_mouse.reach: .*3 values"),
         ({"axes": (0, 1, 2, 3, 4, 4)}, "six different whole numbers"),
         ({"axes": (0, 1, 2, 3, 4, 0.5)}, r"axes\[5\]: 0.5 is not a whole number"),
         ({"axes": (0, 1, 2)}, "axes: needs 6 values, not 3"),

@@ -1,6 +1,7 @@
 """What the gate refuses: by known speeds, by chi-square's own shares, and never for good."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -51,16 +52,12 @@ def test_limits_on_speed(ms, x, turn, believed):
     assert bool(gate.reason) is not believed
 
 
-def test_the_reason_is_a_sentence_with_numbers():
+def test_the_reason_has_the_motion_its_time_and_the_limit():
     gate = OutlierGate(LIMITS)
     verdicts(gate, seen(0, 0.0), seen(10, 0.25))
-    assert gate.reason == (
-        "the pose is 250.0 mm from the one 10.0 ms before, where 12.0 mm are believed"
-    )
+    assert re.search(r"250\.0 mm .*10\.0 ms .*12\.0 mm", gate.reason)
     gate.judge(seen(20, 0.0, 0.5))
-    assert gate.reason == (
-        "the pose is turned 28.6° from the one 20.0 ms before, where 12.6° are believed"
-    )
+    assert re.search(r"28\.6° .*20\.0 ms .*12\.6°", gate.reason)
 
 
 def settled():
@@ -164,10 +161,7 @@ def test_with_covariances_the_fastest_motion_is_at_the_limit():
         gate = OutlierGate(LIMITS)
         gate.judge(seen(0, 0.0, covariance=sure))
         assert gate.judge(seen(100, 0.1 * part, 1.0 * part, covariance=sure)) is verdict
-    assert gate.reason == (
-        "the pose is 100.1 mm and 57.4° from the one before: Mahalanobis distance 6.2, "
-        "the limit is 6.2"
-    )
+    assert re.search(r"100\.1 mm .*57\.4° .*6\.2.* 6\.2", gate.reason)
 
 
 def test_one_covariance_alone_says_nothing_of_a_difference():

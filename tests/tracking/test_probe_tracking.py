@@ -109,7 +109,7 @@ def test_what_is_not_newer_is_refused_and_counted():
     answers = take(tracked, at(0), at(0), at(-999), at(10), at(5))
     assert [answer is None for answer in answers] == [False, True, True, False, True]
     assert tracked.refused == {"order": 3}
-    assert tracked.last_problem == "the pose is not newer than the one before it"
+    assert "not newer" in tracked.last_problem
 
 
 @pytest.mark.parametrize("method", FILTERS.names)
@@ -212,7 +212,7 @@ def test_a_covariance_of_no_distribution_is_refused():
     bad[0, 1] = bad[1, 0] = 2e-6
     assert take(tracked, at(0, covariance=bad)) == [None]
     assert tracked.refused == {"covariance": 1}
-    assert tracked.last_problem == "the pose's covariance has a negative variance"
+    assert "negative variance" in tracked.last_problem
 
 
 @pytest.mark.parametrize("method", FILTERS.names)
@@ -253,21 +253,19 @@ def test_poses_that_never_were_are_counted_beside_the_others():
 
 
 def test_times_that_make_no_sense_are_refused():
-    with pytest.raises(TrackingError, match="time offset of a tracker is nan s"):
+    with pytest.raises(TrackingError, match=r"offset .*nan"):
         tracking(time_offset=float("nan"))
-    with pytest.raises(TrackingError, match="coasts after 2 s"):
+    with pytest.raises(TrackingError, match="2 s"):
         tracking(coast_for=2.0, lost_after=1.0)
 
 
 @pytest.fixture(scope="module")
-def recorded(shared_data):
+def recorded(shared_file):
     """Seconds and (4, 4) matrices, mm, of the transforms of a PLUS recording of 500 samples.
 
     Sample 7 is invalid: its transforms are the identity. So is the first of the stylus.
     """
-    file = shared_data / "plus-tracker-recordings" / "TransformInterpolationTest.igs.mha"
-    if not file.is_file():
-        pytest.skip(f"no recording: {file} is not there")
+    file = shared_file("plus-tracker-recordings/TransformInterpolationTest.igs.mha")
     header = file.read_bytes().split(b"ElementDataFile")[0].decode("latin-1")
     times = np.array(re.findall(r"_Timestamp = (\S+)", header), dtype=float)
     matrices = {

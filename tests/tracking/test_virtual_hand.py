@@ -22,7 +22,6 @@ from us_sim.tracking.virtual_hand import (
     DEEPEST,
     STEEPEST,
     Approach,
-    HandSpeed,
     Motion,
     RestSurface,
     Stance,
@@ -199,6 +198,12 @@ goals = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3).map(np.array)
 steps = st.lists(st.floats(1e-4, 0.1), min_size=1, max_size=12)
 
 
+def advance_both(coarse, fine, steps):
+    coarse.advance(sum(steps))
+    for step in steps:
+        fine.advance(step)
+
+
 def towards(goal):
     approach = Approach(np.zeros(3), SPEED, TAU)
     approach.goal = goal
@@ -209,14 +214,10 @@ def towards(goal):
 @given(goals, steps, goals, steps)
 def test_the_path_does_not_depend_on_the_steps(first, early, second, late):
     coarse, fine = towards(first), towards(first)
-    coarse.advance(sum(early))
-    for step in early:
-        fine.advance(step)
+    advance_both(coarse, fine, early)
     np.testing.assert_allclose(fine.place, coarse.place, atol=1e-12)
     coarse.goal = fine.goal = second
-    coarse.advance(sum(late))
-    for step in late:
-        fine.advance(step)
+    advance_both(coarse, fine, late)
     np.testing.assert_allclose(fine.place, coarse.place, atol=1e-12)
 
 
@@ -293,20 +294,17 @@ def test_poses_do_not_depend_on_the_steps(press, rotation, fan, steps):
     goal = Stance([0.01, 0.02, 0.0], press, rotation, fan)
     coarse.aim(goal)
     fine.aim(goal)
-    coarse.advance(sum(steps))
-    for step in steps:
-        fine.advance(step)
+    advance_both(coarse, fine, steps)
     first, second = coarse.stance.pose(CYLINDER), fine.stance.pose(CYLINDER)
     np.testing.assert_allclose(first.position, second.position, atol=1e-9)
     assert np.abs(rotation_between(first.orientation, second.orientation)).max() < 1e-6
 
 
 def test_a_press_takes_as_long_as_its_speed_says():
-    speed = HandSpeed(press=0.1, time_constant=0.02)
-    motion = Motion(Stance(press=-0.05), speed)
+    motion = Motion(Stance(press=-0.05))
     motion.aim(Stance(press=0.02))
-    motion.advance(0.4)  # 40 mm further, less the lag of a time constant
-    assert motion.stance.press == pytest.approx(-0.05 + 0.1 * (0.4 - 0.02), abs=1e-9)
+    motion.advance(0.4)  # 60 mm further at 0.15 m/s, less the lag of a time constant of 20 ms
+    assert motion.stance.press == pytest.approx(-0.05 + 0.15 * (0.4 - 0.02), abs=1e-9)
 
 
 def test_rotation_takes_the_shorter_way():

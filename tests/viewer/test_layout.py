@@ -9,8 +9,9 @@ from awaiting import until
 from chromium import watched
 from fake_hand import FACE, FakeHand, show_patient
 
+from us_sim.scene.listing import ListedScene
 from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
-from us_sim.viewer.session import LoadableScene, SessionState
+from us_sim.viewer.session import SessionState
 from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Simulator
 
@@ -39,8 +40,8 @@ def hand(simulator: Simulator) -> FakeHand:
     simulator.nodes.tell(NodeParameters(NODE, State.THERE, known))
     simulator.session.state = SessionState(True, "running", "upper_arm", "/arm.yaml")
     simulator.session.scenes = (
-        LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
-        LoadableScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
+        ListedScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+        ListedScene("sweep", "case:/sweep", "case", problem="volume.file: is missing"),
     )
     now = time.monotonic()
     simulator.status.tell(NodeStatus(NODE, Level.WELL, "runs"), now)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from awaiting import until
 
-from us_sim.viewer.session import LoadableScene, SessionBoard, SessionState
+from us_sim.scene.listing import ListedScene
+from us_sim.viewer.session import SessionBoard, SessionState
 
 RUNNING = SessionState(True, "running", "upper_arm", "/arm.yaml")
 
@@ -41,9 +42,9 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     board, asked = session
     _, picture = cv2.imencode(".jpg", np.full((180, 240), 90, np.uint8))
     board.scenes = (
-        LoadableScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
-        LoadableScene("liver", "case:/liver", "case", region="abdomen"),
-        LoadableScene("sweep", "/sweep.yaml", problem="volume.file: is missing"),
+        ListedScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),
+        ListedScene("liver", "case:/liver", "case", region="abdomen"),
+        ListedScene("sweep", "/sweep.yaml", problem="volume.file: is missing"),
     )
     board.thumbnails["case:/liver"] = bytes(picture)
     opened(page, "Cases")

@@ -19,7 +19,6 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import bgr_image_message, image_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited
 from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.share import full_path
@@ -52,9 +51,9 @@ class CameraDriver(GuardedNode):
         self._video = VideoSource(source, size=size, rate=settings.rate)
         self.finished = Future()
         self.health = Health(self, source)
-        self._images = self._publisher(Image, "camera/image_raw")
+        self._images = self.stream(Image, "camera/image_raw")
         self._awaited = Awaited(self, self._images)
-        self._descriptions = self._publisher(CameraInfo, "camera/camera_info")
+        self._descriptions = self.stream(CameraInfo, "camera/camera_info")
         if self._camera is None:
             self.get_logger().warning(
                 "images without a calibration: no pose can be measured in them; make one with "
@@ -79,11 +78,6 @@ class CameraDriver(GuardedNode):
         if not self._thread.is_alive():  # a camera that hangs is left to the process's end
             self._video.close()
         super().destroy_node()
-
-    def _publisher(self, message_type: Any, topic: str) -> Any:
-        return self.create_publisher(
-            message_type, topic, STREAM, qos_overriding_options=overridable()
-        )
 
     # In the camera's thread.
 

@@ -21,12 +21,14 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Nodetype
 
 from us_sim.errors import MessageError, UsSimError, printable
 from us_sim.nodes.messages import nanoseconds_of, require_stamp
-from us_sim.nodes.qos import STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.recording.schemas import jazzy_definitions
 
 
@@ -145,6 +147,14 @@ class GuardedNode(Node):
 
         return call
 
+    def stream(self, message_type: Any, topic: str, qos: QoSProfile = STREAM) -> Publisher:
+        """Create a publisher whose quality of service may be overridden by parameters."""
+        return self.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
+
+    def latched(self, message_type: Any, topic: str) -> Publisher:
+        """Likewise, of messages that are kept for later subscribers."""
+        return self.stream(message_type, topic, LATCHED)
+
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Any:
@@ -201,6 +211,33 @@ class GuardedNode(Node):
         if now - self._said.get(where, -SAY_S) < SAY_S:
             return False
         self._said[where] = now
+        return True
+
+
+class Subscriptions:
+    """Subscriptions that are there or not, all together.
+
+    Args:
+        node: that subscribes.
+        wanted: type, topic, callback, quality of service, and whether bytes are handed over.
+    """
+
+    def __init__(self, node: GuardedNode, *wanted: tuple[Any, str, Any, QoSProfile, bool]) -> None:
+        self._node, self._wanted = node, wanted
+        self._there: list[Any] = []
+
+    def keep(self, is_wanted: bool) -> bool:
+        """Subscribe, or no longer; whether that is a change."""
+        if is_wanted == bool(self._there):
+            return False
+        for subscription in self._there:
+            self._node.destroy_subscription(subscription)
+        self._there = []
+        if is_wanted:
+            self._there = [
+                self._node.create_subscription(kind, topic, take, qos, raw=raw)
+                for kind, topic, take, qos, raw in self._wanted
+            ]
         return True
 
 

@@ -55,10 +55,7 @@ class PathPlayer(GuardedNode):
         self._sent_at = 0.0  # s, of the monotonic clock
         self.finished = Future()
         self.health = Health(self, str(path))
-        qos = EVERY if lockstep else STREAM
-        self._poses = self.create_publisher(
-            PoseStamped, "tracker/pose", qos, qos_overriding_options=overridable()
-        )
+        self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else STREAM)
         if lockstep:
             self.create_subscription(
                 Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
@@ -129,7 +126,7 @@ class PathPlayer(GuardedNode):
             "duration": f"{1e-9 * self._ages[-1]:.3f}",
         }
 
-    def _use(self, _: object = None) -> None:
+    def _use(self, _: object) -> None:
         if self._ticking is not None and self._settings.rate != self._playhead.rate:
             self._tick_at_its_pace()
         self._playback.use()

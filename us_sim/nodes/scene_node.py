@@ -6,13 +6,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.qos import EVERY, LATCHED, STREAM, overridable
-from us_sim.nodes.settings import SceneNodeSettings
+from us_sim.nodes.qos import EVERY, STREAM, overridable
+from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -76,18 +75,6 @@ class SceneNode(GuardedNode):
         self.goes_first = settings.realtime and not settings.lockstep
         self.health: Health = Health(self, self.scene.name)
 
-    def stream(self, message_type: Any, topic: str) -> Publisher:
-        """Create a publisher of messages that change with every pose."""
-        return self.create_publisher(
-            message_type, topic, STREAM, qos_overriding_options=overridable()
-        )
-
-    def latched(self, message_type: Any, topic: str) -> Publisher:
-        """Create a publisher of messages that are kept for later subscribers."""
-        return self.create_publisher(
-            message_type, topic, LATCHED, qos_overriding_options=overridable()
-        )
-
     def newest(
         self,
         message_type: Any,
@@ -123,7 +110,6 @@ class SceneNode(GuardedNode):
 
 
 LEAD_TOPIC = "tracker/pose"
-VIEWER = "viewer"
 NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
 
 

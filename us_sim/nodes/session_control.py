@@ -15,7 +15,7 @@ from sensor_msgs.msg import CompressedImage
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import changed, declared, parameters_with
-from us_sim.nodes.qos import CATALOGUE, LATCHED, overridable
+from us_sim.nodes.qos import CATALOGUE
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
@@ -55,15 +55,9 @@ class SessionControl(GuardedNode):
         self._player_clients: dict[str, AsyncParameterClient] = {}
         self._untold: tuple[str, Mapping[str, Any]] = ("", {})  # node, and parameters for it
         self.health = Health(self, "")
-        self._scenes = self.create_publisher(
-            DiagnosticArray, "session/scenes", LATCHED, qos_overriding_options=overridable()
-        )
-        self._thumbnails = self.create_publisher(
-            CompressedImage, "session/thumbnails", CATALOGUE, qos_overriding_options=overridable()
-        )
-        self._bags = self.create_publisher(
-            DiagnosticArray, "session/bags", LATCHED, qos_overriding_options=overridable()
-        )
+        self._scenes = self.latched(DiagnosticArray, "session/scenes")
+        self._thumbnails = self.stream(CompressedImage, "session/thumbnails", CATALOGUE)
+        self._bags = self.latched(DiagnosticArray, "session/bags")
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._take)
         self.show(settings)

@@ -39,7 +39,8 @@ class SessionPlayer(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_player", **kwargs)
-        self._live = LiveSettings(self, {"player": Group(SessionPlayerSettings())}, use=self._use)
+        group = Group(SessionPlayerSettings())
+        self._live = LiveSettings(self, {"player": group}, use=lambda _: self._playback.use())
         settings = self._settings
         if not settings.path:
             raise BagError("session_player's parameter `path` is missing; name a bag to play")
@@ -144,9 +145,6 @@ class SessionPlayer(GuardedNode):
             "position": f"{1e-9 * position:.3f}",
             "duration": f"{1e-9 * self._length:.3f}",
         }
-
-    def _use(self, _: object = None) -> None:
-        self._playback.use()
 
     def _go_to(self, position: int) -> None:
         """Have the messages from there on wait, and show a moment of them even if it is paused.

@@ -66,7 +66,7 @@ class SessionRecorder(GuardedNode):
         self.health = Health(self, settings.file)
         self._begin(settings.file, further=settings.if_exists == "further")
         self._events = RecorderEvents(self)
-        if not offer_services(self, self):
+        if not offer_services(self):
             self.get_logger().info(
                 "rosbag2_interfaces is not installed, so there are no services to control this"
             )

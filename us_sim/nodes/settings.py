@@ -83,6 +83,9 @@ def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
         yield f"flow.{name}.", type(flow)
 
 
+RECORDER, VIEWER = "session_recorder", "viewer"
+PLAYERS = ("path_player", "session_player")
+"""Nodes that play what was recorded."""
 BEGUN = Quantity("time", 0.0, 1e10)  # when something began, since 1970
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)

@@ -14,7 +14,6 @@ from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import STREAM, overridable
 from us_sim.nodes.settings import SpaceMouseDriverSettings
 from us_sim.tracking.mouse import SpaceMouse
 
@@ -35,9 +34,7 @@ class SpaceMouseDriver(GuardedNode):
         self._patience = 1.0 / settings.rate
         self.health = Health(self, "SpaceMouse")
         self.health.state = "opening"
-        self._joys = self.create_publisher(
-            Joy, "spacenav/joy", STREAM, qos_overriding_options=overridable()
-        )
+        self._joys = self.stream(Joy, "spacenav/joy")
         self._lock = threading.Lock()
         self._newest: tuple[int, list[float], list[int]] | None = None
         self._problem, self._name = "", ""

@@ -28,6 +28,7 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, ChunkIndex, Metadata, Schema
 from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
 
 from us_sim.errors import BagError
 from us_sim.recording.mcap_records import (
@@ -53,14 +54,12 @@ from us_sim.recording.topic import (
     qos_from_yaml,
 )
 
-MCAP_MAGIC = b"\x89MCAP0\r\n"
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _TIME = struct.Struct("<Q8x")  # log time, place in its chunk
 _CHANNEL = struct.Struct("<H4x")  # and the length of the table that follows
 
-_LARGEST_OVERLAP = 1 << 30
-"""Bytes of messages that wait until no earlier one can come."""
+_LARGEST_OVERLAP = 1 << 30  # bytes of messages that wait until no earlier one can come
 _PLACES_TOLD = 3
 
 
@@ -81,19 +80,15 @@ class _Place(NamedTuple):
 
 
 class McapFile:
-    """One MCAP file as a Storage.
-
-    Args:
-        path: the file.
-        label: its name in errors, where that is not its path.
+    """One MCAP file as a Storage; errors call it by the label.
 
     Raises:
         BagError: the file is empty, no MCAP, or of a topic with two types.
     """
 
-    def __init__(self, path: Path, label: str = "") -> None:
+    def __init__(self, path: Path, label: str) -> None:
         self._path = path
-        self._label = label or str(path)
+        self._label = label
         self.faults: list[Fault] = []
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -104,7 +99,7 @@ class McapFile:
         self.start: int | None = None
         self.end: int | None = None
         with path.open("rb") as stream:
-            if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise BagError(f"{self._label} is not an MCAP file: it does not start as one")
             summary = _summary(stream)
             if summary is not None:
@@ -113,15 +108,8 @@ class McapFile:
                 self._scan(stream)
         self.topics = self._topics()
 
-    def attachments(self, damage: list[Fault] | None = None) -> Iterator[BagAttachment]:
-        """The files within this one.
-
-        Args:
-            damage: takes a fault for each that is damaged, which is then left out.
-
-        Raises:
-            BagError: one is damaged, and ``damage`` is None.
-        """
+    def attachments(self, damage: list[Fault] | None) -> Iterator[BagAttachment]:
+        """The files within this one; ``damage`` and errors are as in `Bag.attachments`."""
         for place in self._attachments:
             try:
                 record = attachment(self._content(place))
@@ -130,7 +118,7 @@ class McapFile:
             else:
                 yield BagAttachment(record.name, record.media_type, record.log_time, record.data)
 
-    def notes(self, damage: list[Fault] | None = None) -> Iterator[BagNote]:
+    def notes(self, damage: list[Fault] | None) -> Iterator[BagNote]:
         """The metadata records; ``damage`` and errors are as those of `attachments`."""
         for place in self._notes:
             try:
@@ -142,9 +130,7 @@ class McapFile:
             else:
                 yield BagNote(record.name, record.metadata)
 
-    def messages(
-        self, topics: Collection[str], damage: list[Fault] | None = None
-    ) -> Iterator[BagMessage]:
+    def messages(self, topics: Collection[str], damage: list[Fault] | None) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 
         Args:
@@ -237,7 +223,7 @@ class McapFile:
     def _scan(self, stream: BinaryIO) -> None:
         """Walks the records of a file that has no usable summary."""
         size = stream.seek(0, 2)
-        position = len(MCAP_MAGIC)
+        position = len(MCAP0_MAGIC)
         gaps: list[tuple[int, int]] = []
         tables: dict[int, tuple[int, int]] = {}  # of the last chunk: messages, lowest log time
         missing: Counter[int] = Counter()
@@ -272,8 +258,8 @@ class McapFile:
         self._runs.sort()
         for id in self._counts.keys() - self._channels.keys():
             missing[id] += self._counts.pop(id)  # of a topic whose name is lost
-        stream.seek(max(0, size - len(MCAP_MAGIC)))
-        if not (ended and stream.read() == MCAP_MAGIC):
+        stream.seek(max(0, size - len(MCAP0_MAGIC)))
+        if not (ended and stream.read() == MCAP0_MAGIC):
             count = sum(self._counts.values())
             seconds = (self.end - self.start) / 1e9 if self.start and self.end else 0.0
             text = (
@@ -367,9 +353,9 @@ class McapFile:
 def _summary(stream: BinaryIO) -> Summary | None:
     """The summary of a file that has a sound one, with statistics and an index of its messages."""
     size = stream.seek(0, 2)
-    stream.seek(max(0, size - _FOOTER.size - len(MCAP_MAGIC)))
+    stream.seek(max(0, size - _FOOTER.size - len(MCAP0_MAGIC)))
     tail = stream.read()
-    if len(tail) != _FOOTER.size + len(MCAP_MAGIC) or not tail.endswith(MCAP_MAGIC):
+    if len(tail) != _FOOTER.size + len(MCAP0_MAGIC) or not tail.endswith(MCAP0_MAGIC):
         return None
     _, _, start, _, crc = _FOOTER.unpack_from(tail)
     if not 0 < start < size:
@@ -377,7 +363,7 @@ def _summary(stream: BinaryIO) -> Summary | None:
     if crc:
         stream.seek(start)
         # The checksum covers the summary and the footer up to the checksum itself.
-        if zlib.crc32(stream.read(size - start - len(MCAP_MAGIC) - 4)) != crc:
+        if zlib.crc32(stream.read(size - start - len(MCAP0_MAGIC) - 4)) != crc:
             return None
     stream.seek(0)
     try:

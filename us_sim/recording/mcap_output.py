@@ -39,12 +39,12 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+from mcap.writer import MCAP0_MAGIC
 
-MAGIC = b"\x89MCAP0\r\n"
+from us_sim.recording.mcap_records import CHUNK, LENGTH
+
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
-_CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression
 _FOOTER = struct.Struct("<BQQQ")  # opcode, length, start of the summary, of its offsets
-_LENGTH = struct.Struct("<Q")
 
 _COMPRESS: dict[str, Callable[[bytes], bytes]] = {"": bytes, "zstd": zstandard.compress}
 
@@ -70,7 +70,7 @@ class _WrittenChunk:
     def end(self) -> int:
         """Where it ends, with the tables of its messages."""
         begin, length, offsets = _PLACE.unpack_from(self.index)
-        (tables,) = _LENGTH.unpack_from(self.index, _PLACE.size + offsets)
+        (tables,) = LENGTH.unpack_from(self.index, _PLACE.size + offsets)
         return int(begin + length + tables)
 
 
@@ -112,7 +112,7 @@ class McapOutput:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._begin_chunk()
-        self._begin = [MAGIC, _bytes_of(Header("ros2", library))]
+        self._begin = [MCAP0_MAGIC, _bytes_of(Header("ros2", library))]
         self._size = 0  # bytes of whole records in the file
         self._was_cut = False
         self._file = path.open("xb", buffering=0)
@@ -134,7 +134,8 @@ class McapOutput:
     def place(self) -> Place:
         """Whether somebody else has taken the file away, or a part of it, since it was made."""
         if not self._tells_place or self._is_at_path:
-            return Place.CUT if self._was_cut or self._is_short else Place.HERE
+            is_short = os.fstat(self._file.fileno()).st_size < self._size
+            return Place.CUT if self._was_cut or is_short else Place.HERE
         return Place.MOVED if os.fstat(self._file.fileno()).st_nlink else Place.REMOVED
 
     @property
@@ -214,31 +215,30 @@ class McapOutput:
         first, last = min(times), max(times)
         packed = _COMPRESS[self._compression](records)
         name = self._compression.encode()
-        header = _CHUNK.pack(
-            *(Opcode.CHUNK, _CHUNK.size - 9 + len(name) + 8 + len(packed)),
+        header = CHUNK.pack(
+            *(Opcode.CHUNK, CHUNK.size - 9 + len(name) + 8 + len(packed)),
             *(first, last, len(records), zlib.crc32(records), len(name)),
         )
-        header += name + _LENGTH.pack(len(packed))
+        header += name + LENGTH.pack(len(packed))
+        tables = {}
+        for topic, entries in index.items():
+            channel = self._channels[topic].id
+            tables[channel] = _bytes_of(MessageIndex(channel_id=channel, records=entries))
         try:
             self._notice_cut()
+            # Types and topics are there twice: one damaged chunk does not make later ones
+            # unreadable.
+            new = [topic for topic in index if topic not in self._declared]
+            types = b"".join(map(self._types_of, new))
+            start = self._size + len(types)
+            self._append([types, header, packed, *tables.values()])
         except OSError:
             self._drop(counts)
             raise
-        # Types and topics are there twice: one damaged chunk does not make later ones unreadable.
-        new = [topic for topic in index if topic not in self._declared]
-        types = b"".join(map(self._types_of, new))
-        start = self._size + len(types)
-        offsets, tables, position = {}, [], start + len(header) + len(packed)
-        for topic, entries in index.items():
-            id = self._channels[topic].id
-            tables.append(_bytes_of(MessageIndex(channel_id=id, records=entries)))
-            offsets[id] = position
-            position += len(tables[-1])
-        try:
-            self._append([types, header, packed, *tables])
-        except OSError:
-            self._drop(counts)
-            raise
+        offsets, position = {}, start + len(header) + len(packed)
+        for channel, table in tables.items():
+            offsets[channel] = position
+            position += len(table)
         self._declared.update(new)
         self.start = first if self.start is None else min(first, self.start)
         self.end = last if self.end is None else max(last, self.end)
@@ -248,7 +248,7 @@ class McapOutput:
             chunk_start_offset=start,
             chunk_length=len(header) + len(packed),
             message_index_offsets=offsets,
-            message_index_length=sum(map(len, tables)),
+            message_index_length=sum(map(len, tables.values())),
             compression=self._compression,
             compressed_size=len(packed),
             uncompressed_size=len(records),
@@ -329,10 +329,6 @@ class McapOutput:
         channel = self._channels[topic]
         schema = next(each for each in self._schemas.values() if each.id == channel.schema_id)
         return _bytes_of(schema) + _bytes_of(channel)
-
-    @property
-    def _is_short(self) -> bool:
-        return os.fstat(self._file.fileno()).st_size < self._size
 
     def _notice_cut(self) -> None:
         """Where another process has cut the file: go on after the last record that is whole."""
@@ -420,7 +416,7 @@ class McapOutput:
         # The checksum covers the summary and the footer up to the checksum itself.
         footer = _FOOTER.pack(Opcode.FOOTER, 20, start, offsets_start)
         crc = zlib.crc32(footer, zlib.crc32(content))
-        return [data_end, content, _bytes_of(Footer(start, offsets_start, crc)), MAGIC]
+        return [data_end, content, _bytes_of(Footer(start, offsets_start, crc)), MCAP0_MAGIC]
 
     def _statistics(self) -> Statistics:
         return Statistics(

@@ -26,8 +26,8 @@ from us_sim.errors import BagError
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 
 HEADER = struct.Struct("<BQ")  # opcode, length of what follows
-_CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression
-_LENGTH = struct.Struct("<Q")
+CHUNK = struct.Struct("<BQQQQII")  # opcode, length, start, end, size, CRC, length of compression
+LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<HI")  # channel, length of the entries
 _TIMES = struct.Struct("<QQ")
@@ -54,7 +54,7 @@ AFTER_THE_DATA = frozenset(
         *(Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER),
     )
 )
-"""Kinds of records of which no message comes any more."""
+"""Records that come only after the last message."""
 
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: records.Header,
@@ -145,9 +145,9 @@ def record_at(stream: BinaryIO, offset: int, size: int) -> Record | None:
 
 
 def next_sound(stream: BinaryIO, offset: int, size: int) -> int | None:
-    """Where sound records go on after one that is not, which begins there; None if nowhere.
+    """Where records are sound again after a damaged one that begins there; None if nowhere.
 
-    Records that are parts of chunks are not meant: they have no checksum of their own.
+    Records within chunks do not count: they have no checksum of their own.
     """
     stream.seek(offset)
     head = stream.read(HEADER.size)
@@ -172,11 +172,11 @@ def cut_chunk_at(stream: BinaryIO, offset: int, size: int) -> Chunk | None:
     """The chunk that begins there and within which the file ends."""
     stream.seek(offset)
     head = stream.read(_OVERLAP)
-    if head[:1] != bytes([Opcode.CHUNK]) or len(head) < _CHUNK.size:
+    if head[:1] != bytes([Opcode.CHUNK]) or len(head) < CHUNK.size:
         return None
-    _, length, _, _, unpacked, _, name_length = _CHUNK.unpack_from(head)
-    packed = offset + _CHUNK.size + name_length + _LENGTH.size
-    name = head[_CHUNK.size : _CHUNK.size + name_length]
+    _, length, _, _, unpacked, _, name_length = CHUNK.unpack_from(head)
+    packed = offset + CHUNK.size + name_length + LENGTH.size
+    name = head[CHUNK.size : CHUNK.size + name_length]
     if name not in _COMPRESSIONS or offset + HEADER.size + length <= size or packed > size:
         return None
     return Chunk(offset, packed, size, name.decode(), unpacked, is_whole=False)
@@ -199,14 +199,14 @@ def records_in(stream: BinaryIO, chunk: Chunk) -> Iterator[tuple[int, memoryview
 
 def _chunks(offset: int, head: bytes, size: int) -> Iterator[Chunk]:
     """The chunks that may begin there, by the one or the other of the lengths in their head."""
-    if len(head) < _CHUNK.size + _LENGTH.size:
+    if len(head) < CHUNK.size + LENGTH.size:
         return
-    opcode, length, _, _, unpacked, crc, name_length = _CHUNK.unpack_from(head)
-    name = head[_CHUNK.size : _CHUNK.size + name_length]
-    begin = _CHUNK.size + name_length + _LENGTH.size
+    opcode, length, _, _, unpacked, crc, name_length = CHUNK.unpack_from(head)
+    name = head[CHUNK.size : CHUNK.size + name_length]
+    begin = CHUNK.size + name_length + LENGTH.size
     if name not in _COMPRESSIONS or begin > len(head):
         return
-    (said,) = _LENGTH.unpack_from(head, begin - _LENGTH.size)
+    (said,) = LENGTH.unpack_from(head, begin - LENGTH.size)
     ends = {begin + said, HEADER.size + length}
     if len(ends) > 1 and not (crc and opcode == Opcode.CHUNK):
         return
@@ -217,7 +217,7 @@ def _chunks(offset: int, head: bytes, size: int) -> Iterator[Chunk]:
 
 def _unpacked(stream: BinaryIO, chunk: Chunk) -> memoryview:
     """The bytes of a chunk's records."""
-    if not chunk.offset + _CHUNK.size < chunk.packed <= chunk.end:
+    if not chunk.offset + CHUNK.size < chunk.packed <= chunk.end:
         raise ValueError("its lengths contradict one another")
     if chunk.end - chunk.offset > LARGEST_CHUNK:
         raise ValueError(
@@ -238,7 +238,7 @@ def _unpacked(stream: BinaryIO, chunk: Chunk) -> memoryview:
             raise ValueError(str(error)) from None
     else:
         raise ValueError(f"it is compressed with {chunk.compression!r}, not zstd or lz4")
-    crc = _CHUNK.unpack_from(content)[5]
+    crc = CHUNK.unpack_from(content)[5]
     holds = zlib.crc32(unpacked) == crc if crc else len(unpacked) == chunk.size
     if chunk.is_whole and not holds:
         raise ValueError("its checksum does not match")
@@ -262,7 +262,7 @@ def _ends(stream: BinaryIO, offset: int, opcode: int, length: int) -> Iterator[i
     if opcode == Opcode.ATTACHMENT:
         end = offset + HEADER.size + 16
         try:
-            for form in (_SHORT, _SHORT, _LENGTH):  # of its name, its kind, its data
+            for form in (_SHORT, _SHORT, LENGTH):  # of its name, its kind, its data
                 stream.seek(end)
                 end += form.size + form.unpack(stream.read(form.size))[0]
         except (struct.error, OverflowError, OSError):
@@ -300,7 +300,7 @@ def attachment(content: memoryview) -> records.Attachment:
 
 
 def _may_be_a_record(head: bytes) -> bool:
-    """Whether lengths in the first bytes of a record agree: most bytes are none."""
+    """Whether these may be a record's first bytes: its lengths agree, as those of few bytes do."""
     try:
         opcode, length = HEADER.unpack_from(head)
         if opcode == Opcode.CHUNK:

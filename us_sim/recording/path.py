@@ -93,9 +93,7 @@ def bodies_in(bag: Bag) -> dict[str, list[str]]:
 def pose_rows(bag: Bag, name: str) -> Iterator[Row]:
     """The poses of a body, in the order in which they were recorded.
 
-    Args:
-        bag: that holds them.
-        name: of the body. The leading slash may be left away.
+    The leading slash of its name may be left away.
 
     Raises:
         BagError: the bag has no such topic or body, or one of a type without poses.
@@ -177,8 +175,7 @@ _PATHS = (
     "give a bag (.mcap, .db3), a tracker recording of PLUS (.igs.mha, .igs.nrrd) or a scene of 3D "
     "Slicer (.mrml, .mrb)"
 )
-_MOST_NAMES = 20
-"""Bodies that are listed where one has to be named."""
+_MOST_NAMES = 20  # bodies that are listed where one has to be named
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,12 +274,7 @@ def is_tracker_recording(path: str | Path) -> bool:
 
 
 def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> None:
-    """Writes a path as a bag of its one topic, compressed.
-
-    Args:
-        file: as ``BagWriter`` takes it.
-        path: recorded at its log times.
-        sidecar: False leaves ``metadata.yaml`` away.
+    """Writes a path as a bag of its one topic, compressed; ``sidecar`` is as for `BagWriter`.
 
     Raises:
         BagError: the file exists or cannot be written.

@@ -18,11 +18,7 @@ from __future__ import annotations
 
 
 class Playhead:
-    """Goes on with a clock that is told to it.
-
-    Args:
-        rate: recorded time over the clock's.
-    """
+    """Goes on with a clock that is told to it; the rate is recorded time over the clock's."""
 
     def __init__(self, rate: float = 1.0) -> None:
         self.rate = rate

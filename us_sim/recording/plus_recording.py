@@ -61,7 +61,7 @@ class TrackerRecording:
         body, end = split_transform_name(name) or (name, None)
         if reference is None and end and name not in self.transforms:
             reference = end
-        own = [key for key in self.transforms if _body(key) == body]
+        own = [key for key in self.transforms if (split_transform_name(key) or ("",))[0] == body]
         if reference is None and name in self.transforms:
             own = [name]
         chain = None
@@ -83,24 +83,15 @@ class TrackerRecording:
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """A body's poses in a reference frame (K, 4, 4) m, and which are valid (K,); nan elsewhere.
 
-        Args:
-            name: as in :meth:`chain`.
-            reference: as in :meth:`chain`.
-
-        Raises:
-            TrackingError: see :meth:`chain`.
+        Arguments and errors are those of :meth:`chain`.
         """
         found = along(self.transforms, self.chain(name, reference))
         return found.matrices, found.valid
 
     def probe_path(self, name: str | None = None, reference: str | None = None) -> ProbePath:
-        """The valid poses of a body as a path in the reference's frame.
+        """The valid poses of a body as a path in the reference's frame, by the recorder's clock.
 
-        Its stamps are the recorder's clock.
-
-        Args:
-            name: as in :meth:`chain`; by default the recording's only transform.
-            reference: as in :meth:`chain`.
+        Arguments are as for :meth:`chain`; without a name it is the recording's only transform.
 
         Raises:
             TrackingError: see :meth:`chain`; or the name is missing, or no pose is valid.
@@ -198,7 +189,3 @@ def _rigid(series: FrameTransforms, which: NDArray[np.intp]) -> FrameTransforms:
         else:
             matrices[k, :3, :3] = rotation
     return FrameTransforms(matrices, tuple(faults))
-
-
-def _body(name: str) -> str:
-    return (split_transform_name(name) or ("", ""))[0]

@@ -20,12 +20,7 @@ from us_sim.recording.path import ProbePath, write_path
 
 
 def write_where_asked(arguments: Sequence[str], module: str, make: Callable[[], ProbePath]) -> int:
-    """Write a path to the file that the one argument names.
-
-    Args:
-        arguments: of the command line.
-        module: its name, for the usage.
-        make: the path.
+    """Write a path to the file that the one argument of a module's command line names.
 
     Returns:
         The exit status: 0, 1 where the file cannot be written, 2 for other arguments than one.

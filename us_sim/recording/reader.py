@@ -36,11 +36,7 @@ class Bag:
     """A bag opened for reading; made by :func:`read_bag`."""
 
     def __init__(
-        self,
-        path: Path,
-        storages: list[Storage],
-        metadata: BagMetadata | None,
-        scratch: Scratch,
+        self, path: Path, storages: list[Storage], metadata: BagMetadata | None, scratch: Scratch
     ) -> None:
         self.path = path
         self.metadata = metadata
@@ -74,11 +70,6 @@ class Bag:
     def message_count(self) -> int:
         """Number of messages on all topics."""
         return sum(topic.message_count for topic in self.topics)
-
-    @property
-    def complete(self) -> bool:
-        """False when a file breaks off; then :attr:`note` says how much was recovered."""
-        return not self.note
 
     @property
     def note(self) -> str:
@@ -145,10 +136,10 @@ class Bag:
 
     def lost(self) -> Counter[str]:
         """How many messages the recorder says that it lost, by topic."""
-        counts = [note.values for note in self.notes([]) if note.name == LOST]
         lost: Counter[str] = Counter()
-        for count in counts:
-            lost.update({topic: _count(text) for topic, text in count.items()})
+        for note in self.notes([]):
+            if note.name == LOST:
+                lost.update({topic: _count(text) for topic, text in note.values.items()})
         return lost
 
     def messages(
@@ -301,17 +292,13 @@ def describe(bag: Bag) -> str:
             f"{rate:>{widths[3]}}  {quality}"
         )
     lines += _section("lost", [f"{count} of {topic}" for topic, count in summary["lost"].items()])
-    lines += _section(
-        "marked",
-        [
-            f"{(mark['time'] - (summary['start'] or mark['time'])) * 1e-9:.3f} s  {mark['text']}"
-            for mark in summary["markers"]
-        ],
-    )
-    lines += _section(
-        "attached",
-        [f"{each['name']} ({each['size']} bytes)" for each in summary["attachments"]],
-    )
+    marked = [
+        f"{(mark['time'] - (summary['start'] or mark['time'])) * 1e-9:.3f} s  {mark['text']}"
+        for mark in summary["markers"]
+    ]
+    lines += _section("marked", marked)
+    attached = [f"{each['name']} ({each['size']} bytes)" for each in summary["attachments"]]
+    lines += _section("attached", attached)
     return "\n".join(printable(line) for line in lines)
 
 

@@ -21,8 +21,7 @@ from us_sim.errors import BagError
 
 _RULE = "=" * 80
 _LARGEST_TEXT = 1 << 18
-_MOST_PARTS = 20_000
-"""rosbags writes code for each of them."""
+_MOST_PARTS = 20_000  # rosbags writes code for each of them
 _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }

@@ -16,8 +16,10 @@ from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
 
+from mcap.writer import MCAP0_MAGIC
+
 from us_sim.errors import BagError
-from us_sim.recording.mcap_file import MCAP_MAGIC, McapFile
+from us_sim.recording.mcap_file import McapFile
 from us_sim.recording.metadata import BagMetadata, read_metadata
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import (
@@ -34,18 +36,14 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 class SqliteFile:
-    """One SQLite file as a Storage.
-
-    Args:
-        path: the file.
-        label: its name in errors, where that is not its path.
+    """One SQLite file as a Storage; errors call it by the label.
 
     Raises:
         BagError: the file is damaged, or without the tables of rosbag2.
     """
 
-    def __init__(self, path: Path, label: str = "") -> None:
-        self._label = label or str(path)
+    def __init__(self, path: Path, label: str) -> None:
+        self._label = label
         self._uri, unread = _address(path)
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
@@ -75,19 +73,19 @@ class SqliteFile:
 
     def attachments(
         self,
-        damage: list[Fault] | None = None,  # noqa: ARG002
+        damage: list[Fault] | None,  # noqa: ARG002
     ) -> Iterator[BagAttachment]:
         """None: rosbag2 keeps no files in a database."""
         return iter(())
 
-    def notes(self, damage: list[Fault] | None = None) -> Iterator[BagNote]:  # noqa: ARG002
+    def notes(self, damage: list[Fault] | None) -> Iterator[BagNote]:  # noqa: ARG002
         """None."""
         return iter(())
 
     def messages(
         self,
         topics: Collection[str],
-        damage: list[Fault] | None = None,  # noqa: ARG002 (what SQLite finds damaged ends it)
+        damage: list[Fault] | None,  # noqa: ARG002 (what SQLite finds damaged ends it)
     ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 
@@ -233,27 +231,24 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
     return sorted(files, key=lambda file: int(p[2] or -1) if (p := parts[file]) else 0), None
 
 
-def open_storage(file: Path, scratch: Scratch) -> Storage:
-    """The reader of a file by its first bytes, whatever its name.
+def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
+    """The reader of a file by its first bytes, whatever its name; errors name it, or the label.
 
     Raises:
         NoBagError: the file is of another kind.
         BagError: the file is empty, a bag of ROS 1, or damaged.
     """
-    return _open(file, str(file), scratch)
-
-
-def _open(file: Path, label: str, scratch: Scratch) -> Storage:
+    label = label or str(file)
     with file.open("rb") as stream:
         start = stream.read(16)
     if not start:
         raise BagError(f"{label} is empty: its recorder was ended before it wrote anything")
-    if start.startswith(MCAP_MAGIC):
+    if start.startswith(MCAP0_MAGIC):
         return McapFile(file, label)
     if start == _SQLITE_MAGIC:
         return SqliteFile(file, label)
     if start.startswith(_ZSTD_MAGIC):
-        return _open(scratch.unpack(file), label, scratch)
+        return open_storage(scratch.unpack(file), scratch, label)
     if start.startswith(b"#ROSBAG"):
         raise BagError(f"{label} is a bag of ROS 1: convert it with rosbags-convert first")
     raise NoBagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")

@@ -19,9 +19,7 @@ LARGEST_CHUNK = 1 << 28
 LARGEST_FILE = 1 << 36
 """Bytes of a bag after unpacking: 64 GiB."""
 
-_SPARE = 1 << 30
-"""Bytes of the disk that stay free."""
-
+_SPARE = 1 << 30  # bytes of the disk that stay free
 _STEP = 1 << 20
 _LONGEST_HEADER = 18  # bytes of a zstd frame
 

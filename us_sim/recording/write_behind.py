@@ -256,11 +256,8 @@ class PreRoll:
     """A ring of messages, as rosbag2's snapshot mode keeps it.
 
     Of a latched topic the newest message is kept whatever its age: a late listener would get it,
-    and the recording makes no sense without it.
-
-    Args:
-        max_bytes: of messages; the oldest go.
-        duration: s before the newest message's; 0 for any.
+    and the recording makes no sense without it. Of others the oldest go, where there are more than
+    ``max_bytes``, or they are older than the newest by more than ``duration`` s (0 for any).
     """
 
     def __init__(self, max_bytes: int, duration: float = 0.0) -> None:

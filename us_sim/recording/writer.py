@@ -1,14 +1,4 @@
-"""Recording MCAP as rosbag2 does, so that nothing but the last second is lost to a crash.
-
->>> import tempfile
->>> from us_sim.recording.writer import BagWriter
->>> file = tempfile.mkdtemp() + "/session.mcap"
->>> with BagWriter(file, compression="zstd") as writer:
-...     writer.add_topic("/note", "std_msgs/msg/String")
-...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
->>> open(file, "rb").read(8)
-b'\\x89MCAP0\\r\\n'
-"""
+"""Recording MCAP as rosbag2 does, so that nothing but the last second is lost to a crash."""
 
 from __future__ import annotations
 
@@ -32,6 +22,7 @@ from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
 _CHUNK_SIZE = 768 * 1024  # bytes, rosbag2's default
+_FLUSH = 10**9  # ns of log time after which everything is handed to the operating system
 _ROOM = 16 * 1024 * 1024  # bytes, that must be free again before a full disk is written to
 _COMPRESSIONS = {"none": "", "zstd": "zstd"}
 
@@ -61,14 +52,12 @@ class BagWriter:
             files are called ``FILE_1.mcap`` or ``FOLDER_1.mcap`` and so on.
         compression: of the chunks, ``"none"`` or ``"zstd"``.
         chunk_size: bytes after which a chunk is ended.
-        flush_interval: s of log time after which everything is handed to the operating system.
         max_size: bytes after which a further file is begun; 0 for never.
         max_duration: s after which a further file is begun; 0 for never.
         sidecar: False leaves ``metadata.yaml`` away, for folders with several one-file bags.
         further: where ``FILE.mcap`` exists, go on in ``FILE_1.mcap`` or the next that is free. No
             ``metadata.yaml`` is written then: it would have to speak for files that are not this
             writer's.
-        custom_data: free text for the metadata.
 
     Raises:
         BagError: something is there already, or the file cannot be made.
@@ -80,20 +69,17 @@ class BagWriter:
         *,
         compression: Literal["none", "zstd"] = "none",
         chunk_size: int = _CHUNK_SIZE,
-        flush_interval: float = 1.0,
         max_size: int = 0,
         max_duration: float = 0.0,
         sidecar: bool = True,
         further: bool = False,
-        custom_data: Mapping[str, str] | None = None,
     ) -> None:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
-        self.custom_data = dict(custom_data or {})
+        self.custom_data: dict[str, str] = {}  # free text for the metadata
         self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
         self.on_split: Callable[[str, str], None] | None = None
         self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
-        self._flush_interval = round(flush_interval * 1e9)
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
         self._files: list[FileEntry] = []  # that are closed
         self._counts: Counter[str] = Counter()  # messages in those files, by topic
@@ -242,27 +228,18 @@ class BagWriter:
         if self._is_long(log_time_ns):
             self.split()
         with self._writing():
-            self._output.add_message(
-                topic,
-                log_time_ns,
-                publish_time_ns,
-                sequence & 0xFFFFFFFF,
-                bytes(cdr),
-            )
+            times = log_time_ns, publish_time_ns
+            self._output.add_message(topic, *times, sequence & 0xFFFFFFFF, bytes(cdr))
         if self._last_flush is None:
             self._last_flush = log_time_ns
-        elif log_time_ns - self._last_flush >= self._flush_interval:
+        elif log_time_ns - self._last_flush >= _FLUSH:
             self.flush()
             self._last_flush = log_time_ns
 
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Puts a file into each of the bag's, such as the scene that is recorded.
 
-        Args:
-            name: of the file.
-            media_type: such as ``text/plain``.
-            data: its content.
-            time_ns: ns since the epoch, when it was as it is.
+        The time in ns since the epoch is when it was as it is.
 
         Raises:
             BagError: the bag is closed, or the disk is full.

@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.nodes.settings import checked_parameters
+from us_sim.nodes.settings import RECORDER, VIEWER, checked_parameters
 from us_sim.nodes.topics import published_counts
 from us_sim.progress import Progress, late_progress
 from us_sim.run.fork_server import ForkServer
 from us_sim.run.losses import IMAGES, Outcome
 from us_sim.run.monitored import Monitored, alone_on_domain, domain
 from us_sim.run.plan import (
-    RECORDER,
-    VIEWER,
     NodeProcess,
     Parameters,
     Plan,

@@ -13,11 +13,11 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import UsSimError
+from us_sim.nodes.settings import RECORDER
 from us_sim.progress import Progress
 from us_sim.run.live import prepare_volume
 from us_sim.run.monitored import refuse_unknown, ros_context
 from us_sim.run.plan import (
-    RECORDER,
     NodeProcess,
     Parameters,
     module_of,

@@ -148,10 +148,6 @@ class Monitored:
         self._executor.add_node(self._control)
         return self._control
 
-    def follow(self, nodes: Sequence[str]) -> None:
-        """Follow these nodes from now on."""
-        self.node.follow(nodes)
-
     def spin(self, seconds: float = 0.1) -> None:
         """Take the next message, waiting at most so long."""
         self._executor.spin_once(timeout_sec=seconds)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.settings import SessionRecorderSettings, checked_parameters
+from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
@@ -29,8 +29,6 @@ from us_sim.viewer.server import require_free
 if TYPE_CHECKING:
     from us_sim.run.camera_video import PathVideo
 
-RECORDER, VIEWER = "session_recorder", "viewer"
-PLAYERS = ("path_player", "session_player")
 Parameters = dict[str, dict[str, str]]  # parameters given by a person: YAML texts by node and name
 
 

@@ -18,8 +18,9 @@ from tqdm import tqdm
 
 from us_sim.errors import UsSimError, memory_limit, printable
 from us_sim.nodes import INTERRUPTED, STANDBY, STANDING_BY
+from us_sim.nodes.settings import RECORDER, VIEWER
 from us_sim.run.fork_server import ForkedProcess, ForkServer, end_with_parent, package_on_path
-from us_sim.run.plan import RECORDER, VIEWER, NodeProcess
+from us_sim.run.plan import NodeProcess
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
-from us_sim.nodes.settings import SessionControlSettings
+from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
 from us_sim.recording.reader import read_bag
 from us_sim.run.background import Background, bags_in_reach
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import PLAYERS, RECORDER, VIEWER, Plan, Request, plan_of
+from us_sim.run.plan import Plan, Request, plan_of
 from us_sim.run.supervision import Kept, Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene
@@ -168,15 +168,14 @@ class Simulation:
 
     def _take_what_was_set(self) -> None:
         """Keep all values that were set, by whomever, but for those that a node died of."""
-        kept, dropped = self._supervisor.take_set()
-        for node, values in kept.items():
-            self._kept_here.setdefault(node, {}).update(values)
-        for node in dropped:
-            values = self._kept_here.pop(node, {})
+        for node, values in self._supervisor.kept.items():
+            before = self._kept_here.pop(node, {})
             if values:
+                self._kept_here[node] = values
+            elif before:
                 self._tell_lost(
                     f"{node} ended twice, so it runs without what was set since its start: "
-                    f"{_listed(list(values))}"
+                    f"{_listed(list(before))}"
                 )
 
     def _tell_lost(self, sentence: str) -> None:

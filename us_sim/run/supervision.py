@@ -11,10 +11,11 @@ from tqdm import tqdm
 
 from us_sim.errors import printable
 from us_sim.nodes import INTERRUPTED
+from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER
 from us_sim.run.fork_server import SLOW
 from us_sim.run.losses import IMAGES, Loss, Outcome, Recordings, images_in
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import PLAYERS, RECORDER, VIEWER, NodeProcess, Plan, goes_on, recorder_of
+from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
 from us_sim.run.processes import ProcessGroup, ending
 from us_sim.run.watch import START_LIMIT_S, Restarts, SupervisionSettings, Watch
 
@@ -47,8 +48,6 @@ class Supervisor:
         self._watch = Watch(settings.silence)
         self._away: dict[str, tuple[Loss, float]] = {}  # started again, and when they were lost
         self._back: dict[str, float] = {}  # when they were back
-        self._set: Kept = {}  # of nodes, while they ran
-        self._dropped: Kept = {}  # of it, what was kept in vain
         self._were_ready: set[str] = set()
         self._processes: dict[str, NodeProcess] = {}  # that were started, by node
         self._due: list[NodeProcess] = []  # that are started when others have ended
@@ -79,7 +78,7 @@ class Supervisor:
         self._restarts = Restarts(self._settings)
         self._changed = time.monotonic()
         self._changes += 1
-        self._monitor.follow(plan.nodes)
+        self._monitor.node.follow(plan.nodes)
         self._start_due()
 
     @property
@@ -112,18 +111,14 @@ class Supervisor:
             process = self._processes[node]
             self._processes[node] = replace(process, kept=process.kept | dict(values))
 
-    def take_set(self) -> tuple[Kept, Kept]:
-        """Parameters that were set, and those kept no longer because a node ended of them."""
-        taken = self._set, self._dropped
-        self._set, self._dropped = {}, {}
-        return taken
+    @property
+    def kept(self) -> Kept:
+        """Parameters that were set of each node; nothing of one that has ended twice of them.
 
-    def _keep_what_was_set(self) -> None:
-        """But for nodes that are told by others how to go on."""
-        for node, values in self._monitor.node.take_set().items():
-            if node in self._processes and node not in (*PLAYERS, RECORDER, VIEWER):
-                self.keep(node, values)
-                self._set.setdefault(node, {}).update(values)
+        Nodes that are told by others how to go on are left out.
+        """
+        own = self._processes.keys() - {*PLAYERS, RECORDER, VIEWER}
+        return {node: self._processes[node].kept for node in own}
 
     def update(self) -> None:
         """Take new reports, and restart nodes that have ended or hang.
@@ -136,7 +131,10 @@ class Supervisor:
         ended = self._group.take_ended()
         for _ in range(2 * len(self._processes) if ended else 0):
             self._monitor.spin(0.0)  # what they said last, and what was set of them
-        self._keep_what_was_set()
+        own = self.kept.keys()
+        for node, values in self._monitor.node.take_set().items():
+            if node in own:
+                self.keep(node, values)
         for node, status in ended.items():
             self._ended(node, status)
         hung = self._watch.hung(self._running(), self._monitor.node.heard)
@@ -227,8 +225,6 @@ class Supervisor:
         lived = time.monotonic() - self._back.get(node, -LIVES_S)
         if not process.kept or (node not in self._away and lived > LIVES_S):
             return ""
-        self._dropped[node] = process.kept
-        self._set.pop(node, None)
         self._processes[node] = replace(process, kept={})
         return f", without what was set since its start: {', '.join(process.kept)}"
 

@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from us_sim.settings.choice import Choice
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.settings.spelling import nearest, shown
-from us_sim.settings.text_files import LARGEST_YAML, YamlError, load_yaml, read_text
+from us_sim.settings.text_files import LARGEST_YAML, read_yaml
 from us_sim.share import full_path, shared_roots
 
 BASE = "based_on"
@@ -155,16 +156,10 @@ def _kind_of_each(kind: Any) -> Any:
 
 
 def _yaml(path: Path) -> Any:
-    try:
-        if path.stat().st_size > 4 * LARGEST_YAML:  # bytes of a character at most
-            raise SceneError(
-                f"{path}: has {path.stat().st_size} bytes, which is no scene: name one that is"
-            )
-        return load_yaml(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: cannot be read: {error}") from error
-    except YamlError as error:
-        raise SceneError(f"{path}: {error}") from error
+    with contextlib.suppress(OSError):
+        if (size := path.stat().st_size) > 4 * LARGEST_YAML:  # bytes of a character at most
+            raise SceneError(f"{path}: has {size} bytes, which is no scene: name one that is")
+    return read_yaml(path, SceneError)
 
 
 def check_files(scene: Scene) -> list[str]:

@@ -86,6 +86,20 @@ def load_yaml(text: str) -> Any:
         raise YamlError(f"is not YAML: {error}") from error
 
 
+def read_yaml(path: Path, error_type: type[UsSimError], label: Path | None = None) -> Any:
+    """The content of a YAML file, in Python's own types; errors name it, or the label.
+
+    Raises:
+        UsSimError: of that type, it cannot be read, or as `load_yaml`.
+    """
+    try:
+        return load_yaml(read_text(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise error_type(f"{label or path}: cannot be read: {error}") from error
+    except YamlError as error:
+        raise error_type(f"{label or path}: {error}") from error
+
+
 def _check(text: str) -> None:
     """Count the values in a text without making any of them."""
     sizes: list[int] = [0]  # of what is open

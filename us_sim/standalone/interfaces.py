@@ -73,7 +73,7 @@ _DEFAULTS = {
     ("type_description_interfaces/msg/FieldType", "type_id"): 0,
 }
 
-_IDL_NAMES = {"bool": "boolean", "byte": "octet", "float32": "float", "float64": "double"}
+IDL_NAMES = {"bool": "boolean", "byte": "octet", "float32": "float", "float64": "double"}
 
 
 class InterfaceError(Exception):
@@ -108,7 +108,7 @@ class Field:
             package, _, name = self.kind.split("/")
             element = f"{package}/{name}"
         else:
-            element = _IDL_NAMES.get(self.kind, self.kind)
+            element = IDL_NAMES.get(self.kind, self.kind)
             if self.string_bound:
                 element += f"<{self.string_bound}>"
         if self.shape == "array":

@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .interfaces import (
+    IDL_NAMES,
     Field,
     InterfaceError,
     interface,
@@ -41,7 +42,6 @@ ARRAY_TYPES: dict[str, tuple[str, Any]] = {
     "uint64": ("Q", np.uint64),
 }
 
-_IDL_NAMES = {"float32": "float", "float64": "double"}
 _FLOAT_LIMITS = {"float32": 3.402823466e38, "float64": 1.7976931348623157e308}
 
 Setter = Callable[[Any, Any], None]  # of a message and a value
@@ -84,7 +84,7 @@ def _element_rules(field: Field, message_class: type | None) -> list[Rule]:
         return [(lambda value: isinstance(value, bytes | bytearray) and len(value) == 1, words)]
     if kind in _FLOAT_LIMITS:
         limit = _FLOAT_LIMITS[kind]
-        words = f"be a {_IDL_NAMES[kind]} in [{-limit}, {limit}]"
+        words = f"be a {IDL_NAMES[kind]} in [{-limit}, {limit}]"
         return [
             (lambda value: isinstance(value, float), "be of type 'float'"),
             (lambda value: -limit <= value <= limit or not math.isfinite(value), words),

@@ -83,9 +83,7 @@ class _ServiceEndpoint:
         return None
 
     def _send(self, data: bytes, client: int, sequence: int) -> bool:
-        return self._writer.write_parts(
-            data[:4] + _HEADER.pack(client, sequence), memoryview(data)[4:]
-        )
+        return self._writer.write(data[:4] + _HEADER.pack(client, sequence), memoryview(data)[4:])
 
 
 class ServiceServer(_ServiceEndpoint):

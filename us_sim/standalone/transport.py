@@ -380,8 +380,8 @@ class Writer(Endpoint):
             "the writer has no type",
         )
 
-    def write(self, data: bytes | bytearray | memoryview) -> bool:
-        """Send one sample: a four-byte CDR header and at least one byte.
+    def write(self, *parts: bytes | bytearray | memoryview) -> bool:
+        """Send one sample, in parts: a four-byte CDR header, all in the first, and a byte or more.
 
         Returns:
             False if a reliable reader kept the writer waiting for 0.1 s, so that the sample was
@@ -390,10 +390,6 @@ class Writer(Endpoint):
         Raises:
             DdsError: the writer is closed, or the bytes are no sample.
         """
-        return self.write_parts(data)
-
-    def write_parts(self, *parts: bytes | bytearray | memoryview) -> bool:
-        """Send one sample that is the parts put together; the first holds the CDR header."""
         first, *others = (bytes(part) for part in parts)
         size = len(first) + sum(map(len, others))
         padding = -size % 4  # RTPS wants samples in multiples of four; the header says how many
@@ -484,7 +480,6 @@ class Participant:
             DdsError: the domain cannot be joined.
         """
         self.domain_id = domain_id
-        self.enclave = enclave
         self._endpoints: weakref.WeakSet[Endpoint] = weakref.WeakSet()
         self._topics: dict[tuple[str, str], int] = {}
         self._lock = threading.Lock()

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from cmath import exp, phase
-from math import atan, atan2, cos, pi, sin
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,21 +46,11 @@ class PoseFilter(ABC):
     def lag(self) -> float:
         """s by which, as the filter is set now, its position is behind a uniform motion."""
 
-    @property
-    @abstractmethod
-    def rotation_lag(self) -> float:
-        """s by which, as the filter is set now, its rotation is behind a uniform turn."""
-
-    @abstractmethod
-    def lag_at(self, frequency: float) -> float:
-        """s by which, as the filter is set now, its position is behind a sway at ``frequency``."""
-
 
 class Unfiltered(PoseFilter):
     """Poses as they were measured."""
 
     lag = 0.0
-    rotation_lag = 0.0
 
     def __init__(self, settings: Settings | None = None) -> None:
         """There is nothing to set."""
@@ -72,10 +61,6 @@ class Unfiltered(PoseFilter):
 
     def reset(self) -> None:
         """Nothing is kept."""
-
-    def lag_at(self, frequency: float) -> float:  # noqa: ARG002
-        """s, no lag."""
-        return 0.0
 
 
 def create_filter(name: str, settings: Settings | None = None) -> PoseFilter:
@@ -115,7 +100,6 @@ class OneEuro(PoseFilter):
         self._pose = Pose()  # filtered
         self._velocity = np.zeros(3)  # m/s, low-passed
         self._angular_velocity = np.zeros(3)  # rad/s about the parent's axes, low-passed
-        self._step = 0.0  # s, the newest
 
     def update(self, measurement: Measurement) -> Measurement:
         """The measurement with its pose filtered."""
@@ -123,7 +107,7 @@ class OneEuro(PoseFilter):
         if before is None:
             self._pose = pose
         else:
-            self._step = step = 1e-9 * (measurement.stamp - before.stamp)
+            step = 1e-9 * (measurement.stamp - before.stamp)
             alpha = _alpha(self._settings.derivative_cutoff, step)
             velocity = (pose.position - before.pose.position) / step
             self._velocity = self._velocity + alpha * (velocity - self._velocity)
@@ -131,21 +115,17 @@ class OneEuro(PoseFilter):
             self._angular_velocity = self._angular_velocity + alpha * (
                 turn - self._angular_velocity
             )
-            self._pose = self._towards(pose)
+            self._pose = self._towards(pose, step)
         self._measured = measurement
         return dataclasses.replace(measurement, pose=self._pose)
 
-    def _towards(self, pose: Pose) -> Pose:
-        """The filtered pose after a step towards a measured one."""
+    def _towards(self, pose: Pose, step: float) -> Pose:
+        """The filtered pose after a step (s) towards a measured one."""
         position, orientation = self._pose.position, self._pose.orientation
-        alpha = _alpha(self._cutoff, self._step)
-        turn = _alpha(self._rotation_cutoff, self._step) * rotation_between(
-            orientation, pose.orientation
-        )
-        return Pose(
-            position + alpha * (pose.position - position),
-            product(rotation_exp(turn), orientation),
-        )
+        position = position + _alpha(self._cutoff, step) * (pose.position - position)
+        turn = rotation_between(orientation, pose.orientation)
+        turn = _alpha(self._rotation_cutoff, step) * turn
+        return Pose(position, product(rotation_exp(turn), orientation))
 
     @property
     def _cutoff(self) -> float:
@@ -168,19 +148,6 @@ class OneEuro(PoseFilter):
         the factor of Casiez et al. (eq. 5) that is the time constant, whatever the step is.
         """
         return 1.0 / (2.0 * pi * self._cutoff)
-
-    @property
-    def rotation_lag(self) -> float:
-        """s, behind a uniform turn: see `lag`."""
-        return 1.0 / (2.0 * pi * self._rotation_cutoff)
-
-    def lag_at(self, frequency: float) -> float:
-        """s, the phase delay of a / (1 - (1 - a) / z) at z = exp(2 pi i f T)."""
-        angular = 2.0 * pi * frequency
-        if not self._step:
-            return atan(angular * self.lag) / angular
-        angle, memory = angular * self._step, 1.0 - _alpha(self._cutoff, self._step)
-        return atan2(memory * sin(angle), 1.0 - memory * cos(angle)) / angular
 
 
 def _alpha(cutoff: float, step: float) -> float:
@@ -231,16 +198,14 @@ class ConstantVelocityKalman(PoseFilter):
         self._place: _Place = (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
         self._velocity = np.zeros(6)  # m/s, then rad/s
         self._covariance: NDArray[np.float64] = np.zeros((12, 12))
-        self._step = 0.0  # s, the newest
-        self._gain = np.zeros((12, 6))  # the newest
 
     def update(self, measurement: Measurement) -> Measurement:
         """The measurement with its pose filtered, and the covariance of that."""
-        noise = self._noise(measurement)
+        given = measurement.covariance
+        noise = self._usual_noise if given is None else given
         if self._stamp is None:
             self._start(measurement, noise)
         else:
-            self._step = 1e-9 * (measurement.stamp - self._stamp)
             self._correct(measurement, noise)
         self._stamp = measurement.stamp
         pose = Pose(*self._place)
@@ -248,9 +213,6 @@ class ConstantVelocityKalman(PoseFilter):
         return Measurement(
             measurement.stamp, pose, self._covariance[_POSE, _POSE], measurement.error
         )
-
-    def _noise(self, measurement: Measurement) -> NDArray[np.float64]:
-        return self._usual_noise if measurement.covariance is None else measurement.covariance
 
     def _start(self, measurement: Measurement, noise: NDArray[np.float64]) -> None:
         self._place = measurement.pose.position, measurement.pose.orientation
@@ -292,54 +254,25 @@ class ConstantVelocityKalman(PoseFilter):
             covariance[_POSE, _POSE] + noise, covariance[_POSE]
         ).T.astype(np.float64, copy=False)
         correction = gain @ _difference(place, measurement.pose)
-        self._place = (
-            place[0] + correction[:3],
-            product(rotation_exp(correction[3:6]), place[1]),
-        )
+        turned = product(rotation_exp(correction[3:6]), place[1])
+        self._place = place[0] + correction[:3], turned
         self._velocity = self._velocity + correction[_VELOCITY]
         # Joseph's form stays positive however sure a measurement is of itself.
         kept = _IDENTITY.copy()
         kept[:, _POSE] -= gain
         corrected = kept @ covariance @ kept.T + gain @ noise @ gain.T
         self._covariance = 0.5 * (corrected + corrected.T)
-        self._gain = gain
 
     @property
     def lag(self) -> float:
         """s, none: once it knows the velocity the filter is not behind a uniform motion.
 
-        It settles as an alpha-beta tracker, whose error for a ramp is zero (Kalata 1984); see
-        `lag_at` for motions that change.
+        It settles as an alpha-beta tracker, whose error for a ramp is zero (Kalata 1984).
         """
         return 0.0
-
-    @property
-    def rotation_lag(self) -> float:
-        """s, none: see `lag`."""
-        return 0.0
-
-    def lag_at(self, frequency: float) -> float:
-        """s, the phase delay of the alpha-beta tracker that the filter is with its newest gain.
-
-        With z = exp(2 pi i f T) and gains a of the position and b / T of the velocity it is that
-        of (a + (b - a) / z) / (1 - (2 - a - b) / z + (1 - a) / z²). It may be negative: a filter
-        that extrapolates is ahead of slow sways by a little.
-        """
-        if not self._step:
-            return 0.0
-        step = self._step
-        a = float(np.trace(self._gain[0:3, 0:3])) / 3.0
-        b = step * float(np.trace(self._gain[6:9, 0:3])) / 3.0
-        late = exp(-2j * pi * frequency * step)  # 1 / z
-        response = (a + (b - a) * late) / (1.0 - (2.0 - a - b) * late + (1.0 - a) * late**2)
-        return -phase(response) / (2.0 * pi * frequency)
 
 
 def _difference(expected: _Place, measured: Pose) -> NDArray[np.float64]:
     """(6,) m, rad, from one pose to another, as a measurement's covariance has them."""
-    return np.concatenate(
-        [
-            measured.position - expected[0],
-            rotation_between(expected[1], measured.orientation),
-        ]
-    )
+    turn = rotation_between(expected[1], measured.orientation)
+    return np.concatenate([measured.position - expected[0], turn])

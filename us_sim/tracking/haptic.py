@@ -28,20 +28,11 @@ from us_sim.geometry.pose import Pose
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import HapticSettings
 
-_HEAVIEST, _STIFFEST = 1e5, 1e9
-"""N and N/m beyond which a model is not believed."""
-
-_FADING = 0.5
-"""Fraction of the push at the model's pose below which the rest of the energy fades."""
-
-_FARTHEST = 0.03
-"""m: distance after which the push ends at the latest, however soft the tissue is."""
-
-_STIFFEST_SECANT = 3e3
-"""N/m: beyond it the stiffness is an oscillation of the solver, not tissue."""
-
-_NEAR = 5e-4
-"""m along the push: poses nearer than this do not determine the stiffness between them."""
+_HEAVIEST, _STIFFEST = 1e5, 1e9  # N and N/m beyond which a model is not believed
+_FADING = 0.5  # fraction of the push at the model's pose below which the rest of the energy fades
+_FARTHEST = 0.03  # m: distance after which the push ends at the latest, however soft the tissue is
+_STIFFEST_SECANT = 3e3  # N/m: beyond it the stiffness is an oscillation of the solver, not tissue
+_NEAR = 5e-4  # m along the push: poses nearer than this do not determine the stiffness between them
 
 
 def wrench_in_patient(
@@ -209,30 +200,17 @@ class SecantStiffness:
         return stiffness
 
 
-_REMEMBERED = 4096
-"""Poses of the handle kept for the models that carry their stamps."""
-
-_BETWEEN = 20_000_000
-"""ns: between two poses nearer in time than this the handle's pose is interpolated."""
-
-_RESTART = 1_000_000_000
-"""ns: a stamp that jumps back by more is a restarted device, not a late pose."""
-
-_LEVER = 0.05
-"""m: a turn of the handle by an angle counts as a displacement of this lever times the angle."""
-
-_SMOOTHED = 5
-"""Ticks over which the handle's displacement is averaged to predict the next tick's."""
-
-_RESERVE = 10
-"""Ticks for which the energy left must last: one tick returns at most an equal part of it."""
-
+_REMEMBERED = 4096  # poses of the handle kept for the models that carry their stamps
+_BETWEEN = 20_000_000  # ns: poses nearer in time than this are interpolated between
+_RESTART = 1_000_000_000  # ns: a stamp that jumps back by more is a restarted device, not late
+_LEVER = 0.05  # m: a turn by an angle counts as a displacement of this times the angle
+_SMOOTHED = 5  # ticks over which the handle's displacement is averaged to predict the next tick's
+_RESERVE = 10  # ticks for which the energy left must last: each returns at most an equal part
 _STORED = 2.0
 """Energy returned to the handle at most, over what the model says the tissue has stored, so that
 energy that was lost meanwhile does not come back as a kick."""
 
-_DAMPING = 10.0
-"""N s/m, the strongest damping by which energy returned in excess is taken back."""
+_DAMPING = 10.0  # N s/m, the strongest damping by which energy returned in excess is taken back
 
 
 class HapticRendering:
@@ -275,10 +253,7 @@ class HapticRendering:
         self._not_before: int | None = None  # ns, the next model's stamp must be later
         self._anchor = Pose()  # of the handle, when the model was made
         self._begun: int | None = None  # ns, when the ramp began
-        self._left_over, self._since = (
-            np.zeros(6),
-            0,
-        )  # wrench of earlier models, and since when, ns
+        self._left_over, self._since = np.zeros(6), 0  # wrench of earlier models, since when (ns)
         self._felt = np.zeros(6)
         self._motion = np.zeros(6)  # m, rad, of the handle since the last tick
         self._motions: deque[NDArray[np.float64]] = deque(maxlen=_SMOOTHED)
@@ -314,8 +289,7 @@ class HapticRendering:
     def render(self, now: int) -> NDArray[np.float64]:
         """(6,) N, N m on the handle until the next tick, about its origin, axes of the arm.
 
-        Args:
-            now: ns, of the clock of `pose` and `model`.
+        ``now`` is in ns of the clock of `pose` and `model`.
         """
         doubt = self._take_poses(now)
         self.energy -= float(self._felt @ self._motion)
@@ -503,12 +477,8 @@ class HapticDevice:
     """The coupling of a haptic arm's handle and the probe.
 
     The handle's translation is scaled, its rotation is not. While the clutch is held the probe
-    stays; then it goes on from there, with the handle wherever it is.
-
-    Args:
-        settings: the scales.
-        registration: the arm's base in ``patient``.
-        calibration: the probe in the handle's frame.
+    stays; then it goes on from there, with the handle wherever it is. The registration is the pose
+    of the arm's base in ``patient``, the calibration that of the probe in the handle's frame.
     """
 
     def __init__(
@@ -535,12 +505,7 @@ class HapticDevice:
         self.is_held = False
 
     def take(self, pose: Pose, stamp: int) -> Measurement:
-        """The body that carries the probe, in the arm's frame.
-
-        Args:
-            pose: of the handle in the arm's frame.
-            stamp: ns.
-        """
+        """The body that carries the probe, from the handle's pose, both in the arm's frame."""
         self._last = pose
         body = self._held or self._body(pose)
         if self.is_held:
@@ -559,10 +524,8 @@ class HapticDevice:
         self.is_held = held
 
     def _body(self, pose: Pose) -> Pose:
-        return Pose(
-            self._scale * pose.position + self._offset,
-            se3.product(pose.orientation, self._regrip),
-        )
+        turned = se3.product(pose.orientation, self._regrip)
+        return Pose(self._scale * pose.position + self._offset, turned)
 
     def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> NDArray[np.float64]:
         """How the probe moves with the handle, whatever the clutch did earlier.

@@ -26,8 +26,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import SixDofMouseSettings
 
-_ROUNDING = 1e-3
-"""How far an axis may be beyond ±1: some drivers divide by a rounded full scale."""
+_ROUNDING = 1e-3  # how far an axis may be beyond ±1: some drivers divide by a rounded full scale
 
 
 class SixDofMouse:

@@ -46,11 +46,11 @@ _METRES = 1e-3
 _VERSIONS = (1, 2, 3)
 _EXTENSION = struct.Struct(">HHII")  # its size, metadata's header and body, message number
 _METADATA = struct.Struct(">HHI")  # key's length, value's encoding and length
-_MATRIX = np.dtype((">f4", 12))  # column after column of the upper three rows
 _ELEMENTS = {
-    "TDATA": np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("matrix", _MATRIX)]),
-    "QTDATA": np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("pose", (">f4", 7))]),
+    kind: np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("numbers", ">f4", count)])
+    for kind, count in (("TDATA", 12), ("QTDATA", 7))
 }
+"""Bodies of messages of several poses: matrices as in a TRANSFORM, positions with quaternions."""
 _IMAGE = struct.Struct(">HBBBB3H12f6H")
 _UINT8, _BIG_ENDIAN = 3, 1
 _WORLDS = {"ras": 1, "lps": 2}
@@ -99,20 +99,17 @@ def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]
         status = metadata.get("TransformStatus", "OK")  # of Plus
         if status.upper() != "OK":
             raise TrackingError(f"the server says that {header.device} is {status}")
+    is_matrix = header.kind in ("TRANSFORM", "TDATA")
+    make = _of_columns if is_matrix else _of_quaternion
     if header.kind in _ELEMENTS:
         element = _ELEMENTS[header.kind]
         if len(content) % element.itemsize:
             raise _wrong_size(header, len(content))
         rows = np.frombuffer(content, dtype=element)
-        field = "matrix" if header.kind == "TDATA" else "pose"
-        make = _of_columns if header.kind == "TDATA" else _of_quaternion
-        return [(_text(row["name"]), make(row[field].astype(np.float64))) for row in rows]
-    wanted = 12 if header.kind == "TRANSFORM" else 7
-    if len(content) != 4 * wanted:
+        return [(_text(row["name"]), make(row["numbers"].astype(np.float64))) for row in rows]
+    if len(content) != 4 * (12 if is_matrix else 7):
         raise _wrong_size(header, len(content))
-    numbers = np.frombuffer(content, dtype=">f4").astype(np.float64)
-    make = _of_columns if header.kind == "TRANSFORM" else _of_quaternion
-    return [(header.device, make(numbers))]
+    return [(header.device, make(np.frombuffer(content, dtype=">f4").astype(np.float64)))]
 
 
 def transform_message(
@@ -128,11 +125,7 @@ def transform_message(
 
 
 def image_message(
-    device: str,
-    stamp: int,
-    pixels: NDArray[np.uint8],
-    matrix: NDArray[np.float64],
-    world: str,
+    device: str, stamp: int, pixels: NDArray[np.uint8], matrix: NDArray[np.float64], world: str
 ) -> bytes:
     """An IMAGE message of version 1, at ``stamp`` ns, of grey pixels (rows, columns).
 
@@ -202,6 +195,7 @@ def _without_extension(header: Header, body: bytes) -> tuple[bytes, dict[str, st
 
 
 def _of_columns(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The upper three rows, column after column, mm."""
     matrix = np.eye(4)
     matrix[:3] = numbers.reshape(4, 3).T
     matrix[:3, 3] *= _METRES

@@ -93,12 +93,9 @@ class OutlierGate:
         if before.covariance is None or measurement.covariance is None:
             return self._too_fast(before, measurement, step)
         settings = self._settings
-        difference = np.concatenate(
-            [
-                measurement.pose.position - before.pose.position,
-                rotation_between(before.pose.orientation, measurement.pose.orientation),
-            ]
-        )
+        pose = measurement.pose
+        turn = rotation_between(before.pose.orientation, pose.orientation)
+        difference = np.concatenate([pose.position - before.pose.position, turn])
         covariance = before.covariance + measurement.covariance
         speeds = [settings.maximum_speed] * 3 + [settings.maximum_angular_speed] * 3
         covariance[_DIAGONAL] += np.square(speeds) * (2.0 * step * step / self._limit)

@@ -9,13 +9,8 @@
 >>> from us_sim.tracking.probe_tracking import ProbeTracking
 >>> camera_above = Pose([0.0, 0.0, -0.4])  # and looks along z, into the tissue
 >>> marker_on_grip = Pose([0.0, 0.0, 0.12])  # the probe's face is 120 mm from it
->>> tracking = ProbeTracking(
-...     camera_above,
-...     marker_on_grip,
-...     create_filter("none"),
-...     OutlierGate(GateSettings()),
-...     time_offset=-0.02,
-... )
+>>> filter, gate = create_filter("none"), OutlierGate(GateSettings())
+>>> tracking = ProbeTracking(camera_above, marker_on_grip, filter, gate, time_offset=-0.02)
 >>> probe = tracking.take(Measurement(5_000_000_000, Pose([0.0, 0.0, 0.29])), 5_010_000_000)
 >>> probe.stamp, probe.pose.position.round(6).tolist(), tracking.state(5_010_000_000).value
 (4980000000, [0.0, 0.0, 0.01], 'tracked')

@@ -1,5 +1,8 @@
 """Settings of the tracker sources and filters, each class a section of a scene's `tracker`.
 
+A value that is out of range is a TrackingError with its name and the range, as are two that do not
+go together.
+
 >>> from us_sim.tracking.settings import CameraSettings, OneEuroSettings
 >>> CameraSettings(size="25 mm").size
 0.025
@@ -39,57 +42,43 @@ MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 @dataclass(frozen=True)
 class CameraSettings(Settings):
-    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
-    """
+    """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``."""
 
     section = "camera"
     error = TrackingError
 
     body: str = setting(
-        default="",
-        file=True,
-        description="file of the rigid body of markers; empty for one marker",
+        description="file of the rigid body of markers; empty for one marker", file=True, default=""
     )
-    marker: int = setting(
-        Quantity("number", 0, 65535), default=0, description="number of the one marker"
-    )
-    size: float = setting(
-        MARKER_SIZE, default=0.04, description="edge of the one marker's black square"
-    )
+    marker: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
+    size: float = setting(MARKER_SIZE, "edge of the one marker's black square", default=0.04)
     dictionary: str = setting(
-        default="4X4_50",
-        choices=DICTIONARIES,
         description="dictionary of the marker, or of a body's file that names none",
+        choices=DICTIONARIES,
+        default="4X4_50",
     )
     minimum_markers: int = setting(
-        Quantity("number", 1, 1000),
-        default=1,
-        description="markers that must be seen for a pose to be taken",
+        Quantity("number", 1, 1000), "markers that must be seen for a pose to be taken", default=1
     )
     reprojection_limit: float = setting(
         Quantity("image distance", 0.1, 50.0),
+        "root mean square between the corners seen and those of the pose",
         default=2.0,
-        description="root mean square between the corners seen and those of the pose",
     )
     view_angle_limit: float = setting(
         Quantity("angle", 0.1, 1.5),
+        "angle between a marker's normal and the line of sight, beyond which it is not used",
         default=math.radians(75.0),
-        description="angle between a marker's normal and the line of sight, beyond which it is "
-        "not used",
     )
     corner_deviation: float = setting(
         Quantity("image distance", 0.01, 10.0),
+        "standard deviation of a corner, the least that the covariance of the pose is made with",
         default=0.1,
-        description="standard deviation of a corner, the least that the covariance of "
-        "the pose is made with",
     )
     latency: float = setting(
         Quantity("time", -1.0, 1.0),
+        "time from the middle of the exposure to the image's stamp",
         default=0.0,
-        description="time from the middle of the exposure to the image's stamp",
     )
 
 
@@ -114,41 +103,30 @@ class OneEuroSettings(Settings):
 
     The defaults suit a hand-held probe: at rest the filter takes away most of what trembles above
     1.5 Hz, and in a sweep of 0.1 m/s it lags by 8 ms.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
     """
 
     section = "filter"
     error = TrackingError
     live = True
 
-    minimum_cutoff: float = setting(
-        _CUTOFF, default=1.5, description="cutoff of the position at rest"
-    )
+    minimum_cutoff: float = setting(_CUTOFF, "cutoff of the position at rest", default=1.5)
     speed_coefficient: float = setting(
         Quantity("cutoff per speed", 0.0, 1e5),
+        "how much the position's cutoff rises with speed",
         default=180.0,
-        description="how much the position's cutoff rises with speed",
     )
-    rotation_minimum_cutoff: float = setting(
-        _CUTOFF, default=1.5, description="cutoff of the rotation at rest"
-    )
+    rotation_minimum_cutoff: float = setting(_CUTOFF, "cutoff of the rotation at rest", default=1.5)
     rotation_speed_coefficient: float = setting(
         Quantity("cutoff per angular speed", 0.0, 1e5),
+        "how much the rotation's cutoff rises with angular speed",
         default=20.0,
-        description="how much the rotation's cutoff rises with angular speed",
     )
-    derivative_cutoff: float = setting(_CUTOFF, default=1.0, description="cutoff of the speeds")
+    derivative_cutoff: float = setting(_CUTOFF, "cutoff of the speeds", default=1.0)
 
 
 @dataclass(frozen=True)
 class KalmanSettings(Settings):
-    """The settings of the constant-velocity Kalman filter; each is a key of ``tracker.filter``.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
-    """
+    """The settings of the constant-velocity Kalman filter; each is a key of ``tracker.filter``."""
 
     section = "filter"
     error = TrackingError
@@ -156,66 +134,59 @@ class KalmanSettings(Settings):
 
     acceleration: float = setting(
         Quantity("acceleration noise", 1e-6, 1e4),
-        default=0.05,
-        description="standard deviation of the change of the speed within a second; within a time "
+        "standard deviation of the change of the speed within a second; within a time "
         "t it is the root of t times as much",
+        default=0.05,
     )
     angular_acceleration: float = setting(
         Quantity("angular acceleration noise", 1e-6, 1e5),
+        "the same of the angular speed",
         default=0.5,
-        description="the same of the angular speed",
     )
     position_deviation: float = setting(
         Quantity("length", 1e-9, 0.1),
+        "standard deviation of each coordinate of a pose that comes without covariance",
         default=3e-4,
-        description="standard deviation of each coordinate of a pose that comes without covariance",
     )
     rotation_deviation: float = setting(
         Quantity("angle", 1e-9, 1.0),
+        "standard deviation about each axis of a pose that comes without covariance",
         default=5e-3,
-        description="standard deviation about each axis of a pose that comes without covariance",
     )
 
 
 @dataclass(frozen=True)
 class GateSettings(Settings):
-    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
-    """
+    """The settings of the gate that refuses poses; each is a key of ``tracker.gate``."""
 
     section = "gate"
     error = TrackingError
 
     maximum_speed: float = setting(
-        Quantity("speed", 1e-3, 100.0), default=2.0, description="largest speed of the probe's face"
+        Quantity("speed", 1e-3, 100.0), "largest speed of the probe's face", default=2.0
     )
     maximum_angular_speed: float = setting(
-        Quantity("angular speed", 1e-2, 1e3),
-        default=15.0,
-        description="largest angular speed of the probe",
+        Quantity("angular speed", 1e-2, 1e3), "largest angular speed of the probe", default=15.0
     )
     jump: float = setting(
         Quantity("length", 0.0, 1.0),
+        "distance between two poses that is allowed beside what the speed allows: a pose's noise",
         default=5e-3,
-        description="distance between two poses that is allowed beside what the speed allows: a "
-        "pose's noise",
     )
     rotation_jump: float = setting(
         Quantity("angle", 0.0, math.pi),
+        "turn between two poses that is allowed beside what the angular speed allows",
         default=math.radians(5),
-        description="turn between two poses that is allowed beside what the angular speed allows",
     )
     confidence: float = setting(
         Quantity("number", 0.5, 1 - 1e-12),
+        "fraction of right poses with a covariance that are believed",
         default=0.999999,
-        description="fraction of right poses with a covariance that are believed",
     )
     accept_after: int = setting(
         Quantity("number", 2, 10_000),
+        "so many refused poses in a row that agree with each other are the new place",
         default=5,
-        description="so many refused poses in a row that agree with each other are the new place",
     )
 
 
@@ -224,9 +195,6 @@ class HapticSettings(Settings):
     """The settings of a haptic arm; each is a key of a scene's ``tracker.haptic:``.
 
     The defaults suit a small desktop arm that gives 3 N at most and no torque.
-
-    Raises:
-        TrackingError: a value is out of range, with its name and the range.
     """
 
     section = "haptic"
@@ -234,68 +202,64 @@ class HapticSettings(Settings):
 
     scale: float = setting(
         Quantity("number", 0.01, 100.0),
+        "how far the probe moves for a movement of the handle",
         default=1.0,
-        description="how far the probe moves for a movement of the handle",
     )
     force_scale: float = setting(
         Quantity("number", 0.0, 100.0),
+        "how hard the handle is pushed for a force on the probe",
         default=1.0,
-        description="how hard the handle is pushed for a force on the probe",
     )
     force_limit: float = setting(
-        Quantity("force", 0.0, 50.0), default=3.0, description="largest force on the handle"
+        Quantity("force", 0.0, 50.0), "largest force on the handle", default=3.0
     )
     torque_limit: float = setting(
         Quantity("torque", 0.0, 5.0),
+        "largest torque on the handle; 0 for an arm that gives none",
         default=0.0,
-        description="largest torque on the handle; 0 for an arm that gives none",
     )
     rate: float = setting(
-        Quantity("frequency", 50.0, 4000.0),
-        default=1000.0,
-        description="how often a wrench is sent",
+        Quantity("frequency", 50.0, 4000.0), "how often a wrench is sent", default=1000.0
     )
     ramp: float = setting(
         Quantity("time", 0.01, 30.0),
+        "time in which the force grows from nothing, at the start and after any doubt",
         default=1.0,
-        description="time in which the force grows from nothing, at the start and after any doubt",
     )
     hand_over: float = setting(
         Quantity("time", 1e-3, 1.0),
+        "time for the change from one model of the contact to the next",
         default=0.03,
-        description="time for the change from one model of the contact to the next",
     )
     pose_timeout: float = setting(
         Quantity("time", 2e-3, 1.0),
+        "time without a pose after which the wrench is zero",
         default=0.05,
-        description="time without a pose after which the wrench is zero",
     )
     model_timeout: float = setting(
         Quantity("time", 5e-3, 5.0),
+        "age of the model of the contact from which on the wrench is zero",
         default=0.3,
-        description="age of the model of the contact from which on the wrench is zero",
     )
     jump: float = setting(
         Quantity("length", 1e-4, 1.0),
+        "movement of the handle between two poses, beyond which the wrench is zero",
         default=0.01,
-        description="movement of the handle between two poses, beyond which the wrench is zero",
     )
     rotation_jump: float = setting(
         Quantity("angle", 1e-3, 3.0),
+        "turn of the handle between two poses, beyond which the wrench is zero",
         default=0.3,
-        description="turn of the handle between two poses, beyond which the wrench is zero",
     )
     model_reach: float = setting(
         Quantity("length", 1e-4, 1.0),
+        "distance of the probe from where the contact is known, beyond which the wrench is zero",
         default=0.02,
-        description="distance of the probe from where the contact is known, beyond which the "
-        "wrench is zero",
     )
     model_rotation_reach: float = setting(
         Quantity("angle", 1e-3, 3.0),
+        "turn of the probe from where the contact is known, beyond which the wrench is zero",
         default=0.5,
-        description="turn of the probe from where the contact is known, beyond which the wrench "
-        "is zero",
     )
 
 
@@ -312,81 +276,74 @@ class SixDofMouseSettings(Settings):
 
     A full deflection is 1. The signs of the defaults turn the axes of REP 103, in which mice
     report (x forward, y left, z up), about x: so the probe goes down when the cap is pushed down.
-
-    Raises:
-        TrackingError: a value is out of range, or two do not go together.
     """
 
     section = "six_dof_mouse"
     error = TrackingError
 
     mode: str = setting(
-        default="rate",
-        choices=MOUSE_MODES,
         description="rate: the deflection is the probe's velocity; position: its displacement "
         "from where the clutch was let go",
+        choices=MOUSE_MODES,
+        default="rate",
     )
     frame: str = setting(
-        default="probe", choices=MOTION_FRAMES, description="whose axes the probe moves along"
+        description="whose axes the probe moves along", choices=MOTION_FRAMES, default="probe"
     )
     axes: tuple[int, int, int, int, int, int] = setting(
         Quantity("number", 0, 63),
+        "which axes of the joystick move along x, y, z and turn about x, y, z",
         default=(0, 1, 2, 3, 4, 5),
-        description="which axes of the joystick move along x, y, z and turn about x, y, z",
     )
     speed: tuple[float, float, float] = setting(
         Quantity("speed", -1.0, 1.0),
+        "velocity at full deflection along x, y, z, in rate mode",
         default=(0.05, -0.05, -0.05),
-        description="velocity at full deflection along x, y, z, in rate mode",
     )
     angular_speed: tuple[float, float, float] = setting(
         Quantity("angular speed", -10.0, 10.0),
+        "angular velocity at full deflection about x, y, z, in rate mode",
         default=(0.6, -0.6, -0.6),
-        description="angular velocity at full deflection about x, y, z, in rate mode",
     )
     reach: tuple[float, float, float] = setting(
         Quantity("length", -1.0, 1.0),
+        "displacement at full deflection along x, y, z, in position mode",
         default=(0.03, -0.03, -0.03),
-        description="displacement at full deflection along x, y, z, in position mode",
     )
     angular_reach: tuple[float, float, float] = setting(
         Quantity("angle", -math.pi, math.pi),
+        "turn at full deflection about x, y, z, in position mode",
         default=(0.5, -0.5, -0.5),
-        description="turn at full deflection about x, y, z, in position mode",
     )
     dead_band: float = setting(
         Quantity("number", 0.0, 0.9),
+        "deflection up to which an axis counts as at rest",
         default=0.05,
-        description="deflection up to which an axis counts as at rest",
     )
     clutch_button: int = setting(
-        _BUTTON, default=0, description="button that holds the probe where it is; -1 for none"
+        _BUTTON, "button that holds the probe where it is; -1 for none", default=0
     )
     reset_button: int = setting(
-        _BUTTON, default=1, description="button that brings the probe home; -1 for none"
+        _BUTTON, "button that brings the probe home; -1 for none", default=1
     )
     home: tuple[float, float, float] = setting(
-        _PLACE, default=(0.0, 0.0, -0.01), description="where the probe begins, in patient"
+        _PLACE, "where the probe begins, in patient", default=(0.0, 0.0, -0.01)
     )
     home_orientation: tuple[float, float, float, float] = setting(
         Quantity("number", -1.0, 1.0),
+        "quaternion x, y, z, w of the probe there",
         default=(0.0, 0.0, 0.0, 1.0),
-        description="quaternion x, y, z, w of the probe there",
     )
     workspace_low: tuple[float, float, float] = setting(
-        _PLACE,
-        default=(-0.2, -0.2, -0.1),
-        description="least x, y, z of the probe in patient",
+        _PLACE, "least x, y, z of the probe in patient", default=(-0.2, -0.2, -0.1)
     )
     workspace_high: tuple[float, float, float] = setting(
-        _PLACE,
-        default=(0.2, 0.2, 0.1),
-        description="largest x, y, z of the probe in patient",
+        _PLACE, "largest x, y, z of the probe in patient", default=(0.2, 0.2, 0.1)
     )
     longest_gap: float = setting(
         Quantity("time", 1e-3, 10.0),
+        "time between two messages over which the velocity is still believed",
         default=0.1,
-        description="time between two messages over which the velocity is still believed",
     )
 
     def check(self) -> None:
@@ -420,36 +377,30 @@ class OpenIGTLinkSettings(Settings):
     """The settings of the connection; each is a key of a scene's ``tracker.openigtlink:``.
 
     Which of the server's devices is the probe is the scene's ``tracker.body``.
-
-    Raises:
-        TrackingError: a value is out of range.
     """
 
     section = "openigtlink"
     error = TrackingError
 
-    host: str = setting(default="localhost", description="name or address of the server")
-    port: int = setting(Quantity("number", 1, 65535), default=18944, description="TCP port")
+    host: str = setting(description="name or address of the server", default="localhost")
+    port: int = setting(Quantity("number", 1, 65535), "TCP port", default=18944)
     world: str = setting(
-        default="tracker",
-        choices=WORLDS,
         description="what the poses are in: the tracker's own frame, or an image's LPS or RAS; "
         "RAS, which 3D Slicer sends, is turned into LPS, in which volumes are read",
+        choices=WORLDS,
+        default="tracker",
     )
     clock: str = setting(
-        default="server",
-        choices=CLOCKS,
         description="server: the messages' own stamps; arrival: when they come, for a server "
         "whose clock is not this computer's",
+        choices=CLOCKS,
+        default="server",
     )
     tracking_data: bool = setting(
-        default=False,
-        description="ask for TDATA, for servers that send nothing unasked",
+        description="ask for TDATA, for servers that send nothing unasked", default=False
     )
     interval: float = setting(
-        Quantity("time", 1e-3, 10.0),
-        default=0.01,
-        description="time between two TDATA, if asked for",
+        Quantity("time", 1e-3, 10.0), "time between two TDATA, if asked for", default=0.01
     )
 
     def check(self) -> None:

@@ -97,9 +97,7 @@ class RestSurface:
     ) -> RestSurface:
         """The part of a closed surface that faces -z, on which a probe can stand.
 
-        Args:
-            vertices: (N, 3) m, frame ``patient``.
-            triangles: (T, 3) indices into them, anticlockwise as seen from outside the body.
+        Arguments are as for the class itself.
 
         Raises:
             MeshError: as the class itself; nothing of it faces -z.
@@ -292,18 +290,14 @@ def _norm(vector: NDArray[np.float64]) -> float:
     return math.sqrt(float(vector @ vector))
 
 
-_AT_REST, _ALIGNED = 2e-6, 1e-4
-"""m and rad from the goal: it is reached, for a pixel is some 80 µm."""
+_AT_REST, _ALIGNED = 2e-6, 1e-4  # m and rad from the goal: it is reached, for a pixel is some 80 µm
 
 
-@dataclass(frozen=True)
-class HandSpeed:
-    """Speed limits of a hand: as a quick sonographer's, far below a thrust."""
-
-    slide: float = 0.25  # m/s, of the line from the one point of the skin to the other
-    press: float = 0.15  # m/s
-    turn: float = math.pi  # rad/s, of rotation, fan and rock together, against the skin
-    time_constant: float = 0.02  # s; following a slow mouse, the probe is twice that behind
+# A hand is as fast as a quick sonographer's at most, far below a thrust.
+_SLIDING = 0.25  # m/s, of the line from the one point of the skin to the other
+_PRESSING = 0.15  # m/s
+_TURNING = math.pi  # rad/s, of rotation, fan and rock together, against the skin
+_TIME_CONSTANT = 0.02  # s; following a slow mouse, the probe is twice that behind
 
 
 class Motion:
@@ -314,12 +308,12 @@ class Motion:
     so it goes over the skin of an arm and not through it.
     """
 
-    def __init__(self, stance: Stance, speed: HandSpeed | None = None) -> None:
-        speed = speed or HandSpeed()
+    def __init__(self, stance: Stance) -> None:
         point, press, turn = _parts(stance)
-        self._slide = Approach(point, speed.slide, speed.time_constant)
-        self._press = Approach(press, speed.press, speed.time_constant)
-        self._turn = Approach(turn, speed.turn, speed.time_constant)
+        self._slide = Approach(point, _SLIDING, _TIME_CONSTANT)
+        self._press = Approach(press, _PRESSING, _TIME_CONSTANT)
+        self._turn = Approach(turn, _TURNING, _TIME_CONSTANT)
+        self._approaches = self._slide, self._press, self._turn
 
     @property
     def stance(self) -> Stance:
@@ -353,10 +347,6 @@ class Motion:
         for approach in self._approaches:
             approach.advance(seconds)
         return self.stance
-
-    @property
-    def _approaches(self) -> tuple[Approach, Approach, Approach]:
-        return self._slide, self._press, self._turn
 
 
 def _parts(stance: Stance) -> tuple[NDArray[np.float64], ...]:
@@ -420,11 +410,8 @@ class Stance:
 
     @classmethod
     def home(cls, surface: RestSurface, press: float) -> Stance:
-        """Upright above the origin of ``patient``, or on the middle of a surface that is not there.
-
-        Args:
-            surface: to stand on.
-            press: m.
+        """Upright above the origin of ``patient``, or on the middle of a surface that is not there;
+        ``press`` in m.
         """
         middle = 0.5 * (surface.lower + surface.upper)
         inside = (surface.lower[:2] <= 0.0).all() and (surface.upper[:2] >= 0.0).all()

@@ -24,7 +24,7 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError, VolumeError
-from us_sim.nodes.guarded_node import GuardedNode, decoded
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, decoded
 from us_sim.nodes.messages import (
     affine_from,
     colour_pixels_from,
@@ -71,33 +71,6 @@ def made_of(
     take = decoded(message_type, lambda message: made.append(make(message)))
     node.guarded(node.resolve_topic_name(topic), take)(data)
     return made[0] if made else None
-
-
-class Subscriptions:
-    """Subscriptions that are there or not, all together.
-
-    Args:
-        node: that subscribes.
-        wanted: type, topic, callback, quality of service, and whether bytes are handed over.
-    """
-
-    def __init__(self, node: GuardedNode, *wanted: tuple[Any, str, Any, QoSProfile, bool]) -> None:
-        self._node, self._wanted = node, wanted
-        self._there: list[Any] = []
-
-    def keep(self, is_wanted: bool) -> bool:
-        """Subscribe, or no longer; whether that is a change."""
-        if is_wanted == bool(self._there):
-            return False
-        for subscription in self._there:
-            self._node.destroy_subscription(subscription)
-        self._there = []
-        if is_wanted:
-            self._there = [
-                self._node.create_subscription(kind, topic, take, qos, raw=raw)
-                for kind, topic, take, qos, raw in self._wanted
-            ]
-        return True
 
 
 def topic_feed(

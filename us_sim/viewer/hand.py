@@ -26,14 +26,15 @@ from shape_msgs.msg import Mesh
 
 from us_sim.errors import MessageError, UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
+from us_sim.nodes.settings import PLAYERS
 from us_sim.settings.spelling import shown
 from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance
-from us_sim.viewer.feeds import RestMesh, Subscriptions
+from us_sim.viewer.feeds import RestMesh
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
 
@@ -243,10 +244,6 @@ class AskedPoses:
     def press(self, stamp: int) -> float | None:
         """How deep (m) the pose of a stamp (ns) is pressed; None for poses of others."""
         return self._by_stamp.get(stamp, (None, None))[0]
-
-
-PLAYERS = ("path_player", "session_player")
-"""Nodes that `session_control` starts and ends."""
 
 
 @dataclass(frozen=True)
@@ -496,9 +493,7 @@ class ViewerHand:
             self._elsewhere = None
         elif self._motion is None:
             self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
-        self._publisher = self._node.create_publisher(
-            PoseStamped, LEAD_TOPIC, STREAM, qos_overriding_options=overridable()
-        )
+        self._publisher = self._node.stream(PoseStamped, LEAD_TOPIC)
         self._rests_since = self._taken_at = time.monotonic()
 
     def _let_go(self) -> None:

@@ -22,24 +22,11 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import CompressedImage
 
-from us_sim.nodes.guarded_node import GuardedNode, shown
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
 from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
+from us_sim.scene.listing import ListedScene
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
-
-
-@dataclass(frozen=True)
-class LoadableScene:
-    """A scene or a case."""
-
-    name: str
-    origin: str  # what loads it
-    kind: str = "scene"  # or case
-    description: str = ""
-    region: str = ""  # of the body
-    structures: tuple[str, ...] = ()
-    tracker: str = ""  # where its poses come from, unless the probe is moved by hand
-    problem: str = ""  # why it cannot be loaded
 
 
 @dataclass(frozen=True)
@@ -97,7 +84,7 @@ class SessionBoard:
         self._lock = threading.Lock()
         self._pages = 0
         self.state = SessionState()
-        self.scenes: tuple[LoadableScene, ...] = ()  # another object whenever it changes
+        self.scenes: tuple[ListedScene, ...] = ()  # another object whenever it changes
         self.thumbnails: dict[str, bytes] = {}  # JPEG of the image of a scene, by origins
         self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
@@ -175,8 +162,15 @@ class ViewerSession(SessionBoard):
         super().__init__(lambda: post(self._listen), self._send, folder, is_own=is_own)
         self._node, self._post = node, post
         self._name = f"{node.get_namespace().rstrip('/')}/{CONTROL}"
-        self._subscriptions: list[Any] = []
-        self._timer: Any = None
+        self._subscriptions = Subscriptions(
+            node,
+            (DiagnosticArray, "diagnostics", self._hear, STREAM, False),
+            (DiagnosticArray, "session/scenes", self._take_scenes, LATCHED, False),
+            (CompressedImage, "session/thumbnails", self._take_thumbnail, CATALOGUE, False),
+            (DiagnosticArray, "session/bags", self._take_bags, LATCHED, False),
+        )
+        self._timer = node.create_timer(_EVERY_S, self._check)
+        self._timer.cancel()
         self._client: AsyncParameterClient | None = None
         self._heard = 0.0
         self._asked: list[tuple[Future[str], float]] = []  # and when that was
@@ -188,24 +182,10 @@ class ViewerSession(SessionBoard):
                 told.set_result("the viewer ends")
 
     def _listen(self) -> None:
-        if self.is_watched and not self._subscriptions:
-            if self._client is None:
-                self._client = AsyncParameterClient(self._node, CONTROL)
-            self._subscriptions = [
-                self._node.create_subscription(message_type, topic, callback, qos)
-                for message_type, topic, callback, qos in (
-                    (DiagnosticArray, "diagnostics", self._hear, STREAM),
-                    (DiagnosticArray, "session/scenes", self._take_scenes, LATCHED),
-                    (CompressedImage, "session/thumbnails", self._take_thumbnail, CATALOGUE),
-                    (DiagnosticArray, "session/bags", self._take_bags, LATCHED),
-                )
-            ]
-            self._timer = self._node.create_timer(_EVERY_S, self._check)
-        elif not self.is_watched and self._subscriptions:
-            for subscription in self._subscriptions:
-                self._node.destroy_subscription(subscription)
-            self._subscriptions = []
-            self._node.destroy_timer(self._timer)
+        if self.is_watched and self._client is None:
+            self._client = AsyncParameterClient(self._node, CONTROL)
+        if self._subscriptions.keep(self.is_watched):
+            (self._timer.reset if self.is_watched else self._timer.cancel)()
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -258,17 +238,18 @@ def _tell(told: Future[str], answer: Any) -> None:
         told.set_result(f"{CONTROL} cannot be asked: {error}")
 
 
-def _scene_of(status: DiagnosticStatus) -> LoadableScene:
+def _scene_of(status: DiagnosticStatus) -> ListedScene:
     about = {each.key: shown(each.value) for each in status.values}
     is_wrong = status.level != DiagnosticStatus.OK
     said = shown(status.message)
-    return LoadableScene(
+    return ListedScene(
         shown(status.name),
         status.hardware_id,
         about.get("kind", "scene"),
         "" if is_wrong else said,
         about.get("region", ""),
         _names(about.get("structures", "")),
+        about.get("probe", ""),
         about.get("tracker", ""),
         said if is_wrong else "",
     )

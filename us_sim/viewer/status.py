@@ -21,7 +21,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
-from us_sim.nodes.guarded_node import GuardedNode, shown
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
 from us_sim.nodes.qos import STREAM
 
 GONE_S = 3.0
@@ -199,21 +199,17 @@ class StatusListener(StatusBoard):
 
     def __init__(self, node: GuardedNode, post: Callable[[Callable[[], Any]], Any]) -> None:
         super().__init__(lambda: post(self._subscribe))
-        self._node = node
         self._space = f"{node.get_namespace().rstrip('/')}/"
-        self._subscriptions: dict[str, Any] = {}
+        self._reports = Subscriptions(
+            node, (DiagnosticArray, "diagnostics", self._hear, STREAM, False)
+        )
+        self._wrenches = Subscriptions(
+            node, (WrenchStamped, "probe/wrench", self._hear_force, STREAM, False)
+        )
 
     def _subscribe(self) -> None:
-        for topic, wanted, message_type, callback in (
-            ("diagnostics", self.is_watched, DiagnosticArray, self._hear),
-            ("probe/wrench", self.is_force_watched, WrenchStamped, self._hear_force),
-        ):
-            if wanted and topic not in self._subscriptions:
-                self._subscriptions[topic] = self._node.create_subscription(
-                    message_type, topic, callback, STREAM
-                )
-            elif not wanted and topic in self._subscriptions:
-                self._node.destroy_subscription(self._subscriptions.pop(topic))
+        self._reports.keep(self.is_watched)
+        self._wrenches.keep(self.is_force_watched)
 
     def _hear(self, message: DiagnosticArray) -> None:
         now = time.monotonic()

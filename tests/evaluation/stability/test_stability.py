@@ -266,7 +266,7 @@ def test_what_can_move_as_a_whole_is_refused_by_quasi_static_methods():
         trial = try_case("fem_cg", case)
         assert trial.refused
         assert trial.passed
-        assert trial.actions[0].startswith("refused: the tissue can move as a whole")
+        assert "move as a whole" in trial.refusal
 
 
 def test_a_free_tissue_of_springs_keeps_its_shape():
@@ -279,7 +279,7 @@ def test_a_free_tissue_of_springs_keeps_its_shape():
 def test_broken_input_is_refused_in_one_sentence(name):
     trial = refusal_of("fem_cg", name)
     assert trial.refused, trial.failure
-    sentence = trial.actions[0]
+    sentence = trial.refusal
     assert "\n" not in sentence
     assert len(sentence) > 30
 

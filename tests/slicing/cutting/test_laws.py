@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.ndimage import map_coordinates
-from slicing_cases import KINDS, SIZE, noise_volume, random_case
+from slicing_cases import HIGH, KINDS, LOW, SIZE, around_the_box, box, noise_volume, random_case
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.geometry.pose import Pose
@@ -20,20 +20,10 @@ from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.cutting.trilinear import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
 every_method = pytest.mark.parametrize("method", list(SLICERS))
-LOW, HIGH = -SIZE / [2, 2, 1] * [1, 1, 0], SIZE / [2, 2, 1]
-
-
-def box(counts=(5, 4, 5)):
-    return box_mesh(*(uniform_planes(*ends) for ends in zip(LOW, HIGH, counts, strict=True)))
-
-
-def around_the_box(seed=0):
-    """A volume larger than the box on all sides."""
-    return noise_volume((44, 34, 40), (2e-3, 2e-3, 2e-3), (-0.044, -0.034, -0.015), seed=seed)
 
 
 def random_affine(rng):
@@ -97,7 +87,7 @@ def test_a_linear_volume_stays_linear(method):
     volume = Volume(ramp.astype(np.uint8), around_the_box().index_to_patient)
     assert ramp.max() < 256
     rng = np.random.default_rng(7)
-    mesh = box()
+    mesh = box((5, 4, 5))
     matrix, shift = random_affine(rng)
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
     plane = random_plane(rng, width=0.02)
@@ -112,7 +102,7 @@ def test_a_linear_volume_stays_linear(method):
 @every_method
 def test_tissue_at_rest_is_the_volume_itself(method):
     rng = np.random.default_rng(3)
-    mesh, volume, plane = box(), around_the_box(), random_plane(rng)
+    mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(rng)
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
     image = slicer.image(mesh.nodes, plane)
     assert np.abs(image.astype(int) - sample_plane(volume, plane)).max() <= 1
@@ -144,7 +134,7 @@ def test_a_ball_under_an_affine_map_has_the_area_of_the_ellipse(method, seed):
             (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2 <= radius**2
         )
     )
-    mesh, plane = box(), random_plane(rng, columns=180, rows=170)
+    mesh, plane = box((5, 4, 5)), random_plane(rng, columns=180, rows=170)
     matrix, shift = random_affine(rng)
     # |B u + d| <= radius is an ellipse in the pixels' coordinates u.
     inverse = np.linalg.inv(matrix)
@@ -372,7 +362,7 @@ def test_without_tetrahedra_there_is_the_rigid_volume(method):
 
 @every_method
 def test_a_probe_outside_sees_nothing_and_a_plane_that_misses_sees_the_rigid_volume(method):
-    mesh, volume = box(), around_the_box()
+    mesh, volume = box((5, 4, 5)), around_the_box()
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
     nodes = mesh.nodes * [1.0, 1.0, 0.9]
     probe = LinearProbe(0.04, 0.04, 32, 48)
@@ -391,7 +381,7 @@ def test_a_probe_outside_sees_nothing_and_a_plane_that_misses_sees_the_rigid_vol
 @every_method
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_nodes_that_are_not_finite_are_refused_and_the_next_good_frame_is_right(method, value):
-    mesh, volume, plane = box(), around_the_box(), random_plane(np.random.default_rng(2))
+    mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(np.random.default_rng(2))
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=2)
     nodes = mesh.nodes * [1.0, 1.1, 0.9]
     before, where = slicer.image(nodes, plane), slicer.rest_coordinates(nodes, plane)
@@ -410,7 +400,7 @@ def test_nodes_that_are_not_finite_are_refused_and_the_next_good_frame_is_right(
 @every_method
 def test_nodes_out_of_all_proportion_do_no_harm(method):
     """A solver that has blown up, but not to infinity: no crash, and the next frame is right."""
-    mesh, volume, plane = box(), around_the_box(), random_plane(np.random.default_rng(4))
+    mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(np.random.default_rng(4))
     slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
     before = slicer.image(mesh.nodes, plane)
     for scale in (1e6, 1e30, 1e150):
@@ -422,7 +412,7 @@ def test_nodes_out_of_all_proportion_do_no_harm(method):
 
 @every_method
 def test_other_bad_input_is_refused(method):
-    mesh, volume, plane = box(), around_the_box(), random_plane(np.random.default_rng(2))
+    mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(np.random.default_rng(2))
     with pytest.raises(ValueError, match="thread"):
         create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=0)
     with pytest.raises(MeshError, match="has only 3 nodes"):

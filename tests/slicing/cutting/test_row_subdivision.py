@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slicing_cases import SIZE, around_the_box, box, plane_of_nodes
 
 from us_sim.errors import MeshError, SettingsError
 from us_sim.geometry.pose import Pose
@@ -14,29 +15,10 @@ from us_sim.slicing.cutting.row_subdivision import RowSubdivision, RowSubdivisio
 from us_sim.slicing.cutting.slicer import warm_up
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
-SIZE = np.array([0.06, 0.04, 0.05])
-
-
-def volume_around_the_box(voxel=1e-3, margin=0.01, seed=0):
-    """Noise with labels, larger than the box mesh on all sides but the top."""
-    shape = np.round((SIZE + np.array([2, 2, 1]) * margin) / voxel).astype(int)
-    to_patient = np.diag([voxel, voxel, voxel, 1.0])
-    to_patient[:3, 3] = [-SIZE[0] / 2 - margin + voxel / 2, -SIZE[1] / 2 - margin + voxel / 2,
-                         voxel / 2]  # fmt: skip
-    rng = np.random.default_rng(seed)
-    voxels = rng.integers(0, 256, shape, dtype=np.uint8)
-    return Volume(voxels, to_patient, (voxels // 64) + np.uint8(1), {1: "a", 2: "b", 3: "c"})
-
-
-def box(counts=(7, 5, 6)):
-    return box_mesh(
-        uniform_planes(-SIZE[0] / 2, SIZE[0] / 2, counts[0]),
-        uniform_planes(-SIZE[1] / 2, SIZE[1] / 2, counts[1]),
-        uniform_planes(0.0, SIZE[2], counts[2]),
-    )
+COUNTS = (7, 5, 6)
 
 
 def locate_one_by_one(mesh, nodes, points):
@@ -91,7 +73,7 @@ def test_row_subdivision_equals_a_search_of_every_pixel(seed, strength, regions,
     pose = Pose(rng.uniform(-0.5, 0.5, 3) * SIZE, rng.normal(size=4))
     plane = LinearProbe(rng.uniform(0.01, 0.12), rng.uniform(0.01, 0.12), *shape).plane(pose)
     slicer = RowSubdivision(
-        volume_around_the_box(),
+        around_the_box(),
         mesh.nodes,
         mesh.tetrahedra,
         settings=RowSubdivisionSettings(regions=regions),
@@ -109,7 +91,7 @@ def test_two_separate_bodies_and_the_gap_between_them():
     tetrahedra = np.concatenate([left.tetrahedra, left.tetrahedra + len(left.nodes)])
     mesh = SimpleNamespace(nodes=nodes, tetrahedra=tetrahedra)
     plane = LinearProbe(0.06, 0.03, 301, 40).plane(Pose())
-    slicer = RowSubdivision(volume_around_the_box(), nodes, tetrahedra)
+    slicer = RowSubdivision(around_the_box(), nodes, tetrahedra)
     moved = nodes + np.array([0, 0, 0.002])
     np.testing.assert_allclose(
         slicer.rest_coordinates(moved, plane), expected_rest(mesh, moved, plane), atol=1e-9
@@ -122,9 +104,7 @@ def test_a_needle_thinner_than_the_first_splits_is_found():
     mesh = SimpleNamespace(nodes=needle, tetrahedra=np.array([[0, 1, 2, 3]]))
     plane = LinearProbe(0.06, 0.05, 512, 64).plane(Pose([0, -0.008, 0]))
     moved = needle + np.array([0, 0, 0.001])
-    found = RowSubdivision(volume_around_the_box(), needle, mesh.tetrahedra).rest_coordinates(
-        moved, plane
-    )
+    found = RowSubdivision(around_the_box(), needle, mesh.tetrahedra).rest_coordinates(moved, plane)
     np.testing.assert_allclose(found, expected_rest(mesh, moved, plane), atol=1e-9)
     assert (np.abs(found - plane.pixels()).max(axis=-1) > 5e-4).sum() > 50
 
@@ -133,26 +113,13 @@ def test_a_needle_thinner_than_the_first_splits_is_found():
 @pytest.mark.parametrize("layer", [0, 1, -1])
 def test_a_plane_through_nodes_and_faces_leaves_no_hole(axis, layer):
     """Pixels on vertices, edges and faces; with the outermost layers, on the mesh's boundary."""
-    volume, mesh = volume_around_the_box(), box((7, 5, 6))
-    planes = [np.unique(mesh.nodes[:, a]) for a in range(3)]
-    spacing = [p[1] - p[0] for p in planes]
-    across, down = (a for a in range(3) if a != axis)
-    origin = np.array([p[0] for p in planes])
-    origin[axis] = planes[axis][layer]
-    steps = np.eye(3)
-    count = [len(planes[across]), len(planes[down])]
-    plane = SlicePlane(
-        origin,
-        steps[across] * spacing[across] / 4,
-        steps[down] * spacing[down] / 4,
-        columns=4 * (count[0] - 1) + 1,
-        rows=4 * (count[1] - 1) + 1,
-    )
+    volume, mesh = around_the_box(), box(COUNTS)
+    plane = plane_of_nodes(mesh, axis, layer)
     turn = Pose([0.011, 0.003, -0.007], [0.3, -0.2, 0.5, 0.8])
     slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
     for moved in (Pose(), turn):
         placed = SlicePlane(
-            moved.apply(origin[None])[0],
+            moved.apply(plane.origin[None])[0],
             moved.rotation @ plane.column_step,
             moved.rotation @ plane.row_step,
             columns=plane.columns,
@@ -165,8 +132,9 @@ def test_a_plane_through_nodes_and_faces_leaves_no_hole(axis, layer):
 def test_tissue_that_was_pushed_away_leaves_black_and_no_ghost():
     """Above the dent is air; beside the mesh the volume goes on, without a seam."""
     mesh = box((13, 9, 11))
-    volume = volume_around_the_box()
-    volume = Volume(np.full(volume.shape, 200, np.uint8), volume.index_to_patient, volume.labels)
+    volume = around_the_box()
+    grey, labels = np.full(volume.shape, 200, np.uint8), np.ones(volume.shape, np.uint8)
+    volume = Volume(grey, volume.index_to_patient, labels, {1: "a"})
     plane = LinearProbe(0.07, 0.04, 128, 100).plane(Pose())
     slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
     nodes = pressed(mesh)
@@ -185,7 +153,7 @@ def test_tissue_that_was_pushed_away_leaves_black_and_no_ghost():
 
 
 def test_threads_and_regions_do_not_change_a_byte():
-    volume, mesh = volume_around_the_box(), box()
+    volume, mesh = around_the_box(), box(COUNTS)
     plane = LinearProbe(0.07, 0.05, 200, 150).plane(Pose([0, 1e-3, -0.002], [0.1, 0, 0.2, 1]))
     nodes = pressed(mesh)
     images = [
@@ -206,7 +174,7 @@ def test_bad_regions_and_nodes_of_two_coordinates_are_refused():
     with pytest.raises(SettingsError, match=r"slice\.regions"):
         RowSubdivisionSettings(regions=0)
     mesh = box((3, 3, 3))
-    slicer = RowSubdivision(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
+    slicer = RowSubdivision(around_the_box(), mesh.nodes, mesh.tetrahedra)
     with pytest.raises(MeshError, match=r"\(27, 2\)"):
         slicer.image(mesh.nodes[:, :2], LinearProbe(0.04, 0.04, 8, 8).plane(Pose()))
 
@@ -223,7 +191,7 @@ def test_bad_regions_and_nodes_of_two_coordinates_are_refused():
 )
 def test_a_rest_mesh_that_cannot_be_is_refused(nodes, tetrahedra, words):
     with pytest.raises(MeshError, match=words):
-        RowSubdivision(volume_around_the_box(), nodes, np.array(tetrahedra))
+        RowSubdivision(around_the_box(), nodes, np.array(tetrahedra))
 
 
 def test_nothing_is_left_to_compile_after_warming_up():
@@ -233,7 +201,7 @@ def test_nothing_is_left_to_compile_after_warming_up():
                trilinear.sample_linear, resampling.sample_nearest)  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
     assert min(before) >= 1
-    volume, mesh = volume_around_the_box(), box()
+    volume, mesh = around_the_box(), box(COUNTS)
     slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
     plane = LinearProbe(0.04, 0.04, 30, 20).plane(Pose())
     slicer.image(pressed(mesh), plane)

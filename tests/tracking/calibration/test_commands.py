@@ -1,7 +1,5 @@
 """`us-sim calibrate` from end to end: a file that reads back, one line, and refusals."""
 
-import csv
-
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from us_sim.command.main import main
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath, write_path
-from us_sim.tracking.calibration.transform_file import read_transform, read_transform_file
+from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.tracking.camera.model import read_camera_info
 
 TIP = np.array([0.01, -0.02, 0.12])
@@ -56,7 +54,7 @@ def test_pivot_writes_the_tip(tmp_path, capsys):
     assert calibrate("pivot", pivoting(tmp_path / "pivot.mcap"), "--out", out) == 0
     np.testing.assert_allclose(read_transform(out).position, TIP, atol=1e-9)
     assert "tip at 10.00, -20.00, 120.00 mm" in capsys.readouterr().out
-    assert read_transform_file(out).residuals["rejected"] == 0
+    assert yaml.safe_load(out.read_text())["residuals"]["rejected"] == 0
 
 
 def test_pivot_refuses_one_axis_and_an_existing_file(tmp_path, capsys):
@@ -74,10 +72,18 @@ def test_pivot_refuses_one_axis_and_an_existing_file(tmp_path, capsys):
 POINTS = {"a": [0, 0, 0], "b": [0.1, 0, 0], "c": [0.1, 0.08, 0], "d": [0, 0.05, 0.03]}
 
 
-def table(file, points):
-    rows = [f"{name},{x},{y},{z}" for name, (x, y, z) in points.items()]
-    file.write_text("\n".join(["name,x,y,z", *rows]))
+POSED = "feature,column,row,x,y,z,qx,qy,qz,qw"
+
+
+def sheet(file, header, rows):
+    """A CSV file of numbers and names."""
+    lines = [",".join(map(str, row)) for row in rows]
+    file.write_text("\n".join([header, *lines]))
     return file
+
+
+def table(file, points):
+    return sheet(file, "name,x,y,z", [[name, *point] for name, point in points.items()])
 
 
 def test_landmarks_are_matched_by_name(tmp_path, capsys):
@@ -90,18 +96,18 @@ def test_landmarks_are_matched_by_name(tmp_path, capsys):
     out = tmp_path / "registration.yaml"
     assert calibrate("landmarks", known, table(tmp_path / "m.csv", measured), "--out", out) == 0
     np.testing.assert_allclose(read_transform(out).matrix, pose.matrix, atol=1e-9)
-    found = read_transform_file(out)
-    assert (found.from_frame, found.to_frame) == ("tracker", "patient")
-    assert set(found.residuals["landmarks"]) == set(POINTS)
+    said = yaml.safe_load(out.read_text())
+    assert (said["from"], said["to"]) == ("tracker", "patient")
+    assert set(said["residuals"]["landmarks"]) == set(POINTS)
     said = capsys.readouterr().out
     assert "FRE 0.00 mm over 4 landmarks" in said
     assert "in one file only: elbow" in said
     inverse = tmp_path / "calibration.yaml"
     options = ("--invert", "--to", "probe", "--out", inverse)
     assert calibrate("landmarks", known, tmp_path / "m.csv", *options) == 0
-    found = read_transform_file(inverse)
-    np.testing.assert_allclose(found.pose.matrix, pose.inverse().matrix, atol=1e-9)
-    assert (found.from_frame, found.to_frame) == ("probe", "tracker")
+    np.testing.assert_allclose(read_transform(inverse).matrix, pose.inverse().matrix, atol=1e-9)
+    said = yaml.safe_load(inverse.read_text())
+    assert (said["from"], said["to"]) == ("probe", "tracker")
 
 
 def test_landmarks_are_touched_in_a_recording(tmp_path):
@@ -161,43 +167,25 @@ def test_probe_from_times_and_from_poses(tmp_path, capsys):
     positions = pin - turns.apply(body)
     recording = bag(tmp_path / "probe.mcap", times, positions, turns)
     chosen = [*range(0, 395, 5), 399]  # the first pose and the last among them
-    with (tmp_path / "timed.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["feature", "column", "row", "time"])
-        rows.writerows(["pin", *pixels[k], f"{1_700_000_000 + times[k]:.3f}"] for k in chosen)
-    with (tmp_path / "posed.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["feature", "column", "row", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        rows.writerows(["pin", *pixels[k], *positions[k], *turns[k].as_quat()] for k in chosen)
+    stamped = [["pin", *pixels[k], f"{1_700_000_000 + times[k]:.3f}"] for k in chosen]
+    timed = sheet(tmp_path / "timed.csv", "feature,column,row,time", stamped)
+    placed = [["pin", *pixels[k], *positions[k], *turns[k].as_quat()] for k in chosen]
+    posed = sheet(tmp_path / "posed.csv", POSED, placed)
     phantom = table(tmp_path / "phantom.csv", {"pin": pin})
     first, second = tmp_path / "timed.yaml", tmp_path / "posed.yaml"
     origin = ("--origin", 250, 0)
-    assert (
-        calibrate(
-            "probe",
-            tmp_path / "timed.csv",
-            "--recording",
-            recording,
-            "--phantom",
-            phantom,
-            *origin,
-            "--out",
-            first,
-        )
-        == 0
-    )
-    assert calibrate("probe", tmp_path / "posed.csv", *origin, "--out", second) == 0
+    known = ("--recording", recording, "--phantom", phantom)
+    assert calibrate("probe", timed, *known, *origin, "--out", first) == 0
+    assert calibrate("probe", posed, *origin, "--out", second) == 0
     assert "pixels of 0.2000 × 0.2000 mm" in capsys.readouterr().out
     expected = np.add(corner, [250 * spacing, 0.0, 0.0])
     # Stamps of seconds since 1970 are held to a quarter of a microsecond.
     np.testing.assert_allclose(read_transform(first).position, expected, atol=1e-6)
     np.testing.assert_allclose(read_transform(first).orientation, [0, 0, 0, 1], atol=1e-5)
     np.testing.assert_allclose(read_transform(second).position, expected, atol=1e-9)
-    np.testing.assert_allclose(read_transform_file(second).more["points"]["pin"], pin, atol=1e-9)
+    np.testing.assert_allclose(yaml.safe_load(second.read_text())["points"]["pin"], pin, atol=1e-9)
     other = table(tmp_path / "other.csv", {"wire": pin})
-    said = refusal(
-        capsys, "probe", tmp_path / "posed.csv", "--phantom", other, *origin, "--out", "x.yaml"
-    )
+    said = refusal(capsys, "probe", posed, "--phantom", other, *origin, "--out", "x.yaml")
     assert "has no pin, which" in said
 
 
@@ -214,24 +202,20 @@ def test_sightings_without_a_pose_are_refused(tmp_path, capsys, time):
 def test_probe_that_hardly_turned_over_few_wires_is_remarked_on(tmp_path, capsys):
     rng = np.random.default_rng(3)
     wires = {f"w{k}": [0.02 * k, 0, 0.01 * k**2, 0.02 * (k + 1), 0.04, 0.01] for k in range(4)}
-    with (tmp_path / "wires.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["name", "x1", "y1", "z1", "x2", "y2", "z2"])
-        rows.writerows([name, *ends] for name, ends in wires.items())
-    with (tmp_path / "seen.csv").open("w") as file:
-        rows = csv.writer(file)
-        rows.writerow(["feature", "column", "row", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        for k in range(80):
-            name = f"w{k % 4}"
-            ends = np.reshape(wires[name], (2, 3))
-            place = ends[0] + rng.uniform(0.1, 0.9) * (ends[1] - ends[0])
-            pixel = rng.uniform(50, 450, 2)
-            turn = Rotation.from_rotvec(np.radians(3.0) * rng.uniform(-0.5, 0.5, 3))
-            body = turn.apply([0.01 + 2e-4 * pixel[0], 0.02, 0.06 + 2e-4 * pixel[1]])
-            rows.writerow([name, *pixel, *(place - body), *turn.as_quat()])
+    ends_of = [[name, *ends] for name, ends in wires.items()]
+    phantom = sheet(tmp_path / "wires.csv", "name,x1,y1,z1,x2,y2,z2", ends_of)
+    rows = []
+    for k in range(80):
+        name = f"w{k % 4}"
+        ends = np.reshape(wires[name], (2, 3))
+        place = ends[0] + rng.uniform(0.1, 0.9) * (ends[1] - ends[0])
+        pixel = rng.uniform(50, 450, 2)
+        turn = Rotation.from_rotvec(np.radians(3.0) * rng.uniform(-0.5, 0.5, 3))
+        body = turn.apply([0.01 + 2e-4 * pixel[0], 0.02, 0.06 + 2e-4 * pixel[1]])
+        rows.append([name, *pixel, *(place - body), *turn.as_quat()])
     out = tmp_path / "probe.yaml"
-    chosen = ("--phantom", tmp_path / "wires.csv", "--origin", 250, 0, "--out", out)
-    assert calibrate("probe", tmp_path / "seen.csv", *chosen) == 0
+    chosen = ("--phantom", phantom, "--origin", 250, 0, "--out", out)
+    assert calibrate("probe", sheet(tmp_path / "seen.csv", POSED, rows), *chosen) == 0
     said = capsys.readouterr().out
     assert "the probe turned by only 4°, which determines little" in said
     assert "4 features are too few" in said

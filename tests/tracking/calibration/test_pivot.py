@@ -24,6 +24,10 @@ def pivoting(rotations, tip=TIP, hole=HOLE):
     return [Pose(hole - rotation.apply(tip), rotation.as_quat()) for rotation in rotations]
 
 
+def shifted(pose, by):
+    return Pose(pose.position + by, pose.orientation)
+
+
 def tilts(rng, count, degrees=25.0):
     """Rotations about all axes, after one that no axis is special for."""
     turned = Rotation.from_rotvec(np.radians(degrees) * rng.standard_normal((count, 3)))
@@ -51,9 +55,8 @@ def test_errors_are_as_large_as_the_deviations_say():
     noise = 0.3e-3
     errors = []
     for _ in range(120):
-        exact = pivoting(tilts(rng, 60, 12.0))
-        poses = [Pose(p.position + noise * rng.standard_normal(3), p.orientation) for p in exact]
-        found = calibrate_pivot(poses)
+        poses = pivoting(tilts(rng, 60, 12.0))
+        found = calibrate_pivot([shifted(pose, noise * rng.standard_normal(3)) for pose in poses])
         errors.append((found.tip - TIP) / found.deviations)
         assert found.rms == pytest.approx(noise * np.sqrt(3), rel=0.4)
     # 360 normal deviates: their root mean square is 1 with a standard deviation of 0.04.
@@ -64,8 +67,7 @@ def test_errors_are_as_large_as_the_deviations_say():
 def test_deviations_are_those_of_a_fit_with_six_unknowns(count):
     """Three numbers a pose, less the six that are fitted, as scipy's fit counts them."""
     rng = np.random.default_rng(count)
-    exact = pivoting(tilts(rng, count))
-    poses = [Pose(p.position + 2e-4 * rng.uniform(-1, 1, 3), p.orientation) for p in exact]
+    poses = [shifted(pose, 2e-4 * rng.uniform(-1, 1, 3)) for pose in pivoting(tilts(rng, count))]
     found = calibrate_pivot(poses)
     assert found.rejected == 0
     rotations = np.concatenate([pose.rotation for pose in poses])
@@ -81,39 +83,33 @@ def test_deviations_are_those_of_a_fit_with_six_unknowns(count):
 
 def test_a_third_of_wrong_poses_is_left_out_and_counted():
     rng = np.random.default_rng(8)
-    exact = pivoting(tilts(rng, 90))
-    poses = [Pose(p.position + 2e-4 * rng.standard_normal(3), p.orientation) for p in exact]
+    poses = [shifted(pose, 2e-4 * rng.standard_normal(3)) for pose in pivoting(tilts(rng, 90))]
     for k in range(0, 90, 3):
-        poses[k] = Pose(poses[k].position + rng.uniform(0.01, 0.1, 3), poses[k].orientation)
+        poses[k] = shifted(poses[k], rng.uniform(0.01, 0.1, 3))
     found = calibrate_pivot(poses)
     assert 30 <= found.rejected <= 32
     assert not found.inliers[::3].any()
     np.testing.assert_allclose(found.tip, TIP, atol=2e-4)
 
 
-def test_a_stylus_turned_about_its_own_axis_only_is_refused():
-    spins = Rotation.from_euler("z", np.linspace(0, 5, 50)[:, None]) * Rotation.from_rotvec(
-        [0.4, 1, 0]
-    )
-    with pytest.raises(CalibrationError, match="about one axis only"):
-        calibrate_pivot(pivoting(spins))
+SPUN = Rotation.from_euler("z", np.linspace(0, 5, 50)[:, None])  # about the stylus' own axis
+ROCKED = Rotation.from_euler("x", np.linspace(-0.6, 0.6, 50)[:, None])  # in one plane, and shaken
+SHAKEN = Rotation.from_rotvec(np.random.default_rng(1).normal(0, 1e-3, (50, 3)))
 
 
-def test_a_stylus_rocked_in_one_plane_is_refused():
-    rocked = Rotation.from_euler("x", np.linspace(-0.6, 0.6, 50)[:, None])
-    shaken = rocked * Rotation.from_rotvec(np.random.default_rng(1).normal(0, 1e-3, (50, 3)))
-    with pytest.raises(CalibrationError, match="about one axis only"):
-        calibrate_pivot(pivoting(shaken))
-
-
-def test_a_stylus_that_stood_still_is_refused():
-    with pytest.raises(CalibrationError, match="about one axis only"):
-        calibrate_pivot(pivoting(Rotation.identity(30)))
-
-
-def test_too_few_poses_are_refused():
-    with pytest.raises(CalibrationError, match="at least 10 poses, not 9"):
-        calibrate_pivot(pivoting(tilts(np.random.default_rng(0), 9)))
+@pytest.mark.parametrize(
+    ("rotations", "problem"),
+    [
+        (SPUN * Rotation.from_rotvec([0.4, 1, 0]), "one axis"),
+        (ROCKED * SHAKEN, "one axis"),
+        (Rotation.identity(30), "one axis"),
+        (tilts(np.random.default_rng(0), 9), "10 poses, not 9"),
+    ],
+    ids=["spun", "rocked", "still", "too few"],
+)
+def test_poses_that_do_not_determine_the_tip_are_refused(rotations, problem):
+    with pytest.raises(CalibrationError, match=problem):
+        calibrate_pivot(pivoting(rotations))
 
 
 def fitted(design, observed):

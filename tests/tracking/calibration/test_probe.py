@@ -1,5 +1,7 @@
 """Probe calibration from wires and points whose place is known, with errors, and refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,6 +21,7 @@ NWIRES = {
     for layer in range(3)
     for side, x, shift, end in (("left", 30, 0, 0), ("oblique", 45, 0, 10), ("right", 60, 0, 0))
 }
+PIN = {"pin": np.array([[0.2, -0.1, 0.4]])}
 
 
 def image_to_body(corner=CORNER, spacing=SPACING):
@@ -70,8 +73,7 @@ def test_exact_n_wires_give_the_image_exactly(seed):
 
 
 def test_a_point_at_an_unknown_place_is_found_too():
-    pin = {"pin": np.array([[0.2, -0.1, 0.4]])}
-    found = calibrate_probe(sightings(np.random.default_rng(2), pin, 40), {})
+    found = calibrate_probe(sightings(np.random.default_rng(2), PIN, 40), {})
     np.testing.assert_allclose(found.image_to_body, image_to_body(), atol=1e-9)
     np.testing.assert_allclose(found.points["pin"], [0.2, -0.1, 0.4], atol=1e-9)
 
@@ -99,7 +101,7 @@ def related(rng, count, clusters, bias, noise):
     [
         (NWIRES, NWIRES, 0.0, {"pixel_noise": 2.0}),
         (NWIRES, NWIRES, 2e-4, {"pose_noise": 2e-4}),
-        ({"pin": np.array([[0.2, -0.1, 0.4]])}, {}, 0.0, {"pose_noise": 2e-4}),
+        (PIN, {}, 0.0, {"pose_noise": 2e-4}),
     ],
 )
 def test_errors_are_as_large_as_the_deviations_say(features, known, bias, noise):
@@ -111,12 +113,7 @@ def test_errors_are_as_large_as_the_deviations_say(features, known, bias, noise)
         made = sightings(rng, features, count, **{"pixel_noise": 0.0, **noise, "pose_noise": 0.0})
         drift = related(rng, count, len(features), bias, noise.get("pose_noise", 0.0))
         made = [
-            PixelSighting(
-                seen.feature,
-                seen.column,
-                seen.row,
-                Pose(seen.pose.position + error, seen.pose.orientation),
-            )
+            replace(seen, pose=Pose(seen.pose.position + error, seen.pose.orientation))
             for seen, error in zip(made, drift, strict=True)
         ]
         found = calibrate_probe(made, known)
@@ -139,8 +136,7 @@ def test_wrong_sightings_are_left_out():
     rng = np.random.default_rng(6)
     made = sightings(rng, NWIRES, 120, pose_noise=2e-4)
     for k in range(0, 120, 8):
-        wrong = made[k]
-        made[k] = PixelSighting(wrong.feature, wrong.column + 150.0, wrong.row, wrong.pose)
+        made[k] = replace(made[k], column=made[k].column + 150.0)
     found = calibrate_probe(made, NWIRES)
     assert not found.inliers[::8].any()
     assert (~found.inliers).sum() <= 17
@@ -160,53 +156,49 @@ def test_the_probes_frame_has_its_origin_at_the_transducer_and_z_along_rows():
     assert np.linalg.det(pose.rotation) == pytest.approx(1.0)
 
 
-def parallel(rng):
-    """Wires of one direction, and a body that does not turn."""
-    wires = {k: np.array([[x, 0.0, z], [x, 0.04, z]]) for k, x, z in _grid()}
-    return sightings(rng, wires, 60, turn=0.0), wires
+PARALLEL = {
+    f"{i}{j}": np.array([[0.02 * i, 0.0, 0.01 * j], [0.02 * i, 0.04, 0.01 * j]])
+    for i in range(3)
+    for j in range(3)
+}
 
 
-def _grid():
-    return [(f"{i}{j}", 0.02 * i, 0.01 * j) for i in range(3) for j in range(3)]
+def of_parallel_wires(rng):
+    """Seen by a body that does not turn."""
+    return sightings(rng, PARALLEL, 60, turn=0.0), PARALLEL
 
 
-def test_wires_of_one_direction_without_turning_are_refused():
-    with pytest.raises(CalibrationError, match="do not determine where the image is"):
-        calibrate_probe(*parallel(np.random.default_rng(0)))
+def of_an_unknown_pin(rng):
+    """Seen by a body that hardly turns."""
+    return sightings(rng, PIN, 60, turn=1e-3, pose_noise=2e-4), {}
 
 
-def test_an_unknown_point_without_turning_is_refused():
-    pin = {"pin": np.array([[0.2, -0.1, 0.4]])}
-    made = sightings(np.random.default_rng(0), pin, 60, turn=1e-3, pose_noise=2e-4)
-    with pytest.raises(CalibrationError, match="turn the probe about all axes"):
-        calibrate_probe(made, {})
+def of_one_pixel(rng):
+    return [replace(seen, column=300.0, row=200.0) for seen in sightings(rng, PIN, 60)], PIN
 
 
-def test_one_pixel_seen_again_and_again_is_refused():
-    pin = {"pin": np.array([[0.2, -0.1, 0.4]])}
+def in_millimetres(rng):
     made = [
-        PixelSighting("pin", 300.0, 200.0, seen.pose)
-        for seen in sightings(np.random.default_rng(0), pin, 60)
+        replace(seen, pose=Pose(1000 * seen.pose.position, seen.pose.orientation))
+        for seen in sightings(rng, NWIRES, 60)
     ]
-    with pytest.raises(CalibrationError, match="all over the image"):
-        calibrate_probe(made, pin)
+    return made, {name: 1000 * wire for name, wire in NWIRES.items()}
 
 
-def test_millimetres_in_place_of_metres_are_refused():
-    made = [
-        PixelSighting(
-            seen.feature,
-            seen.column,
-            seen.row,
-            Pose(1000 * seen.pose.position, seen.pose.orientation),
-        )
-        for seen in sightings(np.random.default_rng(3), NWIRES, 60)
-    ]
-    scaled = {name: 1000 * wire for name, wire in NWIRES.items()}
-    with pytest.raises(CalibrationError, match="in metres"):
-        calibrate_probe(made, scaled)
+def too_few(rng):
+    return sightings(rng, NWIRES, 7), NWIRES
 
 
-def test_too_few_sightings_are_refused():
-    with pytest.raises(CalibrationError, match="at least 8 sightings, not 7"):
-        calibrate_probe(sightings(np.random.default_rng(0), NWIRES, 7), NWIRES)
+@pytest.mark.parametrize(
+    ("sightings_of", "problem"),
+    [
+        (of_parallel_wires, "do not determine where"),
+        (of_an_unknown_pin, "turn the probe"),
+        (of_one_pixel, "all over the image"),
+        (in_millimetres, "in metres"),
+        (too_few, "8 sightings, not 7"),
+    ],
+)
+def test_sightings_that_do_not_determine_the_image_are_refused(sightings_of, problem):
+    with pytest.raises(CalibrationError, match=problem):
+        calibrate_probe(*sightings_of(np.random.default_rng(0)))

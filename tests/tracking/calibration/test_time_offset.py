@@ -87,7 +87,7 @@ def test_an_image_without_a_line_has_none():
     assert np.isnan(line_row(np.zeros((50, 60), np.uint8)))
     noise = np.random.default_rng(0).integers(0, 12, (50, 60)).astype(np.uint8)
     assert np.isnan(line_row(noise))
-    with pytest.raises(CalibrationError, match="only 0 of 4 images show a bright line"):
+    with pytest.raises(CalibrationError, match="0 of 4 images"):
         signal_of_images(np.arange(4.0), [noise] * 4)
 
 
@@ -127,29 +127,17 @@ def test_the_water_tanks_offset_is_the_one_that_plus_published(shared_data):
     assert found.correlation < -0.98
 
 
+TENTHS, NOISE = np.arange(1, 21, 0.1), np.random.default_rng(0).standard_normal(200)
+
+
 @pytest.mark.parametrize(
     ("moving", "fixed", "largest", "problem"),
     [
-        (recorded(50, 0.5), recorded(12, 20), 0.5, "at least 30 samples of each signal, not 25"),
+        (recorded(50, 0.5), recorded(12, 20), 0.5, "30 samples .*25"),
         (recorded(50, 20), recorded(12, 20, start=19.0), 0.5, "overlap too little"),
-        (
-            recorded(50, 22, offset=0.4),
-            recorded(12, 20, start=1.0),
-            0.2,
-            "best at an offset of -0.40 s, beyond",
-        ),
-        (
-            recorded(50, 22),
-            PositionSignal(np.arange(1, 21, 0.1), np.zeros(200)),
-            0.5,
-            "does not move at all",
-        ),
-        (
-            recorded(50, 22),
-            PositionSignal(np.arange(1, 21, 0.1), np.random.default_rng(0).standard_normal(200)),
-            0.5,
-            "do not move alike",
-        ),
+        (recorded(50, 22, offset=0.4), recorded(12, 20, start=1.0), 0.2, "-0.40 s"),
+        (recorded(50, 22), PositionSignal(TENTHS, np.zeros(200)), 0.5, "does not move"),
+        (recorded(50, 22), PositionSignal(TENTHS, NOISE), 0.5, "do not move alike"),
     ],
 )
 def test_recordings_that_cannot_tell_are_refused(moving, fixed, largest, problem):
@@ -161,5 +149,5 @@ def test_strokes_as_regular_as_a_pendulum_are_refused():
     times = np.arange(0, 30, 0.02)
     noise = 0.02 * np.random.default_rng(1).standard_normal((2, len(times)))
     pendulum = np.sin(2 * np.pi * 2.0 * times) + noise
-    with pytest.raises(CalibrationError, match=r"so regular that offsets of .* fit alike"):
+    with pytest.raises(CalibrationError, match="so regular"):
         find_time_offset(PositionSignal(times, pendulum[0]), PositionSignal(times, pendulum[1]))

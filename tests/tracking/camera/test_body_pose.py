@@ -63,9 +63,13 @@ def test_points_without_an_area_have_no_pose(points):
     assert plane_poses(points, seen) == []
 
 
+def corners_of(body):
+    """(n, 3) corners, and the number of the marker of each."""
+    return body.corners.reshape(-1, 3), np.repeat(np.arange(len(body.ids)), 4)
+
+
 def test_all_markers_are_solved_together():
-    grip = faceted_grip()
-    points, owners = grip.corners.reshape(-1, 3), np.repeat(np.arange(4), 4)
+    points, owners = corners_of(faceted_grip())
     random = np.random.default_rng(0)
     alone, together = [], []
     for true in random_views(20, 0.4, (5.0, 40.0), seed=1):
@@ -79,8 +83,7 @@ def test_all_markers_are_solved_together():
 
 
 def test_a_marker_out_of_place_pulls_little():
-    grip = faceted_grip(6)
-    points, owners = grip.corners.reshape(-1, 3), np.repeat(np.arange(6), 4)
+    points, owners = corners_of(faceted_grip(6))
     for true in random_views(5, 0.4, (5.0, 30.0), seed=2):
         pixels = WEBCAM.project(true.apply(points))
         pixels[4:8] += [30.0, -20.0]
@@ -91,8 +94,7 @@ def test_a_marker_out_of_place_pulls_little():
 def test_the_covariance_is_that_of_the_errors():
     # Mahalanobis lengths of errors have the mean of chi squared with 6 degrees: 6. Half a pixel
     # of noise, as assumed.
-    grip = faceted_grip()
-    points, owners = grip.corners.reshape(-1, 3), np.repeat(np.arange(4), 4)
+    points, owners = corners_of(faceted_grip())
     random = np.random.default_rng(5)
     lengths = []
     for true in random_views(400, 0.4, (5.0, 40.0), seed=6):

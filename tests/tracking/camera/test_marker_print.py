@@ -106,7 +106,7 @@ def test_the_command_prints(tmp_path, capsys):
         (["--board", "charuco", "--size", "5x7"], "--board charuco needs --square"),
         (["--board", "grid", "--size", "five", "--separation", "5mm"], "write columns and rows"),
         (["--marker", "40"], "--marker: 40 m is outside"),
-        (["--id", "99"], "dictionary 4X4_50 has only markers 0 to 49"),
+        (["--id", "99"], "4X4_50 has only markers 0 to 49"),
     ],
 )
 def test_bad_options_are_one_sentence(options, sentence, tmp_path, capsys):

@@ -120,7 +120,7 @@ projection_matrix:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((640, 480, np.zeros(9), np.zeros(5)), "is not calibrated: its focal length is zero"),
+        ((640, 480, np.zeros(9), np.zeros(5)), "focal length"),
         ((0, 480, MATRIX, np.zeros(5)), "width is 0"),
         ((640, 480, MATRIX[:2], np.zeros(5)), "has 6 numbers"),
         ((640, 480, MATRIX.T, np.zeros(5)), r"must be \[\[fx, skew, cx\]"),
@@ -139,20 +139,17 @@ def test_a_driver_without_calibration_data_is_an_ideal_pinhole():
     assert CameraModel(640, 480, MATRIX, [], "").distortion.tolist() == [0.0] * 5
 
 
+REST = "image_width: 640\ncamera_matrix: 0\ndistortion_coefficients: 0\n"
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("- 1", "it must be a mapping"),
         ("a: [", "not a YAML file"),
         ("image_width: 640", "image_height is missing"),
-        (
-            "{image_width: 640, image_height: 48.5, camera_matrix: 0, distortion_coefficients: 0}",
-            "must be whole",
-        ),
-        (
-            "{image_width: 640, image_height: 48, camera_matrix: 0, distortion_coefficients: 0}",
-            "camera_matrix must be a mapping",
-        ),
+        (f"image_height: 48.5\n{REST}", "whole"),
+        (f"image_height: 48\n{REST}", "camera_matrix must be a mapping"),
     ],
 )
 def test_a_bad_file_is_refused(text, sentence, tmp_path):

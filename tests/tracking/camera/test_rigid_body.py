@@ -8,6 +8,9 @@ from us_sim.errors import TrackingError
 from us_sim.tracking.camera.markers import dictionary, family, proper_name
 from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
+CORNERS = RigidBody.single("4X4_50", 1, 0.04).corners
+BEND = np.array([[0.0, 0, 0.01], [0, 0, 0], [0, 0, 0.01], [0, 0, 0]])
+
 
 def test_boards_are_where_opencv_has_them():
     board = cv2.aruco.GridBoard((4, 5), 0.0375, 0.005, dictionary("6X6_1000"))
@@ -44,23 +47,17 @@ def test_dictionaries_are_known_by_opencvs_names():
         (lambda: RigidBody.charuco("4X4_50", 5, 7, 0.02, 0.04), "must be smaller than its squares"),
         (lambda: RigidBody("4X4_50", np.array([1]), np.zeros((1, 4, 3))), "length of an edge"),
         (lambda: RigidBody("4X4_50", np.array([1]), np.zeros((4, 3))), "4 corners of 3"),
+        (
+            lambda: RigidBody("4X4_50", np.array([1]), CORNERS[:, [0, 2, 1, 3]]),
+            r"marker 1: .*convex",
+        ),
+        (lambda: RigidBody("4X4_50", np.array([1]), CORNERS + BEND), "not in one plane"),
+        (lambda: RigidBody("4X4_50", np.array([1, 1]), CORNERS.repeat(2, 0)), "marker 1 .*twice"),
     ],
 )
 def test_an_impossible_body_is_refused(body, sentence):
     with pytest.raises(TrackingError, match=sentence):
         body()
-
-
-def test_corners_out_of_order_or_plane_are_refused():
-    corners = RigidBody.single("4X4_50", 1, 0.04).corners[0]
-    with pytest.raises(TrackingError, match=r"marker 1: .*convex"):
-        RigidBody("4X4_50", np.array([1]), corners[[0, 2, 1, 3]][None])
-    bent = corners.copy()
-    bent[[0, 2], 2] = 0.01
-    with pytest.raises(TrackingError, match="not in one plane"):
-        RigidBody("4X4_50", np.array([1]), bent[None])
-    with pytest.raises(TrackingError, match="marker 1 is in the body twice"):
-        RigidBody("4X4_50", np.array([1, 1]), np.stack([corners, corners]))
 
 
 def test_a_table_of_millimetres_is_read(tmp_path):
@@ -84,19 +81,19 @@ aruco_bc_dict: ARUCO_MIP_36h12
 aruco_bc_nmarkers: 1
 aruco_bc_mInfoType: 1
 aruco_bc_markers:
-   - { id:81, corners:[ [ -0.02, 0.02, 0. ], [ 0.02, 0.02, 0. ],
+   - { id: 81, corners: [ [ -0.02, 0.02, 0. ], [ 0.02, 0.02, 0. ],
        [ 0.02, -0.02, 0. ], [ -0.02, -0.02, 0. ] ] }
-""".replace("id:81", "id: 81").replace("corners:[", "corners: [")
+"""
     )
     body = read_rigid_body(path)
     assert (body.dictionary, body.ids.tolist()) == ("ARUCO_MIP_36h12", [81])
     assert np.allclose(body.corners, RigidBody.single("ARUCO_MIP_36h12", 81, 0.04).corners)
     known = path.read_text()
     path.write_text(known.replace("id: 81", f"id: {2**70}"))
-    with pytest.raises(TrackingError, match=f"marker {2**70}: dictionary .* has only markers 0 to"):
+    with pytest.raises(TrackingError, match=f"marker {2**70}"):
         read_rigid_body(path)
     path.write_text(known.replace("InfoType: 1", "InfoType: 0"))
-    with pytest.raises(TrackingError, match="its markers are in pixels"):
+    with pytest.raises(TrackingError, match="in pixels"):
         read_rigid_body(path)
 
 
@@ -135,7 +132,7 @@ def test_boards_are_read(tmp_path):
         ("a.txt", "1 2 3", "line 1: a marker has 16 numbers"),
         ("a.txt", f"inf{' 0' * 15}", "line 1: a marker has 16 numbers"),
         ("a.txt", f"1e30{' 0' * 15}", "markers 0 to 1023"),
-        ("a.txt", "# markers\none 2 3", "line 2: 'one 2 3' is not a row of numbers"),
+        ("a.txt", "# markers\none 2 3", "line 2: 'one 2 3'"),
         ("a.yaml", "[1]", "must be a mapping"),
         ("a.yaml", "{a: [", "not a YAML file"),
         ("a.yaml", "dictionary: 4X4_50", "give a list of markers, or a board"),
@@ -143,15 +140,11 @@ def test_boards_are_read(tmp_path):
         ("a.yaml", "markers: []", "give a list of markers"),
         ("a.yaml", "markers: [{size: 30 mm}]", r"markers\[0\].id: is missing"),
         ("a.yaml", "markers: [{id: 1, size: 30}]", r"markers\[0\].size: .*did you mean '30 mm'"),
-        (
-            "a.yaml",
-            "markers: [{id: 1, size: 0.03, position: 3}]",
-            "position: must be a list, not 3",
-        ),
+        ("a.yaml", "markers: [{id: 1, size: 0.03, position: 3}]", "position: must be a list"),
         ("a.yaml", "markers: [{id: 1, size: 0.03, orientation: [0, 0, 0, 0]}]", "is zero"),
         ("a.yaml", "markers: [{id: 1, corners: [[0, 0, 0]]}]", "corners: needs 4 values, not 1"),
         ("a.yaml", "board: {kind: chess}", "'chess' is not one of grid, charuco"),
-        ("a.yaml", "board: {kind: grid, columns: 2}", "board.rows: is missing; a grid board needs"),
+        ("a.yaml", "board: {kind: grid, columns: 2}", "board.rows: is missing"),
         (
             "a.yaml",
             "board: {kind: grid, columns: 2.5, rows: 2, size: 0.03, separation: 0.01}",

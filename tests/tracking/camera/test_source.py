@@ -228,35 +228,37 @@ def test_the_same_images_give_the_same_poses(image):
     assert run() == run()
 
 
-def grey(path):
-    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-
-
-def test_every_photo_of_the_grid_board_shows_19_markers(shared_data):
-    board = RigidBody.grid("6X6_1000", 4, 5, 0.0375, 0.005)
-    photos = sorted((shared_data / "marker-aruco-gridboard").glob("*.jpg"))
-    assert len(photos) == 42
-    points, pixels = [], []
-    for photo in photos:
-        seen = detect_corners(grey(photo), board)
-        assert len(seen[0]) >= 4 * 19
-        points.append(seen[0].astype(np.float32))
-        pixels.append(seen[1].astype(np.float32))
-    # With plain detections it is 0.918 pixels, with OpenCV's refined corners 0.457.
-    assert cv2.calibrateCamera(points, pixels, (640, 480), None, None)[0] < 0.35
-
-
-def test_every_photo_of_the_charuco_board_shows_all_corners(shared_data):
-    board = RigidBody.charuco("6X6_250", 5, 7, 0.04, 0.02)
-    points, pixels = [], []
-    for number in range(4):
-        photo = shared_data / "marker-opencv-charuco" / f"img_0{number}.jpg"
-        seen = detect_corners(grey(photo), board)
-        assert len(seen[0]) == 24
-        points.append(seen[0].astype(np.float32))
-        pixels.append(seen[1].astype(np.float32))
-    # OpenCV's corners give 0.188 pixels, and 0.182 is published.
-    assert cv2.calibrateCamera(points, pixels, (640, 480), None, None)[0] < 0.15
+@pytest.mark.parametrize(
+    ("board", "photos", "count", "corners", "residual"),
+    [
+        # With plain detections it is 0.918 pixels, with OpenCV's refined corners 0.457.
+        (
+            RigidBody.grid("6X6_1000", 4, 5, 0.0375, 0.005),
+            "marker-aruco-gridboard/*.jpg",
+            42,
+            range(4 * 19, 4 * 20 + 1),
+            0.35,
+        ),
+        # OpenCV's corners give 0.188 pixels, and 0.182 is published.
+        (
+            RigidBody.charuco("6X6_250", 5, 7, 0.04, 0.02),
+            "marker-opencv-charuco/img_0[0-3].jpg",
+            4,
+            [24],
+            0.15,
+        ),
+    ],
+    ids=["grid", "charuco"],
+)
+def test_every_photo_of_a_board_shows_its_corners(
+    shared_data, board, photos, count, corners, residual
+):
+    files = sorted(shared_data.glob(photos))
+    assert len(files) == count
+    seen = [detect_corners(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), board) for file in files]
+    assert all(len(points) in corners for points, _ in seen)
+    points, pixels = ([np.float32(each) for each in part] for part in zip(*seen, strict=True))
+    assert cv2.calibrateCamera(points, pixels, (640, 480), None, None)[0] < residual
 
 
 def test_a_chessboard_is_measured_where_its_markers_are_too_small():

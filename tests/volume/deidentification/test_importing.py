@@ -11,7 +11,9 @@ import pytest
 import SimpleITK as sitk
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_dicom import US_IMAGE, US_MULTI_FRAME, enhanced, header, item, turned, write
+from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
+from pydicom.datadict import tag_for_keyword
+from pydicom.uid import JPEG2000Lossless
 
 from us_sim.command.main import main
 from us_sim.errors import UsSimError, VolumeError
@@ -27,6 +29,7 @@ from us_sim.volume.sequences.sweep import read_sweep
 
 VOXELS = np.random.default_rng(5).integers(0, 256, (30, 24, 5), dtype=np.uint8)
 CINE = np.random.default_rng(3).integers(0, 256, (4, 60, 80), dtype=np.uint8)
+WHOLE = ImportSettings(keep_whole_image=True)
 
 
 @pytest.fixture
@@ -111,11 +114,17 @@ def test_regions_that_cannot_be_true_are_not_believed(tmp_path, edges, kind, dou
         import_files([write(tmp_path / "a.dcm", made)], tmp_path / "a.igs.mha")
 
 
-def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
-    frames = np.random.default_rng(4).integers(20, 90, (5, 200, 300), dtype=np.uint8)
+def written_on(shape):
+    """Images (images, rows, columns) with a name on the black above each."""
+    frames = np.random.default_rng(4).integers(20, 90, shape, dtype=np.uint8)
     frames[:, :60] = 0
     for frame in frames:
         cv2.putText(frame, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
+    return frames
+
+
+def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
+    frames = written_on((5, 200, 300))
     path = write(tmp_path / "a.dcm", header(frames, US_MULTI_FRAME))
     found = look_at([path], None, ImportSettings())
     (line,) = found.imported.text
@@ -125,30 +134,18 @@ def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
     assert found.imported.proposal.top >= 55  # what moves is below
     picture = report_picture(found.imported)
     assert (picture == (60, 60, 255)).all(axis=-1).sum() > 200  # the red box
-    kept = look_at([path], tmp_path / "b.igs.mha", ImportSettings(keep_whole_image=True))
+    kept = look_at([path], tmp_path / "b.igs.mha", WHOLE)
     assert "1 would go on" in report_text(kept.imported)
-    import_files(
-        [path], tmp_path / "c.igs.mha", ImportSettings(keep_whole_image=True, blank_text=True)
-    )
+    blank = ImportSettings(keep_whole_image=True, blank_text=True)
+    import_files([path], tmp_path / "c.igs.mha", blank)
     (first, *_) = read_sweep(tmp_path / "c.igs.mha", tracked=False).images()
     assert not first[:60].any()
     assert np.array_equal(first[80:], frames[0, 80:])
 
 
-def written_on(shape=(140, 300, 6)):
-    """Voxels (rows, columns, images) with a name in every image."""
-    voxels = np.random.default_rng(4).integers(20, 90, shape, dtype=np.uint8)
-    voxels[:60] = 0
-    for k in range(shape[2]):
-        image = np.ascontiguousarray(voxels[:, :, k])
-        cv2.putText(image, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
-        voxels[:, :, k] = image
-    return voxels
-
-
 @pytest.mark.parametrize("kind", [".nrrd", ".mha", ".nii.gz", ".dcm", "turned.nrrd"])
 def test_what_may_be_text_wants_a_decision_in_files_of_every_kind(tmp_path, kind):
-    voxels = written_on().transpose(1, 0, 2)  # (i, j, k)
+    voxels = written_on((6, 140, 300)).T  # (i, j, k)
     path, out = tmp_path / f"a{kind}", tmp_path / "o.nrrd"
     if kind == ".dcm":
         write(path, enhanced(voxels, turned()))
@@ -159,7 +156,7 @@ def test_what_may_be_text_wants_a_decision_in_files_of_every_kind(tmp_path, kind
     with pytest.raises(VolumeError, match=r"may be text.*--keep-whole-image"):
         import_files([path], out)
     assert not out.exists()
-    import_files([path], out, ImportSettings(keep_whole_image=True))
+    import_files([path], out, WHOLE)
     assert np.ptp(read_volume(out).intensities) > 200
     if kind[0] == "t":  # blanking looks at the images, and not across them
         with pytest.raises(VolumeError, match="other axes"):
@@ -234,8 +231,7 @@ def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_file, tmp_p
     folder = shared_file("foreign-files")
     with pytest.raises(VolumeError, match="may be text"):
         import_files([folder / "burned_in_stack.nrrd"], tmp_path / "a.nrrd")
-    whole = ImportSettings(keep_whole_image=True)
-    import_files([folder / "us1_pixelspacing.dcm"], tmp_path / "a.igs.mha", whole)
+    import_files([folder / "us1_pixelspacing.dcm"], tmp_path / "a.igs.mha", WHOLE)
     assert sitk.ReadImage(str(tmp_path / "a.igs.mha")).GetSpacing()[:2] == (0.25, 0.2)
 
 
@@ -262,7 +258,7 @@ def test_wrong_options_are_refused(cine, tmp_path, more, message, capsys):
 @pytest.mark.parametrize("name", ["case", "a.nrrd", "a.nii.gz"])
 def test_a_cine_is_no_volume(cine, tmp_path, name):
     with pytest.raises(VolumeError, match="4 images"):
-        import_files([cine], tmp_path / name, ImportSettings(keep_whole_image=True))
+        import_files([cine], tmp_path / name, WHOLE)
     assert list(tmp_path.iterdir()) == [cine]
 
 
@@ -293,9 +289,6 @@ def test_files_that_do_not_go_together_are_refused(volume, tmp_path):
 
 
 def test_a_damaged_image_leaves_nothing_behind(tmp_path):
-    from made_dicom import compressed
-    from pydicom.uid import JPEG2000Lossless
-
     made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
     data = bytearray(made.PixelData)
     last = bytes(data).rindex(b"\xff\x4f\xff\x51")  # the beginning of the last code stream
@@ -347,8 +340,6 @@ def test_only_numbers_in_their_ranges_and_words_of_closed_lists_go_on():
 
 
 def test_every_name_on_the_positive_list_is_the_standards():
-    from pydicom.datadict import tag_for_keyword
-
     keywords = {number.keyword for number in NUMBERS} | USED
     keywords |= {keyword for keyword, _ in CLOSED_LISTS.values()}
     assert {keyword for keyword in keywords if tag_for_keyword(keyword) is None} == set()
@@ -385,7 +376,7 @@ def test_an_import_takes_no_more_than_three_times_its_size(tmp_path):
 
 def test_a_single_image_is_a_sequence_of_one(tmp_path):
     path = write(tmp_path / "a.dcm", header(CINE[:1], US_IMAGE))
-    import_files([path], tmp_path / "a.mha", ImportSettings(keep_whole_image=True))
+    import_files([path], tmp_path / "a.mha", WHOLE)
     assert (tmp_path / "a.mha").read_bytes().endswith(CINE[0].tobytes())
 
 

@@ -1,8 +1,9 @@
 """The cache: made once, whole or absent, shared by processes, mended when damaged."""
 
-import json
 import logging
 import multiprocessing
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -82,20 +83,8 @@ def _flip_a_byte(entry: Path) -> None:
     path.write_bytes(content)
 
 
-def _cut(entry: Path) -> None:
-    path = entry / "intensities.npy"
-    path.write_bytes(path.read_bytes()[:-20])
-
-
-def _forget_a_key(entry: Path) -> None:
-    path = entry / "volume.json"
-    path.write_text(json.dumps({"crc32": {}}))
-
-
 def _replace_by_a_file(entry: Path) -> None:
-    for path in entry.iterdir():
-        path.unlink()
-    entry.rmdir()
+    shutil.rmtree(entry)
     entry.write_text("")
 
 
@@ -103,9 +92,9 @@ def _replace_by_a_file(entry: Path) -> None:
     "damage",
     [
         _flip_a_byte,
-        _cut,
-        _forget_a_key,
         _replace_by_a_file,
+        lambda entry: os.truncate(entry / "intensities.npy", 300),
+        lambda entry: (entry / "volume.json").write_text('{"crc32": {}}'),
         lambda entry: (entry / "labels.npy").unlink(),
         lambda entry: (entry / "labels.npy").write_bytes(b""),
         lambda entry: (entry / "volume.json").write_bytes(b"\xff{"),
@@ -155,7 +144,7 @@ def test_the_folder_is_the_users_own_unless_given(monkeypatch, tmp_path):
 
 
 def test_an_unknown_phantom_is_refused(cache):
-    with pytest.raises(VolumeError, match="phantom 'leg' is not one of upper_arm"):
+    with pytest.raises(VolumeError, match=r"'leg' .*upper_arm"):
         cached_phantom("leg", 1, COARSE)
     assert not cache.exists()
 

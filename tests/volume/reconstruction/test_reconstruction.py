@@ -21,7 +21,7 @@ from us_sim.volume.reconstruction.grid import (
     image_mask,
     proposed_spacing,
 )
-from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
+from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
 from us_sim.volume.reconstruction.reconstruction import leave_one_out, plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sequence import read_sequence
@@ -109,13 +109,15 @@ def test_a_proposed_spacing_is_the_pixel_or_just_keeps_below_the_most_voxels(siz
     assert spacing * 1e5 == pytest.approx(round(spacing * 1e5))
 
 
+ONE_VOXEL = grid_around(np.array([[0.0, 0, 0], [1e-3, 1e-3, 1e-3]]), 1e-3)
+IN_IT = (np.diag([1e-3, 1e-3, 1e-3, 1.0]), np.ones((1, 1), bool))  # an image of one pixel
+
+
 def test_what_is_compounded_is_what_its_name_says():
-    grid = grid_around(np.array([[0.0, 0, 0], [1e-3, 1e-3, 1e-3]]), 1e-3)
-    used, placed = np.ones((1, 1), bool), np.diag([1e-3, 1e-3, 1e-3, 1.0])
     for name, expected in {"mean": 104, "max": 200, "latest": 11, "plus_mean": 103}.items():
-        insertion = Insertion(grid, method="nearest", compounding=name)
+        insertion = Insertion(ONE_VOXEL, method="nearest", compounding=name)
         for value in (200, 101, 103, 105, 11):
-            insertion.insert(np.full((1, 1), value, np.uint8), placed, used)
+            insertion.insert(np.full((1, 1), value, np.uint8), *IN_IT)
         grey, covered = insertion.result()
         assert (grey[0, 0, 0], covered.sum()) == (expected, 1), name
 
@@ -123,16 +125,12 @@ def test_what_is_compounded_is_what_its_name_says():
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=9))
 def test_a_median_is_numpys(values):
-    from us_sim.volume.reconstruction.insertion import Collection
-
-    grid = grid_around(np.array([[0.0, 0, 0], [1e-3, 1e-3, 1e-3]]), 1e-3)
-    pixels = Collection(grid, method="nearest")
-    used, placed = np.ones((1, 1), bool), np.diag([1e-3, 1e-3, 1e-3, 1.0])
+    pixels = Collection(ONE_VOXEL, method="nearest")
     for _ in values:
-        pixels.count(placed, used)
+        pixels.count(*IN_IT)
     pixels.reserve()
     for value in values:
-        pixels.insert(np.full((1, 1), value, np.uint8), placed, used)
+        pixels.insert(np.full((1, 1), value, np.uint8), *IN_IT)
     assert pixels.result()[0][0, 0, 0] == int(np.median(values) + 0.5)
 
 
@@ -172,10 +170,7 @@ def test_a_mask_is_a_rectangle_and_a_fan():
     [
         ({"fan_origin": (1, 2)}, "is missing"),
         ({"clip": (0, 0, 0, 5)}, "columns and rows"),
-        (
-            {"fan_origin": (1, 2), "fan_radius": (5, 2), "fan_angles": (-1, 1)},
-            "less than 2",
-        ),
+        ({"fan_origin": (1, 2), "fan_radius": (5, 2), "fan_angles": (-1, 1)}, "less than 2"),
     ],
 )
 def test_a_part_that_is_none_is_refused(values, message):

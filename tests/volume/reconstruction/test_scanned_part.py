@@ -176,14 +176,20 @@ def test_a_rectangle_that_is_named_is_a_linear_arrays(tmp_path):
     np.testing.assert_allclose(found.poses[0].position, [-139.5 * SIDE[0], 0, 39.5 * SIDE[1]])
 
 
-def test_a_case_of_a_real_sweep_starts_where_its_probe_was(shared_data):
-    folder = shared_data / "plus-nwire-calibration"
-    file = folder / "PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml"
-    calibration = read_calibration(file, "Probe")
-    sequence = read_sequence(folder / "NwirePhantomFreehand.igs.mha")
-    sweep = sweep_of(sequence, calibration=calibration.transforms)
+def found_by_plus_configuration(folder, configuration, recording):
+    """A real sweep and its probe, in the part of the images that a configuration of Plus names."""
+    calibration = read_calibration(folder / configuration, "Probe")
+    sweep = sweep_of(read_sequence(folder / recording), calibration=calibration.transforms)
     used = image_mask(calibration.part, sweep.columns, sweep.rows)
-    found = scanning_probe(sweep, calibration.part, used)
+    return sweep, scanning_probe(sweep, calibration.part, used)
+
+
+def test_a_case_of_a_real_sweep_starts_where_its_probe_was(shared_data):
+    sweep, found = found_by_plus_configuration(
+        shared_data / "plus-nwire-calibration",
+        "PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml",
+        "NwirePhantomFreehand.igs.mha",
+    )
     rows, columns = np.linalg.norm(sweep.image_to_reference[0][:3, 1::-1], axis=0)
     assert found.probe.array.given.aperture == pytest.approx(495 * columns, abs=2 * columns)
     assert found.probe.array.given.depth == pytest.approx(488 * rows, abs=2 * rows)
@@ -214,13 +220,11 @@ def test_the_curved_array_of_a_real_sweep_is_found_in_its_images(shared_data):
 
 
 def test_the_linear_array_of_a_real_sweep_is_found_in_its_images(shared_file):
-    folder = shared_file("plus-spine-freehand")
-    file = folder / "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml"
-    calibration = read_calibration(file, "Probe")
-    sequence = read_sequence(folder / "SpinePhantomFreehand.igs.mha")
-    sweep = sweep_of(sequence, calibration=calibration.transforms)
-    used = image_mask(calibration.part, sweep.columns, sweep.rows)
-    found = scanning_probe(sweep, calibration.part, used)
+    sweep, found = found_by_plus_configuration(
+        shared_file("plus-spine-freehand"),
+        "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml",
+        "SpinePhantomFreehand.igs.mha",
+    )
     assert found.probe.geometry == "linear"
     # Columns 185 to 630 and rows 11 to 600, as one sees them in its pictures.
     columns, rows = np.linalg.norm(sweep.image_to_reference[0][:3, :2], axis=0)

@@ -120,7 +120,7 @@ def test_of_structures_that_overlap_the_one_of_higher_priority_stays(two_tubes):
     assert overlap(made.labels == 2, tube) > 0.95
     assert (made.labels[other] == 1).mean() > 0.98
     assert any("of fluid are in vein and stay there" in remark for remark in made.remarks)
-    with pytest.raises(VolumeError, match=r"vein: all of it is in structures"):
+    with pytest.raises(VolumeError, match="vein: all of it"):
         found(volume, fluid=all_dark, vein=left)
 
 
@@ -172,12 +172,14 @@ DARK = {"method": "growing", "upper": 50}
         (DARK, "growing needs seeds"),
         (DARK | {"seeds_mm": [[0, 0, 0]]}, r"vein\.seeds_mm\[0\].*outside the volume.*spans"),
         (DARK | {"seeds_voxel": [[99, 0, 0]]}, r"vein\.seeds_voxel\[0\].*60 × 60 × 30"),
-        (DARK | {"seeds_voxel": [[5, 30, 15]]}, "seed 1 has the grey value .*outside 0 to 50"),
+        (DARK | {"seeds_voxel": [[5, 30, 15]]}, "seed 1 .*outside 0 to 50"),
         (DARK | {"seeds_voxel": [[20, 30, 15]], "open": "9 mm"}, "nothing is left of it"),
         (DARK | {"seeds_voxel": [[20, 30, 15]], "upper": 5, "lower": 9}, "swap them"),
         (DARK | {"reach": "3 mm"}, "there are none"),
         (DARK | {"keep": "seeded"}, "there are no seeds"),
         (DARK | {"multiplier": 2}, "multiplier is for confidence"),
+        ({"method": "dark_vessels", "thinnest": 5e-3, "thickest": 3e-3}, "less than thinnest"),
+        ({"method": "dark_vessels", "edge_contrast": 0.9}, "more than contrast"),
         ({"method": "grwoing"}, "did you mean 'growing'"),
         ({"method": "watershed", "border": False, "seeds_voxel": [[20, 30, 15]]}, "outside"),
         (DARK | {"seeds_voxel": [[20, 30, 15]], "within_mm": [[0, 0, 0], [1, 1, 1]]}, "nowhere"),
@@ -260,13 +262,6 @@ def test_nothing_is_proposed_where_there_is_nothing():
     assert not DarkVessels().found_in(region(np.zeros((12, 12, 12), np.float32))).any()
     speckle = np.random.default_rng(1).integers(80, 120, (30, 30, 30)).astype(np.float32)
     assert not DarkVessels().found_in(region(speckle)).any()
-
-
-def test_settings_in_the_wrong_order_are_refused():
-    with pytest.raises(VolumeError, match="less than thinnest"):
-        DarkVessels(thinnest=5e-3, thickest=3e-3)
-    with pytest.raises(VolumeError, match="more than contrast"):
-        DarkVessels(edge_contrast=0.9)
 
 
 def test_seeds_and_proposal_find_the_same_vessels_in_a_real_liver(shared_file):

@@ -1,13 +1,13 @@
-"""Tracked sequences in every format and orientation, chains of transforms, 3D Slicer's scenes."""
+"""Tracked sequences: formats, orientations, broken ones, chains of transforms, Slicer's scenes."""
 
 import gzip
 import re
+import tracemalloc
 import zipfile
 import zlib
 
 import numpy as np
 import pytest
-import SimpleITK
 import SimpleITK as sitk
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import shortest_path
 from us_sim.errors import CalibrationError, TrackingError, VolumeError
 from us_sim.recording.path import read_path
 from us_sim.recording.plus_recording import read_tracker_recording
-from us_sim.tracking.calibration.transform_file import read_transform_file
+from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.slicer_transforms import read_slicer_sequences, read_slicer_transform
 from us_sim.volume.sequences.sweep import read_sweep, sweep_of
@@ -28,8 +28,9 @@ from us_sim.volume.sequences.transforms import (
     split_transform_name,
 )
 
-GREY = np.random.Generator(np.random.PCG64(5)).integers(0, 256, (3, 4, 5), dtype=np.uint8)
-POSES = [f"0.2 0 0 {k} 0 0 -0.2 0 0 0.2 0 30 0 0 0 1" for k in range(3)]
+FRAMES, ROWS, COLUMNS = 3, 4, 5
+GREY = np.random.default_rng(5).integers(0, 256, (FRAMES, ROWS, COLUMNS), dtype=np.uint8)
+MATRIX = "0.2 0 0 {x} 0 0 -0.2 0 0 0.2 0 30 0 0 0 1"
 
 # Where column c and row r of the image in MF are stored, as Plus names the orientations: the
 # first letter is where columns lead to, the second where rows do.
@@ -48,31 +49,45 @@ STORED = {
 }
 
 
-def frame_fields():
-    """Fields of each frame as Plus writes them."""
-    for k, pose in enumerate(POSES):
-        yield f"Seq_Frame{k:04d}_ImageToReferenceTransform", pose
-        yield f"Seq_Frame{k:04d}_Timestamp", f"{10 + k / 10}"
-        yield f"Seq_Frame{k:04d}_ImageStatus", "OK"
+def frame_fields(changes=None):
+    """Fields of each frame as Plus writes them, but for changes; one that is None is left out."""
+    for k in range(FRAMES):
+        fields = {
+            "ImageToReferenceTransform": MATRIX.format(x=k),
+            "ImageToReferenceTransformStatus": "OK",
+            "Timestamp": f"{10 + k / 10}",
+            "ImageStatus": "OK",
+            **(changes or {}).get(k, {}),
+        }
+        for key, value in fields.items():
+            if value is not None:
+                yield f"Seq_Frame{k:04d}_{key}", value
 
 
-def metaimage(path, stored, orientation="MF", **more):
+def metaimage(path, stored=GREY, data=None, frames=None, data_file="LOCAL", **fields):
+    """A MetaImage sequence as Plus writes it; a field that is None is left out."""
     rows, columns = stored.shape[1:3]
     header = {
         "ObjectType": "Image",
         "NDims": "3",
         "DimSize": f"{columns} {rows} {len(stored)}",
         "ElementType": "MET_UCHAR",
-        "Kinds": "domain domain list",
-        "UltrasoundImageOrientation": orientation,
-        **more,
-        **dict(frame_fields()),
-        "ElementDataFile": "LOCAL",
+        "UltrasoundImageOrientation": "MF",
+        **fields,
+        **dict(frame_fields(frames)),
+        "ElementDataFile": data_file,  # ends the header
     }
-    packed = more.get("CompressedData") == "True"
-    data = zlib.compress(stored.tobytes()) if packed else stored.tobytes()
-    path.write_bytes("".join(f"{k} = {v}\n" for k, v in header.items()).encode() + data)
+    text = "".join(f"{key} = {value}\n" for key, value in header.items() if value is not None)
+    path.write_bytes(text.encode() + (stored.tobytes() if data is None else data))
     return path
+
+
+def packed(data):
+    """The arguments of a MetaImage whose images are compressed."""
+    return {"data": data, "CompressedData": "True", "CompressedDataSize": str(len(data))}
+
+
+PACKED = packed(zlib.compress(GREY.tobytes()))
 
 
 def nrrd(path, stored, pack=None, *, kinds="domain domain domain list", sizes=None):
@@ -92,17 +107,27 @@ def in_two_members(data):
     return gzip.compress(data[:37]) + gzip.compress(data[37:])
 
 
+def refused(path, message):
+    """One sentence that begins with the file."""
+    with pytest.raises(VolumeError, match=message) as error:
+        read_sweep(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("orientation", STORED)
 def test_images_are_turned_as_their_orientation_says(tmp_path, orientation):
     stored = np.array([STORED[orientation](image) for image in GREY])
-    sequence = read_sequence(metaimage(tmp_path / "a.igs.mha", stored, orientation))
+    path = metaimage(tmp_path / "a.igs.mha", stored, UltrasoundImageOrientation=orientation)
+    sequence = read_sequence(path)
     assert (sequence.rows, sequence.columns) == GREY.shape[1:]
     np.testing.assert_array_equal(list(sequence.images()), GREY)
 
 
 @pytest.mark.parametrize("pack", [None, gzip.compress, in_two_members])
 def test_nrrd_holds_what_metaimage_holds(tmp_path, pack):
-    of_mha = read_sweep(metaimage(tmp_path / "a.mha", GREY, CompressedData="True"))
+    fields = {"CompressedData": "True", "Kinds": "domain domain list"}
+    of_mha = read_sweep(metaimage(tmp_path / "a.mha", data=zlib.compress(GREY.tobytes()), **fields))
     of_nrrd = read_sweep(nrrd(tmp_path / "a.igs.nrrd", GREY, pack))
     for name in ("times", "numbers", "image_to_reference"):
         np.testing.assert_array_equal(getattr(of_mha, name), getattr(of_nrrd, name))
@@ -154,6 +179,154 @@ def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_file)
     stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))  # (row, column, frame)
     (image,) = sequence.images([50])
     np.testing.assert_array_equal(image, stored[:, :, 50])
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_images_poses_and_times(tmp_path, compressed):
+    how = PACKED if compressed else {}
+    sweep = read_sweep(metaimage(tmp_path / "a.igs.mha", **how))
+    assert (sweep.columns, sweep.rows, sweep.left_out) == (COLUMNS, ROWS, {})
+    np.testing.assert_allclose(sweep.times, [10.0, 10.1, 10.2])
+    np.testing.assert_array_equal(np.array(list(sweep.images())), GREY)
+    np.testing.assert_array_equal(np.array(list(sweep.images([2, 0]))), GREY[[0, 2]])
+    # Column 4 and row 3 of frame 1: 1 + 0.2 * 4 mm, 0, 30 + 0.2 * 3 mm.
+    np.testing.assert_allclose(
+        sweep.image_to_reference[1] @ [4, 3, 0, 1], [1.8e-3, 0.0, 30.6e-3, 1.0], atol=1e-15
+    )
+
+
+def test_images_may_lie_in_a_file_beside_the_header(tmp_path):
+    (tmp_path / "a.raw").write_bytes(GREY.tobytes())
+    sweep = read_sweep(metaimage(tmp_path / "a.mhd", data=b"", data_file="a.raw"))
+    np.testing.assert_array_equal(next(sweep.images([1])), GREY[1])
+    (tmp_path / "a.raw").unlink()
+    refused(tmp_path / "a.mhd", r"a\.raw, which is not there")
+
+
+UNUSABLE = "a transform that is singular or not finite"
+
+
+@pytest.mark.parametrize(
+    ("broken", "reason"),
+    [
+        ({"ImageToReferenceTransform": None}, "no ImageToReferenceTransform"),
+        ({"ImageToReferenceTransform": "1 0 0"}, "a transform that is not 16 numbers"),
+        ({"ImageToReferenceTransform": "1 0 x " + "0 " * 13}, "a transform that is not 16 numbers"),
+        ({"ImageToReferenceTransform": " ".join("0" * 16)}, UNUSABLE),
+        ({"ImageToReferenceTransform": MATRIX.format(x="nan")}, UNUSABLE),
+        ({"ImageToReferenceTransform": MATRIX.format(x="inf")}, UNUSABLE),
+        ({"ImageToReferenceTransform": "1 1 0 0 1 1 0 0 0 0 1 0 0 0 0 1"}, UNUSABLE),
+        (
+            {"ImageToReferenceTransformStatus": "INVALID"},
+            "ImageToReferenceTransformStatus is not OK",
+        ),
+        ({"ImageStatus": "INVALID"}, "ImageStatus is not OK"),
+        ({"Timestamp": None}, "no Timestamp"),
+        ({"Timestamp": "nan"}, "no Timestamp"),
+        ({"Timestamp": "soon"}, "no Timestamp"),
+    ],
+)
+def test_a_frame_that_cannot_be_used_is_left_out_and_counted(tmp_path, broken, reason):
+    sweep = read_sweep(metaimage(tmp_path / "a.mha", frames={1: broken}))
+    assert sweep.left_out == {reason: 1}
+    assert sweep.numbers.tolist() == [0, 2]
+    np.testing.assert_array_equal(np.array(list(sweep.images())), GREY[[0, 2]])
+    np.testing.assert_allclose(sweep.image_to_reference[:, 0, 3], [0.0, 2e-3])
+
+
+@pytest.mark.parametrize("missing", ["ImageStatus", "ImageToReferenceTransformStatus"])
+def test_a_status_that_is_not_written_is_good(tmp_path, missing):
+    sweep = read_sweep(metaimage(tmp_path / "a.mha", frames={0: {missing: None}}))
+    assert len(sweep.numbers) == FRAMES
+
+
+def test_frames_that_the_header_does_not_describe_are_counted(tmp_path):
+    path = metaimage(tmp_path / "a.mha", DimSize=f"{COLUMNS} 2 6")
+    sweep = read_sweep(path)
+    assert len(sweep.numbers) == FRAMES
+    assert sweep.left_out == {"no field in the header": 3}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"DimSize": None}, "DimSize"),
+        ({"DimSize": "5 4"}, "DimSize"),
+        ({"DimSize": "5 four 3"}, "DimSize"),
+        ({"DimSize": "5 4 4"}, "60 bytes .* 80"),
+        ({"DimSize": "0 0 3"}, "without images"),
+        ({"DimSize": "5 -4 3"}, "without images"),
+        ({"DimSize": "5 2 2 3"}, "sequence of volumes"),
+        ({"ElementType": "MET_SHORT"}, "60 bytes .* 120"),
+        ({"ElementType": None}, "ElementType"),
+        ({"ElementNumberOfChannels": "2"}, "2 numbers"),
+        ({"UltrasoundImageOrientation": "AMF"}, "'AMF'"),
+        ({"DimSize": "100000 100000 3", **PACKED}, "100000 × 100000"),
+        ({"DimSize": "5 4 9000000000", **PACKED}, "9000000000 frames"),
+        ({"DimSize": ":5 4 3", **PACKED}, "DimSize"),
+    ],
+)
+def test_a_sequence_of_another_kind_is_refused(tmp_path, fields, message):
+    path = metaimage(tmp_path / "bad.mha", **fields)
+    refused(path, message)
+
+
+def test_a_sequence_whose_images_are_not_calibrated_is_refused(tmp_path):
+    fields = {"ImageToReferenceTransform": None, "ProbeToTrackerTransform": MATRIX.format(x=0)}
+    path = metaimage(tmp_path / "a.mha", frames=dict.fromkeys(range(FRAMES), fields))
+    refused(path, r"Image to Reference.* ProbeToTracker: .*calibration")
+
+
+def test_damaged_compression_is_noticed_where_the_images_are_read(tmp_path):
+    whole, short = zlib.compress(GREY.tobytes()), zlib.compress(GREY[:2].tobytes())
+    for data, message in (
+        (whole[:20] + bytes(20) + whole[40:], "compression"),
+        (short, "40 bytes"),
+    ):
+        sweep = read_sweep(metaimage(tmp_path / "a.mha", **packed(data)))
+        with pytest.raises(VolumeError, match=message):
+            list(sweep.images())
+
+
+def test_what_is_no_sequence_is_refused(tmp_path):
+    for content in (b"", b"no image at all\n" * 40, bytes(4096), b"a = b\n"):
+        path = tmp_path / "a.mha"
+        path.write_bytes(content)
+        refused(path, "give a sequence")
+    for path in (tmp_path / "nowhere.mha", tmp_path):
+        refused(path, "no such file")
+
+
+def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_file):
+    path = shared_file("imfusion-liver-sweep/liver_sweep.igs.mha")
+    sweep = read_sweep(path)
+    assert (sweep.columns, sweep.rows, len(sweep.numbers)) == (739, 593, 140)
+    assert (sweep.times[0], sweep.times[-1]) == (0.0, 6.084)
+    sizes = np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1)
+    np.testing.assert_allclose(sizes, 0.314818e-3, rtol=1e-6)  # as its source states
+    stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))
+    tracemalloc.start()
+    for k, image in enumerate(sweep.images()):
+        assert np.array_equal(image, stored[k])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8e6  # of 61 MB
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("plus-spine-freehand/SpinePhantomFreehand.igs.mha", "ProbeToTracker, Ref"),
+        ("plus-tracker-recordings/ReferenceToRASCalibration.igs.mha", "without images"),
+        ("plus-tracker-recordings/TransformInterpolationTest.igs.mha", "ProbeToTracker, Ref"),
+        ("plus-tracker-recordings/WaterTankBottomTranslationVideoBuffer.igs.mha", "no transforms"),
+        ("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha", "tracked frames"),
+        ("plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef.mha", "is a volume"),
+    ],
+)
+def test_real_files_of_other_kinds_are_refused(shared_file, name, message):
+    path = shared_file(name)
+    refused(path, message)
 
 
 def test_plus_rule_for_names():
@@ -208,9 +381,7 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
 )
 def test_an_nrrd_file_of_another_kind_is_refused(tmp_path, change, message):
     path = nrrd(tmp_path / "a.nrrd", GREY, **change)
-    with pytest.raises(VolumeError, match=message) as refused:
-        read_sweep(path)
-    assert str(refused.value).startswith(f"{path}: ")
+    refused(path, message)
 
 
 def test_the_shorter_of_several_ways_is_taken():
@@ -290,34 +461,33 @@ def test_a_file_holds_what_slicer_shows(shared_data, name):
 
 def transform_file(path, angle=0.3, shift=(10.0, 20.0, 30.0)):
     """A rotation about z and a shift, as ITK has them."""
-    made = SimpleITK.Euler3DTransform((0, 0, 0), 0, 0, angle, shift)
-    SimpleITK.WriteTransform(made, str(path))
+    made = sitk.Euler3DTransform((0, 0, 0), 0, 0, angle, shift)
+    sitk.WriteTransform(made, str(path))
     return path
 
 
 @pytest.mark.parametrize("ending", ["h5", "tfm"])
 def test_a_scene_takes_a_transform_of_slicer_as_registration(tmp_path, ending):
-    found = read_transform_file(transform_file(tmp_path / f"NdiToPatient.{ending}"))
-    assert (found.from_frame, found.to_frame) == ("Ndi", "Patient")
+    found = read_transform(transform_file(tmp_path / f"NdiToPatient.{ending}"))
     c, s = np.cos(0.3), np.sin(0.3)
     lps = -np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ [10, 20, 30]  # of the inverse
-    np.testing.assert_allclose(1e3 * found.pose.position, lps * [-1, -1, 1], atol=1e-9)
-    np.testing.assert_allclose(found.pose.rotation[:2, :2], [[c, s], [-s, c]], atol=1e-12)
+    np.testing.assert_allclose(1e3 * found.position, lps * [-1, -1, 1], atol=1e-9)
+    np.testing.assert_allclose(found.rotation[:2, :2], [[c, s], [-s, c]], atol=1e-12)
 
 
 def test_what_is_no_rigid_transform_is_refused(tmp_path):
-    scaled = SimpleITK.ScaleTransform(3, (2.0, 2.0, 2.0))
-    bent = SimpleITK.BSplineTransform(3)
+    scaled = sitk.ScaleTransform(3, (2.0, 2.0, 2.0))
+    bent = sitk.BSplineTransform(3)
     for made, name, said in ((scaled, "a.tfm", "not rigid"), (bent, "b.tfm", "not linear")):
-        SimpleITK.WriteTransform(made, str(tmp_path / name))
+        sitk.WriteTransform(made, str(tmp_path / name))
         with pytest.raises(CalibrationError, match=said):
-            read_transform_file(tmp_path / name)
+            read_transform(tmp_path / name)
     whole = transform_file(tmp_path / "whole.h5").read_bytes()
     (tmp_path / "cut.h5").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(CalibrationError, match=r"cut\.h5: is damaged"):
-        read_transform_file(tmp_path / "cut.h5")
+        read_transform(tmp_path / "cut.h5")
     with pytest.raises(CalibrationError, match="No such file"):
-        read_transform_file(tmp_path / "none.h5")
+        read_transform(tmp_path / "none.h5")
 
 
 def scene(tmp_path, transforms, times="s1:0;s2:0.5", file="../outside.mrb"):

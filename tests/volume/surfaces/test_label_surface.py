@@ -86,16 +86,19 @@ def test_two_calls_give_the_same_bytes():
     assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
 
 
-def test_what_has_no_surface_is_said():
-    mask = np.zeros((12, 12, 12), bool)
-    mask[5:7, 5:7, 5:7] = True
-    volume = labelled(mask)
-    with pytest.raises(VolumeError, match="label 9 occurs nowhere"):
-        label_surface(volume, 9)
-    with pytest.raises(VolumeError, match=r"\(vein\) occurs nowhere within"):
-        label_surface(volume, 3, within=np.array([[1.0] * 3, [2.0] * 3]))
-    with pytest.raises(VolumeError, match=r"\(vein\) is too thin"):
-        label_surface(volume, 3, 5e-3)
-    bare = Volume(volume.intensities, volume.index_to_patient)
-    with pytest.raises(VolumeError, match="the volume has no labels"):
-        label_surface(bare, 3)
+SMALL = labelled(np.pad(np.ones((2, 2, 2), bool), 5))
+BARE = Volume(SMALL.intensities, SMALL.index_to_patient)
+
+
+@pytest.mark.parametrize(
+    ("volume", "label", "how", "message"),
+    [
+        (SMALL, 9, {}, "label 9"),
+        (SMALL, 3, {"within": np.array([[1.0] * 3, [2.0] * 3])}, r"\(vein\) .*within"),
+        (SMALL, 3, {"spacing": 5e-3}, r"\(vein\) .*thin"),
+        (BARE, 3, {}, "no labels"),
+    ],
+)
+def test_what_has_no_surface_is_said(volume, label, how, message):
+    with pytest.raises(VolumeError, match=message):
+        label_surface(volume, label, **how)

@@ -219,26 +219,31 @@ def test_a_tetrahedron_is_closed_and_turned_inside_out_it_has_its_volume_below_z
     assert inverted.volume == pytest.approx(-1 / 6)
 
 
-def test_a_hole_a_turned_triangle_and_a_stray_vertex_are_faults():
-    assert "3 of its 6 edges" in ClosedSurface(CORNERS, FACES[1:]).fault
-    turned = FACES.copy()
-    turned[0] = turned[0, ::-1]
-    assert "the same way" in ClosedSurface(CORNERS, turned).fault
-    assert "1 vertices are in no" in ClosedSurface(np.vstack([CORNERS, [9.0, 9, 9]]), FACES).fault
+OPPOSITE = np.vstack([CORNERS, -CORNERS[1:]])
+AROUND_AN_EDGE = [[0.0, 0, -1], [0, 0, 1], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0]]
 
 
-def test_two_bodies_that_share_a_vertex_touch_themselves():
-    other = np.array([[0.0, 0, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    corners = np.vstack([CORNERS, other[1:]])
-    faces = np.vstack([FACES, np.array([0, 4, 5, 6])[FACES][:, ::-1]])
-    assert "touches itself at 1 vertices" in ClosedSurface(corners, faces).fault
-
-
-def test_three_tetrahedra_around_an_edge_are_refused_as_two_are():
-    outer = np.array([[1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0]]) * 1.0
-    corners = np.vstack([[[0.0, 0, -1], [0, 0, 1]], outer])
-    one, other = np.array([0, 1, 2, 3])[FACES], np.array([0, 1, 4, 5])[FACES]
-    assert "the same way" in ClosedSurface(corners, np.vstack([one, other])).fault
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "fault"),
+    [
+        (CORNERS, FACES[1:], "3 of its 6 edges"),
+        (CORNERS, np.vstack([FACES[:1, ::-1], FACES[1:]]), "the same way"),
+        (np.vstack([CORNERS, [9.0, 9, 9]]), FACES, "1 vertices are in no"),
+        (
+            OPPOSITE,
+            np.vstack([FACES, np.array([0, 4, 5, 6])[FACES][:, ::-1]]),
+            "touches itself at 1 vertices",
+        ),
+        (
+            np.array(AROUND_AN_EDGE),
+            np.vstack([FACES, np.array([0, 1, 4, 5])[FACES]]),
+            "the same way",
+        ),
+    ],
+    ids=["hole", "turned triangle", "stray vertex", "shared vertex", "shared edge"],
+)
+def test_what_is_wrong_with_a_surface_is_its_fault(vertices, triangles, fault):
+    assert fault in ClosedSurface(vertices, triangles).fault
 
 
 @pytest.mark.parametrize(

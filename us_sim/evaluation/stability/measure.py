@@ -56,7 +56,7 @@ class Trial:
     finite: bool = True
     bounded: bool = True
     truthful: bool = True
-    refused: bool = False
+    refusal: str = ""  # the sentence with which the method refused the case
     failure: str = ""  # why it counts as failed though the four above are fine
     recovered_mm: float = math.nan  # farthest node from rest, in the end
     recovery_frames: int | None = None  # until it was near rest; None when it never was
@@ -69,6 +69,11 @@ class Trial:
     slowest_ms: float = 0.0
     kept: int = 0  # frames that failed, so that the solver kept its last good state or rest
     actions: list[str] = field(default_factory=list)  # that it reported, each once
+
+    @property
+    def refused(self) -> bool:
+        """Whether the method refused the case."""
+        return bool(self.refusal)
 
     @property
     def passed(self) -> bool:
@@ -108,6 +113,7 @@ class Tried(Row):
             if not method.is_explicit:
                 varied |= {"stabilisation": None}
         failed = [f"FAILED: {trial.failure}"] if trial.failure else []
+        refused = [f"refused: {trial.refusal}"] if trial.refused else []
 
         def ran(name: str) -> object:
             return None if trial.refused else getattr(trial, name)
@@ -122,7 +128,7 @@ class Tried(Row):
             "dt_limit_predicted": trial.step_limit_predicted,
             "dt_limit_observed": trial.step_limit_observed,
             **{name: ran(name) for name in _RAN},
-            "action": " | ".join([*failed, *trial.actions[:3]]),
+            "action": " | ".join([*failed, *refused, *trial.actions[:3]]),
         }
 
     @property
@@ -148,8 +154,7 @@ def try_case(method: str, case: StabilityCase) -> Trial:
         unheld = TISSUE_METHODS[method].is_quasi_static and not _held(model).all()
         solver = create_solver(method, model, **_settings(method, case, model))
     except UsSimError as error:
-        trial.refused = True
-        trial.say(f"refused: {error}")
+        trial.refusal = str(error)
         too_many_steps = case.stabilisation == "substeps" and TISSUE_METHODS[method].is_explicit
         if not (unheld or too_many_steps):
             trial.failure = "was refused, and has nothing to be refused for"
@@ -346,8 +351,7 @@ def refusal_of(method: str, name: str) -> Trial:
     try:
         REFUSALS[name](method)
     except UsSimError as error:
-        trial.refused = True
-        trial.say(f"refused: {error}")
+        trial.refusal = str(error)
     except Exception as error:  # whatever it is, a user would see a traceback
         trial.failure = f"raised {type(error).__name__} instead of refusing: {error}"
     else:

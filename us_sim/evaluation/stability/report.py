@@ -418,9 +418,8 @@ def _actions(tried: Sequence[Tried]) -> list[str]:
     """Actions that the solver reported, with the number of cases."""
     counted: Counter[str] = Counter()
     for one in tried:
-        if not one.trial.refused:
-            parts = (part for action in one.trial.actions for part in action.split("; "))
-            counted.update(dict.fromkeys(map(_without_numbers, parts), 1))
+        parts = (part for action in one.trial.actions for part in action.split("; "))
+        counted.update(dict.fromkeys(map(_without_numbers, parts), 1))
     if not counted:
         return []
     lines = [f"- {number}: {said}" for said, number in counted.most_common(12)]
@@ -432,7 +431,7 @@ def _refusals(tried: Sequence[Tried]) -> str:
     seen: dict[str, tuple[str, str, list[str]]] = {}
     for one in tried:
         if one.trial.refused:
-            sentence = one.trial.actions[0].removeprefix("refused: ")
+            sentence = one.trial.refusal
             key = _without_numbers(sentence.replace(one.method, ""))
             methods = seen.setdefault(key, (one.name, sentence, []))[2]
             if one.method not in methods:

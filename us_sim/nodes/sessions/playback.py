@@ -10,7 +10,12 @@ from rclpy.publisher import Publisher
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.settings import AwaitedSettings, PathPlayerSettings, SessionPlayerSettings
+from us_sim.nodes.settings import (
+    RECORDER,
+    AwaitedSettings,
+    PathPlayerSettings,
+    SessionPlayerSettings,
+)
 from us_sim.recording.playhead import Playhead
 
 CHECK_S, CHECKS = 0.05, 6
@@ -19,7 +24,6 @@ CHECK_S, CHECKS = 0.05, 6
 A best-effort subscriber may find a publisher a little later than it is found itself.
 """
 TELL_AFTER_S = 5.0  # after so long it is said what is waited for
-RECORDER = "session_recorder"
 
 
 class Awaited:

@@ -77,10 +77,9 @@ def offer_player_services(
     offer("Seek", "seek", seek)
 
 
-def offer_services(node: Node, recorder: SessionRecorder) -> bool:
+def offer_services(recorder: SessionRecorder) -> bool:
     """Offer rosbag2's services; False where ``rosbag2_interfaces`` is not installed."""
-
-    offer = partial(offer_service, node)
+    offer = partial(offer_service, recorder)
 
     def toggle(_: Any, __: Any) -> None:
         (recorder.resume if recorder.paused else recorder.pause)()

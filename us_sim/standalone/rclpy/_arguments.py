@@ -124,8 +124,7 @@ def _tagged_as_string(node: yaml.ScalarNode) -> bool:
 NodeParameter = tuple[str, str, Any]  # node name or wildcard, parameter name, value
 
 _KEY = "ros__parameters"
-_LARGEST = 1 << 20
-"""Characters of a file."""
+_LARGEST = 1 << 20  # characters of a file
 
 
 def read_parameter_file(path: str) -> list[NodeParameter]:

@@ -54,11 +54,7 @@ class NodeParameters:
         self._post_set_parameters_callbacks: list[Callable[..., Any]] = []
 
     def declare_parameter(
-        self,
-        name: str,
-        value: Any = None,
-        descriptor: Any = None,
-        ignore_override: bool = False,
+        self, name: str, value: Any = None, descriptor: Any = None, ignore_override: bool = False
     ) -> Parameter:
         """Make a parameter known.
 
@@ -74,10 +70,7 @@ class NodeParameters:
         return self.declare_parameters("", [parameter], ignore_override)[0]
 
     def declare_parameters(
-        self,
-        namespace: str,
-        parameters: Sequence[tuple[Any, ...]],
-        ignore_override: bool = False,
+        self, namespace: str, parameters: Sequence[tuple[Any, ...]], ignore_override: bool = False
     ) -> list[Parameter]:
         """Make several parameters known; raises as `declare_parameter`."""
         values: list[Parameter] = []

@@ -280,10 +280,8 @@ def open_endpoint(
     package, folder, name = msg_type.__msgtype__.split("/")
     if kind == "publisher":
         create: Any = Participant.create_writer
-        other, effect = (
-            "subscription",
-            "requesting incompatible QoS. No messages will be sent to it",
-        )
+        other = "subscription"
+        effect = "requesting incompatible QoS. No messages will be sent to it"
     else:
         create = Participant.create_reader
         other = "publisher"

@@ -12,15 +12,8 @@ from typing import Any
 
 from ..messages import message_class, service_class
 from .endpoints import CallbackGroup, wait_until
-from .exceptions import (
-    ParameterNotDeclaredException,
-    ParameterUninitializedException,
-)
-from .qos import (
-    QoSProfile,
-    qos_profile_parameters,
-    qos_profile_services_default,
-)
+from .exceptions import ParameterNotDeclaredException, ParameterUninitializedException
+from .qos import QoSProfile, qos_profile_parameters, qos_profile_services_default
 from .task import Future
 
 PARAMETER_SEPARATOR_STRING = "."

@@ -221,10 +221,7 @@ class QoSOverridingOptions:
 
     @classmethod
     def with_default_policies(
-        cls,
-        *,
-        callback: Callable[[QoSProfile], Any] | None = None,
-        entity_id: str | None = None,
+        cls, *, callback: Callable[[QoSProfile], Any] | None = None, entity_id: str | None = None
     ) -> "QoSOverridingOptions":
         """Allow history, depth and reliability to be overridden."""
         kinds = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
@@ -232,11 +229,7 @@ class QoSOverridingOptions:
 
 
 def overridden(
-    kind: str,
-    node: Any,
-    topic_name: str,
-    qos: QoSProfile,
-    options: QoSOverridingOptions | None,
+    kind: str, node: Any, topic_name: str, qos: QoSProfile, options: QoSOverridingOptions | None
 ) -> QoSProfile:
     """A profile after a node's overrides for a 'publisher' or 'subscription' of an absolute topic.
 

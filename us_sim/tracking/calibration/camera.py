@@ -33,9 +33,6 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.settings import BOARD_LENGTH, BOARDS
 
 _SEARCHED = 1600  # pixels, largest side of an image that is searched for a chessboard
-_Corners = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""(N, 3) m on the board and (N, 2) pixels, as of a `BoardView`."""
-_NOTHING: _Corners = np.empty((0, 3), np.float32), np.empty((0, 2), np.float32)
 _FEWEST_CORNERS = 6  # of a view: fewer do not determine the board's pose and an error
 
 
@@ -109,14 +106,13 @@ class Board:
         None where it shows fewer than six, or they are all in one row.
         """
         find = self._find_chessboard if self.kind == "chessboard" else self._find_markers
-        points, pixels = find(image)
-        if len(points) < _FEWEST_CORNERS:
+        seen = find(image)
+        if seen is None or len(seen) < _FEWEST_CORNERS:
             return None
-        if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), tol=1e-6) < 2:
-            return None
-        return BoardView(points, pixels)
+        places = seen.points[:, :2] - seen.points[:, :2].mean(axis=0)
+        return seen if np.linalg.matrix_rank(places, tol=1e-6) == 2 else None
 
-    def _find_chessboard(self, image: NDArray[np.uint8]) -> _Corners:
+    def _find_chessboard(self, image: NDArray[np.uint8]) -> BoardView | None:
         size = (self.columns - 1, self.rows - 1)
         # A large photo is searched at a smaller size, since that takes its pixels' time.
         shrink = min(1.0, _SEARCHED / max(image.shape))
@@ -127,7 +123,7 @@ class Board:
             flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY,
         )
         if not found:
-            return _NOTHING
+            return None
         if shrink < 1.0:
             window = 2 + round(2.0 / shrink)
             pixels = cv2.cornerSubPix(
@@ -139,9 +135,9 @@ class Board:
             )
         rows, columns = np.indices(size[::-1])
         points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
-        return np.float32(self.square) * points.astype(np.float32), _pixels(pixels)
+        return BoardView(np.float32(self.square) * points.astype(np.float32), _pixels(pixels))
 
-    def _find_markers(self, image: NDArray[np.uint8]) -> _Corners:
+    def _find_markers(self, image: NDArray[np.uint8]) -> BoardView | None:
         corners: Any
         if self.kind == "charuco":
             corners, ids, _, _ = self._charuco_detector.detectBoard(image)
@@ -151,11 +147,9 @@ class Board:
                 image, self._printed, *seen
             )
         if ids is None or not len(ids):
-            return _NOTHING
+            return None
         points, pixels = self._printed.matchImagePoints(corners, ids)
-        if points is None:
-            return _NOTHING
-        return points.reshape(-1, 3), _pixels(pixels)
+        return None if points is None else BoardView(points.reshape(-1, 3), _pixels(pixels))
 
     @cached_property
     def _printed(self) -> Any:
@@ -241,12 +235,9 @@ class CameraCalibration:
 
 
 def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> CameraCalibration:
-    """The camera whose pinhole and lens explain the views best.
+    """The camera whose pinhole and lens explain the views of one board from many places best.
 
-    Args:
-        views: of one board, each from another place.
-        width: pixels, of all photos.
-        height: pixels.
+    Width and height are those of all photos, in pixels.
 
     Raises:
         CalibrationError: the views are too few or too alike to determine the camera.

@@ -73,7 +73,7 @@ def register_landmarks(
     pose = _fit(measured, known)
     residuals = np.linalg.norm(pose.apply(measured) - known, axis=1)
     fre = math.sqrt(float((residuals**2).mean()))
-    _check_fit(measured, known, residuals, names)
+    _check_fit(measured, known, residuals, fre, names)
     left_out = _leave_one_out(measured, known)
     deviations = _deviations(known, pose.position, residuals)
     return LandmarkRegistration(pose, names, residuals, fre, left_out, deviations)
@@ -101,7 +101,9 @@ def _check(measured: Array, known: Array, names: Sequence[str]) -> None:
             )
 
 
-def _check_fit(measured: Array, known: Array, residuals: Array, names: Sequence[str]) -> None:
+def _check_fit(
+    measured: Array, known: Array, residuals: Array, fre: float, names: Sequence[str]
+) -> None:
     spread, theirs = (
         math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for points in (known, measured)
@@ -111,7 +113,6 @@ def _check_fit(measured: Array, known: Array, residuals: Array, names: Sequence[
             f"the measured landmarks are {theirs / spread:.3g} times as far apart as the known "
             f"ones: give both in metres"
         )
-    fre = math.sqrt(float((residuals**2).mean()))
     if fre > _WORST_FIT * spread:
         raise CalibrationError(
             f"the landmarks do not fit (FRE {1e3 * fre:.1f} mm, worst at landmark "

@@ -26,9 +26,7 @@ from us_sim.geometry.pose import Pose
 ENOUGH_FEATURES = 6
 """Fewer features are too few clusters: each is divided into parts of the recording."""
 
-_PARTS = 12
-"""Clusters at least, where features are divided."""
-
+_PARTS = 12  # clusters at least, where features are divided
 _OWN = 1e-6
 """The rest of an error in a direction that a cluster alone determines; its residual is zero."""
 
@@ -179,13 +177,10 @@ class PivotCalibration:
 
 
 def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
-    """The tip that stays in one place.
+    """The tip that stays in one place, from poses of the body in the device's frame.
 
     Up to about 40 % of the poses may be wrong (the tip slipped, the tracker saw a reflection):
     a least median of squares start (Rousseeuw 1984) leaves them out.
-
-    Args:
-        poses: of the body in the device's frame, while the tip stands still.
 
     Raises:
         CalibrationError: there are too few poses, they turn about one axis only, or the tip did

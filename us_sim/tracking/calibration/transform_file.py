@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,6 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
-from us_sim.volume.sequences.transforms import split_transform_name
-
-_KEYS = ("from", "to", "position", "orientation")
 
 
 @dataclass(frozen=True)
@@ -49,68 +46,32 @@ class _Written(Settings):
     )
 
 
-@dataclass(frozen=True, eq=False)
-class TransformFile:
-    """A pose, and the frames, residuals and method that its file states."""
-
-    pose: Pose  # of from_frame in to_frame
-    from_frame: str
-    to_frame: str
-    method: str = ""
-    date: str = ""  # ISO 8601
-    residuals: Mapping[str, Any] = field(default_factory=dict)  # SI units, by name
-    more: Mapping[str, Any] = field(default_factory=dict)  # whatever else the method found
-
-
 def read_transform(path: str | Path) -> Pose:
     """The pose of the file's frame `from` in its frame `to`, m.
 
-    Raises:
-        CalibrationError: see :func:`read_transform_file`.
-    """
-    return read_transform_file(path).pose
-
-
-def read_transform_file(path: str | Path) -> TransformFile:
-    """All that a transform's file says.
+    A file of 3D Slicer (.h5, .tfm) holds the transform to the parent, in RAS.
 
     Raises:
         CalibrationError: the file is missing, is no YAML, lacks the position or orientation, or
-            these are not 3 and 4 finite numbers; or a file of 3D Slicer (.h5, .tfm) holds no
-            rigid transform.
+            these are not 3 and 4 finite numbers; or a file of 3D Slicer holds no rigid transform.
     """
     path = Path(path)
-    if path.suffix.lower() in SLICER_TRANSFORMS:
-        return _of_slicer(path)
-    document = _document(path)
-    written = {key: document[key] for key in ("position", "orientation") if key in document}
-    place = Reader(str(path), error=CalibrationError).read(_Written, written)
-    residuals = document.get("residuals", {})
-    if not isinstance(residuals, dict):
-        raise CalibrationError(f"{path}: residuals: must be a mapping of names, not {residuals!r}")
     try:
-        pose = Pose(np.array(place.position), np.array(place.orientation))
-    except PoseError as error:
-        raise CalibrationError(f"{path}: {error}") from error
-    known = {*_KEYS, "method", "date", "residuals"}
-    keys = ("from", "to", "method", "date")
-    from_frame, to_frame, method, date = (str(document.get(key, "")) for key in keys)
-    more = {key: value for key, value in document.items() if key not in known}
-    return TransformFile(pose, from_frame, to_frame, method, date, residuals, more)
-
-
-def _of_slicer(path: Path) -> TransformFile:
-    """The transform to the parent, in RAS, with frames by the file's name (``ProbeToTracker``)."""
-    try:
-        matrix = read_slicer_transform(path)
+        if path.suffix.lower() in SLICER_TRANSFORMS:
+            return Pose.from_matrix(read_slicer_transform(path))
+        document = _document(path)
+        written = {key: document[key] for key in ("position", "orientation") if key in document}
+        place = Reader(str(path), error=CalibrationError).read(_Written, written)
+        residuals = document.get("residuals", {})
+        if not isinstance(residuals, dict):
+            raise CalibrationError(
+                f"{path}: residuals: must be a mapping of names, not {residuals!r}"
+            )
+        return Pose(np.array(place.position), np.array(place.orientation))
     except VolumeError as error:
         raise CalibrationError(str(error)) from error
-    try:
-        pose = Pose.from_matrix(matrix)
     except PoseError as error:
         raise CalibrationError(f"{path}: {error}") from error
-    from_frame, to_frame = split_transform_name(path.stem) or ("", "")
-    return TransformFile(pose, from_frame, to_frame, "3D Slicer")
 
 
 def write_transform(

@@ -187,8 +187,8 @@ def body_poses(
     if guess is not None:
         guesses.append((guess.rotation, guess.position))
     ranked = sorted(
-        (_misfit(_residuals(camera, points, pixels, *each), deviation), i)
-        for i, each in enumerate(guesses)
+        (_misfit(camera.project(points @ turn.T + place) - pixels, deviation), i)
+        for i, (turn, place) in enumerate(guesses)
     )
     found: list[BodyPose] = []
     for misfit, i in ranked[: _REFINED + 1]:
@@ -227,16 +227,6 @@ def _guesses(
     # The largest in the image tell most.
     groups.sort(key=lambda group: -float(np.ptp(pixels[group], axis=0).prod()))
     return [each for group in groups[:_TRIED] for each in plane_poses(points[group], rays[group])]
-
-
-def _residuals(
-    camera: CameraModel,
-    points: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    position: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    return camera.project(points @ rotation.T + position) - pixels
 
 
 def _misfit(residuals: NDArray[np.float64], deviation: float) -> float:

@@ -137,11 +137,7 @@ def fitted_corners(
 
 
 class _View:
-    """A marker's pattern drawn over a part of an image, and the difference.
-
-    Args:
-        image, corners, cells: as for `fitted_corners`.
-    """
+    """A marker's pattern drawn over a part of an image, and what differs; see `fitted_corners`."""
 
     def __init__(
         self, image: NDArray[np.uint8], corners: NDArray[np.float64], cells: NDArray[np.uint8]
@@ -183,8 +179,7 @@ class _View:
     def step(self, doubting: bool) -> bool:
         """One of Gauss and Newton; whether it leads anywhere.
 
-        Args:
-            doubting: what differs by far is a hand, or a gleam, and pulls less (Cauchy's weights).
+        When doubting, what differs by far is a hand, or a gleam: it pulls less (Cauchy's weights).
         """
         drawn = self._draw()
         within = self._within(self._seen)

@@ -278,7 +278,9 @@ def read_camera_info(path: Path | str) -> CameraModel:
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, YamlError) as error:
-        raise TrackingError(f"{path}: not a YAML file of camera info: {_line(error)}") from error
+        raise TrackingError(
+            f"{path}: not a YAML file of camera info: {str(error).splitlines()[0]}"
+        ) from error
     if not isinstance(content, Mapping):
         raise TrackingError(f"{path}: not camera info; it must be a mapping")
     wanted = ("image_width", "image_height", "camera_matrix", "distortion_coefficients")
@@ -309,11 +311,7 @@ def write_camera_info(
 ) -> None:
     """Write the file that `read_camera_info` and ROS's drivers read.
 
-    Args:
-        path: of the new file.
-        camera: what it says.
-        name: the camera's.
-        notes: further keys, which readers pass over: how it was calibrated, and how well.
+    The notes are further keys, which readers pass over: how it was calibrated, and how well.
 
     Raises:
         TrackingError: the file exists.
@@ -349,7 +347,3 @@ def _data(content: Mapping[str, Any], key: str) -> Any:
 def _matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
     rows, columns = values.shape
     return {"rows": rows, "cols": columns, "data": [float(value) for value in values.ravel()]}
-
-
-def _line(error: Exception) -> str:
-    return str(error).splitlines()[0]

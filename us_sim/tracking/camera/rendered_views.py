@@ -57,9 +57,7 @@ class Conditions:
     defocus: float = 0.6  # pixels, standard deviation of the lens's blur
     read_noise: float = 1.0  # grey, standard deviation of what every pixel adds
     shot_noise: float = 0.01  # grey, variance that comes with each level of light
-    gradient: float = (
-        0.0  # fraction of the light that is lost from one side of the image to the other
-    )
+    gradient: float = 0.0  # fraction of the light that is lost from one side to the other
     occlusion: float = 0.0  # fraction of the body's extent in the image that a hand covers
 
 
@@ -190,11 +188,7 @@ class RenderedView:
             )
 
     def _draw_hand(
-        self,
-        image: NDArray[np.float32],
-        pose: Pose,
-        fraction: float,
-        random: np.random.Generator,
+        self, image: NDArray[np.float32], pose: Pose, fraction: float, random: np.random.Generator
     ) -> None:
         """Draw fingers that come from one side and cover a fraction of the body's extent."""
         corners = self.camera.project(pose.apply(self.body.corners.reshape(-1, 3)))
@@ -214,16 +208,9 @@ class RenderedView:
             side = start + finger * (number + 0.5)
             for width, grey in ((1.0, 0.6 * _SKIN), (0.85, _SKIN)):
                 ends = (end * reach + side * across, (end - far) * reach + side * across)
-                points = [tuple(round(16 * float(value)) for value in point) for point in ends]
-                cv2.line(
-                    image,
-                    points[0],
-                    points[1],
-                    grey,
-                    max(1, int(width * finger)),
-                    lineType=cv2.LINE_8,
-                    shift=4,
-                )
+                one, other = (tuple(round(16 * float(n)) for n in point) for point in ends)
+                thickness = max(1, int(width * finger))
+                cv2.line(image, one, other, grey, thickness, lineType=cv2.LINE_8, shift=4)
 
     def _gradient(self, loss: float, random: np.random.Generator) -> NDArray[np.float32]:
         """(rows, columns) fraction of the light, 1 at one side of the image."""

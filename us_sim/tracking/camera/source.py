@@ -98,13 +98,7 @@ _SHORTEST = 40.0  # pixels, of a marker's edge in an image that is reduced to fi
 
 
 class CameraSource:
-    """Tracks one body of markers through the images of one camera.
-
-    Args:
-        camera: of the images.
-        body: what to look for.
-        settings: when to believe it.
-    """
+    """Tracks one body of markers through the images of one camera."""
 
     def __init__(
         self, camera: CameraModel, body: RigidBody, settings: CameraSettings | None = None

@@ -12,8 +12,9 @@ from typing import Any
 
 from nicegui import ui
 
+from us_sim.scene.listing import ListedScene
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.session import NOT_THERE, LoadableScene, SessionState
+from us_sim.viewer.session import NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
 
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
@@ -80,7 +81,7 @@ class _Cases:
                     for each in others:
                         self._card(each, state)
 
-    def _card(self, scene: LoadableScene, state: SessionState) -> None:
+    def _card(self, scene: ListedScene, state: SessionState) -> None:
         is_loaded = scene.origin == state.origin
         with ui.card().classes("us-case") as card:
             if is_loaded:
@@ -105,7 +106,7 @@ class _Cases:
                 button.set_enabled(state.is_there and not state.is_busy and not scene.problem)
                 button.props["title"] = AGAIN if is_loaded else ANOTHER
 
-    async def _load(self, scene: LoadableScene) -> None:
+    async def _load(self, scene: ListedScene) -> None:
         state = self._board.state
         if state.record and not await self._is_sure(scene, state.record):
             return
@@ -113,7 +114,7 @@ class _Cases:
         if refused:
             ui.notify(refused, type="warning", multi_line=True)
 
-    async def _is_sure(self, scene: LoadableScene, record: str) -> bool:
+    async def _is_sure(self, scene: ListedScene, record: str) -> bool:
         """Ask, since the recording ends with its scene."""
         with ui.dialog() as dialog, ui.card():
             dialog.props["aria-label"] = "Load another scene"

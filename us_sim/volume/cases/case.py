@@ -26,7 +26,7 @@ from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
 from us_sim.settings.spelling import nearest
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.files.readers import open_image, read_placement, read_volume
@@ -166,12 +166,7 @@ def read_case(folder: str | os.PathLike[str], shown: Path | None = None) -> Case
         if not (folder / name).is_file():
             raise CaseError(f"{shown}: is no case, as it has no {name}; `us-sim cases` lists some")
     path = shown / CASE
-    try:
-        document = load_yaml(read_text(folder / CASE))
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaseError(f"{path}: cannot be read: {error}") from error
-    except YamlError as error:
-        raise CaseError(f"{path}: {error}") from error
+    document = read_yaml(folder / CASE, CaseError, path)
     if document is None:
         raise CaseError(f"{path}: is empty; a case has at least a name")
     settings = Reader(str(path), None, CaseError).read(CaseSettings, document)

@@ -37,13 +37,13 @@ _WIDENS = -0.12
 """Skewness of the distances along the beams below which the region is said to widen with them: a
 wedge that becomes half as wide again has -0.2, a box 0."""
 _LIKELY = 0.7
-"""Of the least skewness: directions with less of it than this are tried. A fan of 60 degrees has
-three such corners, and echoes are brightest near one of them."""
+"""Fraction of the least skewness, below which directions are tried: a fan of 60 degrees has three
+such corners, and echoes are brightest near one of them."""
 _BESIDE = 4e-3  # m, from the middle beam, within which the skin is looked for
 _FARTHEST = 0.04  # m, along its elevation, that the probe is moved to see structures
 _SLID, _SHOWN = 4e-3, 6e-3
 """m: the press slides 8 mm along y; its middle, and half of what it shows."""
-_BETTER = 1.02
+_BETTER = 1.02  # times as much in the image, for which another pose is preferred
 _ROCK = math.radians(4.0)  # to both sides, in the middle of a whole slide
 
 

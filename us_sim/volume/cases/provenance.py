@@ -21,7 +21,7 @@ from us_sim.errors import CaseError
 from us_sim.settings.reading import document_of
 from us_sim.settings.setting import Settings, rules_of
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import read_yaml
 from us_sim.volume.partial_file import partial_file
 
 PROVENANCE = "provenance.yaml"
@@ -110,12 +110,7 @@ def read_steps(folder: Path) -> tuple[Step, ...]:
     path = folder / PROVENANCE
     if not path.exists():
         return ()
-    try:
-        document = load_yaml(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaseError(f"{path}: cannot be read: {error}") from error
-    except YamlError as error:
-        raise CaseError(f"{path}: {error}") from error
+    document = read_yaml(path, CaseError)
     steps = document.get("steps") if isinstance(document, dict) else None
     if not isinstance(steps, list) or len(steps) > 1000 or set(document) != {"steps"}:
         raise CaseError(f"{path}: must have one key, `steps`, with a list of what was done")

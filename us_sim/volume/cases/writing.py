@@ -29,13 +29,9 @@ from us_sim.volume.partial_file import partial_file
 
 @contextmanager
 def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """A folder to fill; it becomes the case at the end, when it is one.
+    """A folder to fill, beside that of the new case, which it becomes at the end, when it is one.
 
-    Args:
-        folder: of the new case; its parents are made.
-
-    Yields:
-        The folder to write to, beside that.
+    Parents of the new case's folder are made.
 
     Raises:
         CaseError: there is something at that place already, it cannot be made, or what was written

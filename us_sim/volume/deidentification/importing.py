@@ -56,11 +56,9 @@ class _Glyphs:
 
 
 def find_text(images: Sequence[NDArray[np.uint8]]) -> list[Rectangle]:
-    """Lines of possible text, from the top down.
+    """Lines of possible text in images (rows, columns) of equal size, from the top down.
 
-    Args:
-        images: (rows, columns) of equal size; several, from all over a recording, tell text from
-            moving echoes.
+    Several, from all over a recording, tell text from moving echoes.
     """
     stack = np.stack(images)
     low, high = stack.min(axis=0), stack.max(axis=0)
@@ -83,12 +81,8 @@ def find_text(images: Sequence[NDArray[np.uint8]]) -> list[Rectangle]:
 def proposed_part(
     images: Sequence[NDArray[np.uint8]], text: Sequence[Rectangle]
 ) -> Rectangle | None:
-    """The part of images to keep, for a person to decide: the largest connected part that moves,
-    or of one image that is not black; no text.
-
-    Args:
-        images: (rows, columns) of equal size.
-        text: places of possible text.
+    """The part of images (rows, columns) to keep, for a person to decide: the largest connected
+    part that moves, or of one image that is not black; no places of possible text.
     """
     stack = np.stack(images)
     moving = np.ptp(stack, axis=0) > 16  # grey levels
@@ -175,9 +169,7 @@ def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
     return bool(aligned >= 0.7 and width > 1.5 * height)
 
 
-_MARGIN = 3
-"""Pixels around text that are blanked with it: shadows and blurred edges."""
-
+_MARGIN = 3  # pixels around text that are blanked with it: shadows and blurred edges
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 

@@ -107,9 +107,7 @@ _NRRD_TEXT = """
     kinds, endian, encoding, spacings, centers, centerings, thicknesses, measurement frame,
     units, data file, datafile, line skip, byte skip, axis mins, axis maxs, block size
 """
-_NRRD = _listed(_NRRD_TEXT)
-"""Fields that say where voxels are; a volume has no use for others."""
-
+_NRRD = _listed(_NRRD_TEXT)  # fields that say where voxels are; a volume has no use for others
 _COMMON_TEXT = """
     Comment, Name, ID, Modality, AcquisitionDate, PatientName, PatientID, PatientSex,
     PatientBirthDate, StudyDate, StudyTime, StudyID, SeriesDescription, InstitutionName,

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,26 +33,14 @@ _ENHANCED_US_VOLUME = "1.2.840.10008.5.1.4.1.1.6.2"
 _REGIONS = "SequenceOfUltrasoundRegions"
 
 Progress = Callable[[float, str], None]
-
-
-class Voxels(Protocol):
-    """Reads the voxels (i, j, k)."""
-
-    def __call__(
-        self, keep: NDArray[np.bool_] | None, progress: Progress | None, /
-    ) -> NDArray[np.uint8]: ...
-
-
-class Images(Protocol):
-    """Reads the images (rows, columns), one after another."""
-
-    def __call__(self, keep: NDArray[np.bool_] | None, /) -> Iterator[NDArray[np.uint8]]: ...
-
-
-class Sides(Protocol):
-    """Some slices across each of the other two axes, of the kept part of the images."""
-
-    def __call__(self, keep: NDArray[np.bool_] | None, /) -> Iterator[list[NDArray[np.uint8]]]: ...
+Keep = NDArray[np.bool_] | None
+"""(rows, columns) the part of every image that is kept; None: all of it."""
+Voxels = Callable[[Keep, Progress | None], NDArray[np.uint8]]
+"""Reads the voxels (i, j, k)."""
+Images = Callable[[Keep], Iterator[NDArray[np.uint8]]]
+"""Reads the images (rows, columns), one after another."""
+Sides = Callable[[Keep], Iterator[list[NDArray[np.uint8]]]]
+"""Some slices across each of the other two axes."""
 
 
 @dataclass(frozen=True)
@@ -114,15 +102,15 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
     voxels, conversions = grey_voxels(image, volume)
     count = voxels.shape[2]
 
-    def blanked(keep: NDArray[np.bool_] | None, _: Progress | None) -> NDArray[np.uint8]:
+    def blanked(keep: Keep, _: Progress | None) -> NDArray[np.uint8]:
         return voxels if keep is None else np.where(keep.T[:, :, None], voxels, np.uint8(0))
 
-    def slices(keep: NDArray[np.bool_] | None) -> Iterator[NDArray[np.uint8]]:
+    def slices(keep: Keep) -> Iterator[NDArray[np.uint8]]:
         for k in range(count):
             image = np.ascontiguousarray(voxels[:, :, k].T)
             yield image if keep is None else np.where(keep, image, np.uint8(0))
 
-    def sides(keep: NDArray[np.bool_] | None) -> Iterator[list[NDArray[np.uint8]]]:
+    def sides(keep: Keep) -> Iterator[list[NDArray[np.uint8]]]:
         for axis in (0, 1):
             stack = []
             for n in _spread(voxels.shape[axis]):

@@ -112,9 +112,7 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
 def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """The image that a header describes.
 
-    Args:
-        path: of the file.
-        given: (3,) mm, the spacing of a file that does not state it.
+    ``given`` is the spacing, (3,) mm, of a file that does not state it.
 
     Raises:
         VolumeError: as `metaimage_header` and `metaimage_voxels`.

@@ -50,9 +50,8 @@ _TO_LPS = np.diag([-1.0, -1.0, 1.0])  # NIfTI's x goes to the right, its y to th
 def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """The image that a NIfTI header describes; header and voxels may each be packed by gzip.
 
-    Args:
-        path: of the file, or of one of the pair ``.hdr`` and ``.img``.
-        given: (3,) mm, the spacing of a file that does not state it.
+    The file may be one of the pair ``.hdr`` and ``.img``. ``given`` is the spacing, (3,) mm, of a
+    file that does not state it.
 
     Raises:
         VolumeError: it is no such header, or the compression is broken.

@@ -137,9 +137,7 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """The image that a header describes, whose first axis may be numbers of a voxel and whose last
     one several volumes.
 
-    Args:
-        path: of the file.
-        given: (3,) mm, the spacing of a file that does not state it.
+    ``given`` is the spacing, (3,) mm, of a file that does not state it.
 
     Raises:
         VolumeError: as `nrrd_voxels`, or its axes are no volume's.

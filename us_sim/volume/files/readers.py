@@ -117,11 +117,8 @@ def open_image(
 
 
 def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
-    """The grey values (i, j, k) of an image, and the conversion of its numbers in words.
-
-    Args:
-        image: as `open_image` returns it.
-        volume: which one where there are several.
+    """The grey values (i, j, k) of one of an image's volumes, and the conversion of its numbers in
+    words.
 
     Raises:
         VolumeError: its data cannot be read, or there is no such volume.

@@ -178,15 +178,10 @@ class _Inflated:
 
 
 def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
-    """Refuse an image that is larger than `LARGEST_VOLUME` or than the memory that is free.
-
-    Args:
-        path: which errors name.
-        size: numbers along each axis.
-        value: bytes of a number.
+    """Refuse an image of so many numbers along each axis, and so many bytes a number.
 
     Raises:
-        VolumeError: it is.
+        VolumeError: it is larger than `LARGEST_VOLUME`, or than the memory that is free.
     """
     numbers = math.prod(size)
     shown = " × ".join(map(str, size))
@@ -242,8 +237,7 @@ class StoredImage:
     def check(self, *, layers: bool = False) -> None:
         """Refuse an image that is no volume, or none that can be read.
 
-        Args:
-            layers: a voxel may have several numbers, as segmentations of 3D Slicer have.
+        With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
 
         Raises:
             VolumeError: it is not of three dimensions, or of four as several volumes, has one voxel
@@ -264,10 +258,7 @@ class StoredImage:
         check_claim(path, (*self.shape, self.components), self.voxels.type.itemsize)
 
     def slices(self, volume: int = 1) -> Iterator[NDArray[Any]]:
-        """The slices (j, i) of a volume, or (j, i, component), scaled as the header says.
-
-        Args:
-            volume: which one where there are several.
+        """The slices (j, i) of one of the volumes, or (j, i, component), scaled as the header says.
 
         Raises:
             VolumeError: the file holds more or fewer numbers, or is damaged.

@@ -24,6 +24,15 @@ from us_sim.volume.volume import Volume
 
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
 _Grid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Spacing (3,) mm, direction (3, 3) and origin (3,) mm."""
+_METAIMAGE = {
+    "ObjectType": "Image",
+    "NDims": "3",
+    "BinaryData": "True",
+    "BinaryDataByteOrderMSB": "False",
+    "CompressedData": "False",
+}
+"""Beginning of a MetaImage header."""
 
 
 def write_volume(
@@ -53,7 +62,7 @@ def write_volume(
         return
     grid = _grid_in_mm(path, volume)
     _check_fields(path, fields)
-    head = (_nrrd_header if name.endswith(".nrrd") else _metaimage_header)(volume, *grid, fields)
+    head = (_nrrd_header if name.endswith(".nrrd") else _metaimage_header)(volume, grid, fields)
     with partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
         file.write(head.encode("utf-8"))
         for k, step in _slabs(voxels):
@@ -113,11 +122,7 @@ def write_image_sequence(
     assert len(times) == count
     assert all(map(math.isfinite, times))
     fields = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
+        **_METAIMAGE,
         "DimSize": f"{columns} {rows} {count}",
         "ElementSpacing": f"{pixel_mm[0]:.9g} {pixel_mm[1]:.9g} 1",
         "ElementType": "MET_UCHAR",
@@ -137,7 +142,7 @@ def write_image_sequence(
 
 
 def _grid_in_mm(path: Path, volume: Volume) -> _Grid:
-    """Spacing (3,) mm, direction (3, 3) and origin (3,) mm of a volume's grid."""
+    """A volume's grid."""
     matrix = volume.index_to_patient[:3, :3] * 1e3
     spacing = np.linalg.norm(matrix, axis=0)
     direction = matrix / spacing
@@ -170,14 +175,9 @@ def _slabs(voxels: NDArray[np.uint8]) -> Iterator[tuple[int, int]]:
     return ((k, step) for k in range(0, voxels.shape[2], step))
 
 
-def _nrrd_header(
-    volume: Volume,
-    spacing: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    fields: Mapping[str, str],
-) -> str:
+def _nrrd_header(volume: Volume, grid: _Grid, fields: Mapping[str, str]) -> str:
     """teem.sourceforge.net/nrrd/format.html, with pairs of keys and values behind the fields."""
+    spacing, direction, origin = grid
     steps = " ".join(f"({_joined(axis, ',')})" for axis in (direction * spacing).T)
     lines = [
         "NRRD0004",
@@ -195,20 +195,11 @@ def _nrrd_header(
     return "\n".join([*lines, "", ""])
 
 
-def _metaimage_header(
-    volume: Volume,
-    spacing: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    fields: Mapping[str, str],
-) -> str:
+def _metaimage_header(volume: Volume, grid: _Grid, fields: Mapping[str, str]) -> str:
     """itk.org/Wiki/MetaIO/Documentation, with further fields in between."""
+    spacing, direction, origin = grid
     said = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
+        **_METAIMAGE,
         "TransformMatrix": _joined(direction.T.ravel(), " "),
         "Offset": _joined(origin, " "),
         "CenterOfRotation": "0 0 0",

@@ -15,7 +15,7 @@ the scale of a wavelength add an echo of one phase, which does not speckle.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -247,24 +247,17 @@ UPPER_ARM_LABELS = {"skin": 1, "fat": 2, "muscle": 3, "bone": 4, "artery": 5, "v
 
 _SIDE_LOBES = -27.0  # dB
 _BLOOD = -60.0  # dB, all but free of echoes
+_SMOOTH = 0.7  # of an interface
 
 
-@dataclass(frozen=True)
 class ArmSection:
-    """A cross-section of the arm at one y, on evenly spaced x (X,) and z (Z,)."""
+    """A cross-section of the arm at one y (m), on evenly spaced x (X,) and z (Z,) m."""
 
-    x: NDArray[np.float64]  # (X,) m
-    y: float  # m
-    z: NDArray[np.float64]  # (Z,) m
-    labels: NDArray[np.uint8] = field(init=False)  # (X, Z)
-    diffuse: NDArray[np.float64] = field(init=False)  # (X, Z) rms echo of unresolved scatterers
-    specular: NDArray[np.float64] = field(init=False)  # (X, Z) echo of smooth interfaces
-
-    def __post_init__(self) -> None:
-        shape = (len(self.x), len(self.z))
-        object.__setattr__(self, "labels", np.zeros(shape, dtype=np.uint8))
-        object.__setattr__(self, "diffuse", np.zeros(shape))
-        object.__setattr__(self, "specular", np.zeros(shape))
+    def __init__(self, x: NDArray[np.float64], y: float, z: NDArray[np.float64]) -> None:
+        self.x, self.y, self.z = x, y, z
+        self.labels = np.zeros((len(x), len(z)), dtype=np.uint8)
+        self.diffuse = np.zeros((len(x), len(z)))  # rms echo of unresolved scatterers
+        self.specular = np.zeros((len(x), len(z)))  # echo of smooth interfaces
 
     @property
     def steps(self) -> tuple[float, float]:
@@ -282,10 +275,10 @@ class ArmSection:
         self.diffuse[where] = echo[where]
         self.specular[where] = 0.0
 
-    def interface(self, profile: NDArray[np.float64], level: float, smooth: float = 0.7) -> None:
-        """Add an echoing surface: a fraction ``smooth`` is specular, the rest speckled."""
-        np.maximum(self.specular, smooth * _echo(level) * profile, out=self.specular)
-        np.maximum(self.diffuse, (1 - smooth) * _echo(level) * profile, out=self.diffuse)
+    def interface(self, profile: NDArray[np.float64], level: float) -> None:
+        """Add an echoing surface: a fraction of `_SMOOTH` is specular, the rest speckled."""
+        np.maximum(self.specular, _SMOOTH * _echo(level) * profile, out=self.specular)
+        np.maximum(self.diffuse, (1 - _SMOOTH) * _echo(level) * profile, out=self.diffuse)
 
 
 class UpperArm:

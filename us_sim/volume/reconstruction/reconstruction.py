@@ -242,9 +242,6 @@ def _pair(
 class LiveReconstruction:
     """A volume that grows while a probe scans: images inserted at poses, in a box that is fixed.
 
-    Args:
-        box: where, and how.
-
     Raises:
         VolumeError: it has too many voxels, or more than the free memory holds.
     """
@@ -257,11 +254,9 @@ class LiveReconstruction:
         self.frames = 0
 
     def insert(self, image: NDArray[np.uint8], image_to_patient: NDArray[np.float64]) -> None:
-        """Insert an image; pixels that were black in all images so far lie beside the beams.
+        """Insert an image (rows, columns), given the (4, 4) m from (column, row, 0, 1).
 
-        Args:
-            image: (rows, columns) grey values.
-            image_to_patient: (4, 4) m, from (column, row, 0, 1).
+        Pixels that were black in all images so far lie beside the beams.
         """
         if self._used.shape != image.shape:
             self._used = np.zeros(image.shape, dtype=np.bool_)

@@ -120,9 +120,7 @@ def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
 
 
 def fitted_part(
-    seen: NDArray[np.bool_],
-    pixel: NDArray[np.float64],
-    used: NDArray[np.bool_] | None = None,
+    seen: NDArray[np.bool_], pixel: NDArray[np.float64], used: NDArray[np.bool_] | None = None
 ) -> Fan | Rectangle | None:
     """The fan or the rectangle that was scanned; None where neither fits.
 

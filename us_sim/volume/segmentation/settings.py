@@ -180,8 +180,7 @@ class SegmentRequest(Settings):
         description="of the surfaces", choices=SURFACE_FORMATS, default=("stl",)
     )
     report: bool = setting(
-        description="also write segmentation.md, with a table and what was remarked",
-        default=False,
+        description="also write segmentation.md, with a table and what was remarked", default=False
     )
     out: Path | None = setting(
         description="folder to make, where a volume file is segmented", default=None

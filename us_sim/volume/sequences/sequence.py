@@ -49,7 +49,7 @@ NO_FIELDS = "no field in the header"
 
 
 @dataclass(frozen=True)
-class SequenceFile:
+class _Header:
     """The header of a sequence; the images are as they are stored."""
 
     path: Path
@@ -73,10 +73,8 @@ class StoredImages:
     orientation: str
 
     def read(self, wanted: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """Grey images (rows, columns) turned to ``MF``, one in memory at a time.
-
-        Args:
-            wanted: numbers of frames, ascending.
+        """Grey images (rows, columns) turned to ``MF``, one in memory at a time, of frames whose
+        numbers ascend.
 
         Raises:
             VolumeError: there are fewer than promised, or they are damaged.
@@ -144,12 +142,7 @@ class TrackedSequence:
         return self.require_images().read(sorted({int(self.numbers[i]) for i in indices}))
 
     def faults(self, transforms: FrameTransforms | None, *, images: bool) -> list[str]:
-        """(K,) why each frame cannot be used, or an empty text.
-
-        Args:
-            transforms: that are needed, or None.
-            images: whether they are needed.
-        """
+        """(K,) why each frame cannot be used, given what is needed of it, or an empty text."""
         found = [""] * len(self) if transforms is None else list(transforms.faults)
         for k in np.flatnonzero(np.isnan(self.times)):
             found[k] = found[k] or NO_TIME
@@ -173,9 +166,10 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     identity that Plus fills in for what it has not seen, are not valid; the reason is kept.
 
     Raises:
-        VolumeError: the file is missing, is no sequence, or is cut within its header.
+        VolumeError: the file is missing, is of another format, a volume, or cut within its
+            header, or says no usable size.
     """
-    file = read_sequence_file(Path(path))
+    file = _header(Path(path))
     numbers = sorted(number for number in file.frames if number < file.count)
     if not numbers:
         raise VolumeError(
@@ -199,8 +193,8 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     )
 
 
-def _stored_images(file: SequenceFile) -> StoredImages | VolumeError:
-    """The images, or why they cannot be read, which matters to who wants them only."""
+def _stored_images(file: _Header) -> StoredImages | VolumeError:
+    """The images, or the error for whoever asks for them."""
     path = file.path
     if not file.columns:
         return VolumeError(
@@ -248,13 +242,7 @@ def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
     return image[::-1] if down == "N" else image
 
 
-def read_sequence_file(path: Path) -> SequenceFile:
-    """The header of a sequence.
-
-    Raises:
-        VolumeError: the file is missing, is of another format, a volume, or cut within its
-            header, or says no usable size.
-    """
+def _header(path: Path) -> _Header:
     if not os.path.isfile(path):
         raise VolumeError(f"{path}: there is no such file; {_GIVE}")
     with path.open("rb") as file:
@@ -267,7 +255,7 @@ def read_sequence_file(path: Path) -> SequenceFile:
     return _metaimage(path)
 
 
-def _metaimage(path: Path) -> SequenceFile:
+def _metaimage(path: Path) -> _Header:
     header, header_bytes = metaimage_header(path)
     if "ElementDataFile" not in header:
         raise VolumeError(
@@ -276,7 +264,7 @@ def _metaimage(path: Path) -> SequenceFile:
     stated = header.get("DimSize", "")
     sizes = _whole_numbers(path, "DimSize", stated)
     (channels,) = _whole_numbers(path, "channels", header.get("ElementNumberOfChannels", "1"))
-    return SequenceFile(
+    return _Header(
         path,
         *_size(path, "DimSize", stated, sizes, channels),
         _orientation(header),
@@ -285,7 +273,7 @@ def _metaimage(path: Path) -> SequenceFile:
     )
 
 
-def _nrrd(path: Path) -> SequenceFile:
+def _nrrd(path: Path) -> _Header:
     fields, pairs, _ = nrrd_header(path)
     kinds = fields.get("kinds", "").lower().split()
     if frame_fields(pairs) and {"list", "time"} & set(kinds[:-1]) and kinds[-1] == "domain":
@@ -301,7 +289,7 @@ def _nrrd(path: Path) -> SequenceFile:
     channels = 1
     if kinds and kinds[0] in ("vector", "rgb-color", "3-color", "list"):
         channels, *sizes = sizes
-    return SequenceFile(
+    return _Header(
         path,
         *_size(path, "sizes", stated, sizes, channels),
         _orientation(pairs),

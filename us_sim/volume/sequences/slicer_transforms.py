@@ -51,12 +51,10 @@ def read_slicer_transform(path: str | Path) -> NDArray[np.float64]:
 def read_slicer_sequences(
     path: str | Path,
 ) -> tuple[NDArray[np.float64], dict[str, FrameTransforms]]:
-    """The sequences of transforms in a scene, or in a bundle that a scene beside it names.
+    """The sequences of transforms in a scene (`.mrml`), or in a bundle (`.mrb`) that one beside it
+    names.
 
     Transforms of the scene that stand still are there at every time.
-
-    Args:
-        path: of an `.mrml`, or of an `.mrb`.
 
     Returns:
         Times (K,) in s, rising, and the transforms at them, m, by name; one that is not named

@@ -45,8 +45,7 @@ class Sweep:
     def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
         """The images (rows, columns), ascending, one in memory at a time.
 
-        Args:
-            which: indices into `numbers`; all without it.
+        They are all, or those at these indices into `numbers`.
 
         Raises:
             VolumeError: the compressed data are damaged.

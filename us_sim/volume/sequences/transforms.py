@@ -125,11 +125,7 @@ def frame_time(fields: Mapping[str, str]) -> float:
 
 
 def read_transforms(path: Path, frames: Sequence[Mapping[str, str]]) -> dict[str, FrameTransforms]:
-    """The transforms of all frames, by name.
-
-    Args:
-        path: which errors name.
-        frames: their fields.
+    """The transforms of all frames, given the fields of each, by name; errors name the path.
 
     Raises:
         VolumeError: the header names more transforms than any recording has.

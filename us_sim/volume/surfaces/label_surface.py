@@ -34,10 +34,7 @@ and some edges of the surface would have four triangles. Now they are always joi
 
 
 def label_surface(
-    volume: Volume,
-    label: int,
-    spacing: float = 0.0,
-    within: NDArray[np.float64] | None = None,
+    volume: Volume, label: int, spacing: float = 0.0, within: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """The closed surface around all voxels of a label, smoothed to hide their stairs.
 
@@ -85,10 +82,6 @@ def voxel_surface(volume: Volume, label: int) -> tuple[ClosedSurface, float]:
 
     A structure that leaves the volume ends there in a flat cap.
 
-    Args:
-        volume: with labels.
-        label: its number.
-
     Returns:
         The surface in ``patient``, and the volume of the label's voxels in m³.
 
@@ -106,10 +99,7 @@ def voxel_surface(volume: Volume, label: int) -> tuple[ClosedSurface, float]:
 
 
 def spacing_for(
-    volume: Volume,
-    labels: list[int],
-    triangles: int,
-    within: NDArray[np.float64] | None = None,
+    volume: Volume, labels: list[int], triangles: int, within: NDArray[np.float64] | None = None
 ) -> float:
     """m, the spacing at which the surfaces of these labels have about so many triangles together.
 

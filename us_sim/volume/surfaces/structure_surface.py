@@ -27,9 +27,7 @@ from us_sim.volume.surfaces.label_surface import structure_name, voxel_surface
 from us_sim.volume.surfaces.settings import SurfaceSettings
 from us_sim.volume.volume import Volume
 
-_TRIALS = 6
-"""Of decimation; each halves the logarithm of the range in which the answer lies."""
-
+_TRIALS = 6  # of decimation; each halves the logarithm of the range in which the answer lies
 _NO_GAIN = 0.9  # of the triangles; a surface that keeps more stays as it is
 
 
@@ -158,11 +156,8 @@ def with_volume(surface: ClosedSurface, volume: float, farthest: float) -> Close
 
 
 def decimated(surface: ClosedSurface, farthest: float) -> tuple[ClosedSurface, float]:
-    """The same shape in fewer triangles: closed, with the same volume, parts and genus.
-
-    Args:
-        surface: closed.
-        farthest: m, between the two surfaces.
+    """The same shape in fewer triangles: closed, with the same volume, parts and genus, and nowhere
+    farther than so many m from the closed surface given.
 
     Returns:
         The surface, the one given where hardly a triangle can go; and the distance in m between the
@@ -194,10 +189,6 @@ def coarsened(surface: ClosedSurface, triangles: int) -> ClosedSurface:
     """The same shape in about so many triangles: closed, with the same volume, parts and genus.
 
     It keeps more where fewer would change that, or the volume by a hundredth.
-
-    Args:
-        surface: closed.
-        triangles: that it should have.
 
     Raises:
         VolumeError: fast-simplification is not installed.

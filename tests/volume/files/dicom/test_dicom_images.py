@@ -25,6 +25,14 @@ def images(path):
     return np.array(list(GreyImages([open_dicom(path)]).images()))
 
 
+def refused(path, message):
+    """One sentence that begins with the file."""
+    with pytest.raises(VolumeError, match=message) as error:
+        images(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
 @pytest.fixture
 def real(shared_file):
     return shared_file("dicom-us-2d")
@@ -132,8 +140,8 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"Rows": 13}, "holds 480 bytes of images where its header says 520"),
-        ({"NumberOfFrames": 3}, "holds 480 bytes of images where its header says 360"),
+        ({"Rows": 13}, "480 bytes .* 520"),
+        ({"NumberOfFrames": 3}, "480 bytes .* 360"),
         ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "are read at most"),
         ({"NumberOfFrames": -1}, "holds -1 images"),
         ({"Rows": 0}, "10 × 0 pixels"),
@@ -146,16 +154,13 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
 )
 def test_headers_that_cannot_be_are_refused(tmp_path, values, message):
     path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values))
-    with pytest.raises(VolumeError, match=message) as refused:
-        images(path)
-    assert "\n" not in str(refused.value)
+    refused(path, message)
 
 
 def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
     monkeypatch.setattr(stored_image, "free_memory", lambda: 500.0)
-    with pytest.raises(VolumeError, match="of memory where"):
-        images(path)
+    refused(path, "of memory where")
 
 
 def test_a_small_compressed_file_that_claims_gigabytes_is_refused_at_once(tmp_path, monkeypatch):
@@ -169,16 +174,14 @@ def test_a_small_compressed_file_that_claims_gigabytes_is_refused_at_once(tmp_pa
         for key, value in values.items():
             setattr(lying, key, value)
         path = write(tmp_path / "a.dcm", lying, RLELossless)
-        with pytest.raises(VolumeError, match=r"4 compressed images where|are read at most"):
-            images(path)
+        refused(path, r"4 compressed images where|are read at most")
 
 
 def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
     made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
     made.Rows = 13
     path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
-    with pytest.raises(VolumeError, match="damaged"):
-        images(path)
+    refused(path, "damaged")
 
 
 @pytest.mark.parametrize(
@@ -213,15 +216,13 @@ def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):
         (shadow / name).mkdir(parents=True)
         (shadow / name / "__init__.py").write_text("raise ImportError")
     monkeypatch.setenv("PYTHONPATH", str(shadow))
-    with pytest.raises(VolumeError, match=r"JPEG Baseline.*us_sim\[dicom\]"):
-        images(path)
+    refused(path, r"JPEG Baseline.*us_sim\[dicom\]")
 
 
 def test_what_has_no_decoder_at_all_is_refused(tmp_path):
     made = compressed(header(CINE, US_MULTI_FRAME), JPEGBaseline8Bit)
     mpeg = "1.2.840.10008.1.2.4.102"
-    with pytest.raises(VolumeError, match="MPEG-4"):
-        images(write(tmp_path / "a.dcm", made, mpeg))
+    refused(write(tmp_path / "a.dcm", made, mpeg), "MPEG-4")
 
 
 def test_without_pydicom_the_extra_is_named(tmp_path, monkeypatch):
@@ -247,8 +248,7 @@ def test_a_bomb_is_not_inflated(tmp_path):
 def test_what_is_no_dicom_is_refused(tmp_path, content):
     path = tmp_path / "a.dcm"
     path.write_bytes(content)
-    with pytest.raises(VolumeError, match=r"no DICOM file|read as DICOM|holds no image"):
-        images(path)
+    refused(path, r"no DICOM file|read as DICOM|holds no image")
 
 
 def test_a_cut_file_is_refused(tmp_path):

@@ -112,16 +112,20 @@ def single_files(folder: Path, **more) -> list[Path]:
     return paths
 
 
-def test_a_series_of_files_lies_where_simpleitk_says(tmp_path):
-    paths = single_files(tmp_path)
-    placed = placed_images(paths[::-1])
+def read_by_simpleitk(folder):
+    """Axes and origin, m, and values (i, j, k) of a series."""
     reader = sitk.ImageSeriesReader()
-    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(tmp_path)))
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
     image = reader.Execute()
-    matrix = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
-    np.testing.assert_allclose(placed.placement[:3, :3], matrix * 1e-3, atol=1e-9)
-    np.testing.assert_allclose(placed.placement[:3, 3], np.array(image.GetOrigin()) * 1e-3)
-    stored = sitk.GetArrayFromImage(image).transpose(2, 1, 0)
+    axes = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
+    return axes * 1e-3, np.array(image.GetOrigin()) * 1e-3, sitk.GetArrayFromImage(image).T
+
+
+def test_a_series_of_files_lies_where_simpleitk_says(tmp_path):
+    placed = placed_images(single_files(tmp_path)[::-1])
+    matrix, origin, stored = read_by_simpleitk(tmp_path)
+    np.testing.assert_allclose(placed.placement[:3, :3], matrix, atol=1e-9)
+    np.testing.assert_allclose(placed.placement[:3, 3], origin)
     np.testing.assert_array_equal(placed.voxels(), stored)
 
 
@@ -135,16 +139,12 @@ def real_series(name):
 
 def test_a_real_series_lies_where_simpleitk_says():
     files = real_series("98892001/CT5N")
-    reader = sitk.ImageSeriesReader()
-    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(files[0].parent)))
-    image = reader.Execute()
+    matrix, origin, stored = read_by_simpleitk(files[0].parent)
     placed = placed_images(files)
-    assert placed.voxels().shape == image.GetSize()
-    matrix = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
-    np.testing.assert_allclose(placed.placement[:3, :3], matrix * 1e-3, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(placed.placement[:3, 3], np.array(image.GetOrigin()) * 1e-3)
-    stored = sitk.GetArrayFromImage(image).astype(float).transpose(2, 1, 0)
-    spread = (stored - stored.min()) / np.ptp(stored) * 255
+    assert placed.voxels().shape == stored.shape
+    np.testing.assert_allclose(placed.placement[:3, :3], matrix, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(placed.placement[:3, 3], origin)
+    spread = (stored - float(stored.min())) / np.ptp(stored.astype(float)) * 255
     assert np.abs(placed.voxels() - spread).max() <= 0.5 + 1e-9
 
 
@@ -186,7 +186,7 @@ def test_philips_cartesian_export_is_read_as_slicerheart_reads_it(tmp_path):
 
 
 def test_affiniti_and_artemis_state_distances_in_their_own_ways(tmp_path):
-    made = header(VOXELS.transpose(2, 1, 0).copy(), US_MULTI_FRAME)
+    made = header(VOXELS.T.copy(), US_MULTI_FRAME)
     made.add_new(0x200D0010, "LO", "Philips US Imaging DD 036")
     made.add_new(0x200D1003, "LO", ["0.5", "0.25", "2.0"])
     volume = read_volume(write(tmp_path / "a.dcm", made))
@@ -266,12 +266,18 @@ def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
         placed_images(paths)
 
 
-def test_a_two_dimensional_file_says_what_to_do(shared_file):
-    folder = shared_file("dicom-us-2d")
-    with pytest.raises(VolumeError, match="30 images"):
-        read_volume(folder / "examples_ybr_color.dcm")
-    with pytest.raises(VolumeError, match="2D image"):
-        read_volume(folder / "US1_UNCR.dcm")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("dicom-us-2d/examples_ybr_color.dcm", "30 images"),
+        ("dicom-us-2d/US1_UNCR.dcm", "2D image"),
+        ("foreign-files/MOVEKNEE.dcm", "19 images"),
+    ],
+)
+def test_a_real_file_that_is_no_volume_is_called_what_it_is(shared_file, name, message):
+    path = shared_file(name)
+    with pytest.raises(VolumeError, match=message):
+        read_volume(path)
 
 
 def test_a_scene_takes_a_dicom_volume(tmp_path):
@@ -311,13 +317,6 @@ def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
     volume = read_volume(tmp_path)
     np.testing.assert_array_equal(volume.intensities, VOXELS)
     np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, placed[:3, 3])
-
-
-@pytest.mark.parametrize(("name", "message"), [("MOVEKNEE.dcm", "19 images")])
-def test_real_files_are_called_what_they_are(shared_file, name, message):
-    path = shared_file(f"foreign-files/{name}")
-    with pytest.raises(VolumeError, match=message):
-        placed_images([path])
 
 
 @pytest.mark.parametrize(("pack", "word"), [(gzip.compress, "gzip"), (bz2.compress, "bzip2")])

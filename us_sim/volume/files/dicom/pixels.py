@@ -318,9 +318,6 @@ def _failure(file: DicomFile, process: subprocess.Popen[bytes]) -> VolumeError:
 class GreyImages:
     """The images of files that belong together, by (number of the file, number of the image).
 
-    Args:
-        files: all of one size and type.
-
     Raises:
         VolumeError: as `image_format`, or the files differ.
     """

@@ -102,10 +102,7 @@ def sparse_grid_of(
     """Which slice of a grid each image is, several of which may be the same and others missing,
     and the (4, 4) m from (column, row, slice).
 
-    Args:
-        path: which errors name.
-        planes: of the images.
-        step: mm, between slices; None for the smallest that there is.
+    ``step`` is the distance of slices in mm; None for the smallest that there is.
 
     Raises:
         VolumeError: they are not parallel, are shifted against each other, lie between the slices,
@@ -279,9 +276,7 @@ def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float
     - Philips Affiniti: the distances in mm in an element of "Philips US Imaging DD 036".
     - Eigen Artemis: voxels whose edge in mm is a thousandth of the pixels' aspect ratio.
 
-    Args:
-        file: as `one_image_after_another` returns it.
-        frames: how many images it has.
+    The file is as `one_image_after_another` returns it.
     """
     header = file.header
     if is_cartesian(file):
