@@ -108,6 +108,13 @@ def test_poses_round_trip():
     np.testing.assert_array_equal(pose_from(message).matrix, pose.matrix)
 
 
+def test_a_pose_farther_away_than_any_place_is_refused():
+    for axis in np.eye(3):
+        pose_from(pose_message(Pose(-9e6 * axis), STAMP, "patient"))
+        with pytest.raises(PoseError, match="metres"):
+            pose_from(pose_message(Pose(-2e7 * axis), STAMP, "patient"))
+
+
 @pytest.mark.parametrize("frame", ["p", "pa", "patient", "a/long/frame"])
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_a_marker_has_each_corner_of_each_triangle(frame, count):
@@ -150,12 +157,7 @@ FLAT = cloud_message(dict.fromkeys("xy", np.zeros(2)), STAMP, "patient")
 @pytest.mark.parametrize(
     ("read", "message", "error", "fact"),
     [
-        (
-            vectors_from,
-            cloud_message(dict.fromkeys("xy", np.zeros(2)), STAMP, "patient"),
-            MeshError,
-            "'z'",
-        ),
+        (vectors_from, FLAT, MeshError, "'z'"),
         (tetrahedra_from, Int32MultiArray(data=array("i", range(5))), MeshError, "5 "),
         (tetrahedra_from, Int32MultiArray(data=array("i", [0, 1, -1, 2])), MeshError, "-1 "),
         (pixels_from, Image(encoding="rgb8"), VolumeError, "rgb8"),
@@ -316,9 +318,9 @@ def test_what_is_no_affine_map_is_refused():
     for message in (Float64MultiArray(), columns_first, too_short, too_wide):
         with pytest.raises(ProbeError, match="4 by 4"):
             affine_from(message)
-    for matrix in (np.diag([1.0, np.nan, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 2.0])):
+    for diagonal in ([1.0, np.nan, 1.0, 1.0], [1.0, 1.0, 1.0, 2.0], [1e7, 1.0, 1.0, 1.0]):
         with pytest.raises(ProbeError, match="finite"):
-            affine_from(affine_message(matrix))
+            affine_from(affine_message(np.diag(diagonal)))
 
 
 def test_a_transducers_markers_are_read_as_they_were_made():

@@ -112,6 +112,17 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     bench.spin_until(lambda: not control.count_subscribers("session/scenes"))
 
 
+def test_a_page_that_opens_later_has_the_picture_of_every_scene(bench):
+    control, _ = controlled(bench)
+    pictures = {f"/{scene}.yaml": scene.encode() for scene in ("arm", "leg", "liver")}
+    for scene, picture in pictures.items():
+        control.tell_thumbnail(scene, picture)
+    page = bench.add(GuardedNode("page", context=bench.context))
+    session = ViewerSession(page, Posted(page))
+    session.watch()
+    bench.spin_until(lambda: dict(session.thumbnails) == pictures)
+
+
 def test_a_change_is_reported_at_once_but_the_time_in_a_replay_is_not(bench):
     control, _ = controlled(bench)
     reports = bench.collect(DiagnosticArray, "diagnostics")

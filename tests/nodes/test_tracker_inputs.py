@@ -11,7 +11,7 @@ from bench import pose_at
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy, PointCloud2
 from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
@@ -83,6 +83,18 @@ def test_a_pose_in_patient_is_calibrated_where_that_is_the_devices_frame(bench, 
     publisher.publish(pose_at(-0.09, 7, frame="patient"))
     bench.spin_until(lambda: poses)
     np.testing.assert_allclose(place(poses[0]), [0, 0, 0.01], atol=1e-12)
+
+
+def test_a_driver_that_publishes_best_effort_is_heard(bench, tracker):
+    node, poses = tracker("{source: pose}", lockstep=False)
+    weak = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = bench.peer.create_publisher(PoseStamped, "tracker/pose", weak)
+
+    def heard():
+        publisher.publish(pose_at(0.01, node.get_clock().now().nanoseconds // 1_000_000_000))
+        return poses
+
+    bench.spin_until(heard)
 
 
 def test_one_body_of_several_in_a_message(bench, tracker):

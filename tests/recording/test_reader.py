@@ -13,6 +13,8 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import MessageIndex
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
@@ -20,6 +22,7 @@ from rosbags.rosbag2 import Reader
 from us_sim.errors import BagError
 from us_sim.recording import unpacking
 from us_sim.recording.reader import describe, read_bag
+from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 
 STRING = "std_msgs/msg/String"
@@ -207,6 +210,73 @@ def test_blocks_of_zeros_after_a_power_cut(tmp_path, sessions):
     assert bag.note
     assert 10 < len(read) < 100
     assert read == list(read_bag(sessions["none"]).messages())[: len(read)]
+
+
+def test_a_real_bag_that_was_cut(shared_data, tmp_path):
+    real = shared_data / "ros2-jazzy/bags/probe_path_mcap/probe_path_mcap_0.mcap"
+    file = tmp_path / "cut.mcap"
+    file.write_bytes(real.read_bytes()[:180_000])
+    bag = read_bag(file)
+    read = list(bag.messages())
+    with real.open("rb") as stream:
+        (chunk,) = make_reader(stream).get_summary().chunk_indexes
+        stream.seek(0)
+        indexes = [
+            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, MessageIndex)
+        ]
+    # Before a chunk's records: opcode and length, times, size and CRC, no name, their length.
+    available = 180_000 - chunk.chunk_start_offset - 9 - 28 - 4 - 8
+    begun = sum(offset < available for index in indexes for _, offset in index.records)
+    assert begun - len(read) in (0, 1)
+    assert set(read) <= set(read_bag(real).messages())
+    assert bag.note
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_a_flipped_bit_is_noticed(tmp_path, sessions, compression):
+    content = bytearray(sessions[compression].read_bytes())
+    first_chunk = content.index(HI if compression == "none" else b"\x28\xb5\x2f\xfd")
+    content[first_chunk + 60] ^= 4
+    file = tmp_path / "session.mcap"
+    file.write_bytes(content)
+    with pytest.raises(BagError, match=r"session\.mcap is damaged .* \d+"):
+        list(read_bag(file).messages())
+
+
+@pytest.fixture(scope="module")
+def damageable(shared_data, sessions):
+    """Files by kind; the real recorder's chunks have no checksum."""
+    real = shared_data / "ros2-jazzy/bags/probe_path_mcap/probe_path_mcap_0.mcap"
+    return {"real": real, **sessions}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data(), st.sampled_from(["none", "zstd", "real"]))
+def test_no_damage_leads_to_anything_but_a_sentence(tmp_path_factory, damageable, data, kind):
+    content = bytearray(damageable[kind].read_bytes())
+    for _ in range(data.draw(st.integers(1, 5))):
+        content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
+    file = tmp_path_factory.mktemp("damaged") / "session.mcap"
+    file.write_bytes(content)
+    refusal = ""
+    try:
+        list(read_bag(file).messages())
+    except BagError as error:
+        refusal = str(error)
+    assert not refusal or refusal.startswith(str(file))
+
+
+def test_a_damaged_summary_is_done_without(tmp_path, sessions):
+    content = bytearray(sessions["zstd"].read_bytes())
+    with sessions["zstd"].open("rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    offset = chunks[1].chunk_start_offset.to_bytes(8, "little")
+    content[content.rindex(offset)] ^= 1
+    file = tmp_path / "session.mcap"
+    file.write_bytes(content)
+    bag = read_bag(file)
+    assert not bag.note
+    assert list(bag.messages()) == list(read_bag(sessions["zstd"]).messages())
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -446,6 +516,27 @@ def test_a_topic_of_two_types_is_refused(tmp_path):
             bag.add_topic("/note", type_name)
     with pytest.raises(BagError, match="one type"):
         read_bag(tmp_path)
+
+
+@pytest.mark.parametrize("offered", [0, 1])
+def test_quality_of_service_that_one_file_of_a_bag_lacks_is_that_of_the_other(tmp_path, offered):
+    quality = (QosProfile(depth=3),)
+    for k in range(2):
+        with BagWriter(tmp_path / f"bag_{k}.mcap", sidecar=False) as bag:
+            bag.add_topic("/note", STRING, quality if k == offered else ())
+            bag.write("/note", HI, EPOCH + k)
+    assert read_bag(tmp_path).topic("/note").qos == quality
+
+
+def test_messages_of_the_same_time_come_in_the_order_of_the_file(tmp_path):
+    with BagWriter(tmp_path / "session.mcap") as bag:
+        bag.add_topic("/note", STRING)
+        for time, last in ((7, 1), (5, 2), (7, 3)):
+            bag.write("/note", HI + bytes([last]), EPOCH + time)
+            if last == 1:
+                bag.flush()  # what follows is in a chunk of its own, which begins earlier
+    read = [(m.log_time - EPOCH, m.data[-1]) for m in read_bag(tmp_path).messages()]
+    assert read == [(5, 2), (7, 1), (7, 3)]
 
 
 def test_summary(tmp_path):

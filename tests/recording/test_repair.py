@@ -81,6 +81,18 @@ def test_a_damaged_chunk_is_left_out_and_said(session, tmp_path):
     assert made.faults[0].messages == 11
 
 
+@pytest.mark.parametrize("at", [1, 5, 9, 25, 33, 37, 41, 60])
+def test_without_an_index_it_goes_on_at_the_next_sound_chunk(session, tmp_path, at):
+    with session.open("rb") as stream:
+        first, *_ = make_reader(stream).get_summary().chunk_indexes
+    content = bytearray(session.read_bytes())
+    content[first.chunk_start_offset + at] ^= 16
+    session.write_bytes(content[: content.rindex(b"\x0f\x04")])
+    made = repair(session, tmp_path / "whole")
+    lost = sum(fault.messages for fault in made.faults)
+    assert (made.message_count, lost) == ((9, 11) if at in (33, 37, 60) else (20, 0))
+
+
 def test_an_attached_recording_that_is_cut_is_not_taken_for_the_recording(session, tmp_path):
     file = tmp_path / "other.mcap"
     with BagWriter(file, sidecar=False) as bag:

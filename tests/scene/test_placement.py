@@ -187,6 +187,7 @@ def test_the_corners_that_no_beam_reaches_do_not_count():
     [
         ((0, 0, 0), {}),
         ((0, 0, 0.02), {}),
+        ((0, 0, 0.03), {}),  # a twentieth of the deepest image
         # The probe's own poses are not registered again.
         ((0, 0, 0), {"tracker": {"frame": "ndi", "registration": {"position": [0.3, 0, 0]}}}),
     ],

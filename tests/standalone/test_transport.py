@@ -184,6 +184,18 @@ def test_a_latched_sample_reaches_who_comes_later(participant, neighbour, bell):
     assert volatile.take() is None
 
 
+def test_who_comes_later_gets_as_many_latched_samples_as_are_kept(participant, neighbour, bell):
+    three = EndpointQos(depth=3, durability=EndpointQos.TRANSIENT_LOCAL)
+    writer = participant.create_writer("rt/latched", STRING, three)
+    sent = [serialize(message_class("std_msgs/msg/String")(data=text)) for text in "abcd"]
+    for data in sent:
+        writer.write(data)
+    reader = neighbour.create_reader("rt/latched", STRING, three)
+    reader.set_on_data(bell.ring)
+    assert [take_one(reader, bell)[0] for _ in range(3)] == sent[1:]
+    assert reader.take() is None
+
+
 def test_data_that_came_before_the_callback_is_announced_to_it(participant, bell):
     reader = participant.create_reader("rt/early", STRING, RELIABLE)
     participant.create_writer("rt/early", STRING, RELIABLE).write(HELLO)

@@ -372,6 +372,7 @@ def test_with_a_graphics_card_it_looks_the_same_and_is_drawn_into_the_page(page,
     assert seen.ask("return scene.stage.canvas.getContext('webgl2') !== null")
     seen.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     drawn = [seen.becomes(VEIN, is_blue), seen.becomes(ARTERY, is_red)]
+    page.close()  # no other test has that card
     np.testing.assert_allclose(read, drawn, atol=12)
 
 
