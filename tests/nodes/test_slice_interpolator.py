@@ -67,7 +67,7 @@ def test_the_images_topic_is_there_once_all_is_prepared(bench, small_scene, monk
     monkeypatch.setattr(
         SceneNode,
         "stream",
-        lambda node, kind, topic: made.append(topic) or stream(node, kind, topic),
+        lambda node, kind, topic, *qos: made.append(topic) or stream(node, kind, topic, *qos),
     )
     monkeypatch.setattr(MModeStream, "prepare", lambda *_: made.append("prepared"))
     bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)

@@ -53,11 +53,17 @@ def profile(browser: Any) -> Any:
 def tabs(profile: Any, served: Any) -> Callable[[], tuple[Any, list[str]]]:
     """Returns a tab, and what is wrong in it: the last one while it is open, a new one otherwise.
 
-    A tab that has compiled the page's scripts loads it again in half the time.
+    A tab that has compiled the page's scripts loads it again in half the time. It is closed after
+    some tests, since it takes more and more memory.
     """
     tabs: list[tuple[Any, list[str]]] = []
+    tests = 0
 
     def tab() -> tuple[Any, list[str]]:
+        nonlocal tests
+        tests += 1
+        if tabs and tests % 25 == 0:
+            tabs[-1][0].close()
         if not tabs or tabs[-1][0].is_closed():
             page, wrong = profile.new_page(), list[str]()
             page.address = served[0].address

@@ -1,4 +1,14 @@
-"""Recording MCAP as rosbag2 does, so that nothing but the last second is lost to a crash."""
+"""Recording MCAP as rosbag2 does, so that nothing but the last second is lost to a crash.
+
+>>> import tempfile
+>>> from us_sim.recording.writer import BagWriter
+>>> file = tempfile.mkdtemp() + "/session.mcap"
+>>> with BagWriter(file, compression="zstd") as writer:
+...     writer.add_topic("/note", "std_msgs/msg/String")
+...     writer.write("/note", bytes.fromhex("00010000 03000000 686900"), 1_700_000_000_000_000_000)
+>>> open(file, "rb").read(8)
+b'\\x89MCAP0\\r\\n'
+"""
 
 from __future__ import annotations
 

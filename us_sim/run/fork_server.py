@@ -340,7 +340,9 @@ def _become(asked: _Asked, between: int) -> None:
     os.environ.update(asked.environment)
     sys.orig_argv = asked.command
     end_at_once_when_interrupted()
-    sys.argv[1:] = asked.command[asked.command.index("--ros-args") :]  # runpy sets the first
+    module = asked.command[asked.command.index("-m") + 1]
+    program = Path(__file__).parents[2].joinpath(*module.split(".")).with_suffix(".py")
+    sys.argv = [str(program), *asked.command[asked.command.index("--ros-args") :]]
     _show_command(asked.command)
     os.write(ready, str(os.getpid()).encode())
     for file in asked.files:
