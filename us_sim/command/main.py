@@ -62,6 +62,12 @@ _COMMANDS = (
 """Each command, the module in which NAME_options adds its options, and its help."""
 
 
+class _Interrupted(KeyboardInterrupt):
+    """Ctrl-C, as a class of its own: a plain `KeyboardInterrupt` that has passed through an `exec`
+    of text, as where a dataclass is imported, makes Python end as killed by SIGINT (CPython's
+    pythonrun.c), whatever the exit status."""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command; 0 when it did its work, 1 with a sentence for bad input, 130 on Ctrl-C."""
     ended: list[int] = []
@@ -69,7 +75,7 @@ def main(args: Sequence[str] | None = None) -> int:
     def interrupt(number: int, _: object) -> None:
         """End as on Ctrl-C, so that no node outlives the command."""
         ended.append(number)
-        raise KeyboardInterrupt
+        raise _Interrupted
 
     before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
     said, sys.stderr = sys.stderr, cast(TextIO, _Lasting(sys.stderr))
