@@ -139,6 +139,20 @@ def test_ctrl_c_while_something_is_imported_is_one_sentence(module, tmp_path):
     assert (ran.stderr, ran.returncode) == ("us-sim: interrupted\n", 130)
 
 
+def test_ctrl_c_in_a_text_that_is_executed_has_the_status_of_ctrl_c():
+    """As where a dataclass is made: CPython ends as killed once it has seen a KeyboardInterrupt."""
+    program = (
+        "import sys\n"
+        "import us_sim.recording.reader as reader\n"
+        "from us_sim.command.main import main\n"
+        "text = 'import os, signal; os.kill(os.getpid(), signal.SIGINT); [None for _ in [0]]'\n"
+        "reader.read_bag = lambda _: exec(text)\n"
+        "sys.exit(main(['bag', 'info', 'nowhere.mcap']))"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ran.stderr, ran.returncode) == ("us-sim: interrupted\n", 130)
+
+
 def test_what_is_not_chosen_is_not_imported():
     code = (
         "import sys; from us_sim.command.main import main\n"

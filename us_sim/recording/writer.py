@@ -249,7 +249,8 @@ class BagWriter:
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Puts a file into each of the bag's, such as the scene that is recorded.
 
-        The time in ns since the epoch is when it was as it is.
+        ``media_type`` is such as ``text/plain``; ``time_ns``, ns since the epoch, says of when the
+        content is.
 
         Raises:
             BagError: the bag is closed, or the disk is full.

@@ -110,7 +110,7 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor, monitor: Moni
             monitor.refuse_earlier_run()
             more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
             if time.monotonic() - began > _LONG_START_S:
-                more += "; the first run compiles, for minutes"
+                more += "; a first run compiles for minutes"
             bar.update(count - len(waiting), ", ".join(waiting[:2]) + more)
             failed = supervisor.failed()
             if failed:

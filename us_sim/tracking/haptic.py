@@ -505,7 +505,11 @@ class HapticDevice:
         self.is_held = False
 
     def take(self, pose: Pose, stamp: int) -> Measurement:
-        """The body that carries the probe, from the handle's pose, both in the arm's frame."""
+        """The body that carries the probe, from the handle's pose at a stamp, in the arm's frame.
+
+        Args:
+            stamp: ns.
+        """
         self._last = pose
         body = self._held or self._body(pose)
         if self.is_held:

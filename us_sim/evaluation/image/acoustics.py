@@ -60,7 +60,7 @@ def _acoustics(
     surfaces: bool = False,
     anisotropy: bool = True,
 ) -> Acoustics:
-    """Live loss (Hz, dB/cm/MHz) in tissues by their labels, without echoes of surfaces."""
+    """Live acoustics of tissues by label, at a frequency (Hz), compensated by so many dB/cm/MHz."""
     return Acoustics(
         artefacts="live",
         frequency=frequency,

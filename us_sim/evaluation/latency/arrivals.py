@@ -50,7 +50,7 @@ class Arrivals(GuardedNode):
         return list(self._heard[topic])
 
     def heard_between(self, began: int, ended: int) -> dict[str, list[tuple[int, int]]]:
-        """The same by topic, in the order of the graph, of stamps in a time, ns."""
+        """Stamps and arrivals by topic, of messages stamped from ``began`` until ``ended``, ns."""
         return {
             topic: [each for each in self.heard(topic) if began <= each[0] < ended]
             for topic in self._heard

@@ -104,7 +104,8 @@ def pixels_of(
 def fractions_and_depths(probe: Probe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Fraction of the face and depth (m) of each pixel (rows, columns); NaN where no beam reaches.
 
-    Beams are not steered."""
+    Beams are not steered.
+    """
     line, depth = probe.pixel_beams
     return (line + np.float32(0.5)) / np.float32(probe.lines) - np.float32(0.5), depth
 

@@ -80,7 +80,7 @@ def conforming_mesh(
         coarsen: whether tetrahedra are joined wherever their shape allows it, for the fewest nodes.
 
     Raises:
-        MeshError: pytetwild is missing, or fTetWild fails, or takes longer.
+        MeshError: pytetwild is missing, or fTetWild fails, or takes longer than five minutes.
     """
     require_mesher()
     corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -2,9 +2,10 @@
 
 The gradients of a corner alone, which OpenCV's ``cornerSubPix`` uses, put a blurred corner about
 a fifth of a pixel inside the true one, by which a marker seems farther away than it is. Calibrating
-a webcam with 42 photos of a grid of markers leaves 0.46 pixels with them, and less than 0.35 with
-these; with four photos of a ChArUco board, 0.19 with OpenCV's ``CharucoDetector`` and 0.14 with
-these. On rendered boards at 0.25 to 0.9 m its corners are 0.05 to 0.2 pixels off, these 0.015.
+a webcam with 42 photos of a grid of markers leaves 0.46 pixels with them and 0.28 with these; with
+four photos of a ChArUco board, 0.19 with OpenCV's ``CharucoDetector`` and 0.14 with these. In
+rendered images of such a board at 0.25 to 0.9 m its corners are 0.06 to 0.07 pixels off, and these
+0.01 to 0.03 (``tests/tracking/camera/test_corners.py``).
 
 >>> from us_sim.tracking.camera.corner_refinement import refined_corners
 >>> image = np.full((80, 80), 200, np.uint8)

@@ -137,7 +137,7 @@ def fitted_corners(
 
 
 class _View:
-    """A marker's pattern drawn over a part of an image, and what differs; see `fitted_corners`."""
+    """A marker's pattern drawn over a part of an image, and their difference."""
 
     def __init__(
         self, image: NDArray[np.uint8], corners: NDArray[np.float64], cells: NDArray[np.uint8]
