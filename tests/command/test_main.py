@@ -2,6 +2,7 @@
 
 import errno
 import io
+import os
 import re
 import subprocess
 import sys
@@ -139,17 +140,21 @@ def test_ctrl_c_while_something_is_imported_is_one_sentence(module, tmp_path):
     assert (ran.stderr, ran.returncode) == ("us-sim: interrupted\n", 130)
 
 
-def test_ctrl_c_in_a_text_that_is_executed_has_the_status_of_ctrl_c():
-    """As where a dataclass is made: CPython ends as killed once it has seen a KeyboardInterrupt."""
-    program = (
-        "import sys\n"
-        "import us_sim.recording.reader as reader\n"
-        "from us_sim.command.main import main\n"
-        "text = 'import os, signal; os.kill(os.getpid(), signal.SIGINT); [None for _ in [0]]'\n"
-        "reader.read_bag = lambda _: exec(text)\n"
-        "sys.exit(main(['bag', 'info', 'nowhere.mcap']))"
+def test_ctrl_c_in_a_text_that_is_executed_has_the_status_of_ctrl_c(tmp_path):
+    """As where a dataclass is made: there CPython remembers a plain KeyboardInterrupt."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if name == 'us_sim.recording.reader':\n"
+        "            exec('os.kill(os.getpid(), signal.SIGINT)')\n"
+        "sys.meta_path.insert(0, Finder())\n"
     )
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    search = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", "us_sim", "bag", "info", "nowhere.mcap"]
+    ran = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": search}, capture_output=True, text=True
+    )
     assert (ran.stderr, ran.returncode) == ("us-sim: interrupted\n", 130)
 
 

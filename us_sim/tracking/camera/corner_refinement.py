@@ -5,7 +5,7 @@ a fifth of a pixel inside the true one, by which a marker seems farther away tha
 a webcam with 42 photos of a grid of markers leaves 0.46 pixels with them and 0.28 with these; with
 four photos of a ChArUco board, 0.19 with OpenCV's ``CharucoDetector`` and 0.14 with these. In
 rendered images of such a board at 0.25 to 0.9 m its corners are 0.06 to 0.07 pixels off, and these
-0.01 to 0.03 (``tests/tracking/camera/test_corners.py``).
+0.01 to 0.03 (``tests/tracking/camera/test_source.py``).
 
 >>> from us_sim.tracking.camera.corner_refinement import refined_corners
 >>> image = np.full((80, 80), 200, np.uint8)
