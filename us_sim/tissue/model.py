@@ -115,7 +115,7 @@ def nodes_in_label(
 
 
 class Intervention(Flag):
-    """A solver's remedies in a frame that went wrong; `Deformation.action` says it to a person."""
+    """A solver's remedies in a frame that went wrong; `Deformation.actions` say it to a person."""
 
     NONE = 0
     FRAME_FAILED = auto()  # what came out was not finite or far away
@@ -134,10 +134,15 @@ class Deformation:
     force: NDArray[np.float64]  # (3,), N, of the tissue on the probe, frame probe
     torque: NDArray[np.float64]  # (3,), N m, likewise, about the origin of frame probe
     residual: float  # unbalanced force over contact force, of the solver's own equations
-    action: str = ""  # what the solver did to stay stable, in words; '' when nothing
+    actions: tuple[str, ...] = ()  # what the solver did to stay stable, in sentences
     inverted: int = 0  # tetrahedra inside out, as far as the solver counts them
     is_balanced: bool = True  # else force and torque are an unfinished frame's or an older pose's
-    interventions: Intervention = Intervention.NONE  # `action` as a code
+    interventions: Intervention = Intervention.NONE  # `actions` as a code
+
+    @property
+    def action(self) -> str:
+        """All actions in one line, empty when there are none."""
+        return "; ".join(self.actions)
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,7 @@ class Trial:
     step_limit_observed: float = math.nan  # s
     slowest_ms: float = 0.0
     kept: int = 0  # frames that failed, so that the solver kept its last good state or rest
-    actions: list[str] = field(default_factory=list)  # that it reported, each once
+    actions: list[tuple[str, ...]] = field(default_factory=list)  # that frames reported, each once
 
     @property
     def refused(self) -> bool:
@@ -85,10 +85,10 @@ class Trial:
         """Frames of the hold until the residual stays small; None where it never does."""
         return frames_until(self.held, SMALL)
 
-    def say(self, action: str) -> None:
-        """Add an action that a solver reported."""
-        if action and action not in self.actions:
-            self.actions.append(action)
+    def say(self, actions: tuple[str, ...]) -> None:
+        """Add the actions that a solver reported of a frame."""
+        if actions and actions not in self.actions:
+            self.actions.append(actions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ class Tried(Row):
             "dt_limit_predicted": trial.step_limit_predicted,
             "dt_limit_observed": trial.step_limit_observed,
             **{name: ran(name) for name in _RAN},
-            "action": " | ".join([*failed, *refused, *trial.actions[:3]]),
+            "action": " | ".join([*failed, *refused, *map("; ".join, trial.actions[:3])]),
         }
 
     @property
@@ -192,7 +192,7 @@ def run_trial(
             trial.failure = f"raised {type(error).__name__} in frame {number}: {error}"
             return
         trial.slowest_ms = max(trial.slowest_ms, 1e3 * (time.perf_counter() - start))
-        trial.say(deformation.action)
+        trial.say(deformation.actions)
         if not _finite(deformation):
             trial.finite = False
             return

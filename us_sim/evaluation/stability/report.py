@@ -418,7 +418,7 @@ def _actions(tried: Sequence[Tried]) -> list[str]:
     """Actions that the solver reported, with the number of cases."""
     counted: Counter[str] = Counter()
     for one in tried:
-        parts = (part for action in one.trial.actions for part in action.split("; "))
+        parts = (action for frame in one.trial.actions for action in frame)
         counted.update(dict.fromkeys(map(_without_numbers, parts), 1))
     if not counted:
         return []

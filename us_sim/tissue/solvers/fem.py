@@ -146,7 +146,7 @@ class Fem(TissueSolver):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         contact, compliance = self._contact, self._compliance
-        action = ""
+        actions: tuple[str, ...] = ()
         if pose is None:
             contact.clear()
         else:
@@ -160,7 +160,7 @@ class Fem(TissueSolver):
             else:
                 solved = False
             if not solved:
-                action = "the contact did not settle, so the nearest solution found was kept"
+                actions = ("the contact did not settle, so the nearest solution found was kept",)
         self._settled = True
         pushed = np.flatnonzero(contact.forces.any(axis=1))
         if pose is None or len(pushed) == 0:
@@ -176,7 +176,7 @@ class Fem(TissueSolver):
         load = float(np.linalg.norm(forces))
         residual = math.hypot(contact.sliding_force / load, self._rounding(touched, forces))
         inverted = count_inverted(nodes, self._watched)
-        return Deformation(nodes, touched, force, torque, residual, action, inverted)
+        return Deformation(nodes, touched, force, torque, residual, actions, inverted)
 
     def _rounding(self, touched: NDArray[np.int32], forces: NDArray[np.float64]) -> float:
         """Unbalanced force over the norm of the probe's forces (K, 3) N on touched (K,) nodes."""

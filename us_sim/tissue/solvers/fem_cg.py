@@ -217,4 +217,4 @@ class FemCg(TissueSolver):
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[pushed], push[pushing])
         inverted = count_inverted(nodes, self._watched)
-        return Deformation(nodes, pushed, force, torque, residual, "", inverted)
+        return Deformation(nodes, pushed, force, torque, residual, inverted=inverted)

@@ -393,7 +393,7 @@ class FemNonlinear(TissueSolver):
             force,
             torque,
             residual,
-            "; ".join(actions),
+            tuple(actions),
             interventions=interventions,
         )
 

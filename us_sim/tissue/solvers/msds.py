@@ -177,16 +177,16 @@ class SpringTissue(TissueSolver):
         self._residual_norm.reset()
         self._inversion.reset()
 
-    def _untangle(self, touched: bool) -> tuple[int, str, Intervention]:
+    def _untangle(self, touched: bool) -> tuple[int, tuple[str, ...], Intervention]:
         """Put tissue to rest that stayed inside out without a probe.
 
         Returns:
-            How many tetrahedra are inside out now, a remark, and the same as a code.
+            How many tetrahedra are inside out now, remarks, and these as a code.
         """
         inverted, hopeless = self._inversion.check(self._positions, touched)
         if not hopeless:
             words = f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out"
-            return inverted, words if inverted else "", Intervention.NONE
+            return inverted, (words,) if inverted else (), Intervention.NONE
         self._positions[:] = self.model.mesh.nodes
         self._velocity[:] = 0.0
         self._residual_norm.reset()
@@ -194,7 +194,7 @@ class SpringTissue(TissueSolver):
             f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
             f"was put back to rest"
         )
-        return 0, words, Intervention.PUT_TO_REST
+        return 0, (words,), Intervention.PUT_TO_REST
 
     def _stop(self, touched: bool) -> bool:
         """End the motion of settled tissue; returns whether it was put to rest entirely."""
@@ -264,7 +264,7 @@ class Msds(SpringTissue):
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
         self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
-        self.mass, self._substeps, self._action = stabilise(
+        self.mass, self._substeps, remark = stabilise(
             model,
             self._factors,
             settings.time_step,
@@ -272,6 +272,7 @@ class Msds(SpringTissue):
             settings.stabilisation,
             settings.maximum_substeps,
         )  # mass: (N,) kg, as simulated
+        self._actions = (remark,) if remark else ()
         self._time_step = settings.time_step / self._substeps
         self._inverse_mass = np.where(model.fixed, 0.0, 1.0 / self.mass)
         self._forward = only_forward(model.collider, model.contact_spacing)
@@ -299,7 +300,7 @@ class Msds(SpringTissue):
                 self._resting(),
                 nodes=self._positions.copy(),
                 residual=self._last.residual,
-                action=self._action,
+                actions=self._actions,
                 inverted=self._last.inverted,
             )
         probe = ProbeMotion(self.model.collider.offset_box, self._forward, *self._path(pose))
@@ -374,14 +375,13 @@ class Msds(SpringTissue):
         )
         if self._settled and self._stop(is_touched):
             residual = 0.0
-        action = "; ".join(filter(None, [self._action, words]))
         return Deformation(
             self._positions.copy(),
             touched,
             force,
             torque,
             residual,
-            action,
+            self._actions + words,
             inverted,
             interventions=interventions,
         )

@@ -65,7 +65,7 @@ class TissueSolver(ABC):
     """Deforms one tissue, frame by frame.
 
     A solver never returns a number that is not finite, nor nodes that flew off: when a frame fails
-    so, the last good state stays and the deformation's ``action`` says it. After several such
+    so, the last good state stays and the deformation's ``actions`` say it. After several such
     frames in a row the tissue is put back to rest.
     """
 
@@ -141,7 +141,7 @@ class TissueSolver(ABC):
             self.reset()
         self._settled = False
         done |= Intervention.FRAME_FAILED
-        return replace(self._last, action=action, interventions=done, is_balanced=False)
+        return replace(self._last, actions=(action,), interventions=done, is_balanced=False)
 
     def reset(self) -> None:
         """Back to the undeformed tissue, with no probe near."""
