@@ -110,22 +110,28 @@ def test_a_press_shorter_than_a_heartbeat_has_a_picture_of_its_own(session, scen
     assert list(colour_pictures(session, scene)) == ["touched", "full press", "let go"]
 
 
+def times_of_pictures(session, scene, *areas):
+    """s, of the frames whose flow the three pictures show."""
+    times = []
+    original = ColourDoppler.estimate
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            ColourDoppler,
+            "estimate",
+            lambda self, blood, frame: times.append(frame.time) or original(self, blood, frame),
+        )
+        assert len(colour_pictures(session, scene, *areas)) == 3
+    return times
+
+
 def test_no_moment_is_of_a_probe_in_the_air(session, scene):
     """It touches and is let go for 0.2 s only, and then is lifted off."""
     air = Pose([0.0, 0.0, -0.01])
     for k, stamp in enumerate(session.poses):
         if not (11 <= k < 13 or 20 <= k < 62):
             session.poses[stamp] = air
-    seen = []
-    original = ColourDoppler.estimate
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            ColourDoppler,
-            "estimate",
-            lambda self, blood, frame: seen.append(frame.time) or original(self, blood, frame),
-        )
-        assert len(colour_pictures(session, scene)) == 3
-    depths = [session.poses[round(1e9 * time)].position[2] for time in seen]
+    times = times_of_pictures(session, scene)
+    depths = [session.poses[round(1e9 * time)].position[2] for time in times]
     assert min(depths) >= 0.0
 
 
@@ -136,16 +142,7 @@ def test_moments_are_of_images_that_show_the_vessel_whole(session, scene):
     times = np.arange(80) / 10
     rest = np.where((times < 1.4) | (abs(times - 2.5) < 0.2) | (times > 7.5), np.nan, 1e-5)
     areas = LumenAreas(times, np.zeros(80), {"vein": np.full(80, 1e-5)}, {"vein": rest})
-    moments = []
-    original = ColourDoppler.estimate
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            ColourDoppler,
-            "estimate",
-            lambda self, blood, frame: moments.append(frame.time) or original(self, blood, frame),
-        )
-        assert len(colour_pictures(session, scene, areas)) == 3
-    since = np.array(moments) - 1.0  # s
+    since = np.array(times_of_pictures(session, scene, areas)) - 1.0  # s
     assert ((since > 1.3) & (abs(since - 2.5) > 0.1) & (since < 7.6)).all()
     areas.at_rest["vein"][:] = np.nan
     assert colour_pictures(session, scene, areas) == {}
