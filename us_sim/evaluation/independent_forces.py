@@ -63,7 +63,8 @@ def neo_hookean_forces(
     """Derivative of the stable neo-Hookean energy with averaged pressures, (N, 3) N.
 
     (B. Smith, F. de Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Trans. Graph. 37,
-    2018, without its logarithmic barrier.)
+    2018, without its logarithmic barrier, and with the third term of O. H. Yeoh, Some forms of the
+    strain energy function for rubber, Rubber Chem. Technol. 66, 1993, where materials stiffen.)
     """
     shear, whole, volume, gradient = _elements(mesh, materials)
     slope = _slopes(mesh, gradient, displacement)
@@ -87,7 +88,8 @@ def neo_hookean_forces(
         - slope
         + _cofactors(slope)
     )
-    stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
+    stiffer = shear * (1 + materials.stiffening * np.maximum(_distortion(slope), 0.0) ** 2)
+    stress = pressure[:, None, None] * cofactor - stiffer[:, None, None] * difference
     return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
 
 
@@ -202,6 +204,12 @@ def _swelling(slope: Array) -> Array:
     """(M,) J - 1 as a polynomial in the displacement's gradient, so that nothing cancels."""
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
     return np.asarray(_trace(slope) + minors + np.linalg.det(slope))
+
+
+def _distortion(slope: Array) -> Array:
+    """(M,) (I1 - 3) / 2 - (J - 1), as a polynomial likewise."""
+    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
+    return np.asarray((slope**2).sum(axis=(1, 2)) / 2 - minors - np.linalg.det(slope))
 
 
 def _trace(matrices: Array) -> Array:

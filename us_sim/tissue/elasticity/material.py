@@ -36,15 +36,18 @@ YOUNG_MODULUS = Quantity("pressure", 1e-3, 1e13)
 POISSON_RATIO = Quantity("number", -0.99, 0.49999)
 DENSITY = Quantity("density", 1e-3, 1e6)
 LUMEN_PRESSURE = Quantity("pressure", 1.0, 1e5)
+# Below zero tissue would soften until it holds no load.
+STIFFENING = Quantity("number", 0.0, 1000.0)
 
 
 @dataclass(frozen=True)
 class Material(Settings):
-    """Isotropic elastic constants; for `fem_nonlinear`, also the pressure of a vessel's blood.
+    """Isotropic elastic constants; for `fem_nonlinear`, also stiffening and a vessel's pressure.
 
     With a ``lumen_pressure`` it is the inside of a vessel that empties (see
     `neo_hookean_material`), which the solver ``fem_nonlinear`` knows. To the others it is
-    a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it.
+    a solid all the same, of the Young's modulus and Poisson's ratio that stand in for it. The
+    others know no ``stiffening`` either: with it, the shear modulus grows as in `stiffening`.
 
     Raises:
         MaterialError: a constant is out of its range.
@@ -59,6 +62,9 @@ class Material(Settings):
     density: float = setting(DENSITY, "mass per volume", default=1000.0)
     lumen_pressure: float | None = setting(
         LUMEN_PRESSURE, "of a vessel's blood, which leaves if pressed by more", default=None
+    )
+    stiffening: float = setting(
+        STIFFENING, "shear modulus grows by stiffening (I1 - 3)^2 / 4 of itself", default=0.0
     )
 
 

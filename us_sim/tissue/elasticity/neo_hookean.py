@@ -8,7 +8,8 @@ resists the average change of volume around each node:
 
 with c = V nodal / 4, plus the term against being crushed. Tetrahedra with a lumen have its energy
 in place of all but the shear's. Without them, linearised at rest, it is linear elasticity with the
-same split. Kernels gather nodes into rows of `LANES` tetrahedra, whose loops LLVM vectorises.
+same split. Tissue that stiffens has the energy of `stiffening` besides. Kernels gather nodes into
+rows of `LANES` tetrahedra, whose loops LLVM vectorises.
 
 Viscosity is one branch of a Prony series in quasi-static form: beside the tissue's own energy there
 is that of a spring of g times its stiffness K at rest, whose other end v follows the displacement u
@@ -55,110 +56,27 @@ from us_sim.tissue.elasticity.neo_hookean_material import (
 )
 from us_sim.tissue.elasticity.nodal_sums import (
     LANES,
+    OUT,
+    ROWS,
+    SHAPE,
+    SUMS,
     NodalSums,
+    gather,
+    gather_scalar,
+    gradient,
     in_groups,
     in_lanes,
     lumen_energy_at,
     nine,
+    put_forces,
     put_nine,
     put_six,
+    scatter,
+    scatter_scalar,
     three,
 )
+from us_sim.tissue.elasticity.stiffening import Stiffening
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-
-# First row of the constants' gradients of the shape functions of nodes 1, 2 and 3.
-SHAPE = np.int64(0)  # numba compiles callers again for each literal
-FIELD = np.int64(0)  # First row of a buffer's field, row 3 b + axis of it at the b-th node
-SUMS = FIELD + 12  # First row of a buffer's nodal sums, one a node
-OUT = SUMS + 4  # First row of a buffer's result: a field of 3 b + axis, 6 rows a node, or fewer
-ROWS = OUT + 24  # Number of rows of a buffer
-
-
-@njit(**INLINED)
-def gather(field, nodes, lanes):
-    """Fill rows 3 b + axis with the field (3, N) at the b-th node of each tetrahedron."""
-    for axis in range(3):
-        values = field[axis]
-        for corner in range(4):
-            row = FIELD + 3 * corner + axis
-            into = lanes[row * LANES : (row + 1) * LANES]
-            at = nodes[corner * LANES : (corner + 1) * LANES]
-            for w in range(LANES):
-                into[w] = values[at[w]]
-
-
-@njit(**INLINED)
-def gather_scalar(values, nodes, lanes):
-    """Fill rows from SUMS on with the values (N,) at the nodes of each tetrahedron."""
-    for w in range(4 * LANES):
-        lanes[SUMS * LANES + w] = values[nodes[w]]
-
-
-@njit(**INLINED)
-def scatter(lanes, nodes, field):
-    """Add rows 3 b + axis from OUT on to the field (3, N) at the b-th node of each tetrahedron."""
-    for axis in range(3):
-        values = field[axis]
-        for corner in range(4):
-            added = lanes[(OUT + 3 * corner + axis) * LANES :]
-            at = nodes[corner * LANES : (corner + 1) * LANES]
-            for w in range(LANES):
-                values[at[w]] += added[w]
-
-
-@njit(**INLINED)
-def scatter_scalar(lanes, nodes, values):
-    """Add row OUT of lanes to the values (N,) at all four nodes of each tetrahedron."""
-    for corner in range(4):
-        at = nodes[corner * LANES : (corner + 1) * LANES]
-        for w in range(LANES):
-            values[at[w]] += lanes[OUT * LANES + w]
-
-
-@njit(**INLINED)
-def gradient(field, constants, w):
-    """The gradient of the field whose rows `gather` has made."""
-    x0, y0, z0 = three(field, FIELD, w)
-    x1, y1, z1 = three(field, FIELD + 3, w)
-    x2, y2, z2 = three(field, FIELD + 6, w)
-    x3, y3, z3 = three(field, FIELD + 9, w)
-    x1, y1, z1 = x1 - x0, y1 - y0, z1 - z0
-    x2, y2, z2 = x2 - x0, y2 - y0, z2 - z0
-    x3, y3, z3 = x3 - x0, y3 - y0, z3 - z0
-    a0, a1, a2, b0, b1, b2, c0, c1, c2 = nine(constants, SHAPE, w)
-    return (
-        x1 * a0 + x2 * b0 + x3 * c0,
-        x1 * a1 + x2 * b1 + x3 * c1,
-        x1 * a2 + x2 * b2 + x3 * c2,
-        y1 * a0 + y2 * b0 + y3 * c0,
-        y1 * a1 + y2 * b1 + y3 * c1,
-        y1 * a2 + y2 * b2 + y3 * c2,
-        z1 * a0 + z2 * b0 + z3 * c0,
-        z1 * a1 + z2 * b1 + z3 * c1,
-        z1 * a2 + z2 * b2 + z3 * c2,
-    )
-
-
-@njit(**INLINED)
-def _put_row(px, py, pz, constants, w, lanes, row):
-    """Along the axis of ``row``, the force of the stress's row times volume at all four nodes."""
-    a0, a1, a2, b0, b1, b2, c0, c1, c2 = nine(constants, SHAPE, w)
-    a = px * a0 + py * a1 + pz * a2
-    b = px * b0 + py * b1 + pz * b2
-    c = px * c0 + py * c1 + pz * c2
-    lanes[row * LANES + w] = -(a + b + c)
-    lanes[(row + 3) * LANES + w] = a
-    lanes[(row + 6) * LANES + w] = b
-    lanes[(row + 9) * LANES + w] = c
-
-
-@njit(**INLINED)
-def put_forces(p, constants, w, lanes):
-    """Fill rows OUT + 3 b + axis with the force of the stress p, times volume, at node b."""
-    _put_row(p[0], p[1], p[2], constants, w, lanes, OUT)
-    _put_row(p[3], p[4], p[5], constants, w, lanes, OUT + 1)
-    _put_row(p[6], p[7], p[8], constants, w, lanes, OUT + 2)
-
 
 _ROW = np.int64(LANES)  # no literal, for which numba would compile `lumen_energy_at` again
 # Rows of the constants behind the shape gradients: V mu, V element, V nodal / 4; and their
@@ -394,6 +312,9 @@ class NeoHookean:
         total = np.zeros(self.count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])
         self._averaged = bool(total.any())
+        self._stiffening: Stiffening | None = None
+        if materials.stiffening.any():
+            self._stiffening = Stiffening(mesh, materials, self.dtype)
         with np.errstate(divide="ignore"):
             self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
         self._nodal = np.zeros(self.count if self._averaged else 0, dtype=self.dtype)
@@ -421,9 +342,12 @@ class NeoHookean:
                 np.einsum("i,i,i->", self._nodal, self._nodal, self._inverse, dtype=np.float64) / 2
             )
             self._nodal *= self._inverse
-        return energy + sums.energy_and_forces(
+        energy += sums.energy_and_forces(
             displacement, self._nodal, sums.nodes, sums.constants, sums.lumens, sums.lanes, out
         )
+        if self._stiffening is not None:
+            energy += self._stiffening.add_forces(displacement, out)
+        return energy
 
     def linearise(self, displacement: NDArray) -> None:
         """Set the displacement (3, N) m of `tangent_product` and `diagonal_blocks`."""
@@ -434,6 +358,8 @@ class NeoHookean:
             self._nodal *= self._inverse
         arrays = sums.nodes, sums.constants, sums.lumens, sums.lanes, sums.tangent
         sums.linearise(displacement, self._nodal, *arrays)
+        if self._stiffening is not None:
+            self._stiffening.linearise(displacement)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""
@@ -446,6 +372,8 @@ class NeoHookean:
             sums.volume_slopes(change, *arrays, self._nodal)
             self._nodal *= self._inverse
         sums.tangent_product(change, self._nodal, *arrays, out)
+        if self._stiffening is not None:
+            self._stiffening.add_product(change, out)
         return out
 
     def diagonal_blocks(self) -> NDArray:
@@ -457,6 +385,8 @@ class NeoHookean:
         sums = self._sums
         sums.diagonal_blocks(sums.nodes, sums.constants, sums.tangent, sums.lanes, blocks)
         blocks += self._nodal_blocks
+        if self._stiffening is not None:
+            self._stiffening.add_blocks(blocks)
         return blocks
 
     def smallest_volume_ratio(self, displacement: NDArray) -> float:

@@ -259,7 +259,8 @@ def create_solver(
 
 def rehearsal_model(model: TissueModel) -> TissueModel:
     """A tissue of eight cells, like another in what decides which kernels are used: a box mesh or
-    another, the highest Poisson's ratio, how far moduli are apart, lumens, and the probe.
+    another, the highest Poisson's ratio, how far moduli are apart, lumens, stiffening, and the
+    probe.
     """
     side = np.linspace(-0.01, 0.01, 3)
     mesh = box_mesh(side, side, side + 0.01)
@@ -275,6 +276,7 @@ def rehearsal_model(model: TissueModel) -> TissueModel:
             np.full(count, own.density.max()),
             hollow * own.lumen_fraction.max(),
             hollow * own.lumen_pressure.max(),
+            np.full(count, own.stiffening.max()),
         ),
         mesh.nodes[:, 2] > 0.015,
         model.collider,
