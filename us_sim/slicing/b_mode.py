@@ -253,9 +253,7 @@ def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     return index @ to_patient[:3, :3].T + to_patient[:3, 3], np.array(triangles, dtype=np.int32)
 
 
-def beyond(
-    probe: Probe, pose: Pose, extent: NDArray[np.float64], *, pressed: bool = True
-) -> float:
+def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64], *, pressed: bool = True) -> float:
     """m of the middle beam that lie behind a box; 0 where it ends within it or never enters it.
 
     Args:
