@@ -315,8 +315,8 @@ _AREAS = (
 )
 _STRAIN = (
     "Strain: red is pressed together. The first two are the tissue's own, the third is what a "
-    "scanner finds in two images:\nit needs speckle, and has no colour where it finds nothing, as in "
-    "a bone's shadow."
+    "scanner finds in two images:\nit needs speckle, and has no colour where it finds nothing, as "
+    "in a bone's shadow."
 )
 _FLOW = (
     f"Flow: in the systole that follows the moment, on a plane tilted {TILT:g}° along the vessels; "
