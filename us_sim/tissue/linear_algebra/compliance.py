@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -140,9 +141,6 @@ class SurfaceCompliance:
         # a frame calls, which depend on the fields' kind and precision, are compiled now.
         self.matrix.flags.writeable = False
         self.gram.flags.writeable = False
-        dof = 3 * self.nodes.astype(np.int64)[:, None] + np.arange(3)
-        object.__setattr__(self, "_by_node", dof.ravel())
-        object.__setattr__(self, "_by_axis", (dof // 3 + self.count * np.arange(3)).ravel())
         self.add_field(np.zeros((len(self.nodes), 3)), np.zeros((3, self.count), np.float32))
         self.field(np.zeros((len(self.nodes), 3)))
         self.unbalanced(np.ones((len(self.nodes), 3)))
@@ -150,14 +148,20 @@ class SurfaceCompliance:
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add the displacement by forces (S, 3) N to displacement (3, N) m; zeros are not read."""
         self.fields.add(forces.ravel(), displacement.T)
-        self._add_surface(forces, self._by_axis, displacement)
+        self._add_surface(forces, self._places[1], displacement)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m, the displacement of every node by forces (S, 3) N."""
         displacement = np.zeros((self.count, 3))
         self.fields.add(forces.ravel(), displacement)
-        self._add_surface(forces, self._by_node, displacement)
+        self._add_surface(forces, self._places[0], displacement)
         return displacement
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(3S,), where the surface is in fields (N, 3), and in fields (3, N)."""
+        node, axis = self.nodes.astype(np.int64)[:, None], np.arange(3)
+        return (3 * node + axis).ravel(), (node + self.count * axis).ravel()
 
     def _add_surface(
         self, forces: NDArray[np.float64], places: NDArray[np.int64], displacement: NDArray
