@@ -85,6 +85,12 @@ def test_wrong_words_are_refused_in_a_sentence(words, sentence, capsys):
     assert sentence in capsys.readouterr().err
 
 
+def test_a_path_beside_cases_is_told_which_there_are(cases, capsys, monkeypatch):
+    monkeypatch.chdir(cases.parent)
+    assert main(["run", "--case", f"{cases.name}/amr", "--dry-run"]) == 1
+    assert f"did you mean '{cases.name}/arm'?" in capsys.readouterr().err
+
+
 def test_an_empty_folder_says_what_makes_a_case(tmp_path, capsys):
     assert main(["cases", str(tmp_path)]) == 0
     assert "us-sim reconstruct" in capsys.readouterr().out

@@ -65,6 +65,23 @@ def test_bad_input_is_one_sentence(args, words, capsys):
 
 
 @pytest.mark.parametrize(
+    ("args", "meant"),
+    [
+        (["vew"], "view"),
+        (["view", "--recrod", "a.mcap"], "--record"),
+        (["view", "--recrod=a.mcap"], "--record"),
+        (["calibrate", "prob"], "probe"),
+        (["evaluate", "hand", "--sed", "1"], "--seed"),
+    ],
+)
+def test_a_misspelt_command_or_option_is_told_the_one_that_was_meant(args, meant, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(args)
+    assert ended.value.code == 2
+    assert f"did you mean '{meant}'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     "args",
     [
         ["run", "LOOP.yaml", "--dry-run"],

@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
 from us_sim.errors import MeshError, SettingsError
-from us_sim.nodes.scene_node import SceneNode, is_left_by_pages
+from us_sim.nodes.scene_node import NO_PAGE, SceneNode, poses_ended
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of
 from us_sim.slicing.cutting.resampling import Located
@@ -278,12 +278,12 @@ def test_an_image_that_no_page_moves_is_no_fault_of_a_tracker(bench, show):
         bench.add(Node(name, context=bench.context)) for name in ("viewer", "probe_tracker")
     )
     tracker.create_subscription(PoseStamped, "tracker/pose", print, 10)
-    bench.spin_until(lambda: is_left_by_pages(node))
+    bench.spin_until(lambda: poses_ended(node) == NO_PAGE)
     node.annotated.pose_came(node.stamp())
     bench.spin_until(lambda: node.health.warning.startswith("no page moves the probe"))
     assert node.health.problems("pose age") == 0
     driver = viewer.create_publisher(PoseStamped, "tracker/pose", 10)
-    bench.spin_until(lambda: not is_left_by_pages(node))
+    bench.spin_until(lambda: not poses_ended(node))
     node.annotated.pose_came(node.stamp())
     bench.spin_until(lambda: node.health.problems("pose age") == 1)
     viewer.destroy_publisher(driver)

@@ -12,6 +12,7 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.scene_node import NO_SENDER
 from us_sim.settings.registry import PROBES
 
 
@@ -181,3 +182,13 @@ def test_closing_the_last_page_is_no_fault_of_a_tracker(bench, small_scene):
     viewer.destroy_publisher(hand)
     bench.spin_until(lambda: tracker.health.state == "lost")
     assert tracker.health.warning.startswith("no page moves the probe")
+
+
+def test_the_end_of_what_plays_a_path_is_no_fault_of_a_tracker(bench, small_scene):
+    node = bench.make(ProbeTracker, scene=str(small_scene))
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    publisher.publish(pose_at(0.001, node.get_clock().now().to_msg().sec))
+    bench.spin_until(lambda: node.health.state == "tracked")
+    bench.peer.destroy_publisher(publisher)
+    bench.spin_until(lambda: node.health.state == "lost")
+    assert node.health.warning == NO_SENDER

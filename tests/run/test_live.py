@@ -10,7 +10,7 @@ import pytest
 from us_sim.errors import SceneError, UsSimError
 from us_sim.run import live
 from us_sim.run.live import _status, demo
-from us_sim.run.plan import Plan, Request
+from us_sim.run.plan import Plan, Request, viewer_process
 from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
@@ -35,6 +35,24 @@ def test_a_run_says_when_what_it_plays_begins_again(plan: Plan, said: str) -> No
     node: Any = SimpleNamespace(reports={}, count=lambda *_: 0)
     monitor: Any = SimpleNamespace(node=node)
     assert _status(plan, monitor) == said
+
+
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [("127.0.0.1", "http://127.0.0.1:8123/"), ("::1", "http://[::1]:8123/"), ("0.0.0.0", "token")],
+)
+def test_a_run_that_waits_says_where_its_page_is(host: str, address: str) -> None:
+    plan = Plan([viewer_process(ViewerSettings(host=host, port=0))])
+    node: Any = SimpleNamespace(reports={"viewer": {"port": "8123"}}, count=lambda *_: 0)
+    monitor: Any = SimpleNamespace(node=node)
+    assert address in _status(plan, monitor)
+
+
+def test_the_rate_of_the_last_second_is_not_said_once_the_path_is_at_its_end() -> None:
+    reports = {"slice_interpolator": {"rate_hz": "21.0", "latency_p99_ms": "9.5"}}
+    monitor: Any = SimpleNamespace(node=SimpleNamespace(reports=reports, count=lambda *_: 600))
+    assert "21.0" in _status(Plan([], 600), monitor)
+    assert "21.0" not in _status(Plan([], 600), monitor, at_end=True)
 
 
 SCENE = """

@@ -31,7 +31,7 @@ def told(path):
 def test_the_scripted_press():
     moments = told(press_and_slide())
     assert moments["before"] == 0
-    assert moments["touching"] == pytest.approx(1.5, abs=0.02)
+    assert moments["first touch"] == pytest.approx(1.5, abs=0.02)
     assert moments["pressing"] == pytest.approx(2.5, abs=0.02)
     assert moments["full press"] == pytest.approx(3.2, abs=0.3)
     assert moments["slid aside"] == pytest.approx(6.25, abs=0.02)
@@ -59,9 +59,9 @@ def test_nothing_to_show():
 
 
 def test_a_tilt_is_said_where_there_is_one():
-    assert _place(Pose([0.0, 0.0, 0.0123])) == "probe at +12.3 mm"
+    assert _place(Pose([0.0, 0.0, 0.0123])) == "pressed 12.3 mm"
     tilted = Pose([0.0, 0.0, -0.01], [np.sin(np.radians(10)), 0.0, 0.0, np.cos(np.radians(10))])
-    assert _place(tilted) == "probe at -10.0 mm, tilted 20°"
+    assert _place(tilted) == "in the air, 10.0 mm high, tilted 20°"
 
 
 VEIN = {"kind": "venous", "direction": [0, -1, 0], "peak_velocity": 0.5, "mean_velocity": 0.2}
@@ -98,7 +98,7 @@ def colourful(picture):
 def test_flow_shows_before_and_after_a_press_and_not_in_it(session, scene):
     pictures = colour_pictures(session, scene)
     assert list(pictures) == ["touched", "full press", "let go"]
-    touched, pressed, let_go = (colourful(picture) for picture in pictures.values())
+    touched, pressed, let_go = (colourful(picture.pixels) for picture in pictures.values())
     assert touched > 30
     assert let_go > 30
     assert pressed < 0.3 * touched  # what is left is the vein's outline and its name
@@ -173,8 +173,11 @@ def test_an_even_press_has_the_colour_of_its_strain_in_all_pictures(plain_scene)
     titles = ["strain since rest", "strain between two images", "estimate from these two images"]
     assert list(pictures) == titles
     for picture in pictures.values():
-        assert picture.shape == (80, 96, 3)
-    red, green, _ = pictures["strain since rest"][40, 60].astype(int)
+        assert picture.pixels.shape == (80, 96, 3)
+    since_rest, between, estimate = pictures.values()
+    assert estimate.stamps == between.stamps
+    assert since_rest.stamps == between.stamps[1:]
+    red, green, _ = since_rest.pixels[40, 60].astype(int)
     assert red > green + 60  # shortened, at the end of the scale
 
 

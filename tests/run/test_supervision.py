@@ -104,6 +104,7 @@ def test_a_player_at_its_end_is_no_loss(session):
     supervisor.update()
     assert supervisor.finished
     assert not supervisor.losses
+    assert not supervisor.gave_up("path_player")
     assert supervisor.outcome(1.0).sentence() == ""
 
 
@@ -197,6 +198,7 @@ def test_without_its_player_the_run_is_over(session):
         assert not supervisor.finished
         group.ended = {"path_player": INTERRUPTED}
         supervisor.update()
+    assert supervisor.gave_up("path_player")
     assert supervisor.finished
     assert group.started[3].given == {"begun": 1700000000.5}
 

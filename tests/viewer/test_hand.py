@@ -208,6 +208,21 @@ def test_the_space_bar_is_the_pages_after_a_click_and_a_buttons_after_tab(
     assert going_on.is_visible()
 
 
+@pytest.mark.usefixtures("viewer")
+def test_a_key_is_the_pages_as_soon_as_the_help_is_closed(page: Any) -> None:
+    page.keyboard.press("?")
+    page.wait_for_selector(".us-help", state="visible")
+    on_help = """() => {
+        document.querySelector(".us-help").close();
+        const space = new KeyboardEvent("keydown", { key: " ", bubbles: true, cancelable: true });
+        const focused = document.activeElement;
+        focused.dispatchEvent(space);
+        return Boolean(focused.closest(".us-help"));
+    }"""
+    assert page.evaluate(on_help)  # which has the focus until the next picture is drawn
+    page.get_by_role("button", name="Go on").wait_for()
+
+
 def test_dragging_down_the_image_presses_as_many_millimetres(page: Any, viewer: FakeHand) -> None:
     box = box_of_image(page)
     metres = 320 * PIXEL / box["height"]

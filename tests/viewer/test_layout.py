@@ -109,6 +109,20 @@ UNREACHED = """() => [...document.querySelectorAll("header button, .us-main :is(
 """Names of controls that no scrolling brings in front."""
 
 
+def test_a_remark_on_the_image_is_above_it(opened: Open) -> None:
+    page = opened((1280, 720))
+    remark = "No spectrum: the flow is slower than the wall filter lets through"
+    page.evaluate(
+        "said => import('/us_sim/assets/image.js').then(m => { m.setRemarks([said]);"
+        " m.setLive(true); })",
+        remark,
+    )
+    badge = page.locator(".us-stale")
+    until(lambda: badge.inner_text() == remark, "it is said")
+    below = badge.bounding_box()["y"] + badge.bounding_box()["height"]
+    assert below <= page.locator(".us-image").bounding_box()["y"]
+
+
 @pytest.mark.parametrize(
     ("size", "touch"),
     [(PHONE, True), (TURNED, True), (TWICE, False), (FOUR_TIMES, False), ((2560, 1440), False)],

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 from us_sim.errors import UsSimError
 from us_sim.run.watch import SupervisionSettings
 from us_sim.settings.setting import Settings, kinds_of, rules_of
+from us_sim.settings.spelling import unknown
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
@@ -46,11 +47,19 @@ class ChosenParser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """As argparse does, with the options added."""
+        """As argparse does, with the options added; an option that is none of them is refused."""
         add_options, self._add_options = self._add_options, None
         if add_options is not None:
             add_options(self)
-        return super().parse_known_args(args, namespace)
+        parsed, others = super().parse_known_args(args, namespace)
+        for other in others:
+            if other.startswith("--"):
+                self.error(unknown(other.partition("=")[0], self._option_string_actions))
+        return parsed, others
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            raise argparse.ArgumentError(action, unknown(value, map(str, action.choices)))
 
 
 S = TypeVar("S", bound=Settings)

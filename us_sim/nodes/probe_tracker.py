@@ -22,7 +22,7 @@ from us_sim.nodes.messages import (
 )
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
-from us_sim.nodes.scene_node import NO_PAGE, is_left_by_pages
+from us_sim.nodes.scene_node import poses_ended
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
@@ -158,9 +158,9 @@ class ProbeTracker(Device):
         if state is self._state:
             return
         lost = "the probe is lost" if state is TrackingState.LOST else ""
-        if lost and is_left_by_pages(self):
-            lost = NO_PAGE
-            self.get_logger().info(f"{NO_PAGE}: it stays where it is")
+        if lost and (why := poses_ended(self)):
+            lost = why
+            self.get_logger().info(f"{why}: the probe stays where it is")
         elif lost:
             self.get_logger().warning("the probe is lost: no pose of it can be used any more")
         elif state is TrackingState.TRACKED and self._state is not TrackingState.COASTING:

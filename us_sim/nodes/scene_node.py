@@ -111,15 +111,17 @@ class SceneNode(GuardedNode):
 
 LEAD_TOPIC = "tracker/pose"
 NO_PAGE = "no page moves the probe, and nobody else publishes tracker/pose"
+NO_SENDER = "nobody publishes tracker/pose any more"
 
 
-def is_left_by_pages(node: GuardedNode) -> bool:
-    """Whether poses stay away because no page is open, where pages could move the probe."""
+def poses_ended(node: GuardedNode) -> str:
+    """Why no fault of a tracker keeps poses away, as where a path is at its end; empty if it may.
+
+    Where pages could move the probe, it is that none is open.
+    """
     name = node.resolve_topic_name(LEAD_TOPIC)
     hearers = [info.node_name for info in node.get_subscriptions_info_by_topic(name)]
+    if "probe_tracker" not in hearers or node.count_publishers(name):
+        return ""
     viewer = (VIEWER, node.get_namespace())
-    return (
-        "probe_tracker" in hearers
-        and not node.count_publishers(name)
-        and viewer in node.get_node_names_and_namespaces()
-    )
+    return NO_PAGE if viewer in node.get_node_names_and_namespaces() else NO_SENDER

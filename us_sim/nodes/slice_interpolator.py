@@ -261,11 +261,14 @@ class SliceInterpolator(SceneNode):
             self.health.report()
 
     def _reach(self, pose: Pose) -> dict[str, str]:
-        """Report once, and in diagnostics, that the image is deeper than the tissue or volume."""
+        """Report in diagnostics that the image ends beyond the tissue or volume.
+
+        It is said once where not only the press makes it do so, so that a smaller depth helps.
+        """
         too_deep = self._scanner.beyond(pose)
         if too_deep < _BEYOND:
             return {}
-        if not self._is_said:
+        if not self._is_said and self._scanner.beyond(pose, pressed=False) >= _BEYOND:
             self._is_said = True
             what = "tissue's mesh" if self.scene.tissue is not None else "volume"
             self.get_logger().warning(

@@ -12,7 +12,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -103,8 +103,15 @@ _APART = 1.5e-4
 """m, that the probe moves on at most between two images that are compared: some samples."""
 
 
-def strain_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint8]]:
-    """Pictures (rows, columns, 3) of red, green and blue, by their titles, in order.
+class Picture(NamedTuple):
+    """A picture in colours."""
+
+    stamps: tuple[int, ...]  # ns, of the images that it shows
+    pixels: NDArray[np.uint8]  # (rows, columns, 3) of red, green and blue
+
+
+def strain_pictures(session: Session, scene: Scene) -> dict[str, Picture]:
+    """Pictures by their titles, in order.
 
     None of a scene without tissue, or of a session that never presses.
     """
@@ -123,16 +130,17 @@ def strain_pictures(session: Session, scene: Scene) -> dict[str, NDArray[np.uint
     estimate = estimate_strain(before.pixels, now.pixels, scanner.probe, scene.strain)
     annotation = Annotation(scanner.probe, {})
     pictures = {}
-    for title, values, beside in (
-        ("strain since rest", since_rest, since_rest),
-        ("strain between two images", between, between),
-        ("estimate from these two images", estimate.strain, between),
+    for title, stamps_of, values, beside in (
+        ("strain since rest", pair[1:], since_rest, since_rest),
+        ("strain between two images", pair, between, between),
+        ("estimate from these two images", pair, estimate.strain, between),
     ):
         most = max(float(f"{np.nanpercentile(np.abs(beside), 95.0):.1g}"), 1e-4)  # one digit
         pressed = compression(values)
         note = f"mean {100 * pressed.mean:.2g} %, quality {pressed.quality:.2f}"
         overlay = Overlay(values, strain_scale("strain", most), note=note)
-        pictures[title] = annotation.draw(now.pixels, overlay=overlay)
+        pixels = annotation.draw(now.pixels, overlay=overlay)
+        pictures[title] = Picture(stamps_of, pixels)
     return pictures
 
 
@@ -154,8 +162,8 @@ _LET_GO = 0.35  # of the deepest press, from which on the vessels are open again
 
 def colour_pictures(
     session: Session, scene: Scene, areas: LumenAreas | None = None
-) -> dict[str, NDArray[np.uint8]]:
-    """Pictures (rows, columns, 3) of red, green and blue, by their titles, in order.
+) -> dict[str, Picture]:
+    """Pictures by their titles, in order.
 
     None of a scene without flows or without tissue, or whose vessels no image shows.
 
@@ -197,9 +205,10 @@ def colour_pictures(
         if stamp in titles:
             velocity = colour.estimate(blood, frame)
             overlay = Overlay(velocity, colour.scale, 0.9, outline=colour.outline)
-            pictures[titles[stamp]] = annotation.draw(
+            pixels = annotation.draw(
                 frame.pixels, frame.labels, overlay=overlay, settle=partial(onto_border, frame)
             )
+            pictures[titles[stamp]] = Picture((stamp,), pixels)
     return pictures
 
 
@@ -253,7 +262,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     """
     moments = _moments(session)
     strained, colours = strain_pictures(session, scene), colour_pictures(session, scene, areas)
-    more = [each for each in (strained, _flowing(colours)) if each]
+    flowing = {f"flow, {title}": picture for title, picture in colours.items()}
+    more = [each for each in (strained, flowing) if each]
     heights = [1.0, 1.0, *[1.0] * len(more), *[0.55] * (areas is not None)]
     height = 4.5 * sum(heights[:-1]) + (4.5 if areas is None else 3.5)
     figure = Figure(figsize=(15, height), layout="constrained")
@@ -276,7 +286,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
                 axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent
             )
         where = _place(session.poses[stamp])
-        axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, {where}", fontsize=11)
+        axes.set_title(f"{title}: {_times([stamp], first)}, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
         axes.tick_params(labelsize=8)
         if i % 3 == 0:
@@ -284,20 +294,39 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     for row, pictures in enumerate(more, 2):
         for i, (title, picture) in enumerate(pictures.items()):
             axes = figure.add_subplot(grid[row, i])
-            axes.imshow(picture)
-            axes.set_title(title, fontsize=11)
+            axes.imshow(picture.pixels)
+            axes.set_title(f"{title}: {_times(picture.stamps, first)}", fontsize=11)
             axes.axis("off")
     if areas is not None:
         of_vessels = {name: _colour(scene, name) for name in areas.area}
         times = [(stamp - first) * 1e-9 for _, stamp in moments]
         _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, of_vessels)
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
+    notes = [_DARK, *[_AREAS] * (areas is not None), *[_STRAIN] * bool(strained)]
+    notes += [_FLOW] * bool(flowing)
+    figure.supxlabel("\n".join(notes), fontsize=11)
     figure.savefig(file, dpi=80)
 
 
-def _flowing(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, NDArray[np.uint8]]:
-    beside = f"plane tilted {TILT:g}° along the vessels"
-    return {f"flow, {title}; {beside}": picture for title, picture in pictures.items()}
+_DARK = "Beams of the part of the face that does not touch the skin stay dark."
+_AREAS = (
+    "Areas are of the tissue in the image plane, also below a probe in the air. Above 100 % the "
+    "plane cuts more of the vessel than at rest."
+)
+_STRAIN = (
+    "Strain: red is pressed together. The first two are the tissue's own, the third is what a "
+    "scanner finds in two images:\nit needs speckle, and has no colour where it finds nothing, as "
+    "in a bone's shadow."
+)
+_FLOW = (
+    f"Flow: in the systole that follows the moment, on a plane tilted {TILT:g}° along the vessels; "
+    f"colours change with the heart's phase."
+)
+
+
+def _times(stamps: Sequence[int], first: int) -> str:
+    """Times since the first pose (ns), as titles say them."""
+    return f"t = {' and '.join(f'{(stamp - first) * 1e-9:.2f}' for stamp in stamps)} s"
 
 
 def _moments(session: Session) -> list[tuple[str, int]]:
@@ -313,7 +342,7 @@ def _moments(session: Session) -> list[tuple[str, int]]:
     slid = full + int(np.argmax(np.where(depth >= 0.5 * deepest, aside, -1.0)[full:]))
     picked = [
         ("before", 0),
-        ("touching", touch),
+        ("first touch", touch),
         ("pressing", half),
         ("full press", full),
         ("slid aside", slid),
@@ -323,10 +352,12 @@ def _moments(session: Session) -> list[tuple[str, int]]:
 
 
 def _place(pose: Pose) -> str:
-    """How deep the probe is, and how far from upright."""
+    """Where the probe is over or below the skin at rest, and how far from upright."""
     tilt = float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
     tilted = f", tilted {tilt:.0f}°" if tilt >= 0.5 else ""
-    return f"probe at {1e3 * pose.position[2]:+.1f} mm{tilted}"
+    depth = 1e3 * float(pose.position[2])
+    place = f"pressed {depth:.1f} mm" if depth >= 0.05 else "on the skin"
+    return (place if depth > -0.05 else f"in the air, {-depth:.1f} mm high") + tilted
 
 
 def _caption(areas: LumenAreas | None, time: float) -> str:

@@ -33,6 +33,7 @@ from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import full_path
+from us_sim.viewer.access import is_loopback
 
 if TYPE_CHECKING:
     from us_sim.run.camera_video import PathVideo
@@ -109,9 +110,9 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor, monitor: Moni
             update()
             monitor.refuse_earlier_run()
             more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
-            if time.monotonic() - began > _LONG_START_S:
-                more += "; a first run compiles for minutes"
-            bar.update(count - len(waiting), ", ".join(waiting[:2]) + more)
+            is_long = time.monotonic() - began > _LONG_START_S
+            why = "a first run compiles for minutes: " if is_long else ""  # what is behind is cut
+            bar.update(count - len(waiting), why + ", ".join(waiting[:2]) + more)
             failed = supervisor.failed()
             if failed:
                 raise UsSimError(failed)
@@ -132,8 +133,10 @@ def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored
                 played = monitor.node.reports.get(plan.player, {}).get("played", "")
                 is_known = played.isdecimal() and len(played) < 12
                 done = now - began if plan.poses is None else float(played) if is_known else 0.0
-                bar.update(min(done, total or done), _status(plan, monitor))
                 ended = ended or now if supervisor.finished else None
+                if ended is not None and not supervisor.gave_up(plan.player):
+                    done = total or done
+                bar.update(min(done, total or done), _status(plan, monitor, at_end=bool(ended)))
                 if plan.duration is not None and now - began > plan.duration:
                     return
                 if ended is not None and now - ended > SETTLE_S:
@@ -147,7 +150,10 @@ def _shown(plan: Plan) -> tuple[float | None, str]:
     return None if plan.loops else plan.poses, "poses" if plan.player == "path_player" else "images"
 
 
-def _status(plan: Plan, monitor: Monitored) -> str:
+def _status(plan: Plan, monitor: Monitored, *, at_end: bool = False) -> str:
+    page = _page(plan, monitor)
+    if IMAGER not in plan.nodes and page:  # what it shows runs elsewhere
+        return page
     again = ""
     if plan.loops:
         when = "at its end" if plan.poses is None else f"every {plan.poses} {_shown(plan)[1]}"
@@ -157,13 +163,22 @@ def _status(plan: Plan, monitor: Monitored) -> str:
     if not count:
         heard = slicer.get("received", "0") != "0"
         poses = monitor.node.reports.get(plan.player, {}).get("awaited", "poses")
-        return again + (
-            "nobody subscribes to ultrasound/image" if heard else f"waiting for {poses}"
-        )
-    return (
-        f"{again}{count} images, {slicer.get('rate_hz', '?')}/s, "
-        f"sent within {slicer.get('latency_p99_ms', '?')} ms (p99)"
-    )
+        awaited = "nobody subscribes to ultrasound/image" if heard else f"waiting for {poses}"
+        return "; ".join(filter(None, (again + awaited, page)))
+    rate = "" if at_end else f"{slicer.get('rate_hz', '?')}/s, "  # of the last second
+    return f"{again}{count} images, {rate}p99 latency {slicer.get('latency_p99_ms', '?')} ms"
+
+
+def _page(plan: Plan, monitor: Monitored) -> str:
+    """Where a browser finds the page; empty while none is served."""
+    viewer = next((each for each in plan.processes if each.node == VIEWER), None)
+    port = monitor.node.reports.get(VIEWER, {}).get("port", "")
+    if viewer is None or not port:
+        return ""
+    host = str(viewer.all_parameters["host"])
+    if not is_loopback(host):
+        return "open the address with its token, above"
+    return f"open http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 def dry_run(request: Request) -> str:
@@ -461,17 +476,19 @@ def _report(
 
     with Progress("measuring the recording", 100, "%") as bar:
         session = read_session(*outcome.files)
-        areas = session.lumen_areas(scene, 120, lambda done: bar.update(100 * done))
-    summary = session.summary(areas)
-    summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
-    summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
-    tracked = None
-    if video is not None:
-        from us_sim.run.session_summary import tracked_path
+        areas = session.lumen_areas(scene, 120, lambda done: bar.update(50 * done))
+        summary = session.summary(areas)
+        summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
+        summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
+        tracked = None
+        if video is not None:
+            from us_sim.run.session_summary import tracked_path
 
-        tracked = tracked_path(session, video)
-        summary["tracked_path"] = tracked.summary
-    contact_sheet(session, scene, areas, out / "contact_sheet.png")
+            tracked = tracked_path(session, video)
+            summary["tracked_path"] = tracked.summary
+        bar.update(50, "drawing the contact sheet")
+        contact_sheet(session, scene, areas, out / "contact_sheet.png")
+        bar.update(100)
     write_summary(summary, out / "summary.json")
     latency = summary["latency_ms"]["end_to_end"]
     print(

@@ -105,6 +105,10 @@ class Supervisor:
         given_up = (loss for loss in self.losses if loss.given_up and loss.node in late)
         return str(next(given_up, ""))
 
+    def gave_up(self, node: str) -> bool:
+        """Whether a node has ended and is not started again."""
+        return any(loss.given_up for loss in self.losses if loss.node == node)
+
     def keep(self, node: str, values: Mapping[str, object]) -> None:
         """Parameters that a node was given while it runs: started again, it has them, too."""
         if node in self._processes:

@@ -209,12 +209,17 @@ class BMode:
         """
         return self.frame(pose, nodes).labels
 
-    def beyond(self, pose: Pose) -> float:
-        """m by which the middle beam reaches beyond the mesh at rest, or the volume without one."""
+    def beyond(self, pose: Pose, *, pressed: bool = True) -> float:
+        """m by which the middle beam reaches beyond the mesh at rest, or the volume without one.
+
+        Args:
+            pose: of the probe.
+            pressed: False is as if a probe in the mesh stood where its middle beam enters it.
+        """
         extent = self._volume.extent
         if self._mesh is not None:
             extent = np.stack([self._mesh[0].min(axis=0), self._mesh[0].max(axis=0)])
-        return beyond(self._probe, pose, extent)
+        return beyond(self._probe, pose, extent, pressed=pressed or self._mesh is None)
 
     def _acoustics_of(self, probe: Probe, acoustics: Acoustics | None) -> BeamAcoustics | None:
         if acoustics is None or not acoustics.is_live:
@@ -248,11 +253,14 @@ def _outer_box(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     return index @ to_patient[:3, :3].T + to_patient[:3, 3], np.array(triangles, dtype=np.int32)
 
 
-def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64]) -> float:
+def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64], *, pressed: bool = True) -> float:
     """m of the middle beam that lie behind a box; 0 where it ends within it or never enters it.
 
     Args:
+        probe: whose beam it is.
+        pose: of the probe.
         extent: (2, 3) m, lower and upper corner of the box in the pose's parent frame.
+        pressed: False is as if a probe in the box stood where its middle beam enters that.
     """
     direction = pose.rotation[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -260,4 +268,4 @@ def beyond(probe: Probe, pose: Pose, extent: NDArray[np.float64]) -> float:
     entered, left = np.nanmax(distances.min(axis=0)), np.nanmin(distances.max(axis=0))
     if not (entered < left and left > 0.0 and entered < probe.depth):
         return 0.0
-    return max(0.0, float(probe.depth - left))
+    return max(0.0, float(probe.depth - left + (0.0 if pressed else min(entered, 0.0))))

@@ -7,7 +7,8 @@ names made of known words are kept; those that a person writes here are checked 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 
 _TEXT = """
@@ -149,3 +150,23 @@ def anatomical_colour(name: str) -> Colour:
     """Red, green and blue for a structure; of several known words in its name the last one."""
     words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _COLOURS]
     return _COLOURS[words[-1]] if words else _ANY_OTHER
+
+
+_SHADES = (0.0, 0.45, 0.25, 0.65)  # part of white in the first, second, ... of one colour
+
+
+def anatomical_colours(names: Iterable[str]) -> dict[str, Colour]:
+    """Colours of structures by their names; what has the same `anatomical_colour` gets shades.
+
+    >>> anatomical_colours(["portal vein", "hepatic vein", "liver"])["hepatic vein"]
+    (0.588, 0.67, 0.917)
+    """
+    seen: Counter[Colour] = Counter()
+    colours = {}
+    for name in names:
+        colour = anatomical_colour(name)
+        white = _SHADES[seen[colour] % len(_SHADES)]
+        seen[colour] += 1
+        red, green, blue = (round(part + white * (1.0 - part), 3) for part in colour)
+        colours[name] = (red, green, blue)
+    return colours

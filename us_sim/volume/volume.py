@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.structure_names import Colour, anatomical_colour
+from us_sim.volume.structure_names import Colour, anatomical_colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,8 @@ class LabelMap:
                 raise VolumeError(f"label {label} has no name: name it")
         if len(set(names.values())) < len(names):
             raise VolumeError(f"two structures have the same name, of {', '.join(names.values())}")
-        colours = {n: self.colours.get(n) or anatomical_colour(name) for n, name in names.items()}
+        usual = anatomical_colours(names.values())
+        colours = {n: self.colours.get(n) or usual[name] for n, name in names.items()}
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "colours", colours)
 

@@ -255,6 +255,11 @@ def test_an_image_that_is_deeper_than_a_box_says_by_how_much():
     deep = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.08)
     assert beyond(deep, Pose(), box) == pytest.approx(0.03)
     assert beyond(PROBE, Pose(), box) == 0.0
+    pressed = Pose(np.array([0.0, 0.0, 0.01]))
+    assert beyond(deep, pressed, box) == pytest.approx(0.04)
+    assert beyond(deep, pressed, box, pressed=False) == pytest.approx(0.03)
+    lifted = Pose(np.array([0.0, 0.0, -0.01]))
+    assert beyond(deep, lifted, box, pressed=False) == pytest.approx(0.02)
     assert beyond(deep, Pose(np.array([0.0, 0.0, -0.2])), box) == 0.0  # in the air above it
     half = np.radians(30) / 2
     turned = Pose(np.zeros(3), np.array([0.0, np.sin(half), 0.0, np.cos(half)]))

@@ -165,6 +165,27 @@ def test_a_cantilever_bends_as_timoshenko_says():
     assert (4 * deflections[1] - deflections[0]) / 3 == pytest.approx(exact, rel=0.03)
 
 
+@pytest.mark.parametrize("stiffest", [1e4, 1e8])
+def test_what_rounding_leaves_unbalanced_is_known_without_a_product(monkeypatch, stiffest):
+    monkeypatch.setattr(compliance_module, "_DOUBLE", 0)
+    mesh = block_mesh((13, 7, 7))
+    below = mesh.nodes[mesh.tetrahedra][:, :, 2].mean(axis=1) > 0.05
+    count = len(mesh.tetrahedra)
+    modulus = np.where(below, stiffest, 1e4)
+    materials = TissueMaterials(modulus, np.full(count, 0.45), np.full(count, 1000.0))
+    model = block((13, 7, 7), materials=materials)
+    solver = Fem(model)
+    for depth in (0.002, 0.012):
+        deformation = solver.deform(Pose([0.004, 0.0, depth]))
+        loads = np.zeros_like(mesh.nodes)
+        loads[solver._reached] = solver._contact.forces
+        unbalanced = (nodal_forces(model, deformation.nodes) - loads)[~model.fixed]
+        error = np.linalg.norm(unbalanced) / np.linalg.norm(loads)
+        known = solver._compliance.unbalanced(solver._contact.forces)
+        assert known == pytest.approx(error, rel=0.01)
+        assert deformation.residual >= known
+
+
 def test_compressed_fields_of_large_meshes_agree_with_a_sparse_solve(monkeypatch):
     """A press far finer than the mesh's own error of some per cent."""
     monkeypatch.setattr(compliance_module, "_COMPRESSED", 0)

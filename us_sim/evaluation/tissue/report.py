@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from us_sim.evaluation.block import MESHES
@@ -32,6 +33,7 @@ from us_sim.progress import Progress
 
 _PAPERS_FINEST = int(np.prod(MESHES[-1]))
 _FRAME = 1000.0 / 30.0  # ms, at the paper's 30 frames a second
+_AT_FRAME_RATE: Any = {"color": "0.75", "lw": 1, "ls": ":", "zorder": 0}
 _SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the reference's elements
 _DEFAULTS = ("scene", "method", "nodes", "ms", "p99 ms", "L2 %", "max mm", "force %", "volume %")
 
@@ -143,7 +145,10 @@ def _plot_errors(panels: dict[str, list[Point]], title: str, file: Path) -> None
             _draw_errors(axes, [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)])
             handles, names = axes.get_legend_handles_labels()
             keys |= dict(zip(names, handles, strict=True))
-        figure.legend(keys.values(), keys, loc="outside right upper", fontsize=8, frameon=False)
+        keys["filled: its defaults"] = Line2D([], [], color="0.3", marker="o", ms=7, ls="")
+        keys["30 frames a second"] = Line2D([], [], **_AT_FRAME_RATE)
+        look: Any = {"loc": "outside right upper", "fontsize": 8, "frameon": False}
+        figure.legend(keys.values(), keys, handlelength=4.5, **look)  # a dash and a dot are seen
 
 
 def _draw_errors(axes: Axes, points: Sequence[Point]) -> None:
@@ -161,7 +166,7 @@ def _draw_errors(axes: Axes, points: Sequence[Point]) -> None:
             for p in (p for p in chain if p.default):
                 axes.plot(p.ms_median, p.rel_l2_error, method.mark, color=method.colour, ms=7)
     axes.set(xscale="log", yscale="log")
-    axes.axvline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
+    axes.axvline(_FRAME, **_AT_FRAME_RATE)
     plain(axes)
     axes.yaxis.set_major_formatter(FuncFormatter(_percent))
     axes.margins(0.12)
@@ -179,7 +184,7 @@ def _plot_sizes(points: Sequence[Point], title: str, file: Path) -> None:
         time_panel, memory_panel = figure.subplots(1, 2)
         _draw_sizes(time_panel, points, lambda p: p.ms_median, "ms a frame (median)")
         _draw_sizes(memory_panel, points, lambda p: p.memory / 1e6, "MB held")
-        time_panel.axhline(_FRAME, color="0.75", lw=1, ls=":", zorder=0)
+        time_panel.axhline(_FRAME, **_AT_FRAME_RATE)
 
 
 def _draw_sizes(

@@ -15,7 +15,7 @@ from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import colour_image_message, nanoseconds_of
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.scene_node import NO_PAGE, SceneNode, is_left_by_pages
+from us_sim.nodes.scene_node import SceneNode, poses_ended
 from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.nodes.streams.stream import FrameStream
 from us_sim.scene.building import colour_of
@@ -201,8 +201,8 @@ class AnnotatedImage:
         node.health.values["probe_pose"] = state
         missing = state in ("stale", "lost")
         warning = f"the probe's pose is {state}: the image is frozen" if missing else ""
-        if missing and is_left_by_pages(node):
-            warning = f"{NO_PAGE}: the image is frozen"
+        if missing and (why := poses_ended(node)):
+            warning = f"{why}: the image is frozen"
             if not self._missing:
                 node.get_logger().info(f"{warning} until somebody does")
         elif missing and not self._missing and self._age is not None:

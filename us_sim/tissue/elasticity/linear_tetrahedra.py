@@ -135,11 +135,11 @@ class AveragedPressure:
         return (self.element + self.coupling.T @ (scaled @ self.coupling)).tocsr()
 
     def forces(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, 3) N, external forces that hold the nodes at a displacement (N, 3) m."""
-        moved = displacement.ravel()
-        swelling = self.coupling @ moved
-        held = self.element @ moved + self.coupling.T @ (swelling / self.capacity)
-        return held.reshape(-1, 3)
+        """(N, 3, ...) N, external forces that hold the nodes at displacements (N, 3, ...) m."""
+        moved = displacement.reshape(3 * len(displacement), -1)
+        pressure = (self.coupling @ moved) / self.capacity[:, None]
+        held = self.element @ moved + self.coupling.T @ pressure
+        return held.reshape(displacement.shape)
 
 
 def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> AveragedPressure:

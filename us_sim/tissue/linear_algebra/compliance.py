@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -69,10 +71,10 @@ class DenseFields:
 def _add_rows(fields, rows, weights, nodes, displacement):
     width = 1024  # nodes of a piece that stays in the fastest cache
     four = len(rows) // 4 * 4
-    whole = np.empty((3, width))
+    whole = np.empty((fields.shape[1], width))
     for begin in range(0, len(nodes), width):
         end = min(begin + width, len(nodes))
-        for axis in range(3):
+        for axis in range(fields.shape[1]):
             piece = whole[axis, : end - begin]
             piece[:] = 0.0
             for m in range(0, four, 4):
@@ -89,11 +91,23 @@ def _add_rows(fields, rows, weights, nodes, displacement):
                 for i in range(len(piece)):
                     piece[i] += p * a[i]
         for i in range(end - begin):
-            for axis in range(3):
+            for axis in range(fields.shape[1]):
                 displacement[nodes[begin + i], axis] += whole[axis, i]
 
 
-_VERSION = 4  # Part of the cache's key: raise it when the bytes change
+@njit(cache=True, nogil=True, error_model="numpy")
+def _quadratic(gram, rows, loads):
+    total = 0.0
+    for m in range(len(rows)):
+        row = gram[rows[m]]
+        part = 0.0
+        for n in range(m):
+            part += row[rows[n]] * loads[n]
+        total += loads[m] * (2 * part + row[rows[m]] * loads[m])
+    return total
+
+
+_VERSION = 5  # Part of the cache's key: raise it when the bytes change
 # Numbers in the fields below which they are in double precision, as single would save little
 # time.
 _DOUBLE = 4_000_000
@@ -104,7 +118,7 @@ _COMPRESSED = 100_000_000
 # Singular values that compression leaves out, over the largest displacement by each force: a
 # whole press is then off by about a tenth of that.
 _TOLERANCE = 1e-4
-# Number of single forces, and of presses, by which the fields' rounding error is measured.
+# Number of single forces, and of presses, by which the error of compression is measured.
 _SAMPLES = 12
 _PRESSED = 16  # nodes of the surface over those that such a press is on
 
@@ -115,26 +129,55 @@ class SurfaceCompliance:
 
     nodes: NDArray[np.int32]  # (S,), the model's movable contact nodes
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
-    fields: DenseFields | LowRankFields  # of all nodes that are not fixed
+    fields: DenseFields | LowRankFields  # of all nodes not fixed; if dense, without the surface's
     count: int  # N, nodes of the mesh
-    rounding: float  # unbalanced force in a field by rounding or compression, over the force
+    # (3S, 3S), products of the unbalanced forces that rounding leaves in the fields of two unit
+    # forces; nothing where they are compressed
+    gram: NDArray[np.float32]
+    compression: float  # unbalanced force in a compressed field, over the force
 
     def __post_init__(self) -> None:
         # Read-only as from the cache, for which numba compiles kernels of their own; and those that
         # a frame calls, which depend on the fields' kind and precision, are compiled now.
         self.matrix.flags.writeable = False
+        self.gram.flags.writeable = False
         self.add_field(np.zeros((len(self.nodes), 3)), np.zeros((3, self.count), np.float32))
         self.field(np.zeros((len(self.nodes), 3)))
+        self.unbalanced(np.ones((len(self.nodes), 3)))
 
     def add_field(self, forces: NDArray[np.float64], displacement: NDArray[np.float32]) -> None:
         """Add the displacement by forces (S, 3) N to displacement (3, N) m; zeros are not read."""
         self.fields.add(forces.ravel(), displacement.T)
+        self._add_surface(forces, self._places[1], displacement)
 
     def field(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) m, the displacement of every node by forces (S, 3) N."""
         displacement = np.zeros((self.count, 3))
         self.fields.add(forces.ravel(), displacement)
+        self._add_surface(forces, self._places[0], displacement)
         return displacement
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(3S,), where the surface is in fields (N, 3), and in fields (3, N)."""
+        node, axis = self.nodes.astype(np.int64)[:, None], np.arange(3)
+        return (3 * node + axis).ravel(), (node + self.count * axis).ravel()
+
+    def _add_surface(
+        self, forces: NDArray[np.float64], places: NDArray[np.int64], displacement: NDArray
+    ) -> None:
+        if isinstance(self.fields, DenseFields):
+            rows = np.flatnonzero(forces)
+            columns = self.matrix[:, None, :]
+            _add_rows(columns, rows, forces.ravel()[rows], places, displacement.reshape(-1, 1))
+
+    def unbalanced(self, forces: NDArray[np.float64]) -> float:
+        """The norm of the unbalanced force in the field of forces (S, 3) N, over that of these."""
+        if len(self.gram) == 0:
+            return self.compression
+        rows = np.flatnonzero(forces)
+        loads = forces.ravel()[rows]
+        return math.sqrt(max(_quadratic(self.gram, rows, loads), 0.0) / float(loads @ loads))
 
 
 def surface_compliance(
@@ -203,11 +246,15 @@ def _compute(
             found = LowRankFields.compress(points, free, points[nodes], solve, _TOLERANCE)
         else:
             precision = np.float64 if size < _DOUBLE else np.float32
-            found = DenseFields.compute(free, len(nodes), solve, precision)
-    matrix += matrix.T  # symmetric to the last digit
-    matrix /= 2
-    made = SurfaceCompliance(nodes, matrix, found, len(points), 0.0)
-    return replace(made, rounding=_rounding(made, points[nodes], system, model.fixed))
+            inner = np.setdiff1d(free, nodes)
+            found = DenseFields.compute(inner, len(nodes), solve, precision)
+        matrix += matrix.T  # symmetric to the last digit
+        matrix /= 2
+        none = np.zeros((0, 0), np.float32)
+        made = SurfaceCompliance(nodes, matrix, found, len(points), none, 0.0)
+        if isinstance(found, DenseFields):
+            return replace(made, gram=_gram(made, found, system, model.fixed))
+    return replace(made, compression=_compression(made, points[nodes], system, model.fixed))
 
 
 def _scratch(needed: bool) -> AbstractContextManager[Any]:
@@ -217,7 +264,26 @@ def _scratch(needed: bool) -> AbstractContextManager[Any]:
     return contextlib.nullcontext()
 
 
-def _rounding(
+def _gram(
+    made: SurfaceCompliance, found: DenseFields, system: AveragedPressure, fixed: NDArray
+) -> NDArray[np.float32]:
+    """(3S, 3S), products of the unbalanced forces in the fields of two unit forces."""
+    size = len(made.matrix)
+    dof = (3 * made.nodes[:, None] + np.arange(3)).ravel()
+    left = np.empty((size, 3 * made.count), np.float32)
+    for first in range(0, size, 3 * _CHUNK):
+        part = np.arange(first, min(first + 3 * _CHUNK, size))
+        moved = np.zeros((made.count, 3, len(part)))
+        moved[found.nodes] = found.fields[part].transpose(2, 1, 0)
+        moved[made.nodes] = made.matrix[:, part].reshape(-1, 3, len(part))
+        balance = system.forces(moved).reshape(-1, len(part))
+        balance[dof[part], np.arange(len(part))] -= 1.0
+        balance.reshape(-1, 3, len(part))[fixed] = 0.0
+        left[part] = balance.T
+    return left @ left.T
+
+
+def _compression(
     made: SurfaceCompliance, points: NDArray, system: AveragedPressure, fixed: NDArray
 ) -> float:
     """The unbalanced force over the norm of the forces: the median of single ones and of presses,
@@ -256,8 +322,8 @@ def _key(model: TissueModel) -> str:
 
 
 def _pack(made: SurfaceCompliance) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    own = {"surface": made.nodes, "matrix": made.matrix}
-    facts = {"count": made.count, "rounding": made.rounding}
+    own = {"surface": made.nodes, "matrix": made.matrix, "gram": made.gram}
+    facts = {"count": made.count, "compression": made.compression}
     return {**own, **vars(made.fields)}, facts
 
 
@@ -268,7 +334,8 @@ def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> SurfaceComplia
         arrays["matrix"],
         kind(**{field.name: arrays[field.name] for field in fields(kind)}),
         count=int(facts["count"]),
-        rounding=float(facts["rounding"]),
+        gram=arrays["gram"],
+        compression=float(facts["compression"]),
     )
 
 

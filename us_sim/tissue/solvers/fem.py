@@ -35,15 +35,10 @@ from us_sim.tissue.contact.compliant_contact import (
 )
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
-from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
 from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
-from us_sim.tissue.linear_algebra.compliance import DenseFields, surface_compliance
+from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver
-
-_ROUNDING = 1e-8
-"""Rounding error of full fields, over the force, above which it is measured in every frame: where
-moduli are far apart, that of some pushes is a thousand times that of most."""
 
 _EXTENSIONS = 10
 """Times that nodes overlooked at first, being far from the probe, may be added in a frame."""
@@ -71,8 +66,8 @@ class Fem(TissueSolver):
 
     The residual is the error of the stored fields, by rounding or compression, together with the
     forces along the surface of a curved probe (without friction) or the last change of the forces
-    (with friction). That error is the one measured when the fields were made, unless it is large
-    though they are not compressed, as with moduli far apart: then it is computed in every frame.
+    (with friction). Of rounding it is exact, by products of what it leaves unbalanced in the fields
+    of unit forces; of compression a median, as measured when the fields were made.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -111,9 +106,6 @@ class Fem(TissueSolver):
         else:
             coefficient = settings.friction if settings.contact == "coulomb" else math.inf
             self._contact = FrictionalContact(*surface, coefficient)
-        dense = isinstance(self._compliance.fields, DenseFields)
-        imprecise = dense and self._compliance.rounding > _ROUNDING
-        self._equations = averaged_pressure(model.mesh, model.materials) if imprecise else None
         self._watched = watched_tetrahedra(model)
         self._displacement = np.zeros_like(model.mesh.nodes)
         super().__init__(model, settings, progress)
@@ -174,15 +166,6 @@ class Fem(TissueSolver):
         forces = contact.forces[pushed]
         force, torque = wrench_on_probe(pose, nodes[touched], forces)
         load = float(np.linalg.norm(forces))
-        residual = math.hypot(contact.sliding_force / load, self._rounding(touched, forces))
+        residual = math.hypot(contact.sliding_force / load, compliance.unbalanced(contact.forces))
         inverted = count_inverted(nodes, self._watched)
         return Deformation(nodes, touched, force, torque, residual, actions, inverted)
-
-    def _rounding(self, touched: NDArray[np.int32], forces: NDArray[np.float64]) -> float:
-        """Unbalanced force over the norm of the probe's forces (K, 3) N on touched (K,) nodes."""
-        if self._equations is None:
-            return self._compliance.rounding
-        balance = self._equations.forces(self._displacement)
-        balance[touched] -= forces
-        balance[self.model.fixed] = 0.0
-        return float(np.linalg.norm(balance) / np.linalg.norm(forces))

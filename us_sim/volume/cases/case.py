@@ -25,7 +25,7 @@ from us_sim.errors import CaseError, UsSimError, VolumeError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
-from us_sim.settings.spelling import nearest
+from us_sim.settings.spelling import nearest, unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
@@ -246,6 +246,10 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
         if place.exists():
             kind = f"folder without a {CASE}" if place.is_dir() else "file"
             raise CaseError(f"{name}: is a {kind}, and there is no case of that name")
+    for folder in {place.parent for place in places} if path.name != str(path) else ():
+        beside = [path.with_name(case.name) for case in cases_in(folder)] if folder.is_dir() else []
+        if beside:
+            raise CaseError(f"there is no such case: {unknown(str(path), map(str, beside))}")
     like = nearest(name, known)
     there = f"cases are {', '.join(known)}" if known else "there is none"
     raise CaseError(

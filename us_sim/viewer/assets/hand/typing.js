@@ -18,6 +18,8 @@ const PAGES = ["PageUp", "PageDown"];
 /** Whether the person types, or moves or presses a control, so that the key is not for the page. */
 export function isTyping(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return true;
+  // What was closed keeps the focus until the next picture is drawn.
+  if (!(event.target.checkVisibility?.() ?? true)) return false;
   const isOn = (kinds) => Boolean(event.target.closest?.(kinds));
   if (isOn(ENTRIES)) return true;
   if (PRESSES.includes(event.key)) return isOn(`${PRESSED}, ${NEIGHBOURS}`);
