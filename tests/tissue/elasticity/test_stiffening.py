@@ -70,7 +70,9 @@ def test_a_nearly_incompressible_block_that_is_free_across_has_the_uniaxial_stre
     across = brentq(side, 0.9 * stretch**-0.5, 1.1 * stretch**-0.5)
     growth = 1 + 0.7 * ((stretch**2 + 2 / stretch - 3) / 2) ** 2
     expected = 10e3 / 3 * growth * (stretch - stretch**-2)
-    assert nominal_stress(stretch, across, material)[0] == pytest.approx(expected, rel=4e-3)  # it is compressible
+    assert nominal_stress(stretch, across, material)[0] == pytest.approx(
+        expected, rel=4e-3
+    )  # it is compressible
 
 
 @pytest.mark.parametrize("size", [1e-4, 2e-3, 0.02])
