@@ -1,4 +1,4 @@
-"""Tissue that stiffens: against closed forms, Yeoh's own, finite differences, and what it may do."""
+"""Tissue that stiffens: against closed forms, Yeoh's law, finite differences, and its limits."""
 
 import numpy as np
 import pytest
@@ -194,5 +194,5 @@ def test_a_stiffening_that_would_soften_is_refused(value):
     with pytest.raises(MaterialError, match="stiffening"):
         Material(10e3, stiffening=value)
     ones = np.ones(2)
-    with pytest.raises(MaterialError, match="stiffening of tetrahedron 1 .*soften"):
+    with pytest.raises(MaterialError, match=r"stiffening of tetrahedron 1 .*soften"):
         TissueMaterials(ones, 0.3 * ones, ones, stiffening=np.array([0.0, value]))
