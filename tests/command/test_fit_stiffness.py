@@ -96,6 +96,27 @@ def test_what_is_no_press_is_one_sentence(press, small_scene, tmp_path, capsys, 
     assert not list(tmp_path.glob("*fitted*"))
 
 
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("lung", "--stiffening lung: there is no such structure; there are "),
+        ("muscle", "leave muscle out of --stiffening"),  # this press is not deep enough
+    ],
+)
+def test_a_stiffening_that_cannot_be_fitted_is_one_sentence(
+    press, small_scene, tmp_path, capsys, name, sentence
+):
+    wrenches = press.noisy(0.05, np.random.default_rng(3))
+    recording = session(tmp_path / "bag", press.path, felt(press, wrenches))
+    out = tmp_path / "fitted.yaml"
+    words = ["fit-stiffness", str(small_scene), recording, "--out", str(out), "--poses", "14"]
+    assert main([*words, "--keep", *OTHERS, "--stiffening", name]) == 1
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert sentence in error
+    assert not out.exists()
+
+
 def test_a_scene_without_tissue_is_refused(tmp_path, capsys):
     scene = tmp_path / "bare.yaml"
     scene.write_text(

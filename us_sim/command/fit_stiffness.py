@@ -14,11 +14,14 @@ from us_sim.share import full_path
 from us_sim.tissue.identification.settings import StiffnessSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from us_sim.scene.scene import Scene
     from us_sim.tissue.identification.press_record import PressRecord
     from us_sim.tissue.identification.stiffness import StiffnessFit, Tissue
+
+
+_BEGIN = 0.3  # Stiffening with which a fit begins where the scene has none; a silicone's
 
 
 def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
@@ -56,7 +59,7 @@ def _fit(args: argparse.Namespace) -> int:
     landmarks = read_landmarks(settings.landmarks) if settings.landmarks else None
     show = late_progress("fit-stiffness")
     show(0.0, "making the tissue")
-    tissue, remarks = _tissue(scene, show)
+    tissue, remarks = _tissue(scene, settings.stiffening, show)
     record, told = _record(args.session, tissue, settings)
     for remark in (*remarks, *told):
         print(remark)
@@ -85,11 +88,15 @@ def _write_into_case(
 ) -> None:
     """The fitted moduli, with how they were found."""
     from us_sim.volume.cases.provenance import Source, Step
-    from us_sim.volume.cases.writing import write_moduli_into
+    from us_sim.volume.cases.writing import write_constants_into
 
     assert scene.volume.case is not None
+    stiffenings = found.stiffenings
     fitted = {
-        name: {"young_modulus": found.moduli[name], "factor": interval.factor}
+        name: {
+            "stiffening" if name in stiffenings else "young_modulus": found.moduli[name],
+            "factor": interval.factor,
+        }
         for name, interval in found.intervals.items()
     }
     sources = (Source.of(session, "recorded press"),) if session.is_file() else ()
@@ -99,13 +106,14 @@ def _write_into_case(
         {"poses": len(found.depths)},
         sources,
     )
-    moduli = {name: found.moduli[name] for name in fitted}
-    write_moduli_into(scene.volume.case, moduli, step)
+    write_constants_into(scene.volume.case, found.constants, step)
     print(f"{scene.volume.case}: has these moduli now")
 
 
-def _tissue(scene: Scene, progress: Callable[[float, str], None]) -> tuple[Tissue, tuple[str, ...]]:
-    """The tissue that is pressed, and remarks on it."""
+def _tissue(
+    scene: Scene, stiffening: Sequence[str], progress: Callable[[float, str], None]
+) -> tuple[Tissue, tuple[str, ...]]:
+    """The tissue that is pressed, of which some structures' stiffening is unknown; and remarks."""
     from us_sim.scene.building import materials_of, tissue_model_of, volume_of
     from us_sim.tissue.identification.stiffness import Tissue
     from us_sim.tissue.solvers.fem_nonlinear import FemNonlinearSettings
@@ -127,16 +135,25 @@ def _tissue(scene: Scene, progress: Callable[[float, str], None]) -> tuple[Tissu
             f"push back otherwise with them"
         )
     materials = dict(section.materials)
+    for name in stiffening:
+        if name not in materials:
+            raise StiffnessError(
+                f"--stiffening {name}: there is no such structure; there are {', '.join(materials)}"
+            )
+    stiffenings = {f"stiffening of {name}": name for name in stiffening}
 
     def materials_for(moduli: Mapping[str, float]) -> Any:
         made = {
-            name: dataclasses.replace(materials[name], young_modulus=modulus)
-            for name, modulus in moduli.items()
+            name: dataclasses.replace(material, young_modulus=moduli[name])
+            for name, material in materials.items()
         }
+        for key, name in stiffenings.items():
+            made[name] = dataclasses.replace(made[name], stiffening=moduli[key])
         return materials_of(scene, made, model.mesh, volume)
 
     moduli = {name: material.young_modulus for name, material in materials.items()}
-    return Tissue(model, materials_for, moduli), tuple(remarks)
+    begin = {key: materials[name].stiffening or _BEGIN for key, name in stiffenings.items()}
+    return Tissue(model, materials_for, {**moduli, **begin}, stiffenings), tuple(remarks)
 
 
 def _record(

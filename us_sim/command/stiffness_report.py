@@ -23,15 +23,16 @@ def table(found: StiffnessFit) -> str:
     percent = f"{100 * found.confidence:g} %"
     rows = [("structure", "E (kPa)", f"{percent} interval (kPa)", "×/÷", "part of force")]
     for name, modulus in found.moduli.items():
+        unit = _unit(found, name)
         interval = found.intervals.get(name)
         if interval is None:
-            rows.append((name, f"{modulus / 1e3:.4g}", "kept", "", ""))
+            rows.append((name, f"{modulus / unit:.4g}", "kept", "", ""))
             continue
         rows.append(
             (
                 name,
-                f"{modulus / 1e3:.4g}",
-                f"{interval.lower / 1e3:.4g} to {interval.upper / 1e3:.4g}",
+                f"{modulus / unit:.4g}",
+                f"{interval.lower / unit:.4g} to {interval.upper / unit:.4g}",
                 f"{interval.factor:.3f}",
                 f"{interval.weight:.2f}",
             )
@@ -45,6 +46,11 @@ def table(found: StiffnessFit) -> str:
         for row in rows
     ]
     return "\n".join([*lines, "", _left_over(found), *found.remarks])
+
+
+def _unit(found: StiffnessFit, name: str) -> float:
+    """Unit in which a constant is shown: kPa, or none."""
+    return 1.0 if name in found.stiffenings else 1e3
 
 
 def _left_over(found: StiffnessFit) -> str:
@@ -81,8 +87,8 @@ def write_moduli(file: Path, found: StiffnessFit, base: Mapping[str, str], name:
         StiffnessError: it cannot be written.
     """
     materials = {
-        structure: {"young_modulus": float(f"{found.moduli[structure]:.6g}")}
-        for structure in found.intervals
+        structure: {key: float(f"{value:.6g}") for key, value in constants.items()}
+        for structure, constants in found.constants.items()
     }
     document = {"name": f"{name}_fitted", **base, "tissue": {"materials": materials}}
     told = "".join(f"# {line}".rstrip() + "\n" for line in table(found).splitlines())
@@ -197,11 +203,12 @@ def _draw_force_over_depth(panel: Axes, found: StiffnessFit) -> None:
 def _draw_moduli(panel: Axes, found: StiffnessFit) -> None:
     names = list(found.moduli)
     for row, name in enumerate(names):
-        modulus, interval = found.moduli[name] / 1e3, found.intervals.get(name)
+        unit, interval = _unit(found, name), found.intervals.get(name)
+        modulus = found.moduli[name] / unit
         if interval is None:
             panel.plot(modulus, row, "o", color="0.5", mfc="none")
             continue
-        panel.plot([interval.lower / 1e3, interval.upper / 1e3], [row, row], "-", color="#0072B2")
+        panel.plot([interval.lower / unit, interval.upper / unit], [row, row], "-", color="#0072B2")
         panel.plot(modulus, row, "o", color="#0072B2")
     panel.set_xscale("log")
     panel.set_yticks(range(len(names)), names)

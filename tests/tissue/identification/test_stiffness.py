@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from known_press import KnownPress, layered_block
+from known_press import TRUE, KnownPress, layered_block, slide
 
+from us_sim.command.stiffness_report import table
 from us_sim.errors import StiffnessError
 from us_sim.geometry.collider import RoundedBox
 from us_sim.geometry.pose import Pose
@@ -40,6 +41,29 @@ def test_a_sensor_without_torque_will_do(press, random):
     for name, true in press.moduli.items():
         assert found.moduli[name] == pytest.approx(true, rel=0.1)
     assert any("no torque" in remark for remark in found.remarks)
+
+
+def test_a_stiffening_is_found_beside_the_moduli(random):
+    plain = layered_block()
+
+    def materials_for(moduli):
+        made = plain.materials_for(moduli)
+        return replace(made, stiffening=np.full(len(made.density), moduli["stiffening of fat"]))
+
+    start = {**plain.moduli, "stiffening of fat": 0.5}
+    tissue = Tissue(plain.model, materials_for, start, {"stiffening of fat": "fat"})
+    true = {**TRUE, "stiffening of fat": 4.0}
+    path = slide()
+    path.positions[:, 2] *= 1.6  # to 14 mm, where it acts
+    press = KnownPress(tissue, true, path)
+    found = fit_stiffness(tissue, press.record(press.noisy(0.01, random)), FEW)
+    for name, value in true.items():
+        assert found.moduli[name] == pytest.approx(value, rel=0.3 if "of" in name else 0.1)
+    assert found.constants["fat"] == {
+        "young_modulus": found.moduli["fat"],
+        "stiffening": found.moduli["stiffening of fat"],
+    }
+    assert "kept" not in table(found)
 
 
 def test_two_springs_in_series_are_told_as_one_and_either_from_the_other():

@@ -17,7 +17,7 @@ from us_sim.volume.cases.writing import (
     changed_case,
     new_case,
     write_case_settings,
-    write_moduli_into,
+    write_constants_into,
 )
 from us_sim.volume.files.writing import write_volume
 
@@ -161,13 +161,15 @@ def test_a_provenance_that_is_none_is_refused(make_case, text):
 STEP = Step("fitted stiffness to a press", {"confidence": 0.95}, {"poses": 48})
 
 
-def test_moduli_change_and_nothing_else(make_case):
+def test_constants_change_and_nothing_else(make_case):
     folder = make_case()
     before = read_case(folder).settings
-    write_moduli_into(folder, {"vein": 2345.0, "tissue": 9876.0}, STEP)
+    constants = {"young_modulus": 9876.0, "stiffening": 0.4}
+    write_constants_into(folder, {"vein": {"young_modulus": 2345.0}, "tissue": constants}, STEP)
     case = read_case(folder)
     assert case.settings.material_of("vein").young_modulus == 2345.0
     assert case.settings.material_of("tissue").young_modulus == 9876.0
+    assert case.settings.material_of("tissue").stiffening == 0.4
     for name in ("vein", "tissue"):
         was, now = before.material_of(name), case.settings.material_of(name)
         assert (now.poisson_ratio, now.density) == (was.poisson_ratio, was.density)
@@ -177,14 +179,18 @@ def test_moduli_change_and_nothing_else(make_case):
 
 
 @pytest.mark.parametrize(
-    ("moduli", "error", "sentence"),
-    [({"vien": 1e3}, CaseError, "vien"), ({"vein": -1.0}, MaterialError, "young_modulus")],
+    ("constants", "error", "sentence"),
+    [
+        ({"vien": {"young_modulus": 1e3}}, CaseError, "vien"),
+        ({"vein": {"young_modulus": -1.0}}, MaterialError, "young_modulus"),
+        ({"vein": {"stiffening": -1.0}}, MaterialError, "stiffening"),
+    ],
 )
-def test_what_cannot_be_written_leaves_the_case_as_it_was(make_case, moduli, error, sentence):
+def test_what_cannot_be_written_leaves_the_case_as_it_was(make_case, constants, error, sentence):
     folder = make_case()
     before = (folder / "case.yaml").read_bytes()
     with pytest.raises(error, match=sentence):
-        write_moduli_into(folder, moduli, STEP)
+        write_constants_into(folder, constants, STEP)
     assert (folder / "case.yaml").read_bytes() == before
     assert read_case(folder).steps == ()
 

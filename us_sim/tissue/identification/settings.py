@@ -19,6 +19,10 @@ class StiffnessSettings(Settings):
     keep: tuple[str, ...] = setting(
         description="structures whose modulus stays as the scene says", default=()
     )
+    stiffening: tuple[str, ...] = setting(
+        description="structures whose stiffening is fitted besides: the press must be deep",
+        default=(),
+    )
     poses: int = setting(
         Quantity("number", 12, 2000), "of the press that are looked at, at most", default=48
     )

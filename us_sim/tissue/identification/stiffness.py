@@ -14,7 +14,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -247,6 +247,7 @@ def undetermined(
     observed: Observations,
     fitted: FitResult,
     settings: StiffnessSettings,
+    stiffenings: Mapping[str, str],
 ) -> str:
     """Reasons why a press does not determine moduli, and remedies, in a sentence."""
     reasons, unknown = [], [p for p in range(len(names)) if not known.determined[p]]
@@ -259,13 +260,16 @@ def undetermined(
         else:
             factor = np.exp(min(known.half_widths[p], 50.0))
             reasons.append(f"{names[p]} is known to a factor of {factor:.3g} only")
-    those = " ".join(names[p] for p in unknown)
+    those = [names[p] for p in unknown if names[p] not in stiffenings]
+    remedies = [f"fix what it does not with --keep {' '.join(those)}"] * bool(those)
+    for name in (names[p] for p in unknown if names[p] in stiffenings):
+        remedies.append(f"leave {stiffenings[name]} out of --stiffening")
     fine = [name for name, fine in zip(names, known.determined, strict=True) if fine]
     rest = f"; it does determine {', '.join(fine)}" if fine else ""
     return (
         f"this press does not determine {', '.join(names[p] for p in unknown)}: "
-        f"{'; '.join(reasons)}{rest}; fix what it does not with --keep {those}, or press deeper, "
-        f"from other sides, or nearer to it"
+        f"{'; '.join(reasons)}{rest}; {', '.join(remedies)}, or press deeper, from other sides, "
+        f"or nearer to it"
     )
 
 
@@ -298,6 +302,8 @@ class Tissue:
     model: TissueModel
     materials_for: MaterialsFor
     moduli: Mapping[str, float]  # Pa, of all structures, with which a fit begins
+    # Names of stiffenings that are fitted, among the moduli though without unit, and of whom
+    stiffenings: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -321,6 +327,16 @@ class StiffnessFit:
     fitted: FitResult
     depths: NDArray[np.float64]  # (K,) m, of the poses that press
     remarks: tuple[str, ...]
+    stiffenings: Mapping[str, str]  # as of the `Tissue`
+
+    @property
+    def constants(self) -> dict[str, dict[str, float]]:
+        """Fitted constants of materials, by structure."""
+        made: dict[str, dict[str, float]] = {}
+        for name in self.intervals:
+            key = "stiffening" if name in self.stiffenings else "young_modulus"
+            made.setdefault(self.stiffenings.get(name, name), {})[key] = self.moduli[name]
+        return made
 
     @property
     def modelled(self) -> NDArray[np.float64]:
@@ -434,13 +450,18 @@ def _result(
         settings.confidence,
     )
     if not known.determined.all():
-        raise StiffnessError(undetermined(names, known, observed, fitted, settings))
+        raise StiffnessError(
+            undetermined(names, known, observed, fitted, settings, tissue.stiffenings)
+        )
     if fitted.bounded.any():
         first = names[int(np.argmax(fitted.bounded))]
+        kept = f"keep it with --keep {first}"
+        if first in tissue.stiffenings:
+            kept = f"leave {tissue.stiffenings[first]} out of --stiffening"
         raise StiffnessError(
-            f"the modulus of {first} runs to {FARTHEST:g} times what the scene says, or that part "
+            f"{first} runs to {FARTHEST:g} times what the scene says, or that part "
             f"of it: the press contradicts the scene; check the registration, the sensor's "
-            f"units and what else is soft, or keep it with --keep {first}"
+            f"units and what else is soft, or {kept}"
         )
     moduli = np.exp(fitted.log_moduli)
     factors = np.exp(known.half_widths)
@@ -459,6 +480,7 @@ def _result(
         fitted=fitted,
         depths=np.maximum(-chosen.clearance[chosen.pressed], 0.0),
         remarks=_remarks(chosen, observed, fitted),
+        stiffenings=tissue.stiffenings,
     )
 
 

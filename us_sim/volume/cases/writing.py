@@ -103,19 +103,23 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSettings:
-    """A case with these Young's moduli (Pa) by structure, `AROUND` for tissue outside of all.
+Constants = Mapping[str, Mapping[str, float]]
+"""Constants of materials, such as ``young_modulus`` (Pa), by structure."""
+
+
+def with_constants(settings: CaseSettings, constants: Constants) -> CaseSettings:
+    """A case with these constants by structure, `AROUND` for tissue outside of all.
 
     Raises:
         CaseError: there is no such structure.
-        MaterialError: a modulus is out of range.
+        MaterialError: a constant is out of range.
     """
     structures = dict(settings.structures)
     around = settings.around
-    for name, modulus in moduli.items():
+    for name, changed in constants.items():
         if name not in (AROUND, *structures):
             raise CaseError(f"{settings.name}: structure {unknown(name, (AROUND, *structures))}")
-        material = dataclasses.replace(settings.material_of(name), young_modulus=modulus)
+        material = dataclasses.replace(settings.material_of(name), **changed)
         if name == AROUND:
             around = material
         else:
@@ -123,15 +127,13 @@ def with_moduli(settings: CaseSettings, moduli: Mapping[str, float]) -> CaseSett
     return dataclasses.replace(settings, around=around, structures=structures)
 
 
-def write_moduli_into(
-    folder: str | os.PathLike[str], moduli: Mapping[str, float], step: Step
-) -> None:
-    """Write moduli (Pa) by structure into a case, and how they were found.
+def write_constants_into(folder: str | os.PathLike[str], constants: Constants, step: Step) -> None:
+    """Write constants by structure into a case, and how they were found.
 
     Raises:
         CaseError: there is no such case or structure, or it cannot be written.
     """
-    settings = with_moduli(read_case(folder).settings, moduli)
+    settings = with_constants(read_case(folder).settings, constants)
     with changed_case(folder) as partial:
         write_case_settings(partial, settings)
         add_step(partial, step)
