@@ -24,6 +24,7 @@ def test_the_script_makes_an_image():
 VERBS = (
     *("demo", "run", "view", "render", "play", "bag", "info", "to-rerun"),
     *("evaluate", "tissue", "stability", "hand", "slice", "tracking", "latency", "image"),
+    "measured",
     *("calibrate", "camera", "pivot", "landmarks", "probe", "time", "print-marker", "reference"),
     *("compile", "fit-stiffness", "reconstruct", "segment", "cases", "import"),
 )

@@ -1,4 +1,4 @@
-"""Options of `us-sim evaluate hand` and `us-sim evaluate slice`."""
+"""Options of `us-sim evaluate hand`, `us-sim evaluate slice` and `us-sim evaluate measured`."""
 
 from __future__ import annotations
 
@@ -31,3 +31,13 @@ class RecordedSweep(Settings):
                 "--volume and --sweep belong together: give the tracked sweep and the volume that "
                 "was compounded from it"
             )
+
+
+@dataclass(frozen=True)
+class MeasuredData(Settings):
+    """Data that others measured."""
+
+    data: Path | None = setting(
+        description="folder with the folders of measured data; default: US_SIM_TEST_DATA's",
+        default=None,
+    )

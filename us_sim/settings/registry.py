@@ -123,6 +123,10 @@ EVALUATIONS = Choice(
     image=Option(f"{_EVALUATION}.image.report:evaluate_image", _NOTHING),
     latency=Option(f"{_EVALUATION}.latency.report:evaluate_latency", _NOTHING),
     viewer=Option(f"{_EVALUATION}.viewer.report:evaluate_viewer", _NOTHING),
+    measured=Option(
+        f"{_EVALUATION}.measured.report:evaluate_measured",
+        f"{_EVALUATION}.settings:MeasuredData",
+    ),
 )
 
 _CALIBRATION = "us_sim.command.calibration"

@@ -1,0 +1,1 @@
+"""Error against measurements of the real world."""
