@@ -1,13 +1,17 @@
 """Estimated distance of a deformed tissue's nodes from the continuum, without any fitted constant.
 
-Two parts, the root of the sum of whose squares is taken. **Contact**: tissue that a probe touches
-lies on it, but nodes stand off it or are in it, as triangles are flat and contact gives way. Linear
-tissue answers to forces that close these gaps, and its displacement is the error. **Interpolation**:
-linear tetrahedra leave out how a displacement is bent. Gradients recovered at the nodes, as the
-mean of the tetrahedra around each (O. C. Zienkiewicz and J. Z. Zhu, A simple error estimator and
-adaptive procedure, Int. J. Numer. Methods Eng. 24, 1987), give the second derivatives along the
-edges, and with them the quadratic functions that are missing; their L2 norm is the error. Where
-materials meet, gradients jump, and that counts as error too.
+The estimate is the root of the sum of the squares of two parts.
+
+**Contact.** Tissue that a probe touches lies on it without friction. But flat triangles and springs
+leave nodes beside it, pushed in other directions than its normals. So contact forces are replaced
+by forces along the normals at the nodes, which put these exactly onto the probe, and the part is
+how far linear tissue moves by that.
+
+**Interpolation.** Linear tetrahedra leave out how a displacement is bent. Gradients recovered at
+the nodes, as the mean of the tetrahedra around each (O. C. Zienkiewicz and J. Z. Zhu, A simple
+error estimator and adaptive procedure, Int. J. Numer. Methods Eng. 24, 1987), tell its second
+derivatives along the edges, and so the quadratic functions that are missing; the part is their L2
+norm. Where materials meet, gradients jump, and that counts as error too.
 
 An error of the model, such as linear strain in a deep press, is no part of it.
 
