@@ -475,17 +475,17 @@ def _draw_errors(outcomes: list[Outcome], file: Path) -> None:
             panel.set_xlabel("root mean square error, µm")
             plain(panel)
         panels[0].set_ylabel("z, µm")
-        panels[-1].legend(fontsize=8, frameon=False)
+        panels[0].legend(fontsize=8, frameon=False, loc="upper right")
 
 
 STUDY = Study(
     "hydrogel",
     "hydrogel-indentation",
-    "https://github.com/FranckLab/SerialTrack at fdb01c6204e10dc66d5c6baff75f2cfbd904a4d2, "
-    "SerialTrack3D/Example_main_files and SerialTrack3D/results, with beads linked as "
-    "`linked_beads.csv.gz`",
+    "https://github.com/FranckLab/SerialTrack, revision fdb01c6204e10dc66d5c6baff75f2cfbd904a4d2 "
+    "(SerialTrack3D: the beads' positions and the authors' links, which `linked_beads.csv.gz` "
+    "extends upwards by mutually nearest beads around a local affine motion)",
     "MIT",
     "J. Yang, Y. Yin, A. K. Landauer, S. Buyukozturk, J. Zhang, L. Summey, A. McGhee, M. K. Fu, "
-    "J. O. Dabiri and C. Franck, SerialTrack, SoftwareX 19, 101204, 2022",
+    "J. O. Dabiri and C. Franck, SerialTrack, SoftwareX 19, 101204, 2022.",
     measure_hydrogel,
 )
