@@ -22,6 +22,8 @@ from us_sim.scene.reading import load_scene
 from us_sim.tissue.solvers.solver import create_solver
 from us_sim.tissue.solvers.switching import SwitchableTissue
 
+ESTIMATE = "discretisation_error_percent"
+
 
 @pytest.fixture
 def deformer(bench, small_scene):
@@ -153,6 +155,23 @@ def test_two_methods_run_side_by_side_and_diagnostics_say_how_far_they_are_apart
     assert node.set_parameters([Parameter("compare_with", value="")])[0].successful
     press(bench, publisher, nodes, 0.004, 13)
     assert "compared_with" not in node.health.values
+
+
+def test_diagnostics_say_the_estimated_error_where_the_method_knows_it(bench, deformer):
+    node, nodes, _, publisher = deformer
+    statuses = bench.collect(DiagnosticArray, "diagnostics")
+
+    def estimates():
+        return [v.value for s in statuses for v in s.status[0].values if v.key == ESTIMATE]
+
+    press(bench, publisher, nodes, 0.004, 1)
+    statuses.clear()
+    bench.spin_until(lambda: statuses)
+    assert estimates() == []  # by fem
+    assert node.set_parameters([Parameter("solver", value="fem_nonlinear")])[0].successful
+    press(bench, publisher, nodes, 0.004, 2)
+    bench.spin_until(estimates)
+    assert 0.1 < float(estimates()[-1]) < 60.0
 
 
 def test_nothing_is_solved_for_nobody(bench, small_scene):

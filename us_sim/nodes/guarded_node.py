@@ -333,6 +333,7 @@ class Health:
         self.received = 0
         self.dropped = 0
         self.values: dict[str, str] = {}
+        self.measure: Callable[[], dict[str, str]] = dict  # values found for each report
         self.preparing = ""  # what it goes on without until that is ready
         self.scheduling = ""  # how its process goes before others, if that was asked for
         self._publisher = node.create_publisher(
@@ -399,6 +400,7 @@ class Health:
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
             **{f"failed {where}": str(n) for where, n in failures.items()},
             **self.values,
+            **self.measure(),
         }
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])

@@ -332,7 +332,9 @@ class TissueDeformer(SceneNode):
 
     The method, the settings of every method and the materials are parameters that may change while
     running, see `LiveTissue`; the state is carried over. With ``compare_with`` another method runs
-    on the same poses, and diagnostics say how far its nodes are from those published.
+    on the same poses, and diagnostics say how far its nodes are from those published. Once a second
+    they estimate how far the frame's nodes are from the continuum's
+    (``discretisation_error_percent``), where the method can.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -362,6 +364,7 @@ class TissueDeformer(SceneNode):
         self._unbalanced = 0  # frames
         self._came = 0  # poses since `_go_on` was last called
         self.newest(PoseStamped, "probe/pose", self._deform)
+        self.health.measure = self._estimate
         self.health.state = f"ready with {self._live.tissue.name}"
         self.get_logger().info(self.health.state)
 
@@ -439,6 +442,10 @@ class TissueDeformer(SceneNode):
             "difference_max_mm": f"{1e3 * apart.maximum:.4g}",
             "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
         }
+
+    def _estimate(self) -> dict[str, str]:
+        error = self._live.tissue.discretisation_error()
+        return {} if error is None else {"discretisation_error_percent": f"{100 * error:.2g}"}
 
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
         x, y, z = nodes.T

@@ -3,6 +3,7 @@
 import csv
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from us_sim.tissue.solvers.solver import create_solver
 
 COLUMNS = (
     "scene,method,nodes,tets,threads,setting,ms_median,ms_p99,rel_l2_error,max_error_mm,"
-    "force_error,volume_error,reference"
+    "force_error,volume_error,estimated_error,reference"
 )
 PRESS = SCENES["press_12mm"]
 
@@ -51,6 +52,14 @@ def test_errors_of_a_known_field_are_what_they_are_by_hand():
 def test_the_front_leaves_out_what_is_slower_and_worse():
     points = [point(1.0, 0.2), point(2.0, 0.3), point(3.0, 0.1), point(4.0, float("nan"))]
     assert pareto_front(points) == [points[0], points[2]]
+
+
+def test_estimated_errors_are_shown_beside_the_true_ones():
+    known = [replace(point(1.0, 0.04), default=True, estimated_error=e) for e in (0.05, 0.09)]
+    text = tissue._estimates([*known, replace(point(1.0, 0.04), default=True)])
+    assert "in 1 of 2 cases" in text
+    assert "| press_12mm | fem    | 1,000 | 4    | 9           | 2.25  |" in text
+    assert tissue._estimates([point(1.0, 0.04)]) == ""
 
 
 def test_the_exponent_of_a_power_law_is_found():

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from us_sim.errors import UsSimError
+from us_sim.evaluation.measured import hydrogel
 from us_sim.evaluation.measured.silicone import measure_silicone
 from us_sim.evaluation.measured.study import Section, Study
 from us_sim.evaluation.report import ReportFolder, markdown_table
@@ -14,6 +15,7 @@ from us_sim.evaluation.settings import MeasuredData
 from us_sim.evaluation.timing import steps
 
 STUDIES: tuple[Study, ...] = (
+    hydrogel.STUDY,
     Study(
         name="silicone",
         folder="ecoflex-compression",

@@ -14,6 +14,7 @@ deformation on fine quadratic elements (`us_sim.evaluation.tissue.reference`).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -53,6 +54,7 @@ class Point(Row):
     max_error_mm: float = float("nan")  # of the worst node
     force_error: float = float("nan")  # of the force along the probe's axis, relative
     volume_error: float = float("nan")  # of the block's volume, over its volume at rest
+    estimated_error: float = float("nan")  # rel_l2_error as the method itself estimates it
     reference: str = ""  # in words
     own: bool = not_a_column(False)  # compared with the method's own converged equations
     default: bool = not_a_column(False)
@@ -165,6 +167,7 @@ class Bench:
                 solver.warm_up()
                 self._warm.add(trial.method)
             milliseconds, last = _timed(solver, trial.scene, threads)
+            estimated = solver.discretisation_error()
             volumes = signed_volumes(last.nodes, model.mesh.tetrahedra)
             done = replace(
                 done,
@@ -173,6 +176,7 @@ class Bench:
                 memory=float(held_memory(solver)),
                 setup=setup,
                 smallest_volume_ratio=float((volumes / model.mesh.volumes).min()),
+                estimated_error=math.nan if estimated is None else estimated,
             )
             del solver
             found = Outcome.of(model, last)

@@ -128,6 +128,7 @@ def _report(folder: ReportFolder, points: Sequence[Point], references: dict[str,
         ),
         own=_own_table([p for p in own if (p.scene, p.nodes) == (scene, nodes)]),
         locking=_locking(points),
+        estimates=_estimates(points),
         sizes=_size_table(by_size),
     )
 
@@ -236,6 +237,28 @@ def _locking(points: Sequence[Point]) -> str:
         [[method, *(errors.get((name, method), "") for name in ratios)] for method in methods],
     )
     return filled("tissue", "locking", nodes=f"{_PAPERS_FINEST:,}", table=table)
+
+
+def _estimates(points: Sequence[Point]) -> str:
+    """Errors that methods estimate by themselves beside the true ones; nothing without any."""
+    found = [p for p in _defaults(points) if np.isfinite(p.estimated_error * p.rel_l2_error)]
+    if not found:
+        return ""
+    ratios = [p.estimated_error / p.rel_l2_error for p in found]
+    rows = [
+        (
+            *(p.scene, p.method, f"{p.nodes:,}"),
+            *map(_number, (100 * p.rel_l2_error, 100 * p.estimated_error, ratio)),
+        )
+        for p, ratio in zip(found, ratios, strict=True)
+    ]
+    return filled(
+        "tissue",
+        "estimates",
+        right=str(sum(0.5 <= ratio <= 2.0 for ratio in ratios)),
+        cases=str(len(found)),
+        table=markdown_table(("scene", "method", "nodes", "L2 %", "estimated %", "ratio"), rows),
+    )
 
 
 def _reference_table(references: dict[str, Reference]) -> str:

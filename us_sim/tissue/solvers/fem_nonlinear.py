@@ -40,6 +40,7 @@ from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
+from us_sim.tissue.solvers.discretisation_error import relative_error
 from us_sim.tissue.solvers.frame_budget import FrameBudget
 from us_sim.tissue.solvers.newton import Newton
 from us_sim.tissue.solvers.solver import (
@@ -189,6 +190,23 @@ class FemNonlinear(TissueSolver):
             compliance,
             self.model.contact_spacing,
             (normal[nodes], np.zeros((len(nodes), 3, 3))),
+        )
+
+    def discretisation_error(self) -> float | None:
+        """See `us_sim.tissue.solvers.discretisation_error`. Unknown with friction, and of frames
+        that are not in balance.
+        """
+        last, rest = self._last, self.model.mesh.nodes
+        known = last.is_balanced and not last.interventions and len(self._surface)
+        if not known or self.settings.contact != "frictionless" or np.array_equal(last.nodes, rest):
+            return None
+        return relative_error(
+            self.model,
+            self._compliance,
+            self._pose,
+            last.nodes - rest,
+            self._newton.contact_forces.T,
+            self._predicted_gap,
         )
 
     @property

@@ -189,6 +189,7 @@ class TissueSolver(ABC):
         for depth in (0.002, 0.004):
             solver.deform(Pose(position=np.array([depth, 0.0, depth])))
             solver.contact_stiffness()
+            solver.discretisation_error()
         solver._rehearse()
         solver.deform(None)
 
@@ -206,6 +207,14 @@ class TissueSolver(ABC):
         Returns:
             (6, 6) as `us_sim.tissue.contact.stiffness` says, zero without contact; None where this
             solver does not know it.
+        """
+        return None
+
+    def discretisation_error(self) -> float | None:
+        """Estimated relative L2 error of the last frame's displacement to the continuum's.
+
+        Returns:
+            None where nothing is deformed, or this solver does not know it.
         """
         return None
 

@@ -143,6 +143,10 @@ class SwitchableTissue:
         """`TissueSolver.contact_stiffness` of the solver in use."""
         return self._solver.contact_stiffness()
 
+    def discretisation_error(self) -> float | None:
+        """`TissueSolver.discretisation_error` of the solver in use."""
+        return self._solver.discretisation_error()
+
     def make(
         self,
         plan: Plan,

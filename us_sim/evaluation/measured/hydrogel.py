@@ -1,0 +1,491 @@
+"""Beads inside an indented hydrogel: the interior is predicted from the motion of a box's faces.
+
+Confocal microscopy of fluorescent beads before and after an indentation gives the displacement
+inside a real soft solid. Neither force nor modulus is known, and none is needed: the displacement
+of a box's faces is prescribed, and the nonlinear tissue model says where the beads inside went.
+Parameters are fitted on beads on one side of the indenter's axis and judged on the other side.
+"""
+
+from __future__ import annotations
+
+import gzip
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.sparse.linalg import LinearOperator
+from scipy.spatial import KDTree
+
+from us_sim.errors import SolverError, UsSimError
+from us_sim.evaluation.block import conjugate_gradients
+from us_sim.evaluation.measured.study import Finding, Section, Study
+from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.evaluation.timing import steps
+from us_sim.geometry.collider import Sphere
+from us_sim.tissue.elasticity.linear_tetrahedra import lame_stiffness, shape_gradients
+from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.mesh.embedding import locate
+from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.newton import Newton
+
+Array = NDArray[np.float64]
+
+_PIXEL = 0.4e-6  # m
+_MICRON = 1e-6
+_COLUMNS = ("xA_px", "yA_px", "zA_px", "ux_px", "uy_px", "uz_px", "local_detF")
+_LINKED = "linked_fraction_of_24_neighbours"
+_LEAST_LINKED = 0.7
+_BAND = 6e-6
+"""m, from a face: beads nearer give the face's displacement, and are not compared."""
+_SIDES = np.array([[45.2e-6, 48e-6], [365.2e-6, 368e-6]])  # m, of all boxes along x and y
+_BOTTOM, _TOPS = 24e-6, (60e-6, 72e-6, 92e-6)  # m
+_NEAREST, _NEAREST_OF_HALF = 45, 16
+"""Beads of a quadratic fit at a face's node, and of the affine fit of the noise floor."""
+_LAYERS = 1e-6 * np.array([30.0, 48.0, 60.0, 72.0, 80.0, 86.0])  # m, borders
+_TOLERANCE = 1e-5  # residual norm over that of the harmonic start
+_FRAMES, _FRAME_TOLERANCE = 30, 1e-3
+_BEST = "nonlinear, graded"
+_AXIS = 205.2e-6  # m, along x
+_FITTING_MESH, _MESH = 24e-6, 16e-6  # m
+_UNIT = 1e4
+"""1/m, unit of softening in a fit: the modulus falls e-fold over 100 um."""
+_SIMPLEX = np.array([[0.45, 0.0], [0.48, 0.0], [0.45, 1.0]])  # Poisson's ratio, softening
+_BOUNDS = ((0.0, 0.498), (-2.0, 10.0))
+
+
+@dataclass(frozen=True)
+class Beads:
+    """Beads before the indentation, and how they moved."""
+
+    places: Array  # (B, 3) m
+    displacement: Array  # (B, 3) m
+    volume_ratio: Array  # (B,), measured around each
+
+    def __getitem__(self, chosen: NDArray) -> Beads:
+        return Beads(self.places[chosen], self.displacement[chosen], self.volume_ratio[chosen])
+
+
+def read_beads(file: Path) -> Beads:
+    """Linked beads of a CSV file, gzipped, whose neighbours were linked too.
+
+    Raises:
+        UsSimError: the file cannot be read, has not these columns, or has a cell that is no number.
+    """
+    try:
+        with gzip.open(file, "rt", encoding="utf-8") as stream:
+            table = np.genfromtxt(stream, delimiter=",", names=True, ndmin=1)
+    except (OSError, EOFError, ValueError, IndexError) as error:
+        problem = str(error).strip().split("\n")[0]
+        raise UsSimError(
+            f"{file}: cannot be read as a gzipped table ({problem}); fetch it again"
+        ) from error
+    names = table.dtype.names or ()
+    if missing := [name for name in (*_COLUMNS, _LINKED) if name not in names]:
+        raise UsSimError(f"{file}: has no column {', '.join(missing)}; fetch it again")
+    values = np.stack([table[name] for name in (*_COLUMNS, _LINKED)], axis=1)
+    if len(wrong := np.flatnonzero(~np.isfinite(values).all(axis=1))):
+        raise UsSimError(f"{file}: row {wrong[0] + 2} has a cell that is no number; fetch it again")
+    values = values[values[:, 7] > _LEAST_LINKED]
+    if len(values) < 1000:
+        raise UsSimError(f"{file}: {len(values)} well linked beads are too few; fetch it again")
+    return Beads(_PIXEL * values[:, :3], _PIXEL * values[:, 3:6], values[:, 6])
+
+
+def local_fit(beads: Beads, points: Array, nearest: int, *, quadratic: bool) -> Array:
+    """(P, 3) m, displacement at points (P, 3) m by weighted polynomials of the nearest beads."""
+    distance, chosen = KDTree(beads.places).query(points, nearest)
+    x = (beads.places[chosen] - points[:, None]) / distance[:, -1:, None]
+    terms = [np.ones(x.shape[:2]), *np.moveaxis(x, 2, 0)]
+    if quadratic:
+        terms += [x[..., i] * x[..., j] for i in range(3) for j in range(i + 1)]
+    weight = np.sqrt(np.maximum(1 - (x**2).sum(axis=2), 1e-3))
+    matrix = np.stack(terms, axis=2) * weight[..., None]
+    solved = np.linalg.pinv(matrix) @ (beads.displacement[chosen] * weight[..., None])
+    return np.asarray(solved[:, 0])
+
+
+def noise_floor(beads: Beads, random: np.random.Generator) -> Array:
+    """(B, 3) m, difference of each bead from the affine fit of the other half around it."""
+    order = random.permutation(len(beads.places))
+    difference = np.empty_like(beads.displacement)
+    for known, asked in ((order[::2], order[1::2]), (order[1::2], order[::2])):
+        places = beads.places[asked]
+        fit = local_fit(beads[known], places, _NEAREST_OF_HALF, quadratic=False)
+        difference[asked] = fit - beads.displacement[asked]
+    return difference
+
+
+class PrescribedBox:
+    """A box of the live solver's elements whose faces move as prescribed.
+
+    Args:
+        lower, upper: (3,) m, corners.
+        spacing: m, of the mesh, about.
+        prescribe: makes the displacement (P, 3) m of points (P, 3) m on the faces.
+    """
+
+    def __init__(
+        self, lower: Array, upper: Array, spacing: float, prescribe: Callable[[Array], Array]
+    ) -> None:
+        counts = np.maximum(np.rint((upper - lower) / spacing).astype(int), 2) + 1
+        ranges = zip(lower, upper, counts, strict=True)
+        self.mesh = box_mesh(*(np.linspace(*ends) for ends in ranges))
+        nodes = self.mesh.nodes
+        self.fixed = ((nodes == nodes.min(axis=0)) | (nodes == nodes.max(axis=0))).any(axis=1)
+        self.faces = np.zeros_like(nodes)  # (N, 3) m, the displacement, zero inside
+        self.faces[self.fixed] = prescribe(nodes[self.fixed])
+
+    @cached_property
+    def harmonic(self) -> Array:
+        """(N, 3) m, the solution of Laplace's equation: interpolation without mechanics."""
+        ones = np.ones(len(self.mesh.tetrahedra))
+        matrix = lame_stiffness(self.mesh, -ones, ones).tocsr()  # inside, only mu ga.gb I
+        return self._solved(lambda field: matrix @ field)
+
+    def linear(self, ratio: float, softening: float = 0.0) -> Array:
+        """(N, 3) m, of Hooke's law; arguments as those of `nonlinear`."""
+        tissue = NeoHookean(self.mesh, self._materials(ratio, softening), np.float64)
+
+        def product(field: Array) -> Array:
+            columns = np.ascontiguousarray(field.reshape(-1, 3).T)
+            return np.asarray(tissue.tangent_product(columns).T.ravel())
+
+        return self._solved(product)
+
+    def nonlinear(self, ratio: float, softening: float = 0.0) -> Array:
+        """(N, 3) m, the equilibrium of the live solver's model.
+
+        Args:
+            ratio: Poisson's.
+            softening: 1/m, with which the modulus falls exponentially along z.
+
+        Raises:
+            SolverError: it was not found.
+        """
+        newton = self._newton(ratio, softening)
+        newton.set_displacement(np.ascontiguousarray(self.harmonic.T))
+        _balance(newton, _TOLERANCE * newton.residual_norm)
+        return newton.displacement.T.copy()
+
+    def frame_ms(self, ratio: float, softening: float) -> float:
+        """ms of processor time, median, where the faces take many frames to their places."""
+        newton, step = self._newton(ratio, softening), self.harmonic.T / _FRAMES
+        newton.set_displacement(np.ascontiguousarray(self.harmonic.T))
+        goal = _FRAME_TOLERANCE * newton.residual_norm
+        newton.reset()
+        taken = []
+        for _ in range(_FRAMES):
+            began = time.process_time()
+            newton.set_displacement(newton.displacement + step)
+            _balance(newton, goal)
+            taken.append(1e3 * (time.process_time() - began))
+        return float(np.median(taken))
+
+    def at(self, field: Array, points: Array) -> Array:
+        """(P, 3) m, a nodal field (N, 3) m at points (P, 3) m."""
+        place = locate(self.mesh, points)
+        corners = field[self.mesh.tetrahedra[place.tetrahedra]]
+        return np.asarray(np.einsum("pa,pad->pd", place.weights, corners))
+
+    def volume_ratio(self, field: Array, points: Array) -> Array:
+        """(P,), determinant of the deformation gradient of a nodal field (N, 3) m at points."""
+        inside = locate(self.mesh, points).tetrahedra
+        gradients = shape_gradients(self.mesh)[inside]
+        slope = np.einsum("pai,paj->pij", field[self.mesh.tetrahedra[inside]], gradients)
+        return np.asarray(np.linalg.det(np.eye(3) + slope))
+
+    def _materials(self, ratio: float, softening: float) -> TissueMaterials:
+        z = self.mesh.nodes[self.mesh.tetrahedra, 2].mean(axis=1)
+        made = uniform_material(self.mesh, Material(1e3, ratio, 1e3))
+        fall = np.exp(-softening * (z - z.min()))
+        return replace(made, young_modulus=made.young_modulus * fall)
+
+    def _newton(self, ratio: float, softening: float) -> Newton:
+        materials, nothing = self._materials(ratio, softening), np.zeros(0, dtype=np.int32)
+        return Newton(TissueModel(self.mesh, materials, self.fixed, Sphere(0.03), nothing))
+
+    def _solved(self, product: Callable[[Array], Array]) -> Array:
+        free = np.repeat(~self.fixed, 3).astype(float)
+        operator = LinearOperator(
+            2 * free.shape, lambda v: free * product(free * v.ravel()), dtype=np.float64
+        )
+        right = -free * product(self.faces.ravel())
+        found = conjugate_gradients(operator, right, 1e-8, None, 20_000)
+        return self.faces + np.asarray(found).reshape(-1, 3)
+
+
+def _balance(newton: Newton, goal: float) -> None:
+    for _ in range(60):
+        if newton.residual_norm <= goal:
+            return
+        newton.step(newton.iteration_limit)
+    raise SolverError(
+        f"the hydrogel's balance was not found: its residual stays at {newton.residual_norm:.2g} N "
+        f"where {goal:.2g} N is asked for; its faces move too far for its mesh"
+    )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of the beads in a box of one height, all of them in order of ``beads``."""
+
+    top: float  # m
+    beads: Beads  # inside, which gave no face its displacement
+    judged: NDArray[np.bool_]  # (B,), the side on which nothing was fitted
+    floor: Array  # (B, 3) m
+    errors: dict[str, Array]  # (B, 3) m, by method
+    fitted: dict[str, tuple[float, float]]  # Poisson's ratio and softening in 1/m, by method
+    volume_ratio: dict[str, Array]  # (B,), by method
+
+    def part(self, chosen: NDArray[np.bool_], method: str, axes: slice = slice(None)) -> float:
+        """m, root mean square length of the errors of those judged beads that are chosen."""
+        return _length(self.errors[method][chosen & self.judged, axes])
+
+    def part_floor(self, chosen: NDArray[np.bool_], axes: slice = slice(None)) -> float:
+        """m, the same of the noise floor."""
+        return _length(self.floor[chosen & self.judged, axes])
+
+    @property
+    def parts(self) -> dict[str, NDArray[np.bool_]]:
+        """(B,), layers by name that have beads, and the whole box."""
+        z, found = self.beads.places[:, 2], {}
+        for low, high in pairwise(_LAYERS):
+            if high <= self.top - _BAND + 1e-9:
+                found[f"z {low / _MICRON:.0f} to {high / _MICRON:.0f}"] = (z >= low) & (z < high)
+        return found | {"all": np.ones(len(z), dtype=bool)}
+
+
+def _length(vectors: Array) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean())) if len(vectors) else float("nan")
+
+
+class Case:
+    """A box of one height: its faces' displacement by beads near them, and the beads inside."""
+
+    def __init__(self, beads: Beads, top: float) -> None:
+        self.top = top
+        self.lower, self.upper = np.append(_SIDES[0], _BOTTOM), np.append(_SIDES[1], top)
+        places = beads.places
+        depth = np.minimum(places - self.lower, self.upper - places).min(axis=1)
+        self.near, self.inner = beads[abs(depth) < _BAND], depth >= _BAND
+        self.beads = beads[self.inner]
+        self.judged = self.beads.places[:, 0] > _AXIS
+
+    def box(self, spacing: float) -> PrescribedBox:
+        """The mesh, of a spacing in m."""
+        fit = partial(local_fit, self.near, nearest=_NEAREST, quadratic=True)
+        return PrescribedBox(self.lower, self.upper, spacing, fit)
+
+    def error(self, box: PrescribedBox, field: Array) -> Array:
+        """(B, 3) m."""
+        return box.at(field, self.beads.places) - self.beads.displacement
+
+
+def outcome(case: Case, floor: Array, spacing: float) -> Outcome:
+    """Fit on one side of a case's beads, on a coarse mesh, and predict all on a finer one."""
+    coarse, box = case.box(_FITTING_MESH), case.box(spacing)
+    fields, fitted = {"harmonic": box.harmonic}, {}
+    for method, solve_coarse, solve in (
+        ("linear", coarse.linear, box.linear),
+        ("nonlinear", coarse.nonlinear, box.nonlinear),
+    ):
+
+        def misfit(x: Array, solve: Callable[[float, float], Array] = solve_coarse) -> float:
+            softening = _UNIT * x[1] if len(x) > 1 else 0.0
+            error = case.error(coarse, solve(float(x[0]), softening))
+            return 1e6 * _length(error[~case.judged])
+
+        for name, free in ((method, 1), (f"{method}, graded", 2)):
+            found = minimize(
+                *(misfit, _SIMPLEX[0, :free]),
+                method="Nelder-Mead",
+                bounds=_BOUNDS[:free],
+                options={"initial_simplex": _SIMPLEX[: free + 1, :free], "xatol": 5e-3},
+            )
+            fitted[name] = float(found.x[0]), _UNIT * float(found.x[1]) if free > 1 else 0.0
+            fields[name] = solve(*fitted[name])
+    errors = {name: case.error(box, field) for name, field in fields.items()}
+    places = case.beads.places
+    ratios = {name: box.volume_ratio(field, places) for name, field in fields.items()}
+    floor = floor[case.inner]
+    return Outcome(case.top, case.beads, case.judged, floor, errors, fitted, ratios)
+
+
+def measure_hydrogel(folder: Path, out: Path, quick: bool) -> Section:
+    """Predict the beads in boxes of three heights, and in the tallest on several meshes."""
+    beads = read_beads(folder / "linked_beads.csv.gz")
+    floor = noise_floor(beads, np.random.default_rng(1))
+    spacings = (24e-6, 16e-6) if quick else (24e-6, 16e-6, 12e-6, 8.5e-6)
+    cases = steps(
+        "hydrogel", [Case(beads, top) for top in _TOPS], "boxes", lambda c: f"{c.top:g} m"
+    )
+    outcomes = [outcome(case, floor, 16e-6) for case in cases]
+    case, parameters = Case(beads, _TOPS[-1]), outcomes[-1].fitted[_BEST]
+    meshes = [_Mesh.measured(case, spacing, parameters) for spacing in spacings]
+    findings = [
+        Finding(
+            *("hydrogel", f"box to {o.top / _MICRON:.0f} um, {part}", f"rms error, {method}", "um"),
+            measured=_length(o.beads.displacement[chosen & o.judged]) / _MICRON,
+            error=o.part(chosen, method) / _MICRON,
+            floor=o.part_floor(chosen) / _MICRON,
+            fitted_on="" if method == "harmonic" else "beads inside, other side of the axis",
+            ms=meshes[1].ms if o is outcomes[-1] and method == _BEST else float("nan"),
+        )
+        for o in outcomes
+        for part, chosen in o.parts.items()
+        for method in o.errors
+    ]
+    _draw_section(outcomes[-1], out / "measured_hydrogel_section.png")
+    _draw_errors(outcomes, out / "measured_hydrogel_errors.png")
+    text = filled(
+        *("measured", "hydrogel"),
+        count=str(len(beads.places)),
+        inside=str(len(outcomes[-1].beads.places)),
+        table=_table(outcomes),
+        fitted=_fitted_table(outcomes),
+        meshes=_mesh_table(meshes),
+    )
+    return Section("Beads inside an indented hydrogel", text, findings)
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """A mesh of the tallest box, and the error on it in m of the judged beads."""
+
+    spacing: float  # m
+    nodes: int
+    error: float
+    ms: float  # of a frame
+
+    @classmethod
+    def measured(cls, case: Case, spacing: float, parameters: tuple[float, float]) -> _Mesh:
+        box = case.box(spacing)
+        error = case.error(box, box.nonlinear(*parameters))[case.judged]
+        ms = box.frame_ms(*parameters)
+        return cls(spacing, len(box.mesh.nodes), _length(error), ms)
+
+
+def _table(outcomes: list[Outcome]) -> str:
+    rows = []
+    for o in outcomes:
+        for part, chosen in o.parts.items():
+            floor = o.part_floor(chosen)
+            moved = _length(o.beads.displacement[chosen & o.judged])
+            errors = [o.part(chosen, method) for method in o.errors]
+            rows.append(
+                (
+                    *(f"{o.top / _MICRON:.0f}", part, str(int((chosen & o.judged).sum()))),
+                    f"{np.median(o.beads.volume_ratio[chosen]):.3f}",
+                    *(f"{np.median(o.volume_ratio[m][chosen]):.3f}" for m in ("nonlinear", _BEST)),
+                    *(f"{length / _MICRON:.2f}" for length in (moved, floor, *errors)),
+                    *(f"{o.part(chosen, m) / floor:.2f}" for m in ("nonlinear", _BEST)),
+                )
+            )
+    head = ("box to, µm", "layer, µm", "beads", "det F", "nonlinear's", "graded's", "moved, µm")
+    ratios = ("nonlinear over floor", "graded over floor")
+    return markdown_table((*head, "floor", *outcomes[0].errors, *ratios), rows)
+
+
+def _fitted_table(outcomes: list[Outcome]) -> str:
+    rows = [
+        (
+            f"{o.top / _MICRON:.0f}",
+            name,
+            f"{ratio:.3f}",
+            f"{1 / softening / _MICRON:.0f}" if softening else "",
+        )
+        for o in outcomes
+        for name, (ratio, softening) in o.fitted.items()
+    ]
+    head = ("box to, µm", "model", "Poisson's ratio", "height for 1/e of the modulus, µm")
+    return markdown_table(head, rows)
+
+
+def _mesh_table(meshes: list[_Mesh]) -> str:
+    rows = [
+        (f"{m.spacing / _MICRON:g}", str(m.nodes), f"{m.error / _MICRON:.3f}", f"{m.ms:.1f}")
+        for m in meshes
+    ]
+    return markdown_table(("mesh, µm", "nodes", "error, µm", "ms a frame"), rows)
+
+
+def _draw_section(o: Outcome, file: Path) -> None:
+    """Beads near the plane through the axis: measured and predicted motion, and the difference."""
+    places = o.beads.places / _MICRON
+    chosen = abs(places[:, 1] - 208) < 12
+    x, z = places[chosen, 0], places[chosen, 2]
+    measured = o.beads.displacement[chosen] / _MICRON
+    error = o.errors[_BEST][chosen] / _MICRON
+    title = "Beads near the indenter's axis: what was measured, what was predicted, the difference"
+    with picture(file, 13, 8.5, title) as figure:
+        panels = figure.subplots(3, 1, sharex=True)
+        shown = (("measured", measured), ("predicted", measured + error), ("difference", error))
+        for panel, (name, vectors) in zip(panels, shown, strict=True):
+            times = 5 if name == "difference" else 1
+            arrows = panel.quiver(
+                *(x, z, vectors[:, 0], vectors[:, 2], np.linalg.norm(vectors, axis=1)),
+                angles="xy",
+                scale_units="xy",
+                scale=1 / times,
+                width=0.0015,
+                cmap="viridis",
+                clim=(0, 10 / times),
+            )
+            drawn = f", drawn {times} times as long" if times > 1 else ""
+            panel.set_title(name + drawn, fontsize=11, loc="left")
+            panel.set(ylabel="z, µm", aspect="equal")
+            plain(panel)
+            figure.colorbar(arrows, ax=panel, label="µm")
+        panels[-1].set_xlabel("x, µm")
+
+
+def _draw_errors(outcomes: list[Outcome], file: Path) -> None:
+    """Error of each method by height, beside the noise floor, a panel a box."""
+    looks = {
+        "harmonic": ("0.6", "o-"),
+        "linear": ("#9ecae1", "o-"),
+        "linear, graded": ("#3182bd", "s-"),
+        "nonlinear": ("#fdae6b", "o-"),
+        _BEST: ("#d7301f", "s-"),
+    }
+    title = "Error inside the box by height above its bottom, beside the noise of the measurement"
+    with picture(file, 13, 4.4, title) as figure:
+        panels = figure.subplots(1, len(outcomes), sharey=True, sharex=True)
+        for panel, o in zip(panels, outcomes, strict=True):
+            z = o.beads.places[:, 2]
+            borders = np.arange(_BOTTOM + _BAND, o.top - _BAND + 1e-9, 6e-6)
+            layers = [(z >= a) & (z < b) for a, b in pairwise(borders)]
+            middles = (borders[:-1] + borders[1:]) / 2 / _MICRON
+            for name, (colour, look) in looks.items():
+                errors = [o.part(layer, name) / _MICRON for layer in layers]
+                panel.plot(errors, middles, look, ms=4, color=colour, label=name)
+            floor = np.array([o.part_floor(layer) / _MICRON for layer in layers])
+            panel.plot(floor, middles, "k--", label="noise floor")
+            panel.plot(1.5 * floor, middles, "k:", label="1.5 times that")
+            panel.set_title(f"faces up to {o.top / _MICRON:.0f} µm", fontsize=11, loc="left")
+            panel.set_xlabel("root mean square error, µm")
+            plain(panel)
+        panels[0].set_ylabel("z, µm")
+        panels[0].legend(fontsize=8, frameon=False, loc="upper right")
+
+
+STUDY = Study(
+    "hydrogel",
+    "hydrogel-indentation",
+    "https://github.com/FranckLab/SerialTrack, revision fdb01c6204e10dc66d5c6baff75f2cfbd904a4d2 "
+    "(SerialTrack3D: the beads' positions and the authors' links, which `linked_beads.csv.gz` "
+    "extends upwards by mutually nearest beads around a local affine motion)",
+    "MIT",
+    "J. Yang, Y. Yin, A. K. Landauer, S. Buyukozturk, J. Zhang, L. Summey, A. McGhee, M. K. Fu, "
+    "J. O. Dabiri and C. Franck, SerialTrack, SoftwareX 19, 101204, 2022.",
+    measure_hydrogel,
+)
