@@ -7,26 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.measured import hydrogel
-from us_sim.evaluation.measured.silicone import measure_silicone
+from us_sim.evaluation.measured import hydrogel, silicone
 from us_sim.evaluation.measured.study import Section, Study
 from us_sim.evaluation.report import ReportFolder, markdown_table
 from us_sim.evaluation.settings import MeasuredData
 from us_sim.evaluation.timing import steps
 
-STUDIES: tuple[Study, ...] = (
-    hydrogel.STUDY,
-    Study(
-        name="silicone",
-        folder="ecoflex-compression",
-        address="https://github.com/abubakardawood/tissue-phantom-material-database, revision "
-        "52b1271f0f8a966c168e5ddc0886190f12c6551f",
-        licence="CC BY 4.0",
-        citation="A. B. Dawood et al., Tissue Phantom Material Database: Hyperelastic "
-        "Characterisation of Silicone Tissue Phantoms, 2026.",
-        measure=measure_silicone,
-    ),
-)
+STUDIES: tuple[Study, ...] = (hydrogel.STUDY, silicone.STUDY)
 
 
 def evaluate_measured(out: Path, quick: bool, settings: MeasuredData | None = None) -> int:
