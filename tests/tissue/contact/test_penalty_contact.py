@@ -1,5 +1,7 @@
 """Springs between points and a probe: forces are the slope of an energy, with friction too."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -399,3 +401,57 @@ def test_without_a_probe_nothing_hangs():
     contact.clear()
     assert contact.energy == 0.0
     assert not contact.force.any()
+
+
+def triangle_on(probe, corners, spacing=0.01):
+    """A contact at the corners (3, 3) m of a triangle and in its middle, without a pose."""
+    points = np.vstack([corners, corners.mean(axis=0)])
+    corner = np.array([[-1, -1, -1]] * 3 + [[0, 1, 2]])
+    weights = np.vstack([np.tile([1.0, 0.0, 0.0], (3, 1)), [1 / 3, 1 / 3, 1 / 3]])
+    law = FlaredProbe(probe, spacing), np.full(4, STIFF), np.full(4, STRONG), 5e-3
+    return PenaltyContact(*law, corner, weights), points
+
+
+def test_a_triangle_with_its_corners_on_a_sphere_is_relieved_of_a_part_of_its_sagitta():
+    radius, side = 0.03, 0.005
+    turns = np.array([0.0, 2.0, 4.0]) * math.pi / 3
+    away = side / math.sqrt(3)  # of the corners from the middle
+    height = math.sqrt(radius**2 - away**2) - radius
+    corners = np.stack([away * np.cos(turns), away * np.sin(turns), np.full(3, height)], axis=1)
+    contact, points = triangle_on(Sphere(radius), corners)
+    contact.set_pose(Pose(), points)
+    np.testing.assert_allclose(contact.gap[:3], 0.0, atol=1e-15)
+    assert contact.gap[3] == pytest.approx(0.4 * height)  # of 1 - 0.6
+
+
+def test_a_flat_face_relieves_nothing_and_an_edge_no_more_than_springs_stiffen_in():
+    flat = np.array([[0.0, 0.0, -1e-3], [5e-3, 0.0, -1e-3], [0.0, 5e-3, -1e-3]])
+    plate = RoundedBox(0.1, 0.1, 0.03, 0.001)
+    contact, points = triangle_on(plate, flat)
+    contact.set_pose(Pose(), points)
+    np.testing.assert_allclose(contact.gap, -1e-3, atol=1e-12)
+    astride = flat + np.array([0.048, 0.0, 0.0])
+    astride[1, 0] += 0.01  # far beside the edge at 50 mm; the middle is below it
+    contact, points = triangle_on(plate, astride - [0.006, 0.0, 0.0])
+    before = FlaredProbe(plate, 0.01).distance(Pose(), points)[0]
+    contact.set_pose(Pose(), points)
+    relief = contact.gap - before
+    np.testing.assert_array_equal(relief[:3], 0.0)
+    assert before[3] < 0.0 < relief[3] <= 5e-3 / 2
+
+
+@settings(deadline=None, max_examples=50)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_reliefs_change_as_the_slopes_of_the_gaps_say(seed):
+    random = np.random.default_rng(seed)
+    corners = random.normal(0.0, 4e-3, (3, 3)) * [1, 1, 0.1]
+    contact, points = triangle_on(Sphere(0.03), corners)
+    contact.set_pose(Pose([0.0, 0.0, 1e-3]), points)
+    moved = random.normal(0.0, 1e-8, (3, 3))
+    moved = np.vstack([moved, moved.mean(axis=0)])
+    before, expected = contact.gap, contact.relief_change(moved)
+    contact.update_gaps(points + moved)
+    kept = contact.gap
+    contact.update_relief()
+    np.testing.assert_allclose(contact.gap - kept, expected, atol=1e-12)
+    assert (before >= FlaredProbe(Sphere(0.03), 0.01).distance(Pose([0, 0, 1e-3]), points)[0]).all()

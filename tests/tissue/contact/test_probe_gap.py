@@ -149,14 +149,14 @@ def test_tissue_takes_the_shape_of_a_curved_face():
 
 def test_a_curved_face_sinks_into_the_points_of_a_surface_on_springs():
     # Points of the flat triangles between the nodes lie on the face, on springs: it is in by up to
-    # a tenth of the nodes' spacing, and a node of a touched triangle is out by no more than the arc
-    # falls on the way to the next one: l^2 / (2 radius).
+    # an eighth of the nodes' spacing, and a node of a touched triangle is out by no more than the
+    # arc falls on the way to the next one: l^2 / (2 radius).
     model, pressed, deformation = pressed_by_a_curved_face("fem_nonlinear")
     spacing = model.contact_spacing
     displacement = (deformation.nodes - model.mesh.nodes).T
     points = SurfacePoints(model, part_size(CONVEX.rounding, spacing))
     distance, _ = signed_distance(CONVEX, pressed, points.rest + points.moved(displacement))
-    assert -0.1 * spacing < distance.min() < 0.0
+    assert -0.125 * spacing < distance.min() < 0.0
     touching = deformation.nodes[deformation.contact_nodes]
     off = signed_distance(CONVEX, pressed, touching)[0]
     assert -0.1 * spacing < off.min()

@@ -69,7 +69,7 @@ def test_what_sticks_comes_back_with_the_probe():
     for x in (0.001, 0.002, 0.001, 0.0):
         moved = solver.deform(at(x=x, z=0.01))
     last = settle(solver, at(z=0.01))
-    assert abs(moved.force[0]) < 0.03
+    assert abs(moved.force[0]) < 0.002 * abs(moved.force[2])
     np.testing.assert_allclose(last.nodes, first.nodes, atol=2e-5)
 
 
@@ -152,6 +152,7 @@ def test_no_step_raises_the_energy(friction):
         newton.set_pose(at(x=0.003 * i, y=0.001 * i, z=0.004 + 0.003 * i))
         newton.set_friction_bound(newton.contact.normal_force)
         for _ in range(6):
+            newton.update_relief()  # as a step begins
             before = newton.energy
             newton.step(20)
             assert newton.energy <= before * (1 + 1e-9)
@@ -316,6 +317,7 @@ def test_no_step_raises_the_energy_of_viscous_tissue():
         newton.relax()
         newton.set_pose(at(x=0.003 * i, z=0.004 + 0.003 * i))
         for _ in range(6):
+            newton.update_relief()  # as a step begins
             before = newton.energy
             newton.step(20)
             assert newton.energy <= before * (1 + 1e-9)

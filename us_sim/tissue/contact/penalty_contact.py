@@ -10,6 +10,16 @@ So the state of tissue under a probe is a minimum of one energy that depends on 
 on how the probe came there (P. Wriggers, Computational Contact Mechanics, 2nd ed. 2006, section
 5.1). The price is that the probe sinks in a little, as it does into gel.
 
+A point inside a flat triangle is deeper in a round probe than tissue, which bends, would be there;
+and at a probe's edge a triangle is pushed down as a whole, though only a part of it is below the
+probe. Both are errors of linear interpolation. So springs know a gap that is larger than the
+point's own, g(x), by the relief
+
+    min(r (sum of w_i g(x_i) - g(x)), most),    x = sum of w_i x_i,
+
+where x_i are the corners of the point's triangle. It is not negative, since the probe is convex,
+and zero below a flat face. It is measured before each of Newton's steps, and stays during that.
+
 With friction each touched point is attached to the place of the probe where it was touched, by a
 spring along the surface as stiff as the one square to it begins, which slips at a greatest force.
 With t the spring's force, stretched by s, the energy is
@@ -59,6 +69,11 @@ down anew."""
 _OVERSHOOT = 0.1
 """Slope of the energy where a change ends, over the one where it begins, that does not matter."""
 
+_RELIEF = 0.6
+"""Part r of the error of linear interpolation that gaps are relieved of. With 0.5 to 0.7 pushes of
+spheres and plates into 2,000 and 8,192 nodes were nearest to a fine mesh's; without, forces were up
+to 18 % too great, and with 0.95 up to 15 % too small at a plate's edge."""
+
 _HALVINGS = 6
 """Halvings of an interval of lengths in which the energy is least."""
 
@@ -73,6 +88,9 @@ class PenaltyContact:
         stiffness: (P,) N/m, k above.
         greatest_force: (P,) N, F above.
         stiffening: m, d1 above.
+        corners: (P, 3), points at the corners of each point's triangle; -1 where there is none.
+            Not given, no gap is relieved.
+        weights: (P, 3) of these corners, w above.
     """
 
     def __init__(
@@ -81,6 +99,8 @@ class PenaltyContact:
         stiffness: NDArray[np.float64],
         greatest_force: NDArray[np.float64],
         stiffening: float,
+        corners: NDArray[np.integer] | None = None,
+        weights: NDArray[np.float64] | None = None,
     ) -> None:
         self._probe = probe
         self.stiffness = stiffness  # (P,) N/m, with which springs begin
@@ -91,6 +111,12 @@ class PenaltyContact:
         root = np.cbrt(half + np.sqrt(half * half + 1 / 27))
         self._deepest = stiffening * (root - 1 / (3 * root))  # (P,) m, where the push is F
         self._law = stiffness, self._deepest, stiffening
+        self._most_relief = stiffening / 2  # m
+        self._inside = np.zeros(0, dtype=np.int64)  # points that have corners
+        self._corners, self._weights = np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3))
+        if corners is not None and weights is not None:
+            self._inside = np.flatnonzero((corners >= 0).all(axis=1))
+            self._corners, self._weights = corners[self._inside], weights[self._inside]
         self.clear()
 
     def clear(self) -> None:
@@ -101,6 +127,7 @@ class PenaltyContact:
         self._planar = np.zeros(0, dtype=np.int64)  # points that planes push, not the shape
         self._height = np.zeros(0)  # m along the normal, of these planes
         self.normal = np.zeros((count, 3))  # (P, 3), direction in which the probe pushes
+        self._relief = np.zeros(count)  # (P,) m
         self._measure(np.full(count, np.inf))
 
     def depth(self, pose: Pose, positions: NDArray[np.float64]) -> float:
@@ -127,6 +154,7 @@ class PenaltyContact:
             self.normal[self._planar] = normal
             self._height = np.einsum("ij,ij->i", inside, normal) - gap[self._planar]
         self._measure(gap)
+        self.update_relief()
 
     def drop_planes(self, positions: NDArray[np.float64]) -> bool:
         """Let the shape itself push the points at ``positions`` (P, 3) m again, not planes, and any
@@ -142,7 +170,36 @@ class PenaltyContact:
         self._planar = self._planar[:0]
         self.near = np.flatnonzero(gap < self._probe.reach)
         self.update_gaps(positions)
+        self.update_relief()
         return planar > 0 or not np.array_equal(self.normal_force, before)
+
+    def update_relief(self) -> float:
+        """Measure the relief of gaps anew, where the points are.
+
+        Returns:
+            m, by how much it changes at most where the probe pushes.
+        """
+        before, gap = self._relief, self.gap - self._relief
+        at = gap[self._corners]
+        known = np.isfinite(at).all(axis=1) & np.isfinite(gap[self._inside])
+        points, at, weights = self._inside[known], at[known], self._weights[known]
+        error = np.einsum("pk,pk->p", weights, at) - gap[points]
+        self._relief = np.zeros_like(gap)
+        self._relief[points] = np.clip(_RELIEF * error, 0.0, self._most_relief)
+        self._relief[self._planar] = 0.0
+        self._measure(gap)
+        changed = np.abs(self._relief - before)[gap < 0.0]
+        return float(changed.max(initial=0.0))
+
+    def relief_change(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,) m, by how much reliefs change, to first order, as points move by (P, 3) m."""
+        along = np.einsum("pk,pk->p", self.normal, moved)
+        change = np.zeros_like(along)
+        inside = self._inside
+        error = np.einsum("pk,pk->p", self._weights, along[self._corners]) - along[inside]
+        relief = self._relief[inside]
+        change[inside] = _RELIEF * error * ((relief > 0.0) & (relief < self._most_relief))
+        return change
 
     def update_gaps(self, positions: NDArray[np.float64]) -> None:
         """Update gaps, normals and forces at other positions (P, 3) m."""
@@ -156,9 +213,9 @@ class PenaltyContact:
         self._measure(gap)
 
     def _measure(self, gap: NDArray[np.float64]) -> None:
-        self.gap = gap  # (P,) m, infinite where the probe cannot push
+        self.gap = gap + self._relief  # (P,) m, infinite where the probe cannot push
         self.normal_force = np.zeros_like(gap)  # (P,) N, along the normal
-        self._energy = _normal_forces(self.near, gap, *self._law, self.normal_force)
+        self._energy = _normal_forces(self.near, self.gap, *self._law, self.normal_force)
 
     @property
     def energy(self) -> float:
@@ -339,9 +396,11 @@ class PenaltyFriction(PenaltyContact):
         greatest_force: NDArray[np.float64],
         stiffening: float,
         friction: float,
+        corners: NDArray[np.integer] | None = None,
+        weights: NDArray[np.float64] | None = None,
     ) -> None:
         self._friction = friction
-        super().__init__(probe, stiffness, greatest_force, stiffening)
+        super().__init__(probe, stiffness, greatest_force, stiffening, corners, weights)
 
     def clear(self) -> None:
         """Take the probe away."""

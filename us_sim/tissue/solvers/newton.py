@@ -144,7 +144,7 @@ class Newton:
         Returns:
             m, by how much tissue may move for it; infinite where that is not known.
         """
-        change = self.contact.update_friction()
+        change = max(self.contact.update_friction(), self.contact.update_relief())
         self._positions = self.points.placed(self.displacement)
         if self.contact.drop_planes(self._positions):
             change = np.inf
@@ -212,6 +212,7 @@ class Newton:
         Returns:
             Whether a step was taken; if not, the next will be shorter.
         """
+        self.update_relief()
         change, indefinite = self._minimise_model(iterations, goal, start)
         length = self._search(change)
         self._carried_norm = 0.0
@@ -230,6 +231,11 @@ class Newton:
         else:
             self._damping = self._damping / 4 if self._damping > TUNING.least_damping else 0.0
         return length > 0.0
+
+    def update_relief(self) -> None:
+        """Measure the relief of gaps anew, on which the energy depends; nothing moves."""
+        if self.contact.update_relief() > 0.0:
+            self._assemble_contact()
 
     @property
     def has_stagnated(self) -> bool:
