@@ -112,8 +112,9 @@ class PenaltyContact:
         self._deepest = stiffening * (root - 1 / (3 * root))  # (P,) m, where the push is F
         self._law = stiffness, self._deepest, stiffening
         self._most_relief = stiffening / 2  # m
-        self._inside = np.zeros(0, dtype=np.int64)  # points that have corners
-        self._corners, self._weights = np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3))
+        self._inside: NDArray[np.int64] = np.zeros(0, dtype=np.int64)  # points that have corners
+        self._corners: NDArray[np.integer] = np.zeros((0, 3), dtype=np.int64)
+        self._weights = np.zeros((0, 3))
         if corners is not None and weights is not None:
             self._inside = np.flatnonzero((corners >= 0).all(axis=1))
             self._corners, self._weights = corners[self._inside], weights[self._inside]
