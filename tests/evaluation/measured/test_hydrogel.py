@@ -4,26 +4,23 @@ import gzip
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.sparse.linalg import spsolve
+from scipy.spatial import KDTree
 
 from us_sim.errors import UsSimError
+from us_sim.evaluation.measured.beads import FILE, Beads, grow_links, read_beads
 from us_sim.evaluation.measured.hydrogel import (
-    Beads,
     Case,
     PrescribedBox,
-    local_fit,
+    faces_fit,
     noise_floor,
     outcome,
-    read_beads,
 )
 from us_sim.tissue.elasticity.material import Material
 
 _SIZE = 1e-4  # m
 _LOWER, _UPPER = np.zeros(3), np.full(3, _SIZE)
-_HEAD = (
-    "xA_px,yA_px,zA_px,ux_px,uy_px,uz_px,local_affine_residual_px,"
-    "linked_fraction_of_24_neighbours,local_detF\n"
-)
 
 
 def _length(vectors):
@@ -37,9 +34,7 @@ def test_beads_of_a_large_homogeneous_deformation_are_predicted_exactly():
     beads = Beads(places, places @ slope.T, np.full(4000, np.linalg.det(np.eye(3) + slope)))
     depth = np.minimum(places, _SIZE - places).min(axis=1)
     near, inside = beads[depth < 0.1 * _SIZE], beads[depth >= 0.1 * _SIZE]
-    box = PrescribedBox(
-        *(_LOWER, _UPPER, _SIZE / 6), lambda points: local_fit(near, points, 45, quadratic=True)
-    )
+    box = PrescribedBox(*(_LOWER, _UPPER, _SIZE / 6), lambda points: faces_fit(near, points))
     field = box.nonlinear(0.48)
     assert abs(box.at(field, inside.places) - inside.displacement).max() < 1e-5 * _SIZE
     assert box.volume_ratio(field, places[:50]) == pytest.approx(beads.volume_ratio[:50])
@@ -81,7 +76,7 @@ def test_an_inhomogeneous_deformation_is_that_of_quadratic_elements_of_another_p
 
 def test_beads_of_the_real_gel_are_predicted(shared_file):
     """Fitted on one side of the axis, judged on the other, by the noise of the measurement."""
-    beads = read_beads(shared_file("hydrogel-indentation/linked_beads.csv.gz"))
+    beads = read_beads(shared_file("hydrogel-indentation/" + FILE))
     floor = noise_floor(beads, np.random.default_rng(1))
     low = outcome(Case(beads, 60e-6), floor, 24e-6)
     whole = low.parts["all"]
@@ -97,28 +92,75 @@ def test_beads_of_the_real_gel_are_predicted(shared_file):
     assert graded < 0.6 * uniform
 
 
-@pytest.mark.filterwarnings("ignore:genfromtxt")
+def test_links_are_those_that_were_made_by_another_program(shared_file):
+    file = shared_file(f"hydrogel-indentation/{FILE}")
+    beads = read_beads(file)
+    with gzip.open(file.with_name("linked_beads.csv.gz"), "rt") as stream:
+        other = np.genfromtxt(stream, delimiter=",", names=True)
+    places = np.stack([other[name] for name in ("xA_px", "yA_px", "zA_px")], axis=1)
+    moved = np.stack([other[name] for name in ("ux_px", "uy_px", "uz_px")], axis=1)
+    distance, same = KDTree(places).query(beads.places / 0.4e-6)
+    both = distance < 1e-3
+    assert len(beads.places) > 24_000
+    assert both.mean() > 0.98
+    difference = abs(moved[same] - beads.displacement / 0.4e-6).max(axis=1)[both]
+    assert (difference < 1e-3).mean() > 0.998
+    assert abs(np.median(other["local_detF"][same] - beads.volume_ratio)) < 2e-3
+
+
+def test_links_grow_through_a_deformation_in_which_nearest_beads_are_wrong_ones():
+    random = np.random.default_rng(0)
+    before = random.uniform(0, 200, (3000, 3))
+    z = before[:, 2:]
+    order = random.permutation(3000)
+    after = (before + np.array([0.5, -0.3, -0.2]) * z**2 / 400)[order]
+    truth = np.argsort(order)
+    found = grow_links(before, after, np.where(before[:, 2] < 40, truth, -1))
+    linked = found >= 0
+    assert linked.mean() > 0.97
+    assert (found == truth)[linked].mean() > 0.995
+    assert (KDTree(after).query(before)[1] == truth).mean() < 0.5
+
+
+def _content(**changed):
+    places = np.random.default_rng(0).uniform(0, 100, (1500, 3))
+    links = np.arange(1, 1501)[:, None]
+    content = {"before": places, "after": places, "links": links} | changed
+    both, single = np.empty((1, 2), dtype=object), np.empty((1, 1), dtype=object)
+    both[0, 0], both[0, 1], single[0, 0] = content["before"], content["after"], content["links"]
+    return {"parCoord_prev": both, "track_A2B_prev": single}
+
+
 @pytest.mark.parametrize(
-    ("text", "problem"),
+    ("content", "problem"),
     [
-        ("xA_px,yA_px\n1,2\n", "no column zA_px"),
-        (_HEAD + "1,2,3,0,0,0,0,1,1\n1,2,three,0,0,0,0,1,1\n", "row 3 .* no number"),
-        (_HEAD + "1,2,3,0,0,0,0,1,1\n1,2,3\n", "cannot be read"),
-        (_HEAD + "1,2,3,0,0,0,0,1,1\n", "1 well linked beads are too few"),
-        ("", "cannot be read|no column"),
+        ({"other": 1.0}, "cannot be read .*parCoord_prev"),
+        (_content(before=np.zeros((1500, 2))), "do not go with"),
+        (_content(links=np.ones((7, 1))), "do not go with 7 links"),
+        (_content(after=np.zeros((3, 3))), "do not go with"),
+        (_content(after=np.full((1500, 3), np.nan)), "not finite"),
+        (_content(links=np.zeros((1500, 1))), "0 links deep in the gel are too few"),
     ],
 )
-def test_a_malformed_table_is_refused(tmp_path, text, problem):
-    file = tmp_path / "beads.csv.gz"
-    file.write_bytes(gzip.compress(text.encode()))
+def test_a_malformed_file_is_refused(tmp_path, content, problem):
+    savemat(tmp_path / FILE, content)
     with pytest.raises(UsSimError, match=problem):
-        read_beads(file)
+        read_beads(tmp_path / FILE)
 
 
-@pytest.mark.parametrize("content", [b"no gzip", gzip.compress(bytes(5000))[:20], None])
+@pytest.mark.parametrize("content", [b"no such file", b"", None])
 def test_a_broken_file_is_refused(tmp_path, content):
-    file = tmp_path / "beads.csv.gz"
     if content is not None:
-        file.write_bytes(content)
+        (tmp_path / FILE).write_bytes(content)
     with pytest.raises(UsSimError, match="cannot be read"):
-        read_beads(file)
+        read_beads(tmp_path / FILE)
+
+
+@pytest.mark.parametrize("damage", ["cut", "overwritten"])
+def test_a_damaged_file_is_refused(tmp_path, damage):
+    savemat(tmp_path / FILE, _content(), do_compression=True)
+    content = (tmp_path / FILE).read_bytes()
+    kept = content[: len(content) // 2]
+    (tmp_path / FILE).write_bytes(kept + (b"" if damage == "cut" else b"x" * len(kept)))
+    with pytest.raises(UsSimError, match="cannot be read"):
+        read_beads(tmp_path / FILE)

@@ -8,7 +8,6 @@ Parameters are fitted on beads on one side of the indenter's axis and judged on 
 
 from __future__ import annotations
 
-import gzip
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.sparse.linalg import LinearOperator
-from scipy.spatial import KDTree
 
-from us_sim.errors import SolverError, UsSimError
+from us_sim.errors import SolverError
 from us_sim.evaluation.block import conjugate_gradients
+from us_sim.evaluation.measured.beads import FILE, Beads, local_fit, read_beads
 from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import filled, markdown_table, picture, plain
 from us_sim.evaluation.timing import steps
@@ -39,17 +38,14 @@ from us_sim.tissue.solvers.newton import Newton
 
 Array = NDArray[np.float64]
 
-_PIXEL = 0.4e-6  # m
 _MICRON = 1e-6
-_COLUMNS = ("xA_px", "yA_px", "zA_px", "ux_px", "uy_px", "uz_px", "local_detF")
-_LINKED = "linked_fraction_of_24_neighbours"
-_LEAST_LINKED = 0.7
 _BAND = 6e-6
 """m, from a face: beads nearer give the face's displacement, and are not compared."""
 _SIDES = np.array([[45.2e-6, 48e-6], [365.2e-6, 368e-6]])  # m, of all boxes along x and y
 _BOTTOM, _TOPS = 24e-6, (60e-6, 72e-6, 92e-6)  # m
 _NEAREST, _NEAREST_OF_HALF = 45, 16
 """Beads of a quadratic fit at a face's node, and of the affine fit of the noise floor."""
+_PLANE = slice(0, 2)  # x and y
 _LAYERS = 1e-6 * np.array([30.0, 48.0, 60.0, 72.0, 80.0, 86.0])  # m, borders
 _TOLERANCE = 1e-5  # residual norm over that of the harmonic start
 _FRAMES, _FRAME_TOLERANCE = 30, 1e-3
@@ -62,66 +58,24 @@ _SIMPLEX = np.array([[0.45, 0.0], [0.48, 0.0], [0.45, 1.0]])  # Poisson's ratio,
 _BOUNDS = ((0.0, 0.498), (-2.0, 10.0))
 
 
-@dataclass(frozen=True)
-class Beads:
-    """Beads before the indentation, and how they moved."""
-
-    places: Array  # (B, 3) m
-    displacement: Array  # (B, 3) m
-    volume_ratio: Array  # (B,), measured around each
-
-    def __getitem__(self, chosen: NDArray) -> Beads:
-        return Beads(self.places[chosen], self.displacement[chosen], self.volume_ratio[chosen])
-
-
-def read_beads(file: Path) -> Beads:
-    """Linked beads of a CSV file, gzipped, whose neighbours were linked too.
-
-    Raises:
-        UsSimError: the file cannot be read, has not these columns, or has a cell that is no number.
-    """
-    try:
-        with gzip.open(file, "rt", encoding="utf-8") as stream:
-            table = np.genfromtxt(stream, delimiter=",", names=True, ndmin=1)
-    except (OSError, EOFError, ValueError, IndexError) as error:
-        problem = str(error).strip().split("\n")[0]
-        raise UsSimError(
-            f"{file}: cannot be read as a gzipped table ({problem}); fetch it again"
-        ) from error
-    names = table.dtype.names or ()
-    if missing := [name for name in (*_COLUMNS, _LINKED) if name not in names]:
-        raise UsSimError(f"{file}: has no column {', '.join(missing)}; fetch it again")
-    values = np.stack([table[name] for name in (*_COLUMNS, _LINKED)], axis=1)
-    if len(wrong := np.flatnonzero(~np.isfinite(values).all(axis=1))):
-        raise UsSimError(f"{file}: row {wrong[0] + 2} has a cell that is no number; fetch it again")
-    values = values[values[:, 7] > _LEAST_LINKED]
-    if len(values) < 1000:
-        raise UsSimError(f"{file}: {len(values)} well linked beads are too few; fetch it again")
-    return Beads(_PIXEL * values[:, :3], _PIXEL * values[:, 3:6], values[:, 6])
-
-
-def local_fit(beads: Beads, points: Array, nearest: int, *, quadratic: bool) -> Array:
-    """(P, 3) m, displacement at points (P, 3) m by weighted polynomials of the nearest beads."""
-    distance, chosen = KDTree(beads.places).query(points, nearest)
-    x = (beads.places[chosen] - points[:, None]) / distance[:, -1:, None]
-    terms = [np.ones(x.shape[:2]), *np.moveaxis(x, 2, 0)]
-    if quadratic:
-        terms += [x[..., i] * x[..., j] for i in range(3) for j in range(i + 1)]
-    weight = np.sqrt(np.maximum(1 - (x**2).sum(axis=2), 1e-3))
-    matrix = np.stack(terms, axis=2) * weight[..., None]
-    solved = np.linalg.pinv(matrix) @ (beads.displacement[chosen] * weight[..., None])
-    return np.asarray(solved[:, 0])
-
-
 def noise_floor(beads: Beads, random: np.random.Generator) -> Array:
     """(B, 3) m, difference of each bead from the affine fit of the other half around it."""
     order = random.permutation(len(beads.places))
     difference = np.empty_like(beads.displacement)
     for known, asked in ((order[::2], order[1::2]), (order[1::2], order[::2])):
         places = beads.places[asked]
-        fit = local_fit(beads[known], places, _NEAREST_OF_HALF, quadratic=False)
+        fit, _ = local_fit(*_moved(beads[known]), places, _NEAREST_OF_HALF)
         difference[asked] = fit - beads.displacement[asked]
     return difference
+
+
+def faces_fit(beads: Beads, points: Array) -> Array:
+    """(P, 3) m, displacement at points (P, 3) m of faces by the beads near them."""
+    return local_fit(*_moved(beads), points, _NEAREST, quadratic=True)[0]
+
+
+def _moved(beads: Beads) -> tuple[Array, Array]:
+    return beads.places, beads.displacement
 
 
 class PrescribedBox:
@@ -282,8 +236,7 @@ class Case:
 
     def box(self, spacing: float) -> PrescribedBox:
         """The mesh, of a spacing in m."""
-        fit = partial(local_fit, self.near, nearest=_NEAREST, quadratic=True)
-        return PrescribedBox(self.lower, self.upper, spacing, fit)
+        return PrescribedBox(self.lower, self.upper, spacing, partial(faces_fit, self.near))
 
     def error(self, box: PrescribedBox, field: Array) -> Array:
         """(B, 3) m."""
@@ -322,7 +275,7 @@ def outcome(case: Case, floor: Array, spacing: float) -> Outcome:
 
 def measure_hydrogel(folder: Path, out: Path, quick: bool) -> Section:
     """Predict the beads in boxes of three heights, and in the tallest on several meshes."""
-    beads = read_beads(folder / "linked_beads.csv.gz")
+    beads = read_beads(folder / FILE)
     floor = noise_floor(beads, np.random.default_rng(1))
     spacings = (24e-6, 16e-6) if quick else (24e-6, 16e-6, 12e-6, 8.5e-6)
     cases = steps(
@@ -388,11 +341,12 @@ def _table(outcomes: list[Outcome]) -> str:
                     *(f"{np.median(o.volume_ratio[m][chosen]):.3f}" for m in ("nonlinear", _BEST)),
                     *(f"{length / _MICRON:.2f}" for length in (moved, floor, *errors)),
                     *(f"{o.part(chosen, m) / floor:.2f}" for m in ("nonlinear", _BEST)),
+                    f"{o.part(chosen, _BEST, _PLANE) / o.part_floor(chosen, _PLANE):.2f}",
                 )
             )
-    head = ("box to, µm", "layer, µm", "beads", "det F", "nonlinear's", "graded's", "moved, µm")
-    ratios = ("nonlinear over floor", "graded over floor")
-    return markdown_table((*head, "floor", *outcomes[0].errors, *ratios), rows)
+    head = ("box to, µm", "layer, µm", "beads", "det F", "nonlinear: det F", "graded: det F")
+    ratios = ("nonlinear over floor", "graded over floor", "the same in plane")
+    return markdown_table((*head, "moved", "floor", *outcomes[0].errors, *ratios), rows)
 
 
 def _fitted_table(outcomes: list[Outcome]) -> str:
@@ -481,9 +435,8 @@ def _draw_errors(outcomes: list[Outcome], file: Path) -> None:
 STUDY = Study(
     "hydrogel",
     "hydrogel-indentation",
-    "https://github.com/FranckLab/SerialTrack, revision fdb01c6204e10dc66d5c6baff75f2cfbd904a4d2 "
-    "(SerialTrack3D: the beads' positions and the authors' links, which `linked_beads.csv.gz` "
-    "extends upwards by mutually nearest beads around a local affine motion)",
+    "https://github.com/FranckLab/SerialTrack, revision fdb01c6204e10dc66d5c6baff75f2cfbd904a4d2, "
+    f"the file SerialTrack3D/results/{FILE}",
     "MIT",
     "J. Yang, Y. Yin, A. K. Landauer, S. Buyukozturk, J. Zhang, L. Summey, A. McGhee, M. K. Fu, "
     "J. O. Dabiri and C. Franck, SerialTrack, SoftwareX 19, 101204, 2022.",

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.measured.study import Finding, Section
+from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import filled, markdown_table, picture, plain
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.probe import (
@@ -333,3 +333,15 @@ def _draw(
             panel.imshow(grey.max(axis=2).T, cmap="gray", vmin=0, vmax=255)
             panel.set_title(f"{title}, greatest grey", fontsize=10)
             panel.axis("off")
+
+
+STUDY = Study(
+    name="nwires",
+    folder="plus-nwire-calibration",
+    address="https://github.com/PlusToolkit/PlusLibData, revision "
+    "51dcbb76d9f29fad94cf80788a7a0b7c704fb5dc",
+    licence="BSD-style",
+    citation="A. Lasso et al., PLUS: Open-Source Toolkit for Ultrasound-Guided Intervention "
+    "Systems, IEEE Trans. Biomed. Eng. 61, 2014.",
+    measure=measure_nwires,
+)

@@ -7,45 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.measured import hydrogel
-from us_sim.evaluation.measured.nwires import measure_nwires
-from us_sim.evaluation.measured.silicone import measure_silicone
+from us_sim.evaluation.measured import hydrogel, nwires, silicone, vein
 from us_sim.evaluation.measured.study import Section, Study
-from us_sim.evaluation.measured.vein import measure_vein
 from us_sim.evaluation.report import ReportFolder, markdown_table
 from us_sim.evaluation.settings import MeasuredData
 from us_sim.evaluation.timing import steps
 
 STUDIES: tuple[Study, ...] = (
     hydrogel.STUDY,
-    Study(
-        name="silicone",
-        folder="ecoflex-compression",
-        address="https://github.com/abubakardawood/tissue-phantom-material-database, revision "
-        "52b1271f0f8a966c168e5ddc0886190f12c6551f",
-        licence="CC BY 4.0",
-        citation="A. B. Dawood et al., Tissue Phantom Material Database: Hyperelastic "
-        "Characterisation of Silicone Tissue Phantoms, 2026.",
-        measure=measure_silicone,
-    ),
-    Study(
-        name="nwires",
-        folder="plus-nwire-calibration",
-        address="https://github.com/PlusToolkit/PlusLibData, revision "
-        "51dcbb76d9f29fad94cf80788a7a0b7c704fb5dc",
-        licence="BSD-style",
-        citation="A. Lasso et al., PLUS: Open-Source Toolkit for Ultrasound-Guided Intervention "
-        "Systems, IEEE Trans. Biomed. Eng. 61, 2014.",
-        measure=measure_nwires,
-    ),
-    Study(
-        name="vein",
-        folder="",
-        address="",
-        licence="",
-        citation="",
-        measure=measure_vein,
-    ),
+    silicone.STUDY,
+    nwires.STUDY,
+    vein.STUDY,
 )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.stuck_cylinder import StuckCylinder
-from us_sim.evaluation.measured.study import Finding, Section
+from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import filled, markdown_table, picture, plain
 from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
@@ -359,3 +359,15 @@ def _draw(file: Path, shown: Sequence[Mapping[str, Prediction]]) -> None:
         panels[1, 0].set_ylabel("error of the force, %")
         panels[0, 0].legend(fontsize=8, frameon=False)
         panels[1, 0].legend(fontsize=8, frameon=False, loc="lower left")
+
+
+STUDY = Study(
+    name="silicone",
+    folder="ecoflex-compression",
+    address="https://github.com/abubakardawood/tissue-phantom-material-database, revision "
+    "52b1271f0f8a966c168e5ddc0886190f12c6551f",
+    licence="CC BY 4.0",
+    citation="A. B. Dawood et al., Tissue Phantom Material Database: Hyperelastic "
+    "Characterisation of Silicone Tissue Phantoms, 2026.",
+    measure=measure_silicone,
+)

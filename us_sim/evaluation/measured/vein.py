@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.measured.study import Finding, Section
+from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import filled, markdown_table, picture, plain
 from us_sim.evaluation.timing import steps
 from us_sim.geometry.pose import Pose
@@ -219,3 +219,6 @@ def _cropped(section: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 _COLOURS = ("0.5", "tab:blue", "tab:orange", "tab:red")
+
+
+STUDY = Study(name="vein", folder="", address="", licence="", citation="", measure=measure_vein)
