@@ -7,13 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.measured import hydrogel, silicone
+from us_sim.evaluation.measured import hydrogel, nwires, silicone, vein
 from us_sim.evaluation.measured.study import Section, Study
 from us_sim.evaluation.report import ReportFolder, markdown_table
 from us_sim.evaluation.settings import MeasuredData
 from us_sim.evaluation.timing import steps
 
-STUDIES: tuple[Study, ...] = (hydrogel.STUDY, silicone.STUDY)
+STUDIES: tuple[Study, ...] = (
+    hydrogel.STUDY,
+    silicone.STUDY,
+    nwires.STUDY,
+    vein.STUDY,
+)
 
 
 def evaluate_measured(out: Path, quick: bool, settings: MeasuredData | None = None) -> int:

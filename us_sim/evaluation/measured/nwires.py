@@ -1,0 +1,347 @@
+"""A probe calibrated by three N-wires, and a volume of such wires, beside those of Plus.
+
+Plus found nine wires in each image. Of each N, the middle wire's point divides the line between
+those of its parallel ones, which says where on the wire it lies (R. M. Comeau, A. Fenster and T. M.
+Peters, Integrated MR and ultrasound imaging for improved image guidance in neurosurgery, Proc. SPIE
+3338, 1998).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import UsSimError
+from us_sim.evaluation.measured.study import Finding, Section, Study
+from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.geometry.pose import Pose
+from us_sim.tracking.calibration.probe import (
+    PixelSighting,
+    ProbeCalibration,
+    calibrate_probe,
+)
+from us_sim.volume.files.metaimage import metaimage_image
+from us_sim.volume.files.readers import grey_voxels
+from us_sim.volume.reconstruction.calibration_file import read_calibration
+from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
+from us_sim.volume.reconstruction.settings import Compounding
+from us_sim.volume.sequences.sequence import read_sequence
+from us_sim.volume.sequences.sweep import sweep_of
+
+Array = NDArray[np.float64]
+
+_KEPT = 0.95  # part of the errors, the smallest, of which Plus takes the mean
+_SPACING = 0.5e-3  # m, of Plus' volume
+_SETUP = "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml"
+_RESULT = "FreehandCalibration3NWires_fCal2.0.results.xml"
+_SWEEP_SETUP = "PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml"
+_RECORDINGS = {
+    "calibration": "fCal_Test_Calibration_3NWires_fCal2.0.igs.mha",
+    "validation": "fCal_Test_Validation_3NWires_fCal2.0.igs.mha",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The wires' points of a recording: F frames, nine wires, an N every three."""
+
+    wires: Array  # (9, 2, 3) m, both ends in the phantom's frame
+    pixels: Array  # (F, 9, 2), column and row
+    poses: Array  # (F, 4, 4) m, of the probe's body in the phantom's frame
+
+    def to_wires(self, image_to_body: Array) -> Array:
+        """(F, 9) m from the points, placed by a calibration, to their wires."""
+        start = self.wires[:, 0]
+        along = self.wires[:, 1] - start
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        off = self._placed(image_to_body) - start
+        off -= np.einsum("fwi,wi->fw", off, along)[..., None] * along
+        return np.asarray(np.linalg.norm(off, axis=2))
+
+    def to_middles(self, image_to_body: Array) -> Array:
+        """(F, 3) m from the middle wires' points to where the ratio says that they lie."""
+        off = self._placed(image_to_body)[:, 1::3] - self.middles()
+        return np.asarray(np.linalg.norm(off, axis=2))
+
+    def middles(self) -> Array:
+        """(F, 3, 3) m, in the phantom's frame, the point of each N's middle wire."""
+        left, middle, right = (self.pixels[:, k::3] for k in range(3))
+        ratio = np.linalg.norm(middle - left, axis=2) / np.linalg.norm(right - left, axis=2)
+        ends = np.array(
+            [[_meeting(n[1], n[side]) for side in (0, 2)] for n in self.wires.reshape(3, 3, 2, 3)]
+        )
+        return np.asarray(ends[:, 0] + ratio[..., None] * (ends[:, 1] - ends[:, 0]))
+
+    def _placed(self, image_to_body: Array) -> Array:
+        """(F, 9, 3) m, in the phantom's frame."""
+        matrices = self.poses @ image_to_body
+        return np.asarray(
+            np.einsum("fij,fwj->fwi", matrices[:, :3, :2], self.pixels) + matrices[:, None, :3, 3]
+        )
+
+
+def _meeting(one: Array, other: Array) -> Array:
+    """(3,) where two wires (2, 3) cross."""
+    sides = np.stack([one[1] - one[0], other[0] - other[1]], axis=1)
+    part = np.linalg.lstsq(sides, other[0] - one[0], rcond=None)[0][0]
+    return np.asarray(one[0] + part * (one[1] - one[0]))
+
+
+def plus_mean(errors: Array) -> float:
+    """The mean of the smallest 95 % of errors, as Plus states its 3-D error."""
+    return float(np.sort(errors, axis=None)[: round(_KEPT * errors.size)].mean())
+
+
+def read_recording(folder: Path, which: str) -> Recording:
+    """The ``calibration`` or the ``validation``; frames in which Plus found no wires are left out.
+
+    Raises:
+        UsSimError: a file is missing or cannot be read, or misses a wire.
+    """
+    setup, found = _xml(folder / _SETUP), _xml(folder / _RESULT)
+    ends = ("EndPointFront", "EndPointBack")
+    frames = found.findall(f".//{which.capitalize()}Data/Frame")
+    try:
+        wires = [[_numbers(wire.get(end, "")) for end in ends] for wire in setup.iter("Wire")]
+        pixels = [
+            [_numbers(point.get("Position", ""))[:2] for point in frame.iterfind(_POINTS)]
+            for frame in frames
+        ]
+        used = [k for k, found_here in enumerate(pixels) if found_here]
+        shaped = (
+            np.array([pixels[k] for k in used]).reshape(-1, 9, 2),
+            np.array(wires).reshape(9, 2, 3),
+        )
+    except ValueError as error:
+        raise UsSimError(
+            f"{folder}: {_SETUP} or {_RESULT} does not hold nine wires and a point of each in "
+            f"every frame; fetch them again"
+        ) from error
+    fixed = read_calibration(folder / _SETUP, "Probe").transforms["PhantomToReference"]
+    transforms = read_sequence(folder / _RECORDINGS[which]).transforms
+    tracker = {name: transforms[f"{name}ToTracker"].matrices for name in ("Probe", "Reference")}
+    if len(tracker["Probe"]) != len(frames):
+        raise UsSimError(
+            f"{folder}: {_RECORDINGS[which]} has {len(tracker['Probe'])} frames, where {_RESULT} "
+            f"has points of {len(frames)}; fetch them again"
+        )
+    poses = np.linalg.inv(tracker["Reference"] @ fixed) @ tracker["Probe"]
+    return Recording(1e-3 * shaped[1], shaped[0], poses[used])
+
+
+_POINTS = "SegmentedPoints/Point"
+
+
+def _xml(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError) as error:
+        raise UsSimError(f"{path}: cannot be read: {error}; fetch it again") from error
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.split()]
+
+
+def calibrated(recording: Recording, targets: str) -> ProbeCalibration:
+    """The project's calibration on ``wires``, on the ``middle points`` of the Ns, or on ``both``.
+
+    On both, the parallel wires are wires, and the middle ones points.
+    """
+    phantom: dict[str, Array] = {}
+    sightings = []
+    middles = recording.middles()
+    for k, (pixels, matrix) in enumerate(zip(recording.pixels, recording.poses, strict=True)):
+        pose = Pose.from_matrix(matrix)
+        for w, (column, row) in enumerate(pixels.tolist()):
+            is_point = w % 3 == 1 and targets != "wires"
+            if w % 3 != 1 and targets == "middle points":
+                continue
+            name = f"{k}, {w}" if is_point else str(w)
+            phantom[name] = middles[k, w // 3][None] if is_point else recording.wires[w]
+            sightings.append(PixelSighting(name, column, row, pose))
+    return calibrate_probe(sightings, phantom)
+
+
+def measure_nwires(folder: Path, out: Path, quick: bool) -> Section:  # noqa: ARG001
+    """Calibrate and reconstruct from the recordings in ``folder``; draw into ``out``.
+
+    Raises:
+        UsSimError: a file is missing or cannot be read.
+    """
+    recordings = {which: read_recording(folder, which) for which in _RECORDINGS}
+    published = read_calibration(folder / _RESULT, "Probe").transforms["ImageToProbe"]
+    matrices, seconds = {"Plus": published}, {}
+    found = {}
+    for targets in ("wires", "middle points", "both"):
+        begun = time.process_time()
+        found[targets] = calibrated(recordings["calibration"], targets)
+        seconds[targets] = time.process_time() - begun
+        matrices[targets] = found[targets].image_to_body
+    said = _xml(folder / _RESULT).find(".//ReprojectionError3DStatistics")
+    stated = {
+        which: float("nan") if said is None else float(said.get(f"{which.capitalize()}MeanMm", ""))
+        for which in recordings
+    }
+    rows = []
+    findings = []
+    for name, matrix in matrices.items():
+        wire = [1e3 * float(recordings[w].to_wires(matrix).mean()) for w in recordings]
+        middle = [1e3 * plus_mean(recordings[w].to_middles(matrix)) for w in recordings]
+        apart = np.linalg.norm(_corners(matrix) - _corners(published), axis=1)
+        farthest = 1e3 * float(apart.max())
+        cells = [f"{mm:.3f}" for mm in (*wire, *middle)]
+        cells += ["", ""] if name == "Plus" else [f"{farthest:.2f}", f"{seconds[name]:.2f}"]
+        rows.append((name, *cells))
+        if name == "Plus":
+            floor = wire[1]
+            findings.append(
+                Finding("nwires", "matrix of Plus", "3-D error, validation", "mm",
+                        stated["validation"], middle[1], middle[1] - stated["validation"])
+            )  # fmt: skip
+            continue
+        fit = f"calibration recording, {name}"
+        for quantity, error, best in (
+            ("point to wire, validation", wire[1], floor),
+            ("3-D error, validation", middle[1], stated["validation"]),
+            ("corner of the image, from that of Plus", farthest, float("nan")),
+        ):
+            findings.append(
+                Finding("nwires", name, quantity, "mm", error=error, floor=best, fitted_on=fit)
+            )
+    volume = _volume(folder)
+    findings += [
+        Finding("nwires", "volume", "offset from that of Plus", "mm", error=volume.offset),
+        Finding("nwires", "volume", "equal voxels", "%", 100.0, volume.equal, volume.equal - 100.0),
+    ]
+    file = out / "measured_nwires.png"
+    _draw(file, recordings["validation"], matrices, volume)
+    uncertain = [_elevation_deviation(found[name]) for name in ("wires", "middle points")]
+    text = filled(
+        "measured",
+        "nwires",
+        table=markdown_table(
+            ["matrix", "to wire, calibration", "to wire, validation", "3-D, calibration",
+             "3-D, validation", "corner", "time, s"],
+            rows,
+        ),
+        stated=", ".join(f"{mm:.3f}" for mm in stated.values()),
+        turned=f"{np.degrees(found['wires'].turned):.0f}",
+        uncertain=f"{uncertain[0]:.1f}",
+        certain=f"{uncertain[1]:.1f}",
+        volume=volume.words(),
+        picture=file.name,
+    )  # fmt: skip
+    return Section("N-wires and Plus", text, findings)
+
+
+def _elevation_deviation(found: ProbeCalibration) -> float:
+    """Degrees, of the calibration's least certain turn."""
+    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[3:6, 3:6]).max())))
+
+
+def _corners(image_to_body: Array) -> Array:
+    """(4, 3) m, of the image of 820 × 616 pixels."""
+    pixels = np.array([[c, r, 0.0, 1.0] for c in (0.0, 819.0) for r in (0.0, 615.0)])
+    return np.asarray((pixels @ image_to_body.T)[:, :3])
+
+
+@dataclass(frozen=True, eq=False)
+class _Volumes:
+    """The project's volume and that of Plus, in the voxels that both have."""
+
+    ours: Array  # (i, j, k), by Plus' running mean
+    mean: Array  # by the project's own mean
+    plus: Array
+    shapes: Sequence[tuple[int, ...]]
+    seconds: float  # of processor time, with reading
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which voxels are not black in both."""
+        return np.asarray((self.ours > 0) | (self.plus > 0))
+
+    @property
+    def equal(self) -> float:
+        """% of the voxels that are not black in both."""
+        return 100 * float((self.ours == self.plus)[self.seen].mean())
+
+    @property
+    def offset(self) -> float:
+        """mm by which one is shifted against the other, by least squares."""
+        slopes = np.stack([slope.ravel() for slope in np.gradient(self.ours)], axis=1)
+        shift = np.linalg.lstsq(slopes, (self.ours - self.plus).ravel(), rcond=None)[0]
+        return 1e3 * _SPACING * float(np.linalg.norm(shift))
+
+    def words(self) -> str:
+        """For the report."""
+        levels = [np.abs(each - self.plus)[self.seen].mean() for each in (self.ours, self.mean)]
+        sizes = " and ".join(" × ".join(map(str, shape)) for shape in self.shapes)
+        return (
+            f"Grids of {sizes} voxels of {1e3 * _SPACING:g} mm begin at the same place; the "
+            f"volumes are shifted against each other by {self.offset:.4f} mm. With Plus' running "
+            f"mean {self.equal:.1f} % of the voxels are equal that are not black in both, "
+            f"{self.seen.sum():,} of {self.seen.size:,}; the mean difference of their grey is "
+            f"{levels[0]:.2f} of 255 levels. With the project's own mean, which rounds once "
+            f"where Plus rounds down after every pixel, it is {levels[1]:.1f}. Reading and "
+            f"reconstructing took {self.seconds:.1f} s of processor time."
+        )
+
+
+def _volume(folder: Path) -> _Volumes:
+    # Plus wrote it as a sequence of slices, which `read_volume` refuses.
+    theirs = grey_voxels(metaimage_image(folder / "NwirePhantomFreehandReconstructed.mha"))[0]
+    begun = time.process_time()
+    setup = read_calibration(folder / _SWEEP_SETUP, "Probe")
+    sequence = read_sequence(folder / "NwirePhantomFreehand.igs.mha")
+    sweep = sweep_of(sequence, calibration=setup.transforms)
+
+    def made(compounding: str) -> NDArray[np.uint8]:
+        settings = Compounding(spacing=_SPACING, hole_radius=0.0, compounding=compounding)
+        return reconstruct(plan(sweep, settings, setup.part)).volume.intensities
+
+    ours = made("plus_mean")
+    seconds = time.process_time() - begun
+    common = tuple(slice(min(pair)) for pair in zip(ours.shape, theirs.shape, strict=True))
+    running, mean, plus = (
+        np.asarray(each[common], np.float64) for each in (ours, made("mean"), theirs)
+    )
+    return _Volumes(running, mean, plus, (ours.shape, theirs.shape), seconds)
+
+
+def _draw(
+    file: Path, recording: Recording, matrices: Mapping[str, Array], volumes: _Volumes
+) -> None:
+    with picture(file, 11.0, 3.6, "N-wires: errors on the validation recording, and volumes") as f:
+        errors, ours, plus = f.subplots(1, 3)
+        for name, matrix in matrices.items():
+            mm = 1e3 * np.sort(recording.to_middles(matrix), axis=None)
+            errors.plot(mm, np.linspace(0, 100, mm.size), label=name)
+        errors.set(xlabel="3-D error, mm", ylabel="% of the middle wires' points", xlim=(0, 2))
+        errors.legend(fontsize=8, frameon=False)
+        plain(errors)
+        for panel, grey, title in (
+            (ours, volumes.ours, "the project's volume"),
+            (plus, volumes.plus, "Plus' volume"),
+        ):
+            panel.imshow(grey.max(axis=2).T, cmap="gray", vmin=0, vmax=255)
+            panel.set_title(f"{title}, greatest grey", fontsize=10)
+            panel.axis("off")
+
+
+STUDY = Study(
+    name="nwires",
+    folder="plus-nwire-calibration",
+    address="https://github.com/PlusToolkit/PlusLibData, revision "
+    "51dcbb76d9f29fad94cf80788a7a0b7c704fb5dc",
+    licence="BSD-style",
+    citation="A. Lasso et al., PLUS: Open-Source Toolkit for Ultrasound-Guided Intervention "
+    "Systems, IEEE Trans. Biomed. Eng. 61, 2014.",
+    measure=measure_nwires,
+)
