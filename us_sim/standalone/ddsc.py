@@ -173,7 +173,7 @@ _SIGNATURES = """
     b ppp: dds_qget_history dds_qget_liveliness dds_qget_reliability dds_qget_userdata
 """
 _CALLS = {
-    name: types.replace(" ", "")
+    name: list(types.replace(" ", ""))
     for types, _, names in (line.partition(": ") for line in _SIGNATURES.strip().splitlines())
     for name in names.split()
 }

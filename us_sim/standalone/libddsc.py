@@ -46,8 +46,8 @@ def load(needed: Iterable[str], environment: Mapping[str, str] = os.environ) -> 
 def _candidates(environment: Mapping[str, str]) -> Iterator[Path]:
     """Files that may be the library, the likeliest first."""
     if home := environment.get("CYCLONEDDS_HOME"):
-        for folder in ("lib", "bin"):
-            yield from _within(Path(home) / folder)
+        yield from _within(Path(home) / "lib")
+        yield from _within(Path(home) / "bin")
     yield from _in_the_wheel()
     for release in sorted(_ROS.glob("*"), reverse=True):
         for folder in (release / "lib", *sorted(release.glob("lib/*-linux-gnu"))):
