@@ -419,7 +419,8 @@ class FemNonlinear(TissueSolver):
             residual,
             tuple(actions),
             interventions=interventions,
-            is_balanced=not newton.contact_norm or newton.displacement_error <= self.most_unbalanced,
+            is_balanced=not newton.contact_norm
+            or newton.displacement_error <= self.most_unbalanced,
         )
 
 
