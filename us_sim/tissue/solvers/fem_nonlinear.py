@@ -61,8 +61,8 @@ class FemNonlinearSettings(SolverSettings):
 
     frame_tolerance: float = setting(
         TOLERANCE,
-        "residual, unbalanced over contact forces, and estimated error of the displacement over the "
-        "displacement, at which a frame with a moving probe ends",
+        "residual, unbalanced over contact forces, and estimated error of the displacement over "
+        "its norm, at which a frame with a moving probe ends",
         default=0.003,
     )
     frame_budget: float | None = setting(
@@ -308,7 +308,7 @@ class FemNonlinear(TissueSolver):
         return self._newton.contact_norm or self._greatest_norm
 
     def _exceeds(self, tolerance: float) -> bool:
-        """Whether the residual is greater, or in contact the estimated error of the displacement."""
+        """Whether the residual is greater, or in contact the displacement's estimated error."""
         newton = self._newton
         if newton.residual_norm > tolerance * self._reference:
             return True
