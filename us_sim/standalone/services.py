@@ -94,7 +94,7 @@ class ServiceServer(_ServiceEndpoint):
     """Takes requests for a service and sends the responses."""
 
     _key = "serviceid"
-    on_foreign: Callable[[], None] | None = None  # called for each request that is not understood
+    on_foreign: Callable[[], object] | None = None  # called for each request that is not understood
 
     def _understands(self, info: SampleInfo) -> bool:
         """Whether a client of Cyclone's sent it, each of which has had an id since ROS 2 Foxy.
