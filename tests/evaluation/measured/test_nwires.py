@@ -12,6 +12,7 @@ from us_sim.evaluation.measured.nwires import (
     plus_mean,
     read_recording,
 )
+from us_sim.evaluation.report import ReportFolder
 from us_sim.volume.reconstruction.calibration_file import read_calibration
 
 RESULT = "FreehandCalibration3NWires_fCal2.0.results.xml"
@@ -39,7 +40,7 @@ def test_on_the_middle_wires_points_the_calibration_is_that_of_plus(folder):
 
 
 def test_the_study_reports_each_calibration_and_the_volume(folder, tmp_path):
-    section = measure_nwires(folder, tmp_path, True)
+    section = measure_nwires(folder, ReportFolder("measured", tmp_path, True))
     assert (tmp_path / "measured_nwires.png").exists()
     found = {(f.case, f.quantity): f.error for f in section.findings}
     assert found["volume", "offset from that of Plus"] < 0.05  # mm, a tenth of a voxel

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.probe import (
     PixelSighting,
@@ -169,8 +169,8 @@ def calibrated(recording: Recording, targets: str) -> ProbeCalibration:
     return calibrate_probe(sightings, phantom)
 
 
-def measure_nwires(folder: Path, out: Path, quick: bool) -> Section:  # noqa: ARG001
-    """Calibrate and reconstruct from the recordings in ``folder``; draw into ``out``.
+def measure_nwires(folder: Path, report: ReportFolder) -> Section:
+    """Calibrate and reconstruct from the recordings in ``folder``, and draw them.
 
     Raises:
         UsSimError: a file is missing or cannot be read.
@@ -220,7 +220,7 @@ def measure_nwires(folder: Path, out: Path, quick: bool) -> Section:  # noqa: AR
         Finding("nwires", "volume", "offset from that of Plus", "mm", error=volume.offset),
         Finding("nwires", "volume", "equal voxels", "%", 100.0, volume.equal, volume.equal - 100.0),
     ]
-    file = out / "measured_nwires.png"
+    file = report.picture("nwires")
     _draw(file, recordings["validation"], matrices, volume)
     uncertain = [_elevation_deviation(found[name]) for name in ("wires", "middle points")]
     text = filled(

@@ -41,7 +41,7 @@ def evaluate_measured(out: Path, quick: bool, settings: MeasuredData | None = No
         )
     folder = ReportFolder("measured", out, quick)
     sections = [
-        study.measure(_folder(data, study), out, quick)
+        study.measure(_folder(data, study), folder)
         for study in steps("measured", present, "studies", lambda study: study.name)
     ]
     findings = [finding for section in sections for finding in section.findings]
