@@ -1,6 +1,5 @@
 """Small sessions of known content: a press at 60 Hz, one wrench, cloud and image for each pose."""
 
-
 import numpy as np
 
 from us_sim.recording.schemas import jazzy_definitions, stamped
@@ -93,5 +92,3 @@ def write(file, messages, attach=()):
         for topic, data, logged, sent, number in messages:
             bag.write(topic, data, logged, sent, number)
     return file
-
-
