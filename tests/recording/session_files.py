@@ -72,7 +72,7 @@ def press(count=120):
         depth = 0.008 * np.sin(np.pi * k / count)
         contents = (
             pose(stamp, depth),
-            cloud(stamp, nodes + [0, 0, depth]),
+            cloud(stamp, nodes + np.array([0, 0, depth])),
             wrench(stamp, -1e3 * depth),
             image(stamp, ramp + k % 200),
         )

@@ -36,10 +36,8 @@ def test_a_whole_session_passes_with_its_numbers(tmp_path, capsys):
     (head, *rows), by_name = table(found), {}
     for row in rows:
         by_name[row[0]] = dict(zip(head, row, strict=True))
-    assert by_name[IMAGE] == {
-        **{"topic": IMAGE, "count": "120", "Hz": "60.0", "gap s": "0.02"},
-        **{"age ms: median": "4.00", "p99": "4.00", "worst": "4.00", "lost": "0", "unpaired": "0"},
-    }
+    expected = ("120", "60.0", "0.02", "4.00", "4.00", "4.00", "0", "0")
+    assert by_name[IMAGE] == dict(zip(head, (IMAGE, *expected), strict=True))
     assert main(["bag", "check", str(file)]) == 0
     assert "nothing is wrong with it" in capsys.readouterr().out
 
