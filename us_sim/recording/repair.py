@@ -109,7 +109,8 @@ def repair(path: str | Path, out: str | Path) -> Repaired:
             except BagError as error:
                 damage.append(_left_out(topic, str(error)))
         for message in bag.messages(writer.topics, damage):
-            writer.write(message.topic, message.data, message.log_time, message.publish_time)
+            times = message.log_time, message.publish_time
+            writer.write(message.topic, message.data, *times, message.sequence)
     return Repaired(writer.path, writer.message_count, tuple(damage))
 
 
