@@ -132,7 +132,7 @@ def test_a_scene_beside_a_session(tmp_path, capsys, attached, scene):
     assert "leave out the scene, --case, --path and --topic" in told
 
 
-def test_a_cases_files_have_checksums(tmp_path, scene):
+def test_a_cases_files_have_checksums(tmp_path):
     """A folder that a scene names is listed file by file."""
     folder = tmp_path / "case"
     (folder / "in").mkdir(parents=True)

@@ -277,30 +277,42 @@ def _view(args: argparse.Namespace) -> int:
         return run(request, network=args.network, supervision=supervision(args), forks=forks)
 
 
-_OF_THE_PLAYER = ("rate", "loop")
+_OF_THE_PLAYER = ("rate", "loop", "start_offset", "playback_duration", "delay")
 
 
 def play_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.nodes.settings import SessionPlayerSettings
+    from us_sim.nodes.settings import PlayerSettings
 
     parser.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")
-    parser.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
-    add_setting_options(parser, SessionPlayerSettings, _OF_THE_PLAYER)
-    parser.add_argument("--everything", action="store_true", help="publish every topic as recorded")
+    parser.add_argument("--topic", default="", help="of the poses, where the bag has several")
+    add_setting_options(parser, PlayerSettings, _OF_THE_PLAYER)
+    parser.add_argument(
+        "--clock",
+        nargs="?",
+        const="40",
+        default="0",
+        metavar="HZ",
+        help="publish the recording's time on /clock, 40 times a second or so often",
+    )
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--everything", action="store_true", help="publish every topic as recorded")
+    what.add_argument(
+        "--lockstep", action="store_true", help="send each pose when the last one's image is there"
+    )
     add_network_option(parser)
     parser.set_defaults(command=_play)
 
 
 def _play(args: argparse.Namespace) -> int:
-    from us_sim.nodes.settings import SessionPlayerSettings
+    from us_sim.nodes.settings import PlayerSettings
     from us_sim.run.live import play
 
-    player = read_settings(args, SessionPlayerSettings, _OF_THE_PLAYER)
+    player = read_settings(args, PlayerSettings, (*_OF_THE_PLAYER, "clock"))
     return play(
         args.bag,
+        player,
         topic=args.topic,
-        rate=player.rate,
-        loop=player.loop,
         everything=args.everything,
+        lockstep=args.lockstep,
         network=args.network,
     )
