@@ -1,4 +1,4 @@
-"""Write config/us_sim.policy.xml, what each node may do, from the table of topics.
+"""Write config/policy.xml, what each node may do, from the table of topics.
 
 python docs/security.py
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from us_sim.nodes.settings import NODES
 from us_sim.nodes.topics import TOPICS
 
-FILE = Path(__file__).resolve().parents[1] / "config" / "us_sim.policy.xml"
+FILE = Path(__file__).resolve().parents[1] / "config" / "policy.xml"
 
 ASK = ("session_control", "session_monitor", "viewer")
 """Nodes that use the parameters and services of the others."""

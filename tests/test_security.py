@@ -23,7 +23,7 @@ def security():
 
 def test_the_policy_is_what_the_code_says(security):
     assert security.FILE.read_text(encoding="utf-8") == security.policy(), (
-        "config/us_sim.policy.xml is not what the code says: run `python docs/security.py`"
+        "config/policy.xml is not what the code says: run `python docs/security.py`"
     )
 
 

@@ -38,7 +38,7 @@ def module_of(node: str) -> str:
 
 
 def enclave_of(node: str) -> str:
-    """Where ROS 2's security finds a node's keys; config/us_sim.policy.xml says what it may do."""
+    """Where ROS 2's security finds a node's keys; config/policy.xml says what it may do."""
     return f"/us_sim/{node}"
 
 
