@@ -14,7 +14,7 @@ from itertools import count
 from typing import Any
 
 from .interfaces import dds_name, type_hash
-from .middleware import RequestHeader
+from .middleware import RequestHeader, SampleInfo
 from .transport import Participant
 
 _HEADER = struct.Struct("<Qq")
