@@ -25,6 +25,18 @@ FOLDER = Path(__file__).resolve().parent
 BY_COLCON = bool({"install", "develop"} & set(sys.argv))
 """colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel."""
 
+CYCLONEDDS_HAS_WHEELS = (
+    "python_version < '3.14' and (sys_platform == 'darwin' or platform_machine == 'x86_64' "
+    "or platform_machine == 'AMD64')"
+)
+NO_WHEELS = (
+    "python_version >= '3.14' or (sys_platform != 'darwin' and platform_machine != 'x86_64' "
+    "and platform_machine != 'AMD64')"
+)
+ZENOH = "eclipse-zenoh>=1.10,<2"
+STANDALONE = [f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}", f"{ZENOH}; {NO_WHEELS}"]
+"""The middleware that stands in for ROS 2, which brings its own."""
+
 
 def console_scripts() -> list[str]:
     """`us-sim` alone in a wheel, all of whose scripts land on PATH; every node for `ros2 run`."""
@@ -57,7 +69,7 @@ setup(
     },
     python_requires=">=3.11",
     install_requires=[  # .ci/ubuntu tests the versions of Ubuntu 24.04, which are the oldest here
-        *([] if BY_COLCON else ["cyclonedds>=11.0,<12"]),  # which stands in for ROS 2
+        *([] if BY_COLCON else STANDALONE),
         "matplotlib>=3.6.3",
         "filelock>=3.12",
         "lz4>=4",
@@ -90,8 +102,10 @@ setup(
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
         "viewer": ["nicegui>=3.6,<4"],
+        "zenoh": [ZENOH],
         "test": [
             "axe-playwright-python>=0.1.4",
+            ZENOH,
             "fast-simplification>=0.1.7",
             "hypothesis>=6.100",
             "meshio>=5.3",

@@ -8,6 +8,9 @@ from command import us_sim
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from us_sim.recording.reader import read_bag
+from us_sim.run.session_check import check
+
 TOPICS = {
     "/tracker/pose": "geometry_msgs/msg/PoseStamped",
     "/probe/pose": "geometry_msgs/msg/PoseStamped",
@@ -46,6 +49,12 @@ def test_every_topic_of_the_graph_is_recorded_with_type_and_stamps(demo):
                 stamps.append((header.stamp.sec, header.stamp.nanosec))
     assert len(stamps) == POSES
     assert stamps == sorted(set(stamps))
+
+
+def test_the_recording_is_whole(demo):
+    """But for gaps and late images, which a busy machine may make."""
+    found = [each for each in check(read_bag(demo / "session.mcap")).findings if each.matters]
+    assert not [each for each in found if each.kind not in ("gap", "latency")]
 
 
 def test_the_mcap_reader_finds_an_indexed_ros2_file(demo):

@@ -3,15 +3,19 @@
 import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import PoseStamped
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Int32MultiArray, String
 
@@ -356,3 +360,193 @@ def test_a_player_is_controlled_by_the_services_of_rosbag2(bench, path):
     assert ask(bench, player, "IsPaused").paused
     ask(bench, player, "Resume")
     assert not ask(bench, player, "IsPaused").paused
+
+
+def depths(poses):
+    """How deep the probe is, mm: the number of the pose."""
+    return [round(pose.pose.position.z * 1e3) for pose in poses]
+
+
+@pytest.fixture
+def said_bag(tmp_path):
+    """Ten texts, their numbers, 20 ms apart."""
+    file = tmp_path / "said" / "said.mcap"
+    with BagWriter(file) as bag:
+        bag.add_topic("/said", "std_msgs/msg/String")
+        for k in range(10):
+            bag.write("/said", bytes(serialize_message(String(data=str(k)))), EPOCH + k * STEP)
+    return file
+
+
+@pytest.fixture(params=[PathPlayer, SessionPlayer])
+def numbers(request, bench, path, said_bag):
+    """A player that a test makes, and the numbers that it has sent."""
+    if request.param is PathPlayer:
+        poses = bench.collect(PoseStamped, "tracker/pose")
+        return lambda **given: bench.make(PathPlayer, path=str(path), **given), lambda: depths(
+            poses
+        )
+    said = bench.collect(String, "/said")
+    return (
+        lambda **given: bench.make(SessionPlayer, path=str(said_bag), **given),
+        lambda: [int(text.data) for text in said],
+    )
+
+
+def test_a_part_is_played(bench, numbers):
+    make, sent = numbers
+    player = make(start_offset=0.04, playback_duration=0.1)
+    bench.spin_until(player.finished.done)
+    bench.spin_until(lambda: sent()[-1:] == [7])
+    assert sent() == [2, 3, 4, 5, 6, 7]
+
+
+def test_a_loop_begins_again_at_the_offset_after_the_delay(bench, numbers):
+    make, sent = numbers
+    player = make(start_offset=0.1, playback_duration=0.04, delay=0.4, loop=True)
+    began = time.monotonic()
+    bench.spin_until(lambda: len(sent()) >= 7)
+    assert sent()[:7] == [5, 6, 7, 5, 6, 7, 5]
+    assert time.monotonic() - began > 3 * 0.4
+    assert not player.finished.done()
+
+
+def test_nothing_lies_behind_the_end(numbers):
+    make, _ = numbers
+    with pytest.raises(BagError, match=r"ends after 0\.18 s, and so before `start_offset`, 0\.2 s"):
+        make(start_offset=0.2)
+
+
+def test_messages_are_asked_for_one_by_one_and_in_bursts_while_paused(bench, numbers):
+    make, sent = numbers
+    player = make(paused=True, stay=True)
+    bench.spin_until(lambda: player.health.state == "paused")
+    held = isinstance(player, PathPlayer)  # it sends the pose that is held again and again
+    bench.spin_until(lambda: sent() or not held)
+    for number in (1, 2) if held else (0, 1, 2):
+        assert ask(bench, player, "PlayNext").success
+        bench.spin_until(lambda number=number: sent()[-1:] == [number])
+    assert float(player.health.values["position"]) <= 0.04
+    assert ask(bench, player, "Burst", num_messages=3).actually_burst == 3
+    bench.spin_until(lambda: sent()[-1:] == [5])
+    assert ask(bench, player, "Burst").actually_burst == 4  # all that are left
+    assert not ask(bench, player, "PlayNext").success
+    assert ask(bench, player, "Burst", num_messages=1).actually_burst == 0
+    assert player.health.state == "paused"  # as rosbag2's, which ends when it is resumed
+    ask(bench, player, "Resume")
+    bench.spin_until(lambda: player.health.state == "finished")
+    assert sorted(set(sent())) == list(range(10))
+    assert sent() == sorted(sent())
+
+
+def test_single_messages_may_be_asked_for_only_while_paused(bench, numbers):
+    make, sent = numbers
+    player = make(rate=0.01, stay=True)
+    bench.spin_until(sent)
+    assert not ask(bench, player, "PlayNext").success
+    assert ask(bench, player, "Burst", num_messages=2).actually_burst == 0
+    assert max(sent()) <= 1
+
+
+ALL = Duration(sec=-1)
+
+
+def test_what_was_stopped_is_played_again_in_part(bench, numbers):
+    make, sent = numbers
+    player = make(stay=True, loop=True, rate=0.5)
+    bench.spin_until(sent)
+    assert not ask(bench, player, "Play", playback_duration=ALL).success  # it plays already
+    ask(bench, player, "Stop")
+    assert player.health.state == "finished"
+    bench.spin_for(30)
+    assert player.health.state == "finished"  # and does not loop
+    stopped = len(sent())
+    endless = {"playback_duration": ALL, "playback_until_timestamp": TimeMessage(sec=-1)}
+    begun = TimeMessage(nanosec=160_000_000)
+    assert ask(bench, player, "Play", start_offset=begun, **endless).success
+    bench.spin_until(lambda: 9 in sent()[stopped:])
+    assert [n for n in sent()[stopped:] if n > 5][:2] == [8, 9]
+
+
+def test_a_part_has_the_later_of_two_ends_and_a_duration_of_0_is_none(bench, numbers):
+    make, sent = numbers
+    player = make(stay=True, playback_duration=0.0)
+    bench.spin_until(lambda: player.health.state == "finished")
+    assert not sent()
+    until = stamp_message(EPOCH + 3 * STEP)
+    for duration, last in ((Duration(), 3), (Duration(nanosec=STEP), 3), (Duration(sec=9), 9)):
+        request = {"playback_duration": duration, "playback_until_timestamp": until}
+        before = len(sent())
+        assert ask(bench, player, "Play", **request).success
+        bench.spin_until(lambda: player.health.state == "finished")
+        bench.spin_until(lambda before=before, last=last: last in sent()[before:])
+        assert max(sent()[before:]) == last
+    assert ask(bench, player, "Play").success  # a request of zeros plays nothing
+    before = len(sent())
+    bench.spin_until(lambda: player.health.state == "finished")
+    bench.spin_for(5)
+    assert set(sent()[before:]) <= {last}
+
+
+def test_a_player_that_is_stopped_ends(bench, numbers):
+    make, sent = numbers
+    player = make(rate=0.1)
+    bench.spin_until(sent)
+    ask(bench, player, "Stop")
+    assert player.finished.done()
+    assert player.finished.exception() is None
+
+
+def test_the_clock_is_that_of_the_recording(bench, numbers):
+    make, sent = numbers
+    ticks = bench.collect(Clock, "/clock")
+    player = make(clock=100.0, rate=0.5, start_offset=0.02, stay=True)
+    bench.spin_until(lambda: player.health.state == "finished")
+    end = stamp_message(EPOCH + 9 * STEP)
+    bench.spin_until(lambda: ticks[-1].clock == end)
+    times = np.array([Time.from_msg(tick.clock).nanoseconds for tick in ticks]) - EPOCH
+    assert len(times) >= 20  # 160 ms at half the pace are 32 ticks of 10 ms
+    assert STEP <= times[0] < 2 * STEP
+    assert (np.diff(times) >= 0).all()
+    bench.spin_until(lambda: sent()[-1:] == [9])
+
+
+def test_poses_have_the_stamps_of_the_clock(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    ticks = bench.collect(Clock, "/clock")
+    player = bench.make(PathPlayer, path=str(path), clock=40.0, use_sim_time=True)
+    bench.spin_until(player.finished.done)
+    bench.spin_until(lambda: len(poses) == 10)
+    ages = np.array([nanoseconds(pose) for pose in poses]) - EPOCH
+    assert abs(ages - STEP * np.arange(10)).max() < 3 * STEP
+    told = {Time.from_msg(tick.clock).nanoseconds - EPOCH for tick in ticks}
+    assert len(set(ages.tolist()) & told) >= 5  # the clock goes before each
+
+
+def test_in_lockstep_the_clock_goes_with_the_poses(bench, path):
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    ticks = bench.collect(Clock, "/clock")
+    images = bench.peer.create_publisher(Image, "ultrasound/image", 10)
+    given = {"clock": 40.0, "start_offset": 0.04, "playback_duration": 0.04}
+    player = bench.make(PathPlayer, path=str(path), lockstep=True, **given)
+    for count in range(1, 4):
+        bench.spin_until(lambda count=count: len(poses) == count)
+        images.publish(image_message(np.zeros((2, 2), np.uint8), poses[-1].header.stamp, "probe"))
+    bench.spin_until(player.finished.done)
+    assert depths(poses) == [2, 3, 4]
+    times = {Time.from_msg(tick.clock).nanoseconds - EPOCH for tick in ticks}
+    assert times == {2 * STEP, 3 * STEP, 4 * STEP}
+
+
+@pytest.mark.parametrize("topic", ["/tracker/pose", "/tf:probe"])
+def test_poses_and_transforms_of_a_bag_are_played(bench, shared_data, topic):
+    """The bag, made by the real ROS 2, has the motion that its SOURCE.txt describes on both."""
+    bag = shared_data / "ros2-jazzy" / "bags" / "probe_path_mcap"
+    poses = bench.collect(PoseStamped, "tracker/pose")
+    player = bench.make(PathPlayer, path=str(bag), topic=topic, rate=50.0)
+    bench.spin_until(player.finished.done)
+    bench.spin_until(lambda: len(poses) == player.pose_count)
+    down = [pose.pose.position.z for pose in poses]
+    np.testing.assert_allclose(np.diff(down[:100]), 0.01 / 60, atol=1e-9)
+    assert down[-1] == pytest.approx(0.02)
+    assert poses[-1].pose.position.x == pytest.approx(0.04)

@@ -429,3 +429,31 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
     end(bench, recorder)
     assert texts(tmp_path)[-1] == "three"
     assert sum(read_bag(tmp_path).lost().values()) > 0
+
+
+@newer_than_jazzy
+def test_what_is_recorded_and_where_is_told(bench, quiet):
+    *_, file = quiet()
+    assert call(bench, srv.IsRecording, "is_recording").recording
+    assert call(bench, srv.GetUri, "get_uri").uri == str(file)
+    topics = call(bench, srv.GetSubscribedTopics, "get_subscribed_topics").topics
+    assert list(topics) == ["/mesh", "/note"]
+    call(bench, srv.Stop, "stop")
+    assert not call(bench, srv.IsRecording, "is_recording").recording
+    assert call(bench, srv.GetUri, "get_uri").uri == ""
+
+
+@newer_than_jazzy
+def test_without_discovery_new_topics_are_left_out(bench, tmp_path):
+    recorder = bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"))
+    assert call(bench, srv.IsDiscoveryRunning, "is_discovery_running").running
+    assert call(bench, srv.StartDiscovery, "start_discovery").return_code == 1  # it runs already
+    assert call(bench, srv.StopDiscovery, "stop_discovery").return_code == 0
+    assert call(bench, srv.StopDiscovery, "stop_discovery").return_code == 1
+    assert not call(bench, srv.IsDiscoveryRunning, "is_discovery_running").running
+    late = bench.peer.create_publisher(String, "late", 1)
+    bench.spin_for(30)
+    assert not late.get_subscription_count()
+    assert call(bench, srv.StartDiscovery, "start_discovery").return_code == 0
+    bench.spin_until(late.get_subscription_count)
+    assert "/late" in recorder.topics

@@ -32,7 +32,8 @@ def text(content):
 
 def write_all(bag, messages):
     for message in messages:
-        bag.write(message.topic, message.data, message.log_time, message.publish_time)
+        topic, _, *times, data, number = message
+        bag.write(topic, data, *times, number)
 
 
 def mcap_content(file):

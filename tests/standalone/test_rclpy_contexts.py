@@ -166,3 +166,22 @@ def test_shutting_down_the_context_ends_spinning(bench) -> None:
     rclpy.spin(node, bench.executor)  # it is down already: nothing to do
     with pytest.raises(RuntimeError, match="already called"):
         bench.context.shutdown()
+
+
+@pytest.mark.skipif(rclpy.__name__ == "rclpy", reason="ROS 2 has DDS security")
+def test_security_that_is_not_there_is_refused_rather_than_left_out(monkeypatch, capfd) -> None:
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
+    for strategy in ("", "Enforce", "enforce"):
+        monkeypatch.setenv("ROS_SECURITY_STRATEGY", strategy)
+        context = Context()
+        with pytest.raises(RuntimeError, match="ROS_SECURITY_ENABLE is true"):
+            context.init([])
+        assert not context.ok()
+    monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Permissive")
+    with Context() as context:
+        assert context.ok()
+    assert capfd.readouterr().err.count("in the clear") == 1
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "false")
+    monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
+    with Context() as context:
+        assert context.ok()

@@ -12,7 +12,7 @@ from builtin_interfaces.msg import Time as TimeMsg
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import GetParameters, ListParameters
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 from rclpy.exceptions import (
     InvalidHandle,
     NoTypeSupportImportedException,
@@ -399,17 +399,59 @@ def test_a_wrong_response_is_an_error_of_the_server(bench) -> None:
 
 
 @pytest.mark.skipif(rclpy.__name__ == "rclpy", reason="needs the standalone client's insides")
-def test_a_request_of_another_middleware_is_not_answered_and_does_no_harm(bench, capfd) -> None:
-    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        response.success = request.data
-        return response
-
-    bench.node("server").create_service(SetBool, "switch", answer)
+def test_a_request_that_is_cut_off_is_not_answered_and_does_no_harm(bench, capfd) -> None:
+    bench.node("server").create_service(SetBool, "switch", _done)
     client = bench.node("client").create_client(SetBool, "switch")
     assert ready(bench, client)
     client._endpoint.send_request(b"\0\1\0\0")
     assert bench.result(client.call_async(SetBool.Request(data=True))).success
     assert "a request for /switch is not answered" in capfd.readouterr().err
+
+
+def _done(_: Any, response: Any) -> Any:
+    response.success = True
+    return response
+
+
+@pytest.mark.skipif(
+    rclpy.__name__ == "rclpy" or rclpy.get_rmw_implementation_identifier() != "rmw_cyclonedds_cpp",
+    reason="about the mapping of services onto Cyclone DDS",
+)
+def test_requests_of_fast_dds_are_left_alone_and_told_of_once(bench, capfd) -> None:
+    """Its writers' USER_DATA is the type's hash alone, or empty in Humble; it names a request in
+    inline QoS, so that the sample is the message alone."""
+    from us_sim.standalone.ddsc import EndpointQos
+    from us_sim.standalone.transport import Participant
+
+    asked = []
+    server = bench.node("server", start_parameter_services=False)
+    server.create_service(SetParameters, "set", lambda request, _: asked.append(request))
+    server.create_service(SetBool, "switch", _done)
+    client = bench.node("client").create_client(SetBool, "switch")
+    assert ready(bench, client)
+
+    parameter = Parameter("rate", value=30.0).to_parameter_msg()
+    parameters = serialize_message(SetParameters.Request(parameters=[parameter]))
+    told = ""
+    with Participant(bench.context.get_domain_id()) as participant:
+        for service, part, request in (
+            ("set", "rcl_interfaces::srv::dds_::SetParameters_Request_", parameters),
+            ("switch", "std_srvs::srv::dds_::SetBool_Request_", b"\0\1\0\0\1"),
+        ):
+            for user_data in (f"typehash=RIHS01_{'0' * 64};", ""):
+                arguments = f"rq/{service}Request", part, EndpointQos(depth=10), user_data
+                writer = participant.create_writer(*arguments)
+                assert bench.spin_until(writer.matched_count)
+                assert writer.write(request)
+                bench.spin_until(lambda: False, seconds=0.3)
+                told += capfd.readouterr().err
+    assert bench.result(client.call_async(SetBool.Request(data=True))).success
+
+    (line,) = (told + capfd.readouterr().err).splitlines()
+    assert "a request for /set is not answered" in line
+    assert "rmw_cyclonedds_cpp" in line
+    assert "zenoh" in line
+    assert not asked
 
 
 def test_the_six_parameter_services(bench) -> None:

@@ -11,6 +11,11 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
     info = bag_commands.add_parser("info", help="topics, types, counts and times of a recording")
     info.add_argument("file", type=Path)
     info.set_defaults(command=_info)
+    check = bag_commands.add_parser(
+        "check", help="whether a recording is whole: index, order, gaps, latency, losses, stamps"
+    )
+    check.add_argument("file", type=Path, metavar="SESSION")
+    check.set_defaults(command=_check)
     extract = bag_commands.add_parser(
         "extract", help="write the files attached to a recording, such as its scene"
     )
@@ -40,6 +45,16 @@ def _info(args: argparse.Namespace) -> int:
 
     print(describe(read_bag(args.file)))
     return 0
+
+
+def _check(args: argparse.Namespace) -> int:
+    from us_sim.progress import late_progress
+    from us_sim.recording.reader import read_bag
+    from us_sim.run.session_check import check, report
+
+    found = check(read_bag(args.file), late_progress(f"bag check {args.file.name}"))
+    print(report(found))
+    return int(not found.is_whole)
 
 
 def _extract(args: argparse.Namespace) -> int:

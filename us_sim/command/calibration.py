@@ -278,6 +278,7 @@ _SIGHTED_POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(
 _LONGEST_GAP = 0.2  # s, between poses that are interpolated
 _ROUNDED = 1e-3  # s, by which a time may differ from the stamp that it means
 _LITTLE_TURN = math.radians(20.0)
+_UNCERTAIN = 0.5e-3  # m, of the image's edge
 _FEATURE, _PART = "feature", "part of a feature's sightings"
 
 
@@ -328,6 +329,7 @@ def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
                 "position": deviations[:3],  # m, of pixel (0, 0)
                 "rotation": deviations[3:6],  # rad, about the body's axes
                 "pixel_spacing": deviations[6:],  # m
+                "edge": found.edge_deviation,  # m, of the outermost sightings' place
                 # Errors are taken to be independent between these, and related within each.
                 "clusters": clusters,
                 "cluster": _FEATURE if features >= ENOUGH_FEATURES else _PART,
@@ -351,6 +353,12 @@ def _remarks(found: ProbeCalibration, features: int) -> str:
         said += (
             f"; the probe turned by only {math.degrees(found.turned):.0f}°, which determines "
             f"little: turn it by 30° or more about all axes"
+        )
+    if found.edge_deviation > _UNCERTAIN:
+        said += (
+            f"; the image's edge is known to ± {1e3 * found.edge_deviation:.1f} mm and its turn "
+            f"about one axis to ± {math.degrees(found.turn_deviation):.1f}° only: sight it under "
+            f"more angles, or points beside wires"
         )
     if len(found.points) < features < ENOUGH_FEATURES:
         said += (

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +30,7 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.run.plan import Request
+    from us_sim.run.plan import Parameters, Request
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
@@ -165,6 +167,12 @@ def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
 def render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_path_option(render, "bag with the probe path; default: the scene's")
+    render.add_argument(
+        "--session",
+        type=Path,
+        metavar="FILE",
+        help="repeat this recording from itself: its scene, parameters and poses",
+    )
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
     render.add_argument(
         "--truth",
@@ -179,9 +187,33 @@ def _render(args: argparse.Namespace) -> int:
     from us_sim.run.lockstep import render_scene
     from us_sim.scene.reading import load_scene
 
-    scene = load_scene(scene_name(args), volume=args.volume)
     parameters = node_parameters(args.param)
+    if args.session is not None:
+        return _render_session(args, parameters)
+    scene = load_scene(scene_name(args), volume=args.volume)
     return render_scene(scene, args.path, args.out, parameters, topic=args.topic, truth=args.truth)
+
+
+def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
+    from us_sim.run.lockstep import render_scene
+    from us_sim.run.resimulation import resimulation
+
+    if any(each is not None for each in (args.scene, args.case, args.path, args.topic)):
+        raise UsSimError(
+            f"--session {args.session}: the scene and the path are those of the recording; leave "
+            f"out the scene, --case, --path and --topic"
+        )
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
+        again = resimulation(args.session, Path(folder), args.volume)
+        for note in again.notes:
+            print(note, file=sys.stderr)
+        for node, values in parameters.items():
+            again.parameters.setdefault(node, {}).update(values)
+        return render_scene(
+            *(again.scene, again.path, args.out, again.parameters),
+            topic=again.topic,
+            truth=args.truth,
+        )
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:
@@ -245,30 +277,42 @@ def _view(args: argparse.Namespace) -> int:
         return run(request, network=args.network, supervision=supervision(args), forks=forks)
 
 
-_OF_THE_PLAYER = ("rate", "loop")
+_OF_THE_PLAYER = ("rate", "loop", "start_offset", "playback_duration", "delay")
 
 
 def play_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.nodes.settings import SessionPlayerSettings
+    from us_sim.nodes.settings import PlayerSettings
 
     parser.add_argument("bag", type=find_bag, help="file or folder, or name of an installed one")
-    parser.add_argument("--topic", default="", help="PoseStamped topic, where the bag has several")
-    add_setting_options(parser, SessionPlayerSettings, _OF_THE_PLAYER)
-    parser.add_argument("--everything", action="store_true", help="publish every topic as recorded")
+    parser.add_argument("--topic", default="", help="of the poses, where the bag has several")
+    add_setting_options(parser, PlayerSettings, _OF_THE_PLAYER)
+    parser.add_argument(
+        "--clock",
+        nargs="?",
+        const="40",
+        default="0",
+        metavar="HZ",
+        help="publish the recording's time on /clock, 40 times a second or so often",
+    )
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--everything", action="store_true", help="publish every topic as recorded")
+    what.add_argument(
+        "--lockstep", action="store_true", help="send each pose when the last one's image is there"
+    )
     add_network_option(parser)
     parser.set_defaults(command=_play)
 
 
 def _play(args: argparse.Namespace) -> int:
-    from us_sim.nodes.settings import SessionPlayerSettings
+    from us_sim.nodes.settings import PlayerSettings
     from us_sim.run.live import play
 
-    player = read_settings(args, SessionPlayerSettings, _OF_THE_PLAYER)
+    player = read_settings(args, PlayerSettings, (*_OF_THE_PLAYER, "clock"))
     return play(
         args.bag,
+        player,
         topic=args.topic,
-        rate=player.rate,
-        loop=player.loop,
         everything=args.everything,
+        lockstep=args.lockstep,
         network=args.network,
     )

@@ -11,13 +11,12 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from rclpy.task import Future
-from rclpy.time import Time
 from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.messages import nanoseconds_of, pose_message
+from us_sim.nodes.messages import nanoseconds_of, pose_message, stamp_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM, overridable
@@ -49,7 +48,7 @@ class PathPlayer(GuardedNode):
         lockstep = settings.lockstep
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
-        self._next = 0
+        self._next, self._sent = 0, -1  # pose to be sent, and that which was sent last
         self._begun = round(1e9 * settings.begun)  # ns
         self._ticking: Timer | None = None
         self._sent_at = 0.0  # s, of the monotonic clock
@@ -62,13 +61,19 @@ class PathPlayer(GuardedNode):
             )
         self._awaited = Awaited(self, self._poses)
         self.health.state = "waiting"
-        self._starting = self.create_timer(CHECK_S, self._begin)
-        self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
+        self._playback = Playback(
+            self,
+            lambda: self._settings,
+            int(self._path.log_times[0]),
+            int(self._ages[-1]),
+            self._go_to,
+            self._step,
+            self._say_progress,
+        )
         self._playhead = self._playback.head
+        self._starting = self.create_timer(CHECK_S, self._begin, clock=self._playback.clock)
         if not lockstep:
-            length = int(self._ages[-1])
-            first = int(self._path.log_times[0])
-            offer_player_services(self, lambda: self._settings, first, length)
+            offer_player_services(self, self._playback, lambda: self._settings, self._stop)
         self.pose_count = len(self._path)
         self.get_logger().info(
             f"{counted(self.pose_count, 'pose')} of {self._path.topic} in {path}"
@@ -86,12 +91,14 @@ class PathPlayer(GuardedNode):
             return
         self._starting.cancel()
         self.health.state = "playing"
+        now, start = self._playback.now, self._playback.start
         if self._settings.lockstep:
-            self._send()
+            self._playback.has_begun = True
+            self._playhead.pause(now)
+            self._go_to(start)
             return
-        now = self._playback.now
-        begun = self._begun if 0 < self._begun < now else now
-        self._playhead.go_to(round(1e9 * self._settings.time), begun)
+        begun = self._begun if 0 < self._begun < now else now + self._playback.delay
+        self._go_to(max(start, round(1e9 * self._settings.time)), begun)
         self._skip(now)
         self.get_logger().info(f"playing from pose {self._next}")
         self._tick_at_its_pace()
@@ -100,7 +107,8 @@ class PathPlayer(GuardedNode):
     def _tick_at_its_pace(self) -> None:
         if self._ticking is not None:
             self.destroy_timer(self._ticking)
-        self._ticking = self.create_timer(max(1e-9 * self._period, 1e-4), self._tick)
+        period = max(1e-9 * self._period, 1e-4)
+        self._ticking = self.create_timer(period, self._tick, clock=self._playback.clock)
 
     @property
     def _period(self) -> float:
@@ -110,52 +118,71 @@ class PathPlayer(GuardedNode):
 
     def _skip(self, now: int) -> None:
         """Go where the playhead is by now; round and round if the path loops."""
-        turn = int(self._ages[-1] + self._period * self._settings.rate)
-        if self._settings.loop and turn > 0:
-            position = self._playhead.position(now)
-            self._playhead.go_to(position % turn, now)
+        start, position = self._playback.start, self._playhead.position(now)
+        turn = int(self._playback.until - start + self._period * self._settings.rate)
+        if self._settings.loop and 0 < turn < position - start:
+            self._playhead.go_to(start + (position - start) % turn, now)
         due = self._ages <= self._playhead.position(now) - 0.5 * self._period * self._settings.rate
-        self._next = min(int(due.sum()), self.pose_count - 1)
+        first = int(np.searchsorted(self._ages, start))
+        self._next = min(max(int(due.sum()), first), self.pose_count - 1)
 
     def _say_progress(self) -> None:
-        position = min(self._playhead.position(self._playback.now), int(self._ages[-1]))
         self.health.values = {
             "played": str(self._next),
             "begun": f"{1e-9 * self._playhead.begun(self._playback.now):.9f}",
-            "position": f"{1e-9 * max(position, 0):.3f}",
+            "position": f"{1e-9 * self._playback.position:.3f}",
             "duration": f"{1e-9 * self._ages[-1]:.3f}",
         }
 
     def _use(self, _: object) -> None:
         if self._ticking is not None and self._settings.rate != self._playhead.rate:
             self._tick_at_its_pace()
-        self._playback.use()
+        if not self._settings.lockstep:
+            self._playback.use()
 
-    def _go_to(self, position: int) -> None:
+    def _go_to(self, position: int, at: int | None = None) -> None:
         """Play on there, and send at once the pose that is held there while it is paused."""
-        self._playhead.go_to(position, self._playback.now)
+        self._playhead.go_to(position, self._playback.now if at is None else at)
         self._next = min(int(np.searchsorted(self._ages, position)), self.pose_count - 1)
-        self._send()
+        if at is None:
+            self._send(self._next)
+
+    def _step(self) -> bool:
+        """Send the pose after the one that is held."""
+        held = self._next
+        self._next += self._sent == held
+        if self._is_over():
+            self._next = held
+            return False
+        self._playhead.go_to(int(self._ages[self._next]), self._playback.now)
+        self._send(self._next)
+        return True
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
         if self.health.state == "finished":
-            if self._settings.loop:
-                self._again()
+            if self._playback.loops:
+                self._playback.restart()
             else:
-                self._hold()
+                self._hold(self._sent)
             return
         if self._settings.paused:
-            self._hold()
+            self._hold(self._next)
             return
-        while not self.finished.done() and self.health.state != "finished" and self._is_due():
-            self._send()
-            self._advance()
+        while not self._is_over() and self._is_due():
+            self._send(self._next)
+            self._next += 1
+        self._say_progress()
+        if self._is_over():
+            self._begin_again_or_end()
 
-    def _hold(self) -> None:
+    def _hold(self, pose: int) -> None:
         """Say a few times a second that a probe which is held still is still there."""
-        if time.monotonic() - self._sent_at > 1.0 / HELD:
-            self._send()
+        if pose >= 0 and time.monotonic() - self._sent_at > 1.0 / HELD:
+            self._send(pose)
+
+    def _is_over(self) -> bool:
+        return self._next >= self.pose_count or self._ages[self._next] > self._playback.until
 
     def _is_due(self) -> bool:
         half = 0.5 * self._period * self._settings.rate
@@ -163,39 +190,40 @@ class PathPlayer(GuardedNode):
 
     def _imaged(self, image: Image) -> None:
         stamp = nanoseconds_of(image.header.stamp)
-        if stamp == self._stamps[self._next] and not self.finished.done():
-            self._advance()
-            if not self.finished.done():
-                self._send()
-
-    def _send(self) -> None:
-        i = min(self._next, self.pose_count - 1)
-        pose = self._path.pose(i)
-        self._sent_at = time.monotonic()
-        restamp = self._settings.restamp and not self._settings.lockstep
-        stamp = self.get_clock().now() if restamp else Time(nanoseconds=int(self._stamps[i]))
-        self._poses.publish(pose_message(pose, stamp.to_msg(), self._path.frame_id))
-        self.health.published("tracker/pose")
-
-    def _advance(self) -> None:
+        if self.health.state != "playing" or stamp != self._stamps[self._next]:
+            return
         self._next += 1
         self._say_progress()
-        if self._next < self.pose_count:
-            return
-        if self._settings.loop:
-            self._again()
-            return
-        self.health.state = "finished"
-        self.get_logger().info("the path is at its end")
-        if self._settings.stay:
-            self.health.report()
-        else:
-            self.finished.set_result(None)
+        if self._is_over():
+            self._begin_again_or_end()
+        if self.health.state == "playing":
+            self._send(self._next)
 
-    def _again(self) -> None:
-        self._next = 0
-        self.health.state = "playing"
-        self._playhead.go_to(0, self._playback.now + int(self._period))
+    def _send(self, i: int) -> None:
+        self._sent, self._sent_at = i, time.monotonic()
+        if self._settings.lockstep:
+            self._playhead.go_to(int(self._ages[i]), self._playback.now)
+        stamp = self._playback.tell_time()
+        if self._settings.lockstep or not self._settings.restamp:
+            stamp = stamp_message(int(self._stamps[i]))
+        self._poses.publish(pose_message(self._path.pose(i), stamp, self._path.frame_id))
+        self.health.published("tracker/pose")
+
+    def _begin_again_or_end(self) -> None:
+        if self._playback.loops:
+            self._playback.restart(gap=int(self._period))
+        else:
+            self._end()
+
+    def _stop(self) -> None:
+        if self._playback.stop():
+            self._end()
+
+    def _end(self) -> None:
+        self._playback.finish()
+        self.get_logger().info("the path is at its end")
+        if not self._settings.stay:
+            self.finished.set_result(None)
 
 
 def _rising_stamps(path: ProbePath) -> NDArray[np.int64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -50,7 +51,8 @@ class SessionPlayer(GuardedNode):
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
         self._latched: set[str] = set()  # of them
-        offered = [topic for topic in self._bag.topics if topic.name not in settings.exclude]
+        exclude = {*settings.exclude, *(["/clock"] if settings.clock else [])}
+        offered = [topic for topic in self._bag.topics if topic.name not in exclude]
         left_out = [why for topic in offered if (why := self._offer(topic))]
         if not any(self._bag.topic(name).message_count for name in self._topics):
             raise BagError(f"{path} holds nothing that can be played: {_joined(left_out)}")
@@ -65,12 +67,19 @@ class SessionPlayer(GuardedNode):
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._first = self._bag.start or 0
-        self._length = (self._bag.end or 0) - self._first
-        self._until = 0  # of the recording, ns: what is shown of it while it is paused
-        self._start = self.create_timer(START_S, self._begin)
-        self._playback = Playback(self, lambda: self._settings, self._go_to, self._say_progress)
+        self._shown = 0  # of the recording, ns: until when it is shown while it is paused
+        self._playback = Playback(
+            self,
+            lambda: self._settings,
+            self._first,
+            (self._bag.end or 0) - self._first,
+            self._go_to,
+            self._step,
+            self._say_progress,
+        )
         self._playhead = self._playback.head
-        offer_player_services(self, lambda: self._settings, self._first, self._length)
+        self._start = self.create_timer(START_S, self._begin, clock=self._playback.clock)
+        offer_player_services(self, self._playback, lambda: self._settings, self._stop)
 
     @property
     def _settings(self) -> SessionPlayerSettings:
@@ -102,34 +111,55 @@ class SessionPlayer(GuardedNode):
 
     def _begin(self) -> None:
         self._start.cancel()
-        self._go_to(round(1e9 * self._settings.time))
-        self.health.state = "playing"
-        self.create_timer(0.002, self._tick)
+        self._playback.restart()
+        if sought := round(1e9 * self._settings.time):
+            self._go_to(sought)
+        self.create_timer(0.002, self._tick, clock=self._playback.clock)
         self._playback.begin()
 
     def _tick(self) -> None:
         """Send the messages that are due."""
         if self.health.state == "finished":
-            if self._settings.loop:
-                self._go_to(0)
-                self.health.state = "playing"
+            if self._playback.loops:
+                self._playback.restart()
             return
-        elapsed = max(self._playhead.position(self._playback.now), self._until)
-        while self._waiting is not None and self._waiting.log_time - self._first <= elapsed:
-            self._topics[self._waiting.topic].publish(self._waiting.data)
-            self.health.published(self._waiting.topic)
-            self._sent += 1
-            self._waiting = self._next()
+        elapsed = max(self._playhead.position(self._playback.now), self._shown)
+        while self._age() <= elapsed and self._step():
+            pass
         self._say_progress()
-        if self._waiting is not None or self.finished.done():
+        if self._age() <= self._playback.until or self._settings.paused:
             return
-        if self._settings.loop:
-            self._go_to(0)
-            return
-        self.health.state = "finished"
+        if self._playback.loops:
+            self._playback.restart()
+        else:
+            self._end()
+
+    def _age(self) -> float:
+        """ns from the start of the recording to the next message; infinite after the last."""
+        return self._waiting.log_time - self._first if self._waiting else math.inf
+
+    def _step(self) -> bool:
+        """Send the next message."""
+        if self._waiting is None or self._age() > self._playback.until:
+            return False
+        if self._settings.paused and self._age() > self._shown:  # it was asked for
+            self._playhead.go_to(int(self._age()), self._playback.now)
+        self._topics[self._waiting.topic].publish(self._waiting.data)
+        self.health.published(self._waiting.topic)
+        self._sent += 1
+        self._waiting = self._next()
+        return True
+
+    def _stop(self) -> None:
+        if self._playback.stop():
+            self._end(early=True)
+
+    def _end(self, *, early: bool = False) -> None:
+        self._playback.finish()
         if self._settings.stay:
-            self.health.report()
-        elif self._damage or self._sent < self._count:
+            return
+        is_cut = early or self._waiting is not None
+        if self._damage or (self._sent < self._count and not is_cut):
             self.finished.set_exception(
                 BagError(
                     f"{self._sent} of {self._count} messages of {self._bag.path} were played"
@@ -140,13 +170,12 @@ class SessionPlayer(GuardedNode):
             self.finished.set_result(None)
 
     def _say_progress(self) -> None:
-        position = min(max(self._playhead.position(self._playback.now), 0), self._length)
         self.health.values = {
-            "position": f"{1e-9 * position:.3f}",
-            "duration": f"{1e-9 * self._length:.3f}",
+            "position": f"{1e-9 * self._playback.position:.3f}",
+            "duration": f"{1e-9 * self._playback.length:.3f}",
         }
 
-    def _go_to(self, position: int) -> None:
+    def _go_to(self, position: int, at: int | None = None) -> None:
         """Have the messages from there on wait, and show a moment of them even if it is paused.
 
         What is kept for those who come later is sent again from the start.
@@ -160,8 +189,8 @@ class SessionPlayer(GuardedNode):
                 self._topics[self._waiting.topic].publish(self._waiting.data)
             self._sent += 1
             self._waiting = self._next()
-        self._until = position + _SHOWN if position else 0
-        self._playhead.go_to(position, self._playback.now)
+        self._shown = position + _SHOWN if position and at is None else 0
+        self._playhead.go_to(position, self._playback.now if at is None else at)
 
     def _next(self) -> BagMessage | None:
         """The next message; damaged parts are reported, and skipped where possible."""

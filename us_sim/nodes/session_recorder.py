@@ -63,6 +63,7 @@ class SessionRecorder(GuardedNode):
         self._splits: deque[tuple[str, str]] = deque()
         self._bag: WriteBehind | None = None
         self.paused = settings.start_paused
+        self.discovers = True  # new topics are subscribed to
         self.health = Health(self, settings.file)
         self._begin(settings.file, further=settings.if_exists == "further")
         self._events = RecorderEvents(self)
@@ -72,6 +73,16 @@ class SessionRecorder(GuardedNode):
             )
         self.create_timer(0.1, self._discover)
         self.create_timer(1.0, self._follow_publishers)
+
+    @property
+    def file(self) -> str:
+        """The file that is recorded to now; empty where nothing is."""
+        return "" if self._bag is None else self._bag.path
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics that it has subscribed to."""
+        return sorted(self._topics)
 
     def pause(self) -> None:
         """Record nothing until `resume`, but keep the newest of latched messages for that."""
@@ -162,7 +173,7 @@ class SessionRecorder(GuardedNode):
 
     def _discover(self) -> None:
         self._tell_splits()
-        for topic, types in self.get_topic_names_and_types():
+        for topic, types in self.get_topic_names_and_types() if self.discovers else ():
             if not self._is_wanted(topic):
                 continue
             for type_name in types:

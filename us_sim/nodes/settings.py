@@ -112,25 +112,46 @@ class AwaitedSettings(Settings):
 
 
 @dataclass(frozen=True)
-class PathPlayerSettings(Settings):
-    """Of ``path_player``."""
+class PlayerSettings(Settings):
+    """Of nodes that play: what ``ros2 bag play`` has under the same names, and more."""
 
     path: str | None = setting(
-        description="bag or tracker recording to play", default=None, file=True
-    )
-    topic: str | None = setting(
-        description="in the bag; not given: the only one of PoseStamped", default=None
+        description="bag to play; `path_player` takes tracker recordings, too",
+        default=None,
+        file=True,
     )
     rate: float = setting(_SPEED, "speed factor", default=1.0, live=True)
     loop: bool = setting(description="start again at the end", default=False, live=True)
     paused: bool = setting(
-        description="hold the probe where it is; not in lockstep", default=False, live=True
+        description="stay there: the probe is held, nothing else is published; not in lockstep",
+        default=False,
+        live=True,
     )
     time: float = setting(
         _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
     )
+    start_offset: float = setting(_SPAN, "from the start, where playing begins", default=0.0)
+    playback_duration: float = setting(
+        Quantity("time", -1.0, 1e6), "of the recording that is played; -1: all", default=-1.0
+    )
+    delay: float = setting(_SPAN, "before playing begins, and begins again", default=0.0)
+    clock: float = setting(
+        Quantity("frequency", 0.0, 1000.0),
+        "of `/clock`, which tells the time of the recording; poses have its stamps then; 0: none",
+        default=0.0,
+    )
     stay: bool = setting(
-        description="hold the probe at the end until `time` is set, else end there", default=False
+        description="wait at the end until `time` is set, holding the probe; else end there",
+        default=False,
+    )
+
+
+@dataclass(frozen=True)
+class PathPlayerSettings(PlayerSettings):
+    """Of ``path_player``."""
+
+    topic: str | None = setting(
+        description="in the bag; not given: the only one of PoseStamped", default=None
     )
     restamp: bool = setting(
         description="stamp poses when they are sent, else as recorded", default=True
@@ -147,19 +168,9 @@ class PathPlayerSettings(Settings):
 
 
 @dataclass(frozen=True)
-class SessionPlayerSettings(Settings):
+class SessionPlayerSettings(PlayerSettings):
     """Of ``session_player``."""
 
-    path: str | None = setting(description="bag to play", default=None, file=True)
-    rate: float = setting(_SPEED, "speed factor", default=1.0, live=True)
-    loop: bool = setting(description="start again at the end", default=False, live=True)
-    paused: bool = setting(description="publish nothing", default=False, live=True)
-    time: float = setting(
-        _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
-    )
-    stay: bool = setting(
-        description="wait at the end until `time` is set, else end there", default=False
-    )
     exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
 
 

@@ -68,6 +68,7 @@ class _Run(NamedTuple):
 
     start: int  # ns, lowest log time in it
     offset: int  # bytes, of its first record's opcode
+    end: int  # ns, highest log time in it
     chunk: Chunk | None
 
 
@@ -102,6 +103,7 @@ class McapFile:
             if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise BagError(f"{self._label} is not an MCAP file: it does not start as one")
             summary = _summary(stream)
+            self.is_indexed = summary is not None
             if summary is not None:
                 self._take(summary)
             else:
@@ -146,7 +148,7 @@ class McapFile:
             if channel.topic in topics
         }
         total = sum(self._counts[id] for id in wanted)
-        read = 0
+        read = outside = 0
         broken: list[Fault] = []
         # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
         # Of messages with the same log time the one that is earlier in the file comes first.
@@ -160,12 +162,13 @@ class McapFile:
                     yield message
                 try:
                     for index, content in enumerate(_messages(stream, run)):
-                        channel, _, log_time, publish_time = _MESSAGE.unpack_from(content)
+                        channel, sequence, log_time, sent = _MESSAGE.unpack_from(content)
                         if channel not in wanted:
                             continue
                         read += 1
+                        outside += not run.start <= log_time <= run.end
                         data = bytes(content[_MESSAGE.size :])
-                        message = BagMessage(*wanted[channel], log_time, publish_time, data)
+                        message = BagMessage(*wanted[channel], log_time, sent, data, sequence)
                         heapq.heappush(pending, (log_time, run.offset, index, message))
                         held += len(data)
                 except DAMAGE as error:
@@ -190,6 +193,9 @@ class McapFile:
             damage.append(Fault(text, total - read))
         elif damage is not None:
             damage += broken
+        if outside and damage is not None:
+            text = f"{self._label} has {outside} messages at other times than its index says"
+            damage.append(Fault(f"{text}, so that seeking misses them"))
 
     def _tell(self, damage: list[Fault] | None, place: str) -> None:
         """Note damage, or raise it as a BagError."""
@@ -211,7 +217,12 @@ class McapFile:
         self._channels = summary.channels
         self._counts.update(summary.statistics.channel_message_counts)
         self._runs = sorted(
-            _Run(each.message_start_time, each.chunk_start_offset, _indexed(each))
+            _Run(
+                each.message_start_time,
+                each.chunk_start_offset,
+                each.message_end_time,
+                _indexed(each),
+            )
             for each in summary.chunk_indexes
         )
         self._attachments = [_Place(e.offset, e.length, e.name) for e in summary.attachment_indexes]
@@ -285,16 +296,19 @@ class McapFile:
     def _take_chunk(self, stream: BinaryIO, chunk: Chunk) -> dict[int, tuple[int, int]]:
         """Index a chunk; for each channel the messages and their lowest log time."""
         tables: dict[int, tuple[int, int]] = {}
+        last = 0  # ns
         with contextlib.suppress(*DAMAGE):  # of one that is cut
             for opcode, content in records_in(stream, chunk):
                 if opcode == Opcode.MESSAGE:
                     channel, time = self._count(content)
+                    last = max(last, time)
                     count, lowest = tables.get(channel, (0, time))
                     tables[channel] = count + 1, min(lowest, time)
                 else:
                     self._learn(opcode, content)
         if tables:
-            self._runs.append(_Run(min(time for _, time in tables.values()), chunk.offset, chunk))
+            first = min(time for _, time in tables.values())
+            self._runs.append(_Run(first, chunk.offset, last, chunk))
         return tables
 
     def _take_record(self, record: Record) -> None:
@@ -306,7 +320,8 @@ class McapFile:
         elif opcode == Opcode.METADATA:
             self._notes.append(_Place(record.offset, length, parsed(Metadata, content).name))
         elif opcode == Opcode.MESSAGE:
-            self._runs.append(_Run(self._count(content)[1], record.offset, None))
+            time = self._count(content)[1]
+            self._runs.append(_Run(time, record.offset, time, None))
         else:
             self._learn(opcode, content)
 

@@ -72,6 +72,11 @@ class Bag:
         return sum(topic.message_count for topic in self.topics)
 
     @property
+    def is_indexed(self) -> bool:
+        """Whether every file of it has an index, so that none is read to open it."""
+        return all(storage.is_indexed for storage in self._storages)
+
+    @property
     def note(self) -> str:
         """The faults that were found when the bag was opened; empty when there are none."""
         return "; ".join(fault.text for fault in self.opening_faults)
@@ -90,15 +95,20 @@ class Bag:
 
     def faults(self) -> list[Fault]:
         """Everything that is wrong with the bag, for which all of it is read."""
-        found = [*self.opening_faults]
-        self.attachments(found)
-        self.notes(found)
-        try:
-            for _ in self.messages(damage=found):
-                pass
-        except BagError as error:
-            found.append(Fault(str(error)))
+        found: list[Fault] = []
+        for _ in self.all_messages(found):
+            pass
         return found
+
+    def all_messages(self, faults: list[Fault]) -> Iterator[BagMessage]:
+        """Every message that can be read; ``faults`` takes everything that is wrong."""
+        faults += self.opening_faults
+        self.attachments(faults)
+        self.notes(faults)
+        try:
+            yield from self.messages(damage=faults)
+        except BagError as error:
+            faults.append(Fault(str(error)))
 
     def topic(self, name: str) -> BagTopic:
         """The topic of this name, with or without its leading slash.
@@ -182,7 +192,7 @@ class Bag:
                 f"{self.path} holds {topic.name} in the encoding {topic.encoding!r}: only cdr, "
                 f"what ROS 2 writes, can be read"
             )
-        store = self._definitions(topic)
+        store = self.definitions(topic)
         try:
             return store.deserialize_cdr(message.data, topic.type_name)
         except Exception as error:
@@ -224,8 +234,12 @@ class Bag:
             ],
         }
 
-    def _definitions(self, topic: BagTopic) -> Typestore:
-        """The definition of a topic's type: the bag's own, else that of Jazzy."""
+    def definitions(self, topic: BagTopic) -> Typestore:
+        """The definition of a topic's type: the bag's own, else that of Jazzy.
+
+        Raises:
+            BagError: it cannot be understood, or there is none.
+        """
         if topic.schema is not None:
             try:
                 return definitions(topic.type_name, topic.schema)

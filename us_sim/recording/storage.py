@@ -42,6 +42,8 @@ class SqliteFile:
         BagError: the file is damaged, or without the tables of rosbag2.
     """
 
+    is_indexed = True
+
     def __init__(self, path: Path, label: str) -> None:
         self._label = label
         self._uri, unread = _address(path)

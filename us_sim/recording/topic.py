@@ -204,6 +204,7 @@ class BagMessage(NamedTuple):
     log_time: int  # ns since the epoch, when the recorder received it
     publish_time: int  # ns since the epoch, when it was sent; the log time where none is kept
     data: bytes
+    sequence: int = 0  # its number on its topic; 0 where none is kept
 
 
 class BagAttachment(NamedTuple):

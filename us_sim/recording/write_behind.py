@@ -107,6 +107,11 @@ class WriteBehind:
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
 
+    @property
+    def path(self) -> str:
+        """The file that is written now."""
+        return str(self._bag.path)
+
     def add_topic(self, topic: str, type_name: str, qos: Sequence[object] = ()) -> None:
         """Make a topic known before its first message.
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.nodes.settings import RECORDER, VIEWER, checked_parameters
-from us_sim.nodes.topics import published_counts
+from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
 from us_sim.progress import Progress, late_progress
 from us_sim.run.fork_server import ForkServer
 from us_sim.run.losses import IMAGES, Outcome
@@ -348,28 +347,37 @@ def view_running(
     return 0
 
 
-def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, network: bool) -> int:
-    """Play a bag into whatever runs on this ROS domain."""
+def play(
+    bag: Path,
+    player: PlayerSettings,
+    *,
+    topic: str,
+    everything: bool,
+    lockstep: bool,
+    network: bool,
+) -> int:
+    """Play a bag into whatever runs on this ROS domain.
+
+    Raises:
+        UsSimError: it cannot be played.
+    """
     from us_sim.recording.path import read_path
-    from us_sim.recording.reader import read_bag
 
     keep_on_this_host(network=network)
     settings: dict[str, object] = {
         "path": str(full_path(bag)),
-        "rate": rate,
-        "loop": loop,
+        **{name: value for name, value in vars(player).items() if value is not None},
     }
     if everything:
-        count = read_bag(bag).message_count
         process = NodeProcess("session_player", settings)
     else:
-        count = len(read_path(bag, topic or None, option="--topic"))
-        process = NodeProcess("path_player", settings | {"topic": topic})
+        read_path(bag, topic or None, option="--topic")  # or say why it cannot be
+        process = NodeProcess("path_player", settings | {"topic": topic, "lockstep": lockstep})
     group, watch = ProcessGroup(), Watch(SupervisionSettings().silence)
     try:
         with (
             contextlib.closing(Monitored([process.node])) as monitor,
-            Progress("playing", count, "messages") as bar,
+            Progress("playing", 100, "%") as bar,
         ):
             group.start([process])
             while group.is_running(process.node):
@@ -377,13 +385,13 @@ def play(bag: Path, *, topic: str, rate: float, loop: bool, everything: bool, ne
                 for how in watch.hung(group.pids, monitor.node.heard).values():
                     raise UsSimError(f"{process.node} {how}, and what it plays is not at its end")
                 report = monitor.node.reports.get(process.node, {})
-                done = sum(published_counts(report).values())
+                done, length = (float(report.get(name, 0)) for name in ("position", "duration"))
                 state = report.get("state", "starting")
                 if state == "waiting":
                     state = f"waiting for the simulation on ROS domain {domain()}"
-                bar.update(min(done, count), state)
+                bar.update(100 * done / length if length else 0, state)
             group.check()
-            bar.update(count)
+            bar.update(100)
     finally:
         group.stop()
     return 0

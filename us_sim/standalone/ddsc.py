@@ -1,20 +1,20 @@
 """Eclipse Cyclone DDS's C interface, as far as serialized samples need it, and quality of service.
 
-The C library comes with the PyPI package `cyclonedds`. Its Python classes are not used: they hold
-the interpreter's lock while a write blocks, describe every type by XTypes (which Jazzy does not
-send and need not agree with), and turn each sample into objects. Calls through ctypes release the
-lock.
+The C library comes with the PyPI package `cyclonedds` or from elsewhere (`libddsc`). The package's
+Python classes are not used: they hold the interpreter's lock while a write blocks, describe every
+type by XTypes (which Jazzy does not send and need not agree with), and turn each sample into
+objects. Calls through ctypes release the lock.
 """
 
 from __future__ import annotations
 
 import ctypes as ct
-import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
+
+from .libddsc import DdsError, load
 
 INFINITY = 2**63 - 1
 ANY_STATE = 0x7F
@@ -29,10 +29,6 @@ BUILTIN_SUBSCRIPTION = 0x7FFF0004
 
 InstanceHandle = ct.c_uint64
 Pointer = ct.c_void_p
-
-
-class DdsError(Exception):
-    """The transport refuses a request."""
 
 
 class RawSampleInfo(ct.Structure):
@@ -122,22 +118,6 @@ def topic_descriptor(type_name: str) -> Any:
     )
 
 
-def _library_path() -> str:
-    """The C library in the `cyclonedds` package, without importing that (0.2 s)."""
-    package = importlib.util.find_spec("cyclonedds")
-    if package is None or package.origin is None:
-        raise DdsError("the package cyclonedds is not installed; run pip install cyclonedds")
-    folder = Path(package.origin).parent
-    for place in (folder.parent / "cyclonedds.libs", folder / ".dylibs"):
-        for library in sorted(place.glob("*ddsc[.-]*")):
-            return str(library)
-    from cyclonedds.internal import DDS  # built from source, it knows where its library is
-
-    return DDS._dll_handle._name
-
-
-lib: Any = ct.CDLL(_library_path())
-
 # The functions that are called, by the types of what they return and take:
 # i int32 (entities too), u uint32, n size_t, l int64, h uint64, b bool, s text, p pointer,
 # E a pointer to an endpoint, - nothing.
@@ -165,9 +145,9 @@ _SIGNATURES = """
     i ipspp: dds_create_topic
     i iipp: dds_create_reader dds_create_writer
     i i: dds_delete dds_create_waitset dds_create_guardcondition
-    i ip: dds_get_guid dds_get_instance_handle dds_get_entity_sertype dds_take_guardcondition
+    i ip: dds_get_guid dds_get_instance_handle dds_take_guardcondition
     i ip: dds_get_offered_incompatible_qos_status dds_get_requested_incompatible_qos_status
-    i ip: dds_writecdr
+    i ip: dds_write dds_writecdr
     i ib: dds_set_guardcondition
     i iin: dds_waitset_attach
     i ipnl: dds_waitset_wait
@@ -192,13 +172,17 @@ _SIGNATURES = """
     b pp: dds_qget_deadline dds_qget_durability dds_qget_lifespan
     b ppp: dds_qget_history dds_qget_liveliness dds_qget_reliability dds_qget_userdata
 """
-for _line in _SIGNATURES.strip().splitlines():
-    _types, _, _functions = _line.partition(": ")
-    _result, *_arguments = list(_types.replace(" ", ""))
-    for _name in _functions.split():
-        _function = getattr(lib, _name)
-        _function.restype = _C_TYPES[_result]
-        _function.argtypes = [_C_TYPES[_argument] for _argument in _arguments]
+_CALLS = {
+    name: list(types.replace(" ", ""))
+    for types, _, names in (line.partition(": ") for line in _SIGNATURES.strip().splitlines())
+    for name in names.split()
+}
+
+lib: Any = load(_CALLS)
+for _name, (_result, *_arguments) in _CALLS.items():
+    _function = getattr(lib, _name)
+    _function.restype = _C_TYPES[_result]
+    _function.argtypes = [_C_TYPES[_argument] for _argument in _arguments]
 
 
 def check(returned: int, sentence: str) -> int:
@@ -214,6 +198,41 @@ def guid_of(entity: int) -> bytes:
     guid = (ct.c_uint8 * 16)()
     check(lib.dds_get_guid(entity, guid), "an endpoint that was closed has no identity")
     return bytes(guid)
+
+
+_TYPE_OF_SAMPLE = 24  # bytes into ddsi_serdata: its operations, hash, references, kind, type
+
+
+def serialized_type(writer: int, participant: int, type_name: str) -> ct.c_void_p:
+    """Cyclone's own description of a writer's type, which has this name.
+
+    Version 0.10 does not tell it, but each sample points to it; so one is sent to oneself, on a
+    topic of its own.
+    """
+    found = ct.c_void_p()
+    if hasattr(lib, "dds_get_entity_sertype"):
+        check(lib.dds_get_entity_sertype(writer, ct.byref(found)), "the writer has no type")
+        return found
+    descriptor = topic_descriptor(type_name)
+    topic = check(
+        lib.dds_create_topic(participant, ct.byref(descriptor), b"us_sim/type", None, None),
+        f"there can be no type {type_name!r}",
+    )
+    made = [topic]
+    try:
+        for create in (lib.dds_create_reader, lib.dds_create_writer):
+            made.append(check(create(participant, topic, None, None), "no endpoint can be made"))
+        check(lib.dds_write(made[2], ct.byref(ct.c_uint8())), "no sample can be written")
+        sample, info = ct.c_void_p(), RawSampleInfo()
+        taken = lib.dds_takecdr(made[1], ct.byref(sample), 1, ct.byref(info), ANY_STATE)
+        if taken != 1 or not sample.value:
+            raise DdsError("Cyclone DDS did not hand over a sample of its own")
+        found.value = ct.c_void_p.from_address(sample.value + _TYPE_OF_SAMPLE).value
+        lib.ddsi_serdata_unref(sample)
+        return found
+    finally:
+        for entity in reversed(made):
+            lib.dds_delete(entity)
 
 
 _UNSPECIFIED = (0, INFINITY)

@@ -29,16 +29,27 @@ _SERVICE_TEXTS = {
         SetParametersAtomically | rcl_interfaces/Parameter[] parameters \
             | rcl_interfaces/SetParametersResult result""",
     "rosbag2_interfaces": """
+        Burst | uint64 num_messages | uint64 actually_burst
         GetRate | | float64 rate
+        GetSubscribedTopics | | string[] topics
+        GetUri | | string uri
+        IsDiscoveryRunning | | bool running
         IsPaused | | bool paused
+        IsRecording | | bool recording
         Pause | |
+        Play | builtin_interfaces/Time start_offset; \
+            builtin_interfaces/Duration playback_duration; \
+            builtin_interfaces/Time playback_until_timestamp | bool success
+        PlayNext | | bool success
         Record | string uri | int32 return_code; string error_string
         Resume | |
         Seek | builtin_interfaces/Time time | bool success
         SetRate | float64 rate | bool success
         Snapshot | | bool success
         SplitBagfile | |
+        StartDiscovery | | int32 return_code; string error_string
         Stop | |
+        StopDiscovery | | int32 return_code; string error_string
         TogglePaused | |""",
     "std_srvs": """
         Empty | |
@@ -53,7 +64,7 @@ for _package, _text in _SERVICE_TEXTS.items():
             part.strip().replace("; ", "\n") for part in _parts
         ]
 
-# Newer than Jazzy, as is the service Record.
+# Newer than Jazzy, as are the services Record, GetUri, and those of discovery and IsRecording.
 _MESSAGES = {
     "rosbag2_interfaces/msg/MessagesLostEvent": (
         "string node_name\nMessagesLostEventTopicStat[] messages_lost_statistics"

@@ -75,12 +75,16 @@ class _ServiceEndpoint:
         """The next request or response, serialized, with its origin; None if there is none."""
         while (sample := self._reader.take()) is not None:
             data, info = sample
-            if len(data) < 4 + _HEADER.size:
+            if not self._understands(info) or len(data) < 4 + _HEADER.size:
                 continue
             client, sequence = _HEADER.unpack_from(data, 4)
             header = RequestHeader(client, sequence, info)
             return data[:4] + data[4 + _HEADER.size :], header
         return None
+
+    def _understands(self, info: SampleInfo) -> bool:  # noqa: ARG002
+        """Whether the writer puts the header before the message."""
+        return True
 
     def _send(self, data: bytes, client: int, sequence: int) -> bool:
         return self._writer.write(data[:4] + _HEADER.pack(client, sequence), memoryview(data)[4:])
@@ -90,6 +94,20 @@ class ServiceServer(_ServiceEndpoint):
     """Takes requests for a service and sends the responses."""
 
     _key = "serviceid"
+    on_foreign: Callable[[], object] | None = None  # called for each request that is not understood
+
+    def _understands(self, info: SampleInfo) -> bool:
+        """Whether a client of Cyclone's sent it, each of which has had an id since ROS 2 Foxy.
+
+        Fast DDS names the request in inline QoS instead, which Cyclone's C interface hides. Of a
+        writer that has gone nothing is known; its request is taken, as rmw_cyclonedds takes it.
+        """
+        client = self._reader.user_data_of(info.publication_handle)
+        if client is None or "clientid" in client:
+            return True
+        if self.on_foreign is not None:
+            self.on_foreign()
+        return False
 
     def send_response(self, data: bytes, header: RequestHeader) -> bool:
         """Answer a request; False if the client's reader was not there within 0.1 s."""
@@ -119,12 +137,13 @@ class ServiceClient(_ServiceEndpoint):
         self._number = self._writer.instance_handle()
 
     def service_is_ready(self) -> bool:
-        """Whether a server is connected in both directions."""
+        """Whether a server is connected in both directions that understands the header.
+
+        A server on Fast DDS, without an id, may take all memory to read it (rmw_cyclonedds#577).
+        """
         readers = self._writer.matched_user_data()
         writers = self._reader.matched_user_data()
         servers = {reader["serviceid"] for reader in readers if "serviceid" in reader}
-        if not servers:
-            return bool(readers and writers)
         return any(writer.get("serviceid") in servers for writer in writers)
 
     def send_request(self, data: bytes) -> int:

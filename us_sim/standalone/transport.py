@@ -372,13 +372,9 @@ class Writer(Endpoint):
     _side = "subscription"
     _incompatible = (1 << 3, "offered")
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._sertype = ct.c_void_p()
-        check(
-            lib.dds_get_entity_sertype(self._handle, ct.byref(self._sertype)),
-            "the writer has no type",
-        )
+    def set_type(self, participant: int, dds_type: str) -> None:
+        """Prepare for samples of a type; `Participant` does so."""
+        self._sertype = ddsc.serialized_type(self._handle, participant, dds_type)
 
     def write(self, *parts: bytes | bytearray | memoryview) -> bool:
         """Send one sample, in parts: a four-byte CDR header, all in the first, and a byte or more.
@@ -540,6 +536,8 @@ class Participant:
                 f"no {kind} can be made on {dds_topic!r}; check its quality of service",
             )
         endpoint = cls(self.dispatcher, handle, policies, on_incompatible)
+        if isinstance(endpoint, Writer):
+            endpoint.set_type(self.handle, dds_type)
         self._endpoints.add(endpoint)
         return endpoint
 

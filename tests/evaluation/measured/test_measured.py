@@ -11,8 +11,9 @@ from us_sim.evaluation.settings import MeasuredData
 
 
 def _study(name, folder, found):
-    def measure(data, out, quick):
-        found.append((data, out, quick))
+    def measure(data, made):
+        made.picture(name).touch()
+        found.append((data, made.report.parent, made.quick))
         return Section(f"About {name}", "text", [Finding(name, "a case", "depth", "mm", 2.0, 2.5)])
 
     return Study(name, folder, f"https://example.org/{name}@1", "MIT", "By A.", measure)
@@ -41,11 +42,12 @@ def test_studies_without_data_are_left_out_and_say_from_where_to_fetch_them(tmp_
     assert "gel" not in left_out
 
 
-def test_the_environment_names_the_folder(tmp_path, found, monkeypatch):
+def test_the_environment_names_the_folder(tmp_path, found, monkeypatch, capsys):
     (tmp_path / "steel-data").mkdir()
     monkeypatch.setenv("US_SIM_TEST_DATA", str(tmp_path))
     report.evaluate_measured(tmp_path / "out", False)
     assert found == [(tmp_path / "steel-data", tmp_path / "out", False)]
+    assert str(tmp_path / "out" / "measured_steel.png") in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("named", [True, False])

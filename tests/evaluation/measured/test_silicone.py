@@ -19,6 +19,7 @@ from us_sim.evaluation.measured.silicone import (
     slipping_force,
 )
 from us_sim.evaluation.measured.stuck_cylinder import StuckCylinder
+from us_sim.evaluation.report import ReportFolder
 
 
 @pytest.fixture(scope="session")
@@ -128,7 +129,7 @@ def test_constants_of_a_made_up_silicone_are_found_and_its_forces_predicted(tmp_
         for test in (1, 2):
             file = tmp_path / "data" / "EF" / f"EF_{specimen}{test}.csv"
             write_test(file, 5e3 * slipping_force(COMPRESSIONS, 0.4))
-    section = measure_silicone(tmp_path, tmp_path, quick=True)
+    section = measure_silicone(tmp_path, ReportFolder("measured", tmp_path, True))
     assert (tmp_path / "measured_silicone.png").stat().st_size > 10_000
     slip = {row.quantity: row.error for row in section.findings if "slip" in row.quantity}
     assert slip["force at 10 %, slip, neo-Hookean"] < 0.2  # %

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from us_sim.evaluation.measured.vein import PUBLISHED, VENOUS, mean_pressure, measure_vein, press
+from us_sim.evaluation.report import ReportFolder
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.model import TissueModel
 
@@ -32,7 +33,7 @@ def test_a_vein_of_higher_pressure_closes_at_a_higher_one():
 
 
 def test_the_study_needs_no_data_and_reports_each_posture(tmp_path):
-    section = measure_vein(tmp_path / "none", tmp_path, True)
+    section = measure_vein(tmp_path / "none", ReportFolder("measured", tmp_path, True))
     assert (tmp_path / "measured_vein.png").exists()
     assert {finding.case for finding in section.findings} == set(PUBLISHED)
     for finding in section.findings:

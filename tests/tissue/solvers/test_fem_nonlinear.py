@@ -177,6 +177,18 @@ def test_while_sliding_the_nodes_stay_within_a_percent_of_the_balanced_ones(rati
     assert max(errors) < 0.02
 
 
+def test_a_frame_ends_with_an_error_as_great_as_its_tolerance():
+    model = block((20, 10, 10), Sphere(0.03), materials=made_of(0.45, (20, 10, 10)))
+    solver = FemNonlinear(model, FemNonlinearSettings(frame_tolerance=1e-6))
+    poses = [at(z=0.0025 * frame) for frame in range(1, 11)]
+    moved = [solver.deform(pose).nodes - model.mesh.nodes for pose in poses]
+    for tolerance in (0.01, 0.03, 0.1, 0.3, 1.0):
+        made_anew(solver, frame_tolerance=tolerance)
+        for pose, exact in zip(poses, moved, strict=True):
+            error = np.linalg.norm(solver.deform(pose).nodes - model.mesh.nodes - exact)
+            assert error < 1.2 * tolerance * np.linalg.norm(exact)
+
+
 @pytest.mark.parametrize("ratio", [0.45, 0.49])
 def test_after_a_jump_and_a_sudden_change_the_nodes_are_right_within_five_frames(ratio):
     model = block(FINE, Sphere(0.05), materials=made_of(ratio))

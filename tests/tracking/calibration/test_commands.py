@@ -219,10 +219,18 @@ def test_probe_that_hardly_turned_over_few_wires_is_remarked_on(tmp_path, capsys
     said = capsys.readouterr().out
     assert "the probe turned by only 4°, which determines little" in said
     assert "4 features are too few" in said
+    assert "the image's edge is known" not in said  # sighted without errors
     written = yaml.safe_load(out.read_text())
     assert np.radians(2.5) < written["residuals"]["turned"] < np.radians(5.2)
     assert written["standard_deviations"]["clusters"] == 12
     assert written["standard_deviations"]["cluster"] == "part of a feature's sightings"
+    assert written["standard_deviations"]["edge"] < 1e-5
+    for row in rows:
+        row[3:6] += rng.normal(0.0, 3e-3, 3)
+    out = tmp_path / "noisy.yaml"
+    seen = sheet(tmp_path / "noisy.csv", POSED, rows)
+    assert calibrate("probe", seen, *chosen[:-1], out) == 0
+    assert "the image's edge is known to ± " in capsys.readouterr().out
 
 
 def test_camera_from_photos_of_a_chessboard(tmp_path, capsys):

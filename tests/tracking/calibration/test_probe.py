@@ -107,7 +107,7 @@ def related(rng, count, clusters, bias, noise):
 def test_errors_are_as_large_as_the_deviations_say(features, known, bias, noise):
     # Of each wire a bias, and errors of the tracker that drift, as real recordings have them.
     rng = np.random.default_rng(11)
-    said, happened = [], []
+    said, happened, edges, apart = [], [], [], []
     count = 90
     for _ in range(40):
         made = sightings(rng, features, count, **{"pixel_noise": 0.0, **noise, "pose_noise": 0.0})
@@ -119,9 +119,18 @@ def test_errors_are_as_large_as_the_deviations_say(features, known, bias, noise)
         found = calibrate_probe(made, known)
         said.append(deviations(found))
         happened.append(errors(found))
+        pixels = np.array([[seen.column, seen.row] for seen in made])
+        corners = [[c, r, 0, 1] for c in (0, 1) for r in (0, 1)] * np.append(
+            np.ptp(pixels, 0), (1, 1)
+        )
+        corners[:, :2] += pixels.min(axis=0)
+        edges.append(found.edge_deviation)
+        apart.append(np.linalg.norm(corners @ (found.image_to_body - image_to_body()).T, axis=1))
     for part in (slice(0, 3), slice(3, 6), slice(6, 8)):
         true = np.sqrt(np.mean(np.square(np.array(happened)[:, part])))
         assert np.sqrt(np.mean(np.square(np.array(said)[:, part]))) == pytest.approx(true, rel=0.3)
+    worst = np.sqrt(np.mean(np.square(apart), axis=0)).max()
+    assert np.sqrt(np.mean(np.square(edges))) == pytest.approx(worst, rel=0.3)
 
 
 def test_the_body_turned_by_as_much_as_it_did():

@@ -189,11 +189,24 @@ def test_a_real_volume_in_which_plus_left_the_status_of_a_frame_is_a_volume(shar
     )
 
 
+def test_a_real_volume_that_plus_wrote_with_the_axes_of_a_sequence_is_a_volume(shared_file):
+    path = shared_file("plus-nwire-calibration/NwirePhantomFreehandReconstructed.mha")
+    assert b"Kinds = domain domain list" in path.open("rb").read(1000)
+    volume = read_volume(path)
+    stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path)))
+    np.testing.assert_array_equal(volume.intensities, stored.transpose(2, 1, 0))
+    np.testing.assert_allclose(
+        volume.index_to_patient[:3, 3], [-0.0222573, -0.137793, -0.0585829], atol=1e-12
+    )
+
+
 @pytest.mark.parametrize(
     ("kinds", "frames", "message"),
     [
         ("domain domain domain", 1, None),
+        ("domain domain list", 0, None),
         ("domain domain list", 1, "without poses"),
+        ("domain domain time", 0, "without poses"),
         ("", 1, None),
         ("", 2, "without poses"),
     ],

@@ -24,7 +24,7 @@ from us_sim.errors import SolverError
 from us_sim.evaluation.block import conjugate_gradients
 from us_sim.evaluation.measured.beads import FILE, Beads, local_fit, read_beads
 from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
 from us_sim.evaluation.timing import steps
 from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.linear_tetrahedra import lame_stiffness, shape_gradients
@@ -273,11 +273,11 @@ def outcome(case: Case, floor: Array, spacing: float) -> Outcome:
     return Outcome(case.top, case.beads, case.judged, floor, errors, fitted, ratios)
 
 
-def measure_hydrogel(folder: Path, out: Path, quick: bool) -> Section:
+def measure_hydrogel(folder: Path, report: ReportFolder) -> Section:
     """Predict the beads in boxes of three heights, and in the tallest on several meshes."""
     beads = read_beads(folder / FILE)
     floor = noise_floor(beads, np.random.default_rng(1))
-    spacings = (24e-6, 16e-6) if quick else (24e-6, 16e-6, 12e-6, 8.5e-6)
+    spacings = (24e-6, 16e-6) if report.quick else (24e-6, 16e-6, 12e-6, 8.5e-6)
     cases = steps(
         "hydrogel", [Case(beads, top) for top in _TOPS], "boxes", lambda c: f"{c.top:g} m"
     )
@@ -297,8 +297,8 @@ def measure_hydrogel(folder: Path, out: Path, quick: bool) -> Section:
         for part, chosen in o.parts.items()
         for method in o.errors
     ]
-    _draw_section(outcomes[-1], out / "measured_hydrogel_section.png")
-    _draw_errors(outcomes, out / "measured_hydrogel_errors.png")
+    _draw_section(outcomes[-1], report.picture("hydrogel_section"))
+    _draw_errors(outcomes, report.picture("hydrogel_errors"))
     text = filled(
         *("measured", "hydrogel"),
         count=str(len(beads.places)),

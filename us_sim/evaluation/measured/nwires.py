@@ -19,15 +19,14 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.probe import (
     PixelSighting,
     ProbeCalibration,
     calibrate_probe,
 )
-from us_sim.volume.files.metaimage import metaimage_image
-from us_sim.volume.files.readers import grey_voxels
+from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
 from us_sim.volume.reconstruction.settings import Compounding
@@ -169,8 +168,8 @@ def calibrated(recording: Recording, targets: str) -> ProbeCalibration:
     return calibrate_probe(sightings, phantom)
 
 
-def measure_nwires(folder: Path, out: Path, quick: bool) -> Section:  # noqa: ARG001
-    """Calibrate and reconstruct from the recordings in ``folder``; draw into ``out``.
+def measure_nwires(folder: Path, report: ReportFolder) -> Section:
+    """Calibrate and reconstruct from the recordings in ``folder``, and draw them.
 
     Raises:
         UsSimError: a file is missing or cannot be read.
@@ -220,9 +219,8 @@ def measure_nwires(folder: Path, out: Path, quick: bool) -> Section:  # noqa: AR
         Finding("nwires", "volume", "offset from that of Plus", "mm", error=volume.offset),
         Finding("nwires", "volume", "equal voxels", "%", 100.0, volume.equal, volume.equal - 100.0),
     ]
-    file = out / "measured_nwires.png"
+    file = report.picture("nwires")
     _draw(file, recordings["validation"], matrices, volume)
-    uncertain = [_elevation_deviation(found[name]) for name in ("wires", "middle points")]
     text = filled(
         "measured",
         "nwires",
@@ -233,17 +231,13 @@ def measure_nwires(folder: Path, out: Path, quick: bool) -> Section:  # noqa: AR
         ),
         stated=", ".join(f"{mm:.3f}" for mm in stated.values()),
         turned=f"{np.degrees(found['wires'].turned):.0f}",
-        uncertain=f"{uncertain[0]:.1f}",
-        certain=f"{uncertain[1]:.1f}",
+        edge=f"{1e3 * found['wires'].edge_deviation:.1f}",
+        uncertain=f"{np.degrees(found['wires'].turn_deviation):.1f}",
+        certain=f"{np.degrees(found['middle points'].turn_deviation):.1f}",
         volume=volume.words(),
         picture=file.name,
     )  # fmt: skip
     return Section("N-wires and Plus", text, findings)
-
-
-def _elevation_deviation(found: ProbeCalibration) -> float:
-    """Degrees, of the calibration's least certain turn."""
-    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[3:6, 3:6]).max())))
 
 
 def _corners(image_to_body: Array) -> Array:
@@ -295,8 +289,7 @@ class _Volumes:
 
 
 def _volume(folder: Path) -> _Volumes:
-    # Plus wrote it as a sequence of slices, which `read_volume` refuses.
-    theirs = grey_voxels(metaimage_image(folder / "NwirePhantomFreehandReconstructed.mha"))[0]
+    theirs = read_volume(folder / "NwirePhantomFreehandReconstructed.mha").intensities
     begun = time.process_time()
     setup = read_calibration(folder / _SWEEP_SETUP, "Probe")
     sequence = read_sequence(folder / "NwirePhantomFreehand.igs.mha")

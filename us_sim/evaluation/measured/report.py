@@ -6,6 +6,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from us_sim.errors import UsSimError
 from us_sim.evaluation.measured import hydrogel, nwires, silicone, vein
 from us_sim.evaluation.measured.study import Section, Study
@@ -40,10 +42,11 @@ def evaluate_measured(out: Path, quick: bool, settings: MeasuredData | None = No
             f"US_SIM_TEST_DATA, the folder that has one or more of these: {folders}"
         )
     folder = ReportFolder("measured", out, quick)
-    sections = [
-        study.measure(_folder(data, study), out, quick)
-        for study in steps("measured", present, "studies", lambda study: study.name)
-    ]
+    with threadpool_limits(1):  # as live; threads that wait would count as time of a frame
+        sections = [
+            study.measure(_folder(data, study), folder)
+            for study in steps("measured", present, "studies", lambda study: study.name)
+        ]
     findings = [finding for section in sections for finding in section.findings]
     folder.write_rows("measured", findings)
     table = markdown_table(list(findings[0].values), [finding.cells for finding in findings])

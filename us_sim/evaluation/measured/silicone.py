@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.stuck_cylinder import StuckCylinder
 from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
 from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
@@ -194,20 +194,22 @@ class Prediction:
         return float(self.force(stiffening)[there] / self.silicone.second[:, there].mean() - 1.0)
 
 
-def measure_silicone(folder: Path, out: Path, quick: bool) -> Section:
-    """Compare predictions with the compressions in ``folder``, and draw them into ``out``.
+def measure_silicone(folder: Path, report: ReportFolder) -> Section:
+    """Compare predictions with the compressions in ``folder``, and draw them.
 
     Raises:
         UsSimError: a test is missing or cannot be read.
     """
     silicones = read_silicones(folder / "data")
-    counts, stiffenings = ((8, 8), (0.0, 0.5)) if quick else ((14, 14), (0.0, 0.15, 0.3, 0.6, 1.0))
+    counts, stiffenings = (
+        ((8, 8), (0.0, 0.5)) if report.quick else ((14, 14), (0.0, 0.15, 0.3, 0.6, 1.0))
+    )
     cases = {"slip": sliding(), "stick": sticking(counts, stiffenings)}
     made = [
         {name: Prediction.of(silicone, platens) for name, platens in cases.items()}
         for silicone in silicones
     ]
-    file = out / "measured_silicone.png"
+    file = report.picture("silicone")
     _draw(file, [each for each in made if each["slip"].silicone.name in _SHOWN] or made[:3])
     ms = _frame_ms()
     medians = _medians(made)

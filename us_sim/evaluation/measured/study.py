@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import nan
 from pathlib import Path
 
-from us_sim.evaluation.report import Row
+from us_sim.evaluation.report import ReportFolder, Row
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,7 @@ class Section:
 class Study:
     """Where a study's data come from, and the function that measures.
 
-    The function takes the folder with the data, the folder for pictures, and whether it is a quick
-    run.
+    The function takes the folder with the data, and the report whose pictures it draws.
     """
 
     name: str
@@ -51,4 +50,4 @@ class Study:
     address: str  # public, with the revision, from which a user fetches the data
     licence: str
     citation: str
-    measure: Callable[[Path, Path, bool], Section]
+    measure: Callable[[Path, ReportFolder], Section]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import filled, markdown_table, picture, plain
+from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
 from us_sim.evaluation.timing import steps
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
@@ -142,9 +142,9 @@ def _touched_area(model: TissueModel, nodes: Array, touched: NDArray[np.integer]
     return float((areas * np.isin(surface, touched).sum(axis=1)).sum() / 3.0)
 
 
-def measure_vein(folder: Path, out: Path, quick: bool) -> Section:  # noqa: ARG001
-    """Press the vein shut in each posture, without data, and draw it into ``out``."""
-    count = 20 if quick else 40
+def measure_vein(folder: Path, report: ReportFolder) -> Section:  # noqa: ARG001
+    """Press the vein shut in each posture, without data, and draw it."""
+    count = 20 if report.quick else 40
     cases = {"no blood": _NO_BLOOD, **VENOUS}
     made = {name: press(cases[name], count) for name in steps("vein", list(cases), "postures")}
     rows, findings = [], []
@@ -165,7 +165,7 @@ def measure_vein(folder: Path, out: Path, quick: bool) -> Section:  # noqa: ARG0
                     ("closing pressure, beside the vein", pressures[3]),
                 )
             ]  # fmt: skip
-    file = out / "measured_vein.png"
+    file = report.picture("vein")
     _draw(file, made)
     heads = ["posture", "venous", "published"]
     heads += [f"{100 * a:.0f} %, {of}" for a in _AREAS for of in ("probe", "beside")]

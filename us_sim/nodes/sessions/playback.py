@@ -5,17 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from builtin_interfaces.msg import Time as TimeMessage
+from rclpy.clock import Clock
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock as ClockMessage
 
+from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.nodes.messages import stamp_message
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.settings import (
-    RECORDER,
-    AwaitedSettings,
-    PathPlayerSettings,
-    SessionPlayerSettings,
-)
+from us_sim.nodes.settings import RECORDER, AwaitedSettings, PlayerSettings
 from us_sim.recording.playhead import Playhead
 
 CHECK_S, CHECKS = 0.05, 6
@@ -73,31 +73,68 @@ class Awaited:
 
 
 class Playback:
-    """Does as the parameters ``rate``, ``loop``, ``paused`` and ``time`` of a player say.
+    """Does as a player's parameters and services say.
+
+    The player publishes ``/clock`` where its parameter ``clock`` asks for it, and then goes by the
+    computer's clock itself.
 
     Args:
         node: that plays; the state is told in its diagnostics.
         settings: gives them as they are now.
-        go_to: has the node play on at a time of the recording, ns.
+        first: ns since 1970, when what is played was recorded.
+        length: of the recording, ns.
+        go_to: has the node play on at a time of the recording, ns, from a time of `now` on; without
+            that at once, and then what is there is shown even if it is paused.
+        step: sends the next message before ``until``; False where there is none.
         say: puts into the node's health how far it is.
     """
 
     def __init__(
         self,
         node: GuardedNode,
-        settings: Callable[[], PathPlayerSettings | SessionPlayerSettings],
-        go_to: Callable[[int], None],
+        settings: Callable[[], PlayerSettings],
+        first: int,
+        length: int,
+        go_to: Callable[[int, int | None], None],
+        step: Callable[[], bool],
         say: Callable[[], None],
     ) -> None:
         self._node, self._settings, self._go_to, self._say = node, settings, go_to, say
+        self.first, self.length, self.step = first, length, step
         self.head = Playhead(settings().rate)
-        self.has_begun = False
+        self.has_begun = self.is_stopped = False
+        self.delay = round(1e9 * settings().delay)
+        duration = round(1e9 * settings().playback_duration)
+        self._select(round(1e9 * settings().start_offset), duration, until=-1)
+        if self.start > length:
+            raise BagError(
+                f"{settings().path} ends after {1e-9 * length:g} s, and so before `start_offset`, "
+                f"{settings().start_offset:g} s"
+            )
+        self.clock = Clock() if settings().clock else node.get_clock()
+        if settings().clock:
+            self._clock = node.stream(ClockMessage, "/clock")
+            node.create_timer(1.0 / settings().clock, self.tell_time, clock=self.clock)
         node.add_post_set_parameters_callback(self._seek)
 
     @property
     def now(self) -> int:
-        """ns, of the node's clock."""
-        return int(self._node.get_clock().now().nanoseconds)
+        """ns, of the clock that the player goes by."""
+        return int(self.clock.now().nanoseconds)
+
+    @property
+    def position(self) -> int:
+        """ns from the recording's start, within what is played."""
+        return min(max(self.head.position(self.now), self.start), max(self.start, self.until))
+
+    def tell_time(self) -> TimeMessage:
+        """The present time: of the recording where ``/clock`` is, which is published then."""
+        if not self._settings().clock:
+            return self._node.get_clock().now().to_msg()
+        stamp = stamp_message(self.first + self.position)
+        if self.has_begun:
+            self._clock.publish(ClockMessage(clock=stamp))
+        return stamp
 
     def begin(self) -> None:
         """Parameters are obeyed from now on, and those that are set already."""
@@ -111,16 +148,64 @@ class Playback:
         settings = self._settings()
         self.head.run_at(settings.rate, self.now)
         self.head.hold(settings.paused, self.now)
-        if self._node.health.state != "finished" or settings.loop:
+        if self._node.health.state != "finished" or self.loops:
             self._node.health.state = "paused" if settings.paused else "playing"
         self._report()
+
+    @property
+    def loops(self) -> bool:
+        """Whether it begins again at the end."""
+        return self._settings().loop and not self.is_stopped
+
+    def may_step(self) -> bool:
+        """Whether single messages may be asked for: only while it is paused."""
+        return self.has_begun and self._node.health.state == "paused"
+
+    def play(self, offset: int, duration: int, until: int) -> bool:
+        """Play a part, ns from the start and since 1970; False where something is played already.
+
+        As rosbag2's player, it takes the later of both ends, or the recording's where both are
+        negative; a duration of 0 is no end.
+        """
+        if self._node.health.state != "finished" or offset > self.length:
+            return False
+        self._select(offset, duration, until)
+        self.is_stopped = False
+        self.restart()
+        self._report()
+        return True
+
+    def restart(self, gap: int = 0) -> None:
+        """Play from the start on, after the delay and a gap, ns."""
+        self._node.health.state = "paused" if self._settings().paused else "playing"
+        self._go_to(self.start, self.now + self.delay + gap)
+
+    def finish(self) -> None:
+        """Be at the end."""
+        self._node.health.state = "finished"
+        self._report()
+
+    def stop(self) -> bool:
+        """Play no more until `play` or a seek; False where nothing is played."""
+        if not self.has_begun or self._node.health.state == "finished":
+            return False
+        self.is_stopped = True
+        return True
+
+    def _select(self, start: int, duration: int, until: int) -> None:
+        self.start = start
+        self.until = self.length
+        if duration >= 0 or until >= 0:
+            by_duration = start + duration if duration else -1
+            self.until = max(by_duration, until - self.first)
 
     def _seek(self, parameters: list[Parameter]) -> None:
         """Continue at a time, whenever it is set, even to the same value."""
         times = [round(1e9 * each.value) for each in parameters if each.name == "time"]
         if not self.has_begun or not times:
             return
-        self._go_to(times[-1])
+        self.is_stopped = False
+        self._go_to(times[-1], None)
         self._node.health.state = "paused" if self._settings().paused else "playing"
         self._report()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from us_sim.nodes.settings import LOST, PathPlayerSettings, SessionPlayerSettings
+from us_sim.nodes.sessions.playback import Playback
+from us_sim.nodes.settings import LOST, PlayerSettings
 from us_sim.recording.write_behind import Loss
 
 if TYPE_CHECKING:
@@ -41,18 +43,15 @@ def offer_service(node: Node, service: str, name: str, act: Callable[[Any, Any],
 
 
 def offer_player_services(
-    node: Node,
-    settings: Callable[[], PathPlayerSettings | SessionPlayerSettings],
-    first: int,
-    length: int,
+    node: Node, playback: Playback, settings: Callable[[], PlayerSettings], stop: Callable[[], None]
 ) -> None:
     """Offer them where ``rosbag2_interfaces`` is installed.
 
     Args:
         node: that plays, with the parameters ``rate``, ``paused`` and ``time``.
-        settings: gives them as they are now.
-        first: ns since 1970, when what is played was recorded: `seek` counts as its stamps do.
-        length: ns.
+        playback: what it plays.
+        settings: gives its parameters as they are now.
+        stop: ends playing.
     """
 
     def set_to(name: str, value: object) -> bool:
@@ -60,12 +59,27 @@ def offer_player_services(
         return bool(result.successful)
 
     def seek(request: Any, response: Any) -> None:
-        position = 1_000_000_000 * request.time.sec + request.time.nanosec - first
-        inside = 0 <= position <= length
+        position = _nanoseconds(request.time) - playback.first
+        inside = 0 <= position <= playback.length
         response.success = inside and set_to("time", 1e-9 * position)
 
     def set_rate(request: Any, response: Any) -> None:
         response.success = set_to("rate", request.rate)
+
+    def play(request: Any, response: Any) -> None:
+        response.success = playback.play(
+            _nanoseconds(request.start_offset),
+            _nanoseconds(request.playback_duration),
+            _nanoseconds(request.playback_until_timestamp),
+        )
+
+    def play_next(_: Any, response: Any) -> None:
+        response.success = playback.may_step() and playback.step()
+
+    def burst(request: Any, response: Any) -> None:
+        most = request.num_messages or sys.maxsize  # 0 is all
+        while response.actually_burst < most and playback.may_step() and playback.step():
+            response.actually_burst += 1
 
     offer = partial(offer_service, node)
     offer("Pause", "pause", lambda *_: set_to("paused", True))
@@ -75,6 +89,14 @@ def offer_player_services(
     offer("GetRate", "get_rate", lambda _, answer: setattr(answer, "rate", settings().rate))
     offer("SetRate", "set_rate", set_rate)
     offer("Seek", "seek", seek)
+    offer("Play", "play", play)
+    offer("PlayNext", "play_next", play_next)
+    offer("Burst", "burst", burst)
+    offer("Stop", "stop", lambda *_: stop())
+
+
+def _nanoseconds(time: Any) -> int:
+    return int(1_000_000_000 * time.sec + time.nanosec)
 
 
 def offer_services(recorder: SessionRecorder) -> bool:
@@ -84,9 +106,17 @@ def offer_services(recorder: SessionRecorder) -> bool:
     def toggle(_: Any, __: Any) -> None:
         (recorder.resume if recorder.paused else recorder.pause)()
 
-    def record(request: Any, response: Any) -> None:
-        response.error_string = recorder.record(request.uri)
-        response.return_code = int(bool(response.error_string))
+    def told(response: Any, problem: str) -> None:
+        if hasattr(response, "return_code"):  # newer than Jazzy
+            response.return_code, response.error_string = int(bool(problem)), problem
+
+    def stop(_: Any, response: Any) -> None:
+        told(response, "" if recorder.file else "nothing is recorded")
+        recorder.stop()
+
+    def discover(wanted: bool, _: Any, response: Any) -> None:
+        is_change, recorder.discovers = recorder.discovers != wanted, wanted
+        told(response, "" if is_change else "that is so already")
 
     if not offer("Pause", "pause", lambda *_: recorder.pause()):
         return False
@@ -94,13 +124,32 @@ def offer_services(recorder: SessionRecorder) -> bool:
     offer("TogglePaused", "toggle_paused", toggle)
     offer("IsPaused", "is_paused", lambda _, answer: setattr(answer, "paused", recorder.paused))
     offer("SplitBagfile", "split_bagfile", lambda *_: recorder.split())
-    offer("Stop", "stop", lambda *_: recorder.stop())
-    offer("Record", "record", record)  # newer than Jazzy
+    offer("Stop", "stop", stop)
     offer(
         "Snapshot",
         "snapshot",
         lambda _, answer: setattr(answer, "success", recorder.snapshot()),
     )
+    # Newer than Jazzy:
+    offer("Record", "record", lambda request, answer: told(answer, recorder.record(request.uri)))
+    offer("StartDiscovery", "start_discovery", partial(discover, True))
+    offer("StopDiscovery", "stop_discovery", partial(discover, False))
+    offer(
+        "IsDiscoveryRunning",
+        "is_discovery_running",
+        lambda _, answer: setattr(answer, "running", recorder.discovers),
+    )
+    offer(
+        "GetSubscribedTopics",
+        "get_subscribed_topics",
+        lambda _, answer: setattr(answer, "topics", recorder.topics),
+    )
+    offer(
+        "IsRecording",
+        "is_recording",
+        lambda _, answer: setattr(answer, "recording", bool(recorder.file)),
+    )
+    offer("GetUri", "get_uri", lambda _, answer: setattr(answer, "uri", recorder.file))
     return True
 
 

@@ -22,7 +22,9 @@ from ..graph import Graph, GraphNode
 from ..transport import DdsError, Participant
 from ._arguments import parse_arguments
 from .exceptions import NotInitializedException, RCLError
-from .logging import configure, release
+from .logging import configure, get_logger, release
+
+_logger = get_logger("rclpy")
 
 
 class WakeUp:
@@ -146,6 +148,7 @@ class Context(AbstractContextManager["Context"]):
                 raise RuntimeError(f"Domain id ({domain_id}) should not be lower than zero.")
             if self._initialized:
                 raise RuntimeError("Context.init() must only be called once")
+            _refuse_security()
             self._arguments = parse_arguments(sys.argv if args is None else args)
             self._domain_id = _domain_from_environment() if domain_id is None else domain_id
             try:
@@ -280,6 +283,28 @@ class Context(AbstractContextManager["Context"]):
         with self._lock:
             if not self._postponing:
                 self._graph.announce(self._nodes.values())
+
+
+def _refuse_security() -> None:
+    """Raise RCLError where the environment asks for encryption, which no transport here has.
+
+    With ROS_SECURITY_STRATEGY=Permissive a node of ROS that has no keys speaks in the clear, so
+    nodes here do, too. ROS takes that also where the variable is not set; here it has to be said.
+    """
+    if os.environ.get("ROS_SECURITY_ENABLE") != "true":
+        return
+    if os.environ.get("ROS_SECURITY_STRATEGY") == "Permissive":
+        _logger.warning(
+            "ROS_SECURITY_ENABLE is true, but without ROS 2 there is no DDS security: as "
+            "ROS_SECURITY_STRATEGY is Permissive, everything is sent in the clear",
+            once=True,
+        )
+        return
+    raise RCLError(
+        "failed to initialize rcl: ROS_SECURITY_ENABLE is true, but without ROS 2 there is no DDS "
+        "security; install ROS 2, or unset it, or set ROS_SECURITY_STRATEGY=Permissive, to send "
+        "everything in the clear"
+    )
 
 
 def _domain_from_environment() -> int:

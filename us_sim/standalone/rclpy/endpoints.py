@@ -501,6 +501,7 @@ class Subscription(Receiver):
         return partial(self.callback, message, origin)
 
 
+_logger = get_logger("rclpy")
 _PAUSE = 0.01  # s, between two looks at whether a service is there
 
 
@@ -614,6 +615,12 @@ class Service(Receiver):
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.callback = callback
+        endpoint.on_foreign = lambda: _logger.warning(
+            f"a request for {full_name} is not answered, since its client does not run on Cyclone "
+            f"DDS: set RMW_IMPLEMENTATION=rmw_cyclonedds_cpp there, or rmw_zenoh_cpp on both "
+            f"sides; further requests of this kind are ignored silently",
+            once=True,
+        )
 
     def send_response(self, response: Any, header: Any) -> None:
         """Answer a request, given the header that came with it."""
@@ -629,10 +636,8 @@ class Service(Receiver):
         try:
             request = message_of(data, self.srv_type.Request)
         except RCLError as error:
-            get_logger("rclpy").warning(
-                f"a request for {self._full_name} is not answered: {error}; a client on Fast DDS "
-                f"cannot call a service on Cyclone DDS: set RMW_IMPLEMENTATION=rmw_cyclonedds_cpp "
-                f"there",
+            _logger.warning(
+                f"a request for {self._full_name} is not answered: {error}",
                 throttle_duration_sec=5.0,
             )
             return None

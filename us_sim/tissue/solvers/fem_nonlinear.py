@@ -61,7 +61,8 @@ class FemNonlinearSettings(SolverSettings):
 
     frame_tolerance: float = setting(
         TOLERANCE,
-        "residual, unbalanced over contact forces, at which a frame with a moving probe ends",
+        "residual, unbalanced over contact forces, and estimated error of the displacement over "
+        "its norm, at which a frame with a moving probe ends",
         default=0.003,
     )
     frame_budget: float | None = setting(
@@ -131,7 +132,9 @@ class FemNonlinear(TissueSolver):
     )
     must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
-    most_unbalanced: ClassVar[float] = 0.1  # within 6 % in 95 of 100 frames; at 1 tenfold
+    # Of the residual and of the estimated error: then the displacement of 2,000 and 8,192 nodes is
+    # within 7 % in 95 of 100 frames that ended too early, and within 11 % in all.
+    most_unbalanced: ClassVar[float] = 0.1
 
     Settings = FemNonlinearSettings
     settings: FemNonlinearSettings
@@ -305,8 +308,11 @@ class FemNonlinear(TissueSolver):
         return self._newton.contact_norm or self._greatest_norm
 
     def _exceeds(self, tolerance: float) -> bool:
-        """Whether the residual is greater."""
-        return self._newton.residual_norm > tolerance * self._reference
+        """Whether the residual is greater, or in contact the displacement's estimated error."""
+        newton = self._newton
+        if newton.residual_norm > tolerance * self._reference:
+            return True
+        return newton.contact_norm > 0.0 and newton.displacement_error > tolerance
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
         """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
@@ -415,6 +421,8 @@ class FemNonlinear(TissueSolver):
             residual,
             tuple(actions),
             interventions=interventions,
+            is_balanced=not newton.contact_norm
+            or newton.displacement_error <= self.most_unbalanced,
         )
 
 

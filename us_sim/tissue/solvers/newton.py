@@ -103,6 +103,7 @@ class Newton:
         if self.overstress is not None:
             self.overstress.reset(self.displacement)
         self._damping = 0.0
+        self._conditioner: Preconditioner | None = None  # of the last step
         self.iteration_limit = TUNING.first_iteration_limit  # of the next step
         self._needs_factor = False  # whether a step since has needed more iterations than allowed
         self._assemble()
@@ -121,7 +122,8 @@ class Newton:
         self._carried_norm = self.contact_norm
         self._positions = self.points.placed(self.displacement)
         self.contact.set_pose(pose, self._positions)
-        self._damping = TUNING.damping
+        # Damping by nodes' own blocks would halve the first step of the smoothest modes.
+        self._damping = 0.0
         self.iteration_limit = TUNING.first_iteration_limit
         self._assemble_contact()
 
@@ -182,6 +184,7 @@ class Newton:
         self.residual = self._tissue_forces - self.contact_forces
         clear_nodes(self.residual, self._fixed)
         self.residual_norm = float(np.linalg.norm(self.residual))
+        self._displacement_error: float | None = None
         free = self.contact_forces.copy()
         clear_nodes(free, self._fixed)
         self.contact_norm = float(np.linalg.norm(free))
@@ -241,6 +244,23 @@ class Newton:
     def has_stagnated(self) -> bool:
         """Whether even the shortest steps lead no further."""
         return self._damping >= TUNING.most_damping
+
+    @property
+    def displacement_error(self) -> float:
+        """Estimated distance to balance, over the displacement's norm; infinite before a step.
+
+        It is that by which the last step's preconditioner would move the tissue. Smooth errors need
+        hardly any force, so that the residual says little of them.
+        """
+        if self._displacement_error is None:
+            self._displacement_error = np.inf
+            size = float(np.linalg.norm(self.displacement))
+            if self._conditioner is not None and size > 0.0:
+                change = np.empty(self.residual.shape, self._dtype)
+                scale = self.residual_norm or 1.0
+                self._conditioner.apply((self.residual / scale).astype(self._dtype), change)
+                self._displacement_error = scale * float(np.linalg.norm(change)) / size
+        return self._displacement_error
 
     def _minimise_model(
         self, iterations: int, goal: float, start: NDArray[np.float64] | None
@@ -305,9 +325,11 @@ class Newton:
                 """The springs' forces, added."""
                 add_springs(*springs, change, image)
 
+            lumped = points.lumped(active, directions, stiffness)
+            self._conditioner = self._preconditioner(blocks, *lumped)
             solved = conjugate_gradients(
                 tangent_product,
-                self._preconditioner(blocks, *points.lumped(active, directions, stiffness)),
+                self._conditioner,
                 (residual / norm).astype(self._dtype),
                 min(iterations - self.iterations, interval),
                 tolerance / norm,

@@ -44,6 +44,7 @@ _OPEN = (
     "the sightings do not determine where the image is: turn the probe about all axes, and let "
     "the features appear all over the image"
 )
+_STEP = [3, 4, 5, 0, 1, 2, 6, 7]  # rows of the covariance that a step's parameters have
 _PIXEL_SIZES = (1e-6, 5e-3)  # m, that make sense
 
 
@@ -67,9 +68,15 @@ class ProbeCalibration:
     residuals: NDArray[np.float64]  # (N,) m, of all sightings
     inliers: NDArray[np.bool_]  # (N,)
     covariance: NDArray[np.float64]  # (8, 8) of position, rotation (about the body's axes), spacing
+    edge_deviation: float  # m, standard deviation of the outermost sightings' place, at the worst
     clusters: NDArray[np.intp]  # (N,) of sightings whose errors are taken to be related
     turned: float  # rad, by which the body turned: about the largest angle between two poses
     points: Mapping[str, NDArray[np.float64]]  # (3,) m, where features were found to be
+
+    @property
+    def turn_deviation(self) -> float:
+        """Standard deviation, rad, of the turn about the axis that is determined worst."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.covariance[3:6, 3:6]).max()))
 
     def probe_pose(self, column: float, row: float) -> Pose:
         """The pose of ``probe`` in the body's frame, from the pixel at the face's middle."""
@@ -121,13 +128,15 @@ def calibrate_probe(
     residuals = np.linalg.norm(seen.distances(image), axis=1)
     clusters = cluster_numbers([sighting.feature for sighting in sightings])
     _, of_used = np.unique(clusters[inliers], return_inverse=True)
+    covariance = _covariance(used, image, jacobian, of_used.astype(np.intp))
     return ProbeCalibration(
         image.matrix,
         image.spacing,
         math.sqrt(float((residuals[inliers] ** 2).mean())),
         residuals,
         inliers,
-        _covariance(used, image, jacobian, of_used.astype(np.intp)),
+        covariance,
+        _edge(used, image, covariance[np.ix_(_STEP, _STEP)]),
         clusters,
         _turned(used.rotations),
         dict(zip(unknown, image.points, strict=True)),
@@ -274,7 +283,6 @@ def _fit(seen: _Sightings, start: _Image, **robust: Any) -> tuple[_Image, NDArra
 
 def _gain(seen: _Sightings, image: _Image, jacobian: NDArray[np.float64]) -> float:
     """The image's error at the outermost sightings, for an error of 1 in every sighting."""
-    free = seen.spacing is None
     scale = np.linalg.norm(jacobian, axis=0)
     if not scale.all():
         return math.inf
@@ -282,12 +290,17 @@ def _gain(seen: _Sightings, image: _Image, jacobian: NDArray[np.float64]) -> flo
     values, vectors = np.linalg.eigh((jacobian / scale).T @ (jacobian / scale))
     if values[0] <= _SINGULAR:
         return math.inf
-    spread = ((vectors / values) @ vectors.T) / np.outer(scale, scale)
+    return _edge(seen, image, ((vectors / values) @ vectors.T) / np.outer(scale, scale))
+
+
+def _edge(seen: _Sightings, image: _Image, covariance: NDArray[np.float64]) -> float:
+    """m, deviation of the outermost sightings for the covariance of a step."""
+    free = seen.spacing is None
     lower, upper = seen.pixels.min(axis=0), seen.pixels.max(axis=0)
     worst = 0.0
     for corner in ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)):
         slope = image.slope(lower + np.array(corner) * (upper - lower), free)
-        block = spread[: slope.shape[1], : slope.shape[1]]
+        block = covariance[: slope.shape[1], : slope.shape[1]]
         worst = max(worst, float(np.trace(slope @ block @ slope.T)))
     return math.sqrt(worst)
 

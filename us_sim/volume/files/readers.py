@@ -169,6 +169,8 @@ def _sequence_remedy(path: Path) -> str | None:
         return None
     if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != "1" and sizes[0] != "0"):
         return None  # several volumes in time are no sequence of flat images
+    if "time" not in kinds.lower() and len(sizes) == 3 and not any(map(FRAME_KEY.match, keys)):
+        return None  # Plus also writes volumes with the axes of a sequence, but without frames
     if "0" in sizes:
         return f"a recording of poses without images; play it with `--path {path.name}`"
     if not any(match and match[2].endswith("Transform") for match in map(FRAME_KEY.match, keys)):

@@ -1,0 +1,339 @@
+"""A recording is whole, or broken in one way, which is told in one sentence."""
+
+import struct
+import time
+import zlib
+
+import numpy as np
+import pytest
+from session_files import EPOCH, PERIOD, TYPES, press, write
+
+from us_sim.command.main import main
+from us_sim.recording.reader import read_bag
+from us_sim.recording.repair import repair
+from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.topic import QosProfile
+from us_sim.recording.write_behind import WriteBehind
+from us_sim.recording.writer import BagWriter
+from us_sim.run.session_check import check, report, table
+
+IMAGE = "/ultrasound/image"
+
+
+def findings(file):
+    found = check(read_bag(file))
+    return found, [(each.kind, each.text) for each in found.findings if each.matters]
+
+
+def of(messages, topic):
+    return [message for message in messages if message[0] == topic]
+
+
+def test_a_whole_session_passes_with_its_numbers(tmp_path, capsys):
+    file = write(tmp_path / "s.mcap", press())
+    found, told = findings(file)
+    assert told == []
+    (head, *rows), by_name = table(found), {}
+    for row in rows:
+        by_name[row[0]] = dict(zip(head, row, strict=True))
+    expected = ("120", "60.0", "0.02", "4.00", "4.00", "4.00", "0", "0")
+    assert by_name[IMAGE] == dict(zip(head, (IMAGE, *expected), strict=True))
+    assert main(["bag", "check", str(file)]) == 0
+    assert "nothing is wrong with it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["mcap", "chunkzstd", "zstd", "sqlite3"])
+def test_bags_of_the_real_rosbag2_pass(shared_data, name):
+    found, told = findings(shared_data / f"ros2-jazzy/bags/probe_path_{name}")
+    assert told == []
+    rates = {row[0]: row[2] for row in table(found)}
+    assert abs(float(rates["/tracker/pose"]) - 60) < 0.2
+
+
+def test_the_bags_of_rosbag2s_own_tests_pass(shared_data):
+    files = [*shared_data.glob("mcap-rosbag2/rosbag2_[pt]*/**/metadata.yaml")]
+    assert len(files) > 8
+    for file in files:
+        assert findings(file.parent)[1] == [], file.parent
+
+
+def test_stamps_are_those_that_rosbags_decodes(shared_data):
+    bag = read_bag(shared_data / "ros2-jazzy/bags/probe_path_mcap")
+    seen = set()
+    for message in bag.messages():
+        topic = bag.topic(message.topic)
+        reader = stamp_reader(bag, topic)
+        decoded = bag.deserialize(message)
+        header = getattr(decoded, "header", None) or (
+            decoded.transforms[0].header if topic.name == "/tf" else None
+        )
+        if header is None:
+            assert reader is None
+            continue
+        assert reader(message.data) == header.stamp.sec * 10**9 + header.stamp.nanosec
+        seen.add(topic.type_name)
+    assert len(seen) == 5
+
+
+def test_a_big_endian_stamp_is_read(tmp_path):
+    bag = read_bag(write(tmp_path / "s.mcap", press(1)))
+    reader = stamp_reader(bag, bag.topic("/probe/pose"))
+    assert reader(b"\0\0\0\0" + struct.pack(">iI", 7, 5)) == 7 * 10**9 + 5
+
+
+def broken(tmp_path, change):
+    """A session whose messages were changed, and its one finding."""
+    messages = press()
+    change(messages)
+    file = write(tmp_path / "s.mcap", sorted(messages, key=lambda message: message[2]))
+    assert main(["bag", "check", str(file)]) == 1
+    (finding,) = findings(file)[1]
+    return finding
+
+
+def test_lost_messages_are_proven_by_numbers(tmp_path):
+    def lose(messages):
+        for message in of(messages, "/probe/wrench")[30:37]:
+            messages.remove(message)
+
+    kind, text = broken(tmp_path, lose)
+    assert kind == "loss"
+    assert text.startswith(
+        "7 messages are missing in the numbers of /probe/wrench, the first after 0.485 s"
+    )
+
+
+def test_what_a_full_queue_lost_is_told_with_the_recorders_own_count(tmp_path):
+    messages = press()
+    bag = BagWriter(tmp_path / "s.mcap", sidecar=False)
+    recorder = WriteBehind(bag, 40_000)
+    for topic, kind in TYPES.items():
+        recorder.add_topic(topic, kind)
+    recorder._changed.acquire()  # the thread that writes cannot
+    for topic, data, logged, sent, _ in messages:
+        recorder.put(topic, data, logged, sent)
+    recorder._changed.release()
+    last = (*messages[-1][:2], messages[-1][2] + 1, messages[-1][3])
+    while not recorder.put(*last):
+        time.sleep(0.01)
+    recorder.close()
+    lost = recorder.losses.total
+    assert lost > 100
+    found, told = findings(tmp_path / "s.mcap")
+    assert sum(each.missing or 0 for each in found.topics) <= lost == sum(found.bag.lost().values())
+    ((_, text),) = [each for each in told if f"in the numbers of {IMAGE}" in each[1]]
+    assert f"(the recorder itself counted {found.bag.lost()[IMAGE]})" in text
+
+
+def test_a_repaired_bag_still_proves_its_losses(tmp_path):
+    messages = press()
+    del messages[101]
+    write(tmp_path / "s.mcap", messages)
+    again = repair(tmp_path / "s.mcap", tmp_path / "again").path
+    assert [kind for kind, _ in findings(again)[1]] == ["loss"]
+
+
+def test_a_gap_in_everything_is_told_of_the_poses(tmp_path):
+    messages = press()
+    for message in messages:
+        message[2] += 800_000_000 * (message[4] > 60)
+        message[3] += 800_000_000 * (message[4] > 60)
+        stamp = EPOCH + (message[4] - 1) * PERIOD + 800_000_000 * (message[4] > 60)
+        message[1] = message[1][:4] + struct.pack("<iI", *divmod(stamp, 10**9)) + message[1][12:]
+    file = write(tmp_path / "s.mcap", messages)
+    ((kind, text),) = findings(file)[1]
+    assert kind == "gap"
+    assert text.startswith(
+        "/probe/pose has 1 gap, the longest of 0.817 s at 0.983 s, where 60.0 Hz are usual"
+    )
+
+
+def test_a_node_that_ended_leaves_a_gap_to_the_end(tmp_path):
+    def end(messages):
+        for message in of(messages, IMAGE)[60:]:
+            messages.remove(message)
+
+    kind, text = broken(tmp_path, end)
+    assert kind == "gap"
+    assert text.startswith(f"{IMAGE} has 1 gap, the longest of 0.997 s at 0.986 s, while poses")
+    assert "slice_interpolator" in text
+
+
+def test_a_stamp_of_no_pose_is_told(tmp_path):
+    def restamp(messages):
+        message = of(messages, "/tissue/nodes")[50]
+        stamp = EPOCH + 50 * PERIOD + 1
+        message[1] = message[1][:4] + struct.pack("<iI", *divmod(stamp, 10**9)) + message[1][12:]
+
+    kind, text = broken(tmp_path, restamp)
+    assert kind == "stamp"
+    assert text.startswith("1 message of /tissue/nodes have no pose's stamp on /probe/pose, first")
+
+
+def test_messages_that_were_exchanged_are_told(tmp_path):
+    def exchange(messages):
+        one, other = of(messages, IMAGE)[40:42]
+        one[4], other[4] = other[4], one[4]
+
+    kind, text = broken(tmp_path, exchange)
+    assert kind == "order"
+    assert text.startswith(f"the numbers of {IMAGE} go back 1 time, first at 0.686 s")
+
+
+def test_stamps_that_go_back_are_told(tmp_path):
+    def exchange(messages):
+        one, other = of(messages, IMAGE)[40:42]
+        one[1], other[1] = other[1], one[1]
+
+    messages = press()
+    exchange(messages)
+    told = findings(write(tmp_path / "s.mcap", messages))[1]
+    assert [kind for kind, text in told if "the stamps of" in text and "go back 1" in text] == [
+        "order"
+    ]
+
+
+def test_clocks_apart_are_told(tmp_path):
+    def set_forward(messages):
+        for message in of(messages, IMAGE):
+            message[3] += 50_000_000
+
+    kind, text = broken(tmp_path, set_forward)
+    assert kind == "latency"
+    assert "came up to 49.7 ms before being sent" in text
+
+
+def test_images_of_old_poses_are_told(tmp_path):
+    def delay(messages):
+        for message in of(messages, IMAGE):
+            message[2] += 700_000_000
+            message[3] += 700_000_000
+
+    kind, text = broken(tmp_path, delay)
+    assert kind == "latency"
+    assert text.startswith(f"120 messages of {IMAGE} followed from poses more than 0.5 s old")
+
+
+def test_poses_played_with_old_stamps_tell_no_latency(tmp_path):
+    messages = press()
+    for message in messages:
+        message[2] += 86_400 * 10**9
+        message[3] += 86_400 * 10**9
+    found = check(read_bag(write(tmp_path / "s.mcap", messages)))
+    assert found.is_whole
+    assert "1.00 days older than the recording" in report(found)
+    assert table(found)[1][4] == "-"
+
+
+def test_a_message_too_short_for_its_type_is_told(tmp_path):
+    def cut(messages):
+        of(messages, "/probe/pose")[20][1] = b"\0\1\0\0\1"
+
+    messages = press()
+    cut(messages)
+    told = findings(write(tmp_path / "s.mcap", messages))[1]
+    assert told[0][1].startswith("/probe/pose has 1 message too short for a geometry_msgs/msg/Pose")
+    assert [kind for kind, _ in told[1:]] == ["stamp"] * 3  # of what followed from it
+
+
+def test_a_cut_file_is_told_with_what_to_do(tmp_path):
+    file = write(tmp_path / "s.mcap", press())
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    (index, *_) = findings(file)[1]
+    assert index[0] == "index"
+    assert "was not ended properly" in index[1]
+    assert index[1].endswith(f"`us-sim bag repair {file}` writes all that can be read as a new bag")
+
+
+def test_a_damaged_chunk_is_told(tmp_path):
+    file = write(tmp_path / "s.mcap", press())
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 1
+    file.write_bytes(content)
+    kinds = [kind for kind, _ in findings(file)[1]]
+    assert kinds[0] == "index"
+
+
+def test_an_index_with_wrong_times_is_told(tmp_path):
+    file = write(tmp_path / "s.mcap", press())
+    content = bytearray(file.read_bytes())
+    # The CRC of the summary is left away (0), as the format allows; then a chunk's end is moved.
+    content[-12:-8] = bytes(4)
+    bag = read_bag(file)
+    run = bag._storages[0]._runs[3]
+    times = struct.pack("<QQ", run.start, run.end)
+    at = content.rindex(times)
+    content[at : at + 16] = struct.pack("<QQ", run.start, run.start)
+    file.write_bytes(content)
+    ((kind, text),) = findings(file)[1]
+    assert kind == "index"
+    assert "at other times than its index says" in text
+
+
+def test_a_folder_that_holds_more_than_its_metadata_says(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic, kind in TYPES.items():
+            bag.add_topic(topic, kind)
+        for topic, data, *times, number in press():
+            bag.write(topic, data, *times, number)
+    yaml = tmp_path / "bag" / "metadata.yaml"
+    yaml.write_text(yaml.read_text().replace("message_count: 480", "message_count: 400", 1))
+    ((kind, text),) = findings(tmp_path / "bag")[1]
+    assert kind == "index"
+    assert "holds 480 messages where its metadata.yaml says 400" in text
+
+
+def test_nothing_in_a_file_is_told(tmp_path):
+    ((kind, text),) = findings(write(tmp_path / "s.mcap", []))[1]
+    assert (kind, "holds no message" in text) == ("index", True)
+
+
+def test_one_counter_for_all_topics_proves_no_loss(tmp_path):
+    messages = press()
+    for number, message in enumerate(messages):
+        message[4] = number
+    found, told = findings(write(tmp_path / "s.mcap", messages))
+    assert told == []
+    assert {each.missing for each in found.topics} == {None}
+
+
+def test_numbers_begin_again_with_another_recorder(tmp_path):
+    messages = press()
+    for message in messages:
+        message[4] = message[4] if message[4] <= 60 else message[4] - 60
+    assert findings(write(tmp_path / "s.mcap", messages))[1] == []
+
+
+def test_latched_messages_have_no_age_and_no_rate(tmp_path):
+    latched = QosProfile(durability="transient_local", depth=1)
+    with BagWriter(tmp_path / "s.mcap", sidecar=False) as bag:
+        for topic, kind in TYPES.items():
+            bag.add_topic(topic, kind, [latched])
+        for topic, data, *times, number in press()[::40]:
+            bag.write(topic, data, *(time + 10**10 for time in times), number)
+    found = check(read_bag(tmp_path / "s.mcap"))
+    assert {row[4] for row in table(found)[1:]} == {"-"}
+
+
+def test_no_bag_is_one_sentence(tmp_path, capsys):
+    (tmp_path / "x.mcap").write_bytes(b"none")
+    assert main(["bag", "check", str(tmp_path / "x.mcap")]) == 1
+    assert "is not a bag" in capsys.readouterr().err
+
+
+def test_reading_keeps_up_with_a_disk(tmp_path):
+    """A large file is read in at most five times the time of its checksum alone."""
+    pixels = np.zeros(512 * 512, np.uint8).tobytes()
+    messages = press(300)
+    with BagWriter(tmp_path / "s.mcap", sidecar=False) as bag:
+        for topic, kind in TYPES.items():
+            bag.add_topic(topic, kind)
+        for topic, data, *times, number in messages:
+            bag.write(topic, data + (pixels if topic == IMAGE else b""), *times, number)
+    content = (tmp_path / "s.mcap").read_bytes()
+    began = time.process_time()
+    zlib.crc32(content)
+    alone = time.process_time() - began
+    began = time.process_time()
+    check(read_bag(tmp_path / "s.mcap"))
+    assert time.process_time() - began < 5 * alone + 0.2
