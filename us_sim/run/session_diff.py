@@ -46,8 +46,8 @@ def _pose_apart(one: Any, other: Any) -> Measured:
         for q in (a.orientation, b.orientation)
     )
     # From the chord: the angle's cosine has no digits left where the two are close.
-    chord = min(np.linalg.norm(first - second), np.linalg.norm(first + second))
-    angle = 4.0 * np.arcsin(min(chord / 2.0, 1.0)) if np.isfinite(chord) else np.nan
+    chord = min(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
+    angle = 4.0 * float(np.arcsin(min(chord / 2.0, 1.0))) if np.isfinite(chord) else np.nan
     return 1e3 * float(np.linalg.norm(apart)), float(np.degrees(angle))
 
 
@@ -166,11 +166,12 @@ def diff(one: Bag, other: Bag, progress: Progress = lambda *_: None) -> SessionD
             f"{one.path} and {other.path} have no poses, nodes, wrenches or images on topics of "
             f"the same names: give two sessions of the same simulator"
         )
-    notes, topics, images = [], [], None
-    for bag, mine, yours in ((one, *types), (other, *reversed(types))):
-        for name in sorted(mine):
-            if mine[name] in QUANTITIES and name not in yours:
-                notes.append(f"{name} is in {bag.path} alone")
+    notes: list[str] = []
+    topics: list[Difference] = []
+    images = None
+    for bag, mine, yours in ((one, types[0], types[1]), (other, types[1], types[0])):
+        alone = [name for name in sorted(mine.keys() - yours.keys()) if mine[name] in QUANTITIES]
+        notes += [f"{name} is in {bag.path} alone" for name in alone]
     for k, name in enumerate(names):
         progress(k / (len(names) + 1), name)
         found, worst = _compare(one, other, name, QUANTITIES[types[0][name]])
