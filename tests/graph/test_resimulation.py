@@ -30,6 +30,7 @@ def test_a_session_gives_its_own_bytes_again(first, tmp_path):
     result = us_sim("render", "--session", alone, "--out", tmp_path / "again", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "images may differ" not in result.stderr
+    assert "pairs are equal" in result.stdout
     one, other = payloads(alone), payloads(tmp_path / "again" / "session.mcap")
     assert one.keys() == other.keys()
     for topic in one:
@@ -57,3 +58,10 @@ def test_a_parameter_that_is_given_counts(first, tmp_path):
     one, other = payloads(first / "session.mcap"), payloads(out / "session.mcap")
     assert one["/probe/pose"] == other["/probe/pose"]
     assert one["/tissue/nodes"] != other["/tissue/nodes"]
+    files = first / "session.mcap", out / "session.mcap"
+    result = us_sim("bag", "diff", *files)
+    assert result.returncode == 1, result.stderr
+    rows = {line.split("  ")[0]: line for line in result.stdout.splitlines()}
+    assert "90    90" in rows["/probe/pose"]
+    assert "vein (mm²)" in rows["areas of vessels"]
+    assert us_sim("bag", "diff", files[0], files[0]).returncode == 0
