@@ -78,7 +78,7 @@ def compressed(image: Image, settings: CompressedSettings) -> CompressedImage:
     shape = (image.height, image.width, 3) if is_colour else (image.height, image.width)
     pixels: NDArray[np.uint8] = np.frombuffer(image.data, np.uint8).reshape(shape)
     if is_colour:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        pixels = np.ascontiguousarray(pixels[..., ::-1])
     target = "bgr8" if is_colour else "mono8"
     options: list[Any]
     if settings.format == "png":
