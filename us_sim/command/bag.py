@@ -1,9 +1,12 @@
-"""The command `us-sim bag`: list, extract, repair and convert recordings."""
+"""The command `us-sim bag`: list, check, compare, extract, repair and convert recordings."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+
+from us_sim.errors import UsSimError
 
 
 def bag_options(bag: argparse.ArgumentParser) -> None:
@@ -16,6 +19,13 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
     )
     check.add_argument("file", type=Path, metavar="SESSION")
     check.set_defaults(command=_check)
+    diff = bag_commands.add_parser(
+        "diff", help="how far two recordings of the same poses are apart; status 0 if they are not"
+    )
+    diff.add_argument("one", type=Path, metavar="A")
+    diff.add_argument("other", type=Path, metavar="B")
+    diff.add_argument("--out", type=Path, help="folder for the numbers as CSV, and a picture")
+    diff.set_defaults(command=_diff)
     extract = bag_commands.add_parser(
         "extract", help="write the files attached to a recording, such as its scene"
     )
@@ -55,6 +65,24 @@ def _check(args: argparse.Namespace) -> int:
     found = check(read_bag(args.file), late_progress(f"bag check {args.file.name}"))
     print(report(found))
     return int(not found.is_whole)
+
+
+def _diff(args: argparse.Namespace) -> int:
+    """As diff: 0 if they are equal, 1 if they differ, 2 if they cannot be compared."""
+    from us_sim.progress import end_late_bars, late_progress
+    from us_sim.recording.reader import read_bag
+    from us_sim.run.session_diff import diff, table, write
+
+    try:
+        found = diff(read_bag(args.one), read_bag(args.other), late_progress("bag diff"))
+        print(table(found))
+        for file in write(found, args.out) if args.out is not None else ():
+            print(file)
+    except UsSimError as error:
+        end_late_bars()
+        print(f"us-sim: {error}", file=sys.stderr)
+        return 2
+    return int(not found.is_none)
 
 
 def _extract(args: argparse.Namespace) -> int:

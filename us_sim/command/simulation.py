@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,13 +24,13 @@ from us_sim.command.options import (
     viewed,
     viewer,
 )
-from us_sim.errors import UsSimError
+from us_sim.errors import BagError, UsSimError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.run.plan import Request
+    from us_sim.run.plan import Parameters, Request
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
@@ -165,6 +167,12 @@ def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
 def render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_path_option(render, "bag with the probe path; default: the scene's")
+    render.add_argument(
+        "--session",
+        type=Path,
+        metavar="FILE",
+        help="repeat this recording from itself: its scene, parameters and poses",
+    )
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
     render.add_argument(
         "--truth",
@@ -179,9 +187,42 @@ def _render(args: argparse.Namespace) -> int:
     from us_sim.run.lockstep import render_scene
     from us_sim.scene.reading import load_scene
 
-    scene = load_scene(scene_name(args), volume=args.volume)
     parameters = node_parameters(args.param)
+    if args.session is not None:
+        return _render_session(args, parameters)
+    scene = load_scene(scene_name(args), volume=args.volume)
     return render_scene(scene, args.path, args.out, parameters, topic=args.topic, truth=args.truth)
+
+
+def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
+    from us_sim.progress import late_progress
+    from us_sim.recording.reader import read_bag
+    from us_sim.run.lockstep import render_scene
+    from us_sim.run.resimulation import resimulation
+    from us_sim.run.session_diff import diff, table
+
+    if any(each is not None for each in (args.scene, args.case, args.path, args.topic)):
+        raise UsSimError(
+            f"--session {args.session}: the scene and the path are those of the recording; leave "
+            f"out the scene, --case, --path and --topic"
+        )
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
+        again = resimulation(args.session, Path(folder), args.volume)
+        for note in again.notes:
+            print(note, file=sys.stderr)
+        for node, values in parameters.items():
+            again.parameters.setdefault(node, {}).update(values)
+        render_scene(
+            *(again.scene, again.path, args.out, again.parameters),
+            topic=again.topic,
+            truth=args.truth,
+        )
+    made = args.out / "session.mcap"
+    try:
+        print(table(diff(read_bag(args.session), read_bag(made), late_progress("comparing"))))
+    except BagError as error:  # it is made, and may have nothing to be compared with
+        print(f"it is not compared: {error}")
+    return 0
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:

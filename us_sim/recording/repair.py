@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import sys
@@ -56,6 +57,7 @@ def versions() -> str:
         f"ROS_DISTRO {os.environ.get('ROS_DISTRO') or 'none'}",
         f"RMW_IMPLEMENTATION {os.environ.get('RMW_IMPLEMENTATION') or 'default'}",
         f"byte order {sys.byteorder}",
+        f"us_sim_code {code_checksum()}",
     ]
     packages = {
         str(each.metadata["Name"]): str(each.version)
@@ -63,6 +65,16 @@ def versions() -> str:
         if each.metadata["Name"]
     }
     return "\n".join([*lines, *(f"{n} {v}" for n, v in sorted(packages.items()))]) + "\n"
+
+
+def code_checksum() -> str:
+    """SHA-256 of this package's own source files: its version does not change with each of them."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        digest.update(f"{file.relative_to(root).as_posix()}\0".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

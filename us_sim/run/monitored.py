@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock, Timeout
 
 from us_sim.errors import UsSimError
-from us_sim.run.plan import NodeProcess
+from us_sim.run.plan import NodeProcess, enclave_of
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -100,8 +100,9 @@ def ros_context(number: int | None = None) -> Context:
     from rclpy.signals import SignalHandlerOptions
 
     context, silent = Context(), SignalHandlerOptions.NO
+    enclave = ["--ros-args", "--enclave", enclave_of("session_control")]
     try:
-        rclpy.init(args=[], context=context, domain_id=number, signal_handler_options=silent)
+        rclpy.init(args=enclave, context=context, domain_id=number, signal_handler_options=silent)
     except Exception as error:  # what rcl raises differs between its versions
         raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
     return context

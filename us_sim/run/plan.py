@@ -37,6 +37,11 @@ def module_of(node: str) -> str:
     return "us_sim.viewer.viewer" if node == "viewer" else f"us_sim.nodes.{node}"
 
 
+def enclave_of(node: str) -> str:
+    """Where ROS 2's security finds a node's keys; config/policy.xml says what it may do."""
+    return f"/us_sim/{node}"
+
+
 @dataclass(frozen=True)
 class NodeProcess:
     """One node and its parameters.
@@ -59,8 +64,8 @@ class NodeProcess:
         return [sys.executable, "-P", "-m", module_of(self.node), *self.arguments()]
 
     def arguments(self) -> list[str]:
-        """ROS arguments that set its parameters."""
-        arguments = ["--ros-args"]
+        """ROS arguments: its enclave, and its parameters."""
+        arguments = ["--ros-args", "--enclave", enclave_of(self.node)]
         for name, value in self.all_parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments

@@ -46,7 +46,7 @@ def session_attachments(settings: SessionRecorderSettings) -> dict[str, tuple[st
         if not path.is_file():
             raise BagError(f"{path} cannot be attached: it is no file")
         if is_large:
-            listed[path] = _checksum(path)
+            listed[path] = checksum(path)
         else:
             _attach(attached, path)
     if settings.scene is not None:
@@ -70,26 +70,27 @@ def _attach_scene(
     places = {}
     scene = parse_scene(document, origin=origin, folders=folders)
     for path in sorted(set(_files(scene))):
-        parts = _parts(path)
+        parts = parts_of(path)
         small = sum(part.stat().st_size for part in parts if part.is_file()) <= LARGEST
         whole = small and all(
             part.is_file() and _attach(attached, part, str(part.relative_to(path.parent)))
             for part in parts
         )
         places[path] = path.name if whole else str(path)
-        listed |= {part: _checksum(part) for part in parts}
+        listed |= {part: checksum(part) for part in parts}
     text = yaml.safe_dump(_placed(document, places), sort_keys=False, allow_unicode=True)
     attached["scene.yaml"] = "application/yaml", text.encode()
     return listed
 
 
-def _parts(path: Path) -> list[Path]:
+def parts_of(path: Path) -> list[Path]:
+    """The files of a bag, a case, a series of DICOM or another folder; or the file itself."""
     if not path.is_dir():
         return [path]
     try:
         files, metadata = bag_files(path)
     except (BagError, OSError):
-        return [path]
+        return sorted(file for file in path.rglob("*") if file.is_file())
     return [*files, path / "metadata.yaml"] if metadata else files
 
 
@@ -137,7 +138,12 @@ def _placed(document: Any, places: dict[Path, str]) -> Any:
     return document
 
 
-def _checksum(path: Path) -> str:
+def checksum(path: Path) -> str:
+    """SHA-256 in hexadecimal digits; dashes for what is no file.
+
+    Raises:
+        UsSimError: it cannot be read.
+    """
     if not path.is_file():
         return "-" * 64
     try:

@@ -1,0 +1,146 @@
+"""The command `us-sim param` against a running node; the outputs are those of ros2cli's verbs.
+
+They were compared byte for byte with what ros2param of Jazzy prints for the same node.
+"""
+
+import threading
+
+import pytest
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from us_sim.command.main import main
+
+
+@pytest.fixture(scope="module", autouse=True)
+def node():
+    context = Context()
+    rclpy.init(context=context, args=[])
+    node = Node("sample", namespace="left", context=context)
+    limits = [FloatingPointRange(from_value=1.0, to_value=60.0)]
+    node.declare_parameter(
+        "rate", 30.0, ParameterDescriptor(description="how often, Hz", floating_point_range=limits)
+    )
+    steps = [IntegerRange(from_value=0, to_value=10, step=1)]
+    node.declare_parameter("deep.count", 3, ParameterDescriptor(integer_range=steps))
+    node.declare_parameter("names", ["vein", "artery"])
+    node.declare_parameter("numbers", [1, 2])
+    node.declare_parameter("fixed", "x", ParameterDescriptor(read_only=True))
+    node.declare_parameter("on", True)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    yield node
+    executor.shutdown()
+    thread.join(timeout=5)
+    node.destroy_node()
+    context.try_shutdown()
+
+
+NAMES = "  deep.count\n  fixed\n  names\n  numbers\n  on\n  rate\n  use_sim_time\n"
+DESCRIBED = """\
+Parameter name: rate
+  Type: double
+  Description: how often, Hz
+  Constraints:
+    Min value: 1.0
+    Max value: 60.0
+Parameter name: deep.count
+  Type: integer
+  Constraints:
+    Min value: 0
+    Max value: 10
+    Step: 1
+Parameter name: fixed
+  Type: string
+  Constraints:
+    Read only: true
+"""
+DUMPED = """\
+/left/sample:
+  ros__parameters:
+    deep:
+      count: 3
+    fixed: x
+    names:
+    - vein
+    - artery
+    numbers:
+    - 1
+    - 2
+    'on': true
+    rate: 30.0
+    use_sim_time: false
+
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "printed"),
+    [
+        ("list", f"/left/sample:\n{NAMES}"),
+        ("list left/sample", NAMES),
+        ("get /left/sample rate", "Double value is: 30.0\n"),
+        ("get /left/sample deep.count", "Integer value is: 3\n"),
+        ("get /left/sample names", "String values are: ['vein', 'artery']\n"),
+        ("get /left/sample numbers", "Integer values are: [1, 2]\n"),
+        ("get /left/sample on", "Boolean value is: True\n"),
+        ("describe /left/sample rate deep.count fixed", DESCRIBED),
+        ("dump /left/sample", DUMPED),
+    ],
+)
+def test_parameters_are_shown_as_ros2_param_shows_them(words, printed, capsys) -> None:
+    assert main(["param", *words.split()]) == 0
+    assert capsys.readouterr().out == printed
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [("rate", "12.5", 12.5), ("names", "[a, b]", ["a", "b"]), ("on", "false", False)],
+)
+def test_a_value_is_set_by_its_yaml(node, name, text, value, capsys) -> None:
+    before = node.get_parameter(name)
+    assert main(["param", "set", "/left/sample", name, text]) == 0
+    assert capsys.readouterr().out == "Set parameter successful\n"
+    assert node.get_parameter(name).value == value
+    node.set_parameters([before])
+
+
+def test_a_file_is_loaded_and_each_refusal_told(node, tmp_path, capsys) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text(DUMPED.replace("rate: 30.0", "rate: 99.0").replace("count: 3", "count: 4"))
+    assert main(["param", "load", "/left/sample", str(file)]) == 1
+    told = capsys.readouterr()
+    assert "Set parameter deep.count successful\n" in told.out
+    assert "Set parameter rate failed: Parameter rate out of range" in told.err
+    assert (node.get_parameter("deep.count").value, node.get_parameter("rate").value) == (4, 30.0)
+    file.write_text("/**: {ros__parameters: {deep: {count: 1}}}\nsample: {ros__parameters: {}}\n")
+    assert main(["param", "load", "/left/sample", str(file)]) == 0
+    assert node.get_parameter("deep.count").value == 1
+    file.write_text("{/right: {ros__parameters: {on: true}}}")
+    assert main(["param", "load", "/left/sample", str(file)]) == 1
+    assert "has no `ros__parameters` below `/left/sample`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("get /left/sampel rate", "node not found: '/left/sampel' is not one of /left/sample; did"),
+        ("get /left/sample ratee", "did you mean 'rate'?"),
+        ("describe /left/sample rate oon", "did you mean 'on'?"),
+        ("set /left/sample ratee 1.0", "did you mean 'rate'?"),
+        ("set /left/sample rate 99.0", "Setting parameter failed: Parameter rate out of range"),
+        ("set /left/sample rate fast", "Setting parameter failed: Wrong parameter type"),
+        ("load /left/sample nowhere.yaml", "nowhere.yaml: cannot be read"),
+    ],
+)
+def test_a_mistake_is_one_sentence(words, sentence, capsys) -> None:
+    assert main(["param", *words.split()]) == 1
+    told = capsys.readouterr()
+    assert sentence in told.err
+    assert told.err.count("\n") == 1
+    assert not told.out

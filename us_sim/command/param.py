@@ -1,0 +1,278 @@
+"""The command `us-sim param`: what `ros2 param` does and prints, where ROS 2 is not installed."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from us_sim.command.options import add_network_option
+from us_sim.errors import UsSimError
+from us_sim.settings.spelling import unknown
+from us_sim.settings.text_files import YamlError, load_yaml, read_yaml
+
+DISCOVERY_S = 2.0  # to discover a node
+ALL_S = 1.0  # to discover all of them
+ANSWER_S = 5.0  # for a node to answer
+
+_TYPES = (  # by rcl_interfaces/msg/ParameterType: its name, the field of a value, and its label
+    ("not set", "", "Parameter not set."),
+    ("boolean", "bool_value", "Boolean value is:"),
+    ("integer", "integer_value", "Integer value is:"),
+    ("double", "double_value", "Double value is:"),
+    ("string", "string_value", "String value is:"),
+    ("byte array", "byte_array_value", "Byte values are:"),
+    ("boolean array", "bool_array_value", "Boolean values are:"),
+    ("integer array", "integer_array_value", "Integer values are:"),
+    ("double array", "double_array_value", "Double values are:"),
+    ("string array", "string_array_value", "String values are:"),
+)
+
+
+def param_options(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, command, arguments, text in (
+        ("list", _list, ("node?",), "names of a node's parameters, or of those of all nodes"),
+        ("get", _get, ("node", "name"), "value of a parameter"),
+        ("set", _set, ("node", "name", "value"), "set a parameter; floats need a decimal point"),
+        ("describe", _describe, ("node", "names+"), "type, range and meaning of parameters"),
+        ("dump", _dump, ("node",), "all parameters of a node, as YAML for --params-file"),
+        ("load", _load, ("node", "file"), "set the parameters that such a file has for a node"),
+    ):
+        subparser = commands.add_parser(name, help=text)
+        for argument in arguments:
+            count = argument[-1] if argument[-1] in "?+" else None
+            subparser.add_argument(argument.rstrip("?+"), nargs=count)
+        add_network_option(subparser)
+        subparser.set_defaults(command=partial(_run, command))
+
+
+def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Namespace) -> int:
+    from us_sim.run.processes import keep_on_this_host
+
+    keep_on_this_host(network=args.network)
+    with _asker() as asker:
+        return command(asker, args)
+
+
+def _list(asker: _Asker, args: argparse.Namespace) -> int:
+    if args.node is not None:
+        for name in asker.names(asker.find(args.node)):
+            print(f"  {name}")
+        return 0
+    for node in asker.nodes():
+        try:
+            names = asker.names(node)
+        except UsSimError as error:
+            print(error, file=sys.stderr)
+            continue
+        print("\n".join([f"{node}:", *(f"  {name}" for name in names)]))
+    return 0
+
+
+def _get(asker: _Asker, args: argparse.Namespace) -> int:
+    node = asker.find(args.node)
+    values = asker.ask(node, "get_parameters", [args.name]).values
+    if not values:
+        asker.refuse_unknown(node, [args.name])
+        raise UsSimError(f"{args.name} of {node} is not set")
+    value = _python(values[0])
+    print(_TYPES[values[0].type][2], *([] if value is None else [value]))
+    return 0
+
+
+def _set(asker: _Asker, args: argparse.Namespace) -> int:
+    from rclpy.parameter import Parameter
+
+    try:
+        value = load_yaml(args.value)
+    except YamlError:
+        value = args.value  # a text with a colon, say
+    try:
+        parameter = Parameter(args.name, value=value)
+    except (TypeError, ValueError):  # a mapping, or a list of several types
+        parameter = Parameter(args.name, value=args.value)
+    node = asker.find(args.node)
+    (result,) = asker.ask(node, "set_parameters", [parameter]).results
+    reason = f": {result.reason}" if result.reason else ""
+    if not result.successful:
+        asker.refuse_unknown(node, [args.name])
+        raise UsSimError(f"Setting parameter failed{reason}")
+    print(f"Set parameter successful{reason}")
+    return 0
+
+
+def _describe(asker: _Asker, args: argparse.Namespace) -> int:
+    node = asker.find(args.node)
+    descriptors = asker.ask(node, "describe_parameters", args.names).descriptors
+    if not descriptors:
+        asker.refuse_unknown(node, args.names)
+    for each in descriptors:
+        print("Parameter name:", each.name)
+        print("  Type:", _TYPES[each.type][0])
+        if each.description:
+            print("  Description:", each.description)
+        print("  Constraints:")
+        if each.read_only:
+            print("    Read only: true")
+        for limits in [*each.floating_point_range, *each.integer_range][:1]:
+            print("    Min value:", limits.from_value)
+            print("    Max value:", limits.to_value)
+            if limits.step:
+                print("    Step:", limits.step)
+        if each.additional_constraints:
+            print("    Additional constraints:", each.additional_constraints)
+    return 0
+
+
+def _dump(asker: _Asker, args: argparse.Namespace) -> int:
+    node = asker.find(args.node)
+    names = asker.names(node)
+    values = asker.ask(node, "get_parameters", names).values
+    nested: dict[str, Any] = {}
+    for name, value in zip(names, values, strict=False):
+        *groups, last = name.split(".")
+        inner = nested
+        for group in groups:
+            inner = inner.setdefault(group, {})
+        inner[last] = _python(value)
+    print(yaml.dump({node: {"ros__parameters": nested}}, default_flow_style=False))
+    return 0
+
+
+def _load(asker: _Asker, args: argparse.Namespace) -> int:
+    from rclpy.parameter import Parameter
+
+    node = asker.find(args.node)
+    values = _of_node(Path(args.file), node)
+    parameters = [Parameter(name, value=value) for name, value in values.items()]
+    results = asker.ask(node, "set_parameters", parameters).results
+    for name, result in zip(values, results, strict=True):
+        reason = f": {result.reason}" if result.reason else ""
+        if result.successful:
+            print(f"Set parameter {name} successful{reason}")
+        else:
+            print(f"Set parameter {name} failed{reason}", file=sys.stderr)
+    return int(not all(result.successful for result in results))
+
+
+def _of_node(file: Path, node: str) -> dict[str, Any]:
+    """Values by name that a parameter file has for a node; its own go before those of ``/**``."""
+    content = read_yaml(file, UsSimError)
+    found: dict[str, Any] = {}
+    for key in ("/**", node.rpartition("/")[2], node):
+        part = content.get(key) if isinstance(content, dict) else None
+        if isinstance(part, dict) and isinstance(part.get("ros__parameters"), dict):
+            found |= _flat(part["ros__parameters"])
+    if not found:
+        raise UsSimError(f"{file}: has no `ros__parameters` below `{node}` or `/**`")
+    return found
+
+
+def _flat(nested: dict[Any, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in nested.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _python(value: Any) -> Any:
+    """The content of a rcl_interfaces/msg/ParameterValue; None where it is not set."""
+    field = _TYPES[value.type][1]
+    content: Any = getattr(value, field) if field else None
+    return list(content) if field.endswith("array_value") else content
+
+
+class _Asker:
+    """A hidden node that asks others for their parameters."""
+
+    def __init__(self, node: Any, executor: Any) -> None:
+        self._node, self._executor = node, executor
+
+    def nodes(self) -> list[str]:
+        """The full names of all nodes but hidden ones, sorted."""
+        until = time.monotonic() + ALL_S
+        while time.monotonic() < until:
+            self._executor.spin_once(timeout_sec=0.05)
+        return self._seen()
+
+    def find(self, name: str) -> str:
+        """The full name of a node; raises UsSimError when it is not discovered."""
+        full = name if name.startswith("/") else f"/{name}"
+        until = time.monotonic() + DISCOVERY_S
+        while full not in (seen := self._seen()):
+            if time.monotonic() > until:
+                raise UsSimError(
+                    f"node not found: {unknown(full, seen)}"
+                    if seen
+                    else f"node not found: {full}; there is no node on ROS domain "
+                    f"{self._node.context.get_domain_id()}, as far as can be seen from here"
+                )
+            self._executor.spin_once(timeout_sec=0.05)
+        return full
+
+    def names(self, node: str) -> list[str]:
+        return sorted(self.ask(node, "list_parameters").result.names)
+
+    def ask(self, node: str, request: str, *arguments: Any) -> Any:
+        """The response of a node; raises UsSimError when none comes."""
+        from rclpy.parameter_client import AsyncParameterClient
+
+        client = AsyncParameterClient(self._node, node)
+        if not client.wait_for_services(timeout_sec=ANSWER_S):
+            raise UsSimError(
+                f"{node} offers no parameter services that can be called from here; where it runs "
+                f"on Fast DDS, use ros2 param"
+            )
+        answer = getattr(client, request)(*arguments)
+        self._executor.spin_until_future_complete(answer, timeout_sec=ANSWER_S)
+        if not answer.done():
+            raise UsSimError(f"{node} did not answer within {ANSWER_S:g} s")
+        return answer.result()
+
+    def refuse_unknown(self, node: str, names: list[str]) -> None:
+        """Raise UsSimError when a node has no parameter of one of these names."""
+        known = self.names(node)
+        for name in names:
+            if name not in known:
+                raise UsSimError(f"{node} has no such parameter: {unknown(name, known)}")
+
+    def _seen(self) -> list[str]:
+        nodes = self._node.get_node_names_and_namespaces()
+        return sorted(f"{space.rstrip('/')}/{name}" for name, space in nodes if name[0] != "_")
+
+
+@contextlib.contextmanager
+def _asker() -> Iterator[_Asker]:
+    from us_sim.run.monitored import ros_context
+
+    context = ros_context()
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+
+    node = Node(
+        f"_us_sim_param_{os.getpid()}",
+        context=context,
+        enable_rosout=False,
+        start_parameter_services=False,
+        use_global_arguments=False,
+    )
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        yield _Asker(node, executor)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        context.try_shutdown()

@@ -1,0 +1,183 @@
+"""A session simulated again from its recording alone: its scene, parameters and poses.
+
+What the recording does not hold is checked: files that were too large to be attached by their
+checksums, and the versions of whatever computes. Parameters that were set while it ran are in no
+recording; those of its start are used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from us_sim.errors import BagError
+from us_sim.nodes.sessions.attachments import checksum, parts_of
+from us_sim.recording.path import write_path
+from us_sim.recording.reader import read_bag
+from us_sim.recording.repair import extract, versions
+from us_sim.recording.topic import BagAttachment
+from us_sim.run.plan import Parameters, simulation_nodes
+from us_sim.scene.building import path_of
+from us_sim.scene.reading import load_scene
+from us_sim.scene.scene import Scene
+from us_sim.settings.text_files import YamlError, load_yaml
+
+_OF_THE_RUN = {"scene", "volume", "source"}
+"""Parameters that the run sets by itself."""
+_COMPUTING = (
+    *("us_sim", "us_sim_code", "python", "byte order", "numpy", "scipy", "numba", "llvmlite"),
+    *("opencv-python-headless", "opencv-python", "SimpleITK", "pydicom"),
+)
+"""Entries of `versions.txt` that can change an image."""
+POSES = "poses.mcap"
+
+
+@dataclass(frozen=True)
+class Resimulation:
+    """Everything that `us-sim render` needs to repeat a session."""
+
+    scene: Scene
+    path: Path  # poses of the session alone
+    topic: str  # of them
+    parameters: Parameters
+    notes: list[str]  # sentences on what may make images differ
+
+
+def resimulation(session: Path, folder: Path, volume: Path | None = None) -> Resimulation:
+    """Prepare a session to be simulated again.
+
+    Args:
+        session: its recording.
+        folder: gets the files that are attached and the poses as a bag, and must stay until the
+            simulation has ended; empty.
+        volume: where the scene's volume is now.
+
+    Raises:
+        BagError: the session has no scene or poses, or a file of the scene is missing or another.
+        UsSimError: a file cannot be read or written.
+    """
+    attached = read_bag(session).attachments()
+    if "scene.yaml" not in attached:
+        raise BagError(
+            f"{session} has no scene attached, so it cannot be simulated from itself: name the "
+            f"scene, and play it with `us-sim render SCENE --path {session}`"
+        )
+    scene = scene_within(session, attached, folder / "attached", volume)
+    path = path_of(scene, session)
+    write_path(folder / POSES, path, sidecar=False)
+    parameters = _parameters(session, attached, scene)
+    if path.topic.endswith("/probe/pose"):  # the filter has had its say
+        parameters.setdefault("probe_tracker", {})["filter"] = "none"
+    return Resimulation(
+        replace(scene, path=str(folder / POSES)),
+        folder / POSES,
+        path.topic,
+        parameters,
+        [*_other_versions(session, attached)],
+    )
+
+
+def scene_within(
+    session: Path,
+    attached: Mapping[str, BagAttachment],
+    folder: Path,
+    volume: Path | None = None,
+) -> Scene:
+    """The scene that is attached to a session, of files that are as they were.
+
+    Args:
+        session: its recording.
+        attached: to it, a scene among them.
+        folder: gets the attached files; new or empty.
+        volume: where the scene's volume is now.
+
+    Raises:
+        BagError, UsSimError: as of `resimulation`.
+    """
+    _require_files(session, attached, volume)
+    extract(session, folder)
+    return load_scene(folder / "scene.yaml", volume=volume)
+
+
+def _text(attached: Mapping[str, BagAttachment], name: str) -> str:
+    return attached[name].data.decode("utf-8", "replace") if name in attached else ""
+
+
+def _require_files(
+    session: Path, attached: Mapping[str, BagAttachment], volume: Path | None
+) -> None:
+    """Refuse files of the scene that are neither attached nor as they were."""
+    held = {hashlib.sha256(each.data).hexdigest() for each in attached.values()}
+    lines = [line.partition("  ") for line in _text(attached, "files.txt").splitlines()]
+    recorded = {Path(name): digest for digest, _, name in lines}
+    if volume is not None:
+        now = {checksum(part) for part in parts_of(volume)}
+        if not now <= set(recorded.values()):
+            raise BagError(
+                f"--volume {volume} is not the volume that {session} was recorded with (SHA-256 "
+                f"{_short(now)} is none of those in its files.txt): name that one"
+            )
+        held |= now
+    for path, digest in recorded.items():
+        if digest in held or not digest.strip("-"):
+            continue
+        found = checksum(path)
+        if not found.strip("-"):
+            raise BagError(
+                f"{session} needs {path}, which was too large to be attached and is not there: "
+                f"bring it back, or say with --volume where it is if it is the volume"
+            )
+        if found != digest:
+            raise BagError(
+                f"{path} is not the file that {session} was recorded with (SHA-256 "
+                f"{found[:12]}… where {digest[:12]}… was): bring that one back"
+            )
+
+
+def _short(digests: set[str]) -> str:
+    return ", ".join(f"{digest[:12]}…" for digest in sorted(digests)[:3])
+
+
+def _parameters(session: Path, attached: Mapping[str, BagAttachment], scene: Scene) -> Parameters:
+    """The recorded parameters of the nodes that run again."""
+    try:
+        document = load_yaml(_text(attached, "parameters.yaml")) or {}
+        given: dict[str, Any] = {
+            node: document[node]["ros__parameters"]
+            for node in (process.node for process in simulation_nodes(scene, played=True))
+            if node in document
+        }
+        return {
+            node: {
+                name: json.dumps(value) for name, value in values.items() if name not in _OF_THE_RUN
+            }
+            for node, values in given.items()
+        }
+    except (YamlError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise BagError(
+            f"{session} has a parameters.yaml that holds no parameters of nodes: {error}"
+        ) from None
+
+
+def _other_versions(session: Path, attached: Mapping[str, BagAttachment]) -> Iterator[str]:
+    """A sentence if something that computes is of another version now."""
+
+    def by_name(text: str) -> dict[str, str]:
+        lines = (line.rpartition(" ") for line in text.splitlines())
+        return {name: version for name, _, version in lines}
+
+    then, now = by_name(_text(attached, "versions.txt")), by_name(versions())
+    if not any(name in then for name in _COMPUTING):
+        yield f"{session} does not say with which versions it was made, so images may differ"
+        return
+    other = [
+        f"{name} {then.get(name, 'none')[:12]} (now {now.get(name, 'none')[:12]})"
+        for name in _COMPUTING
+        if then.get(name) != now.get(name)
+    ]
+    if other:
+        yield f"{session} was made with {', '.join(other)}: images may differ"
