@@ -332,7 +332,7 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
 
 @standalone_only
 def test_foreign_types_are_said_once_and_nothing_is_imported_for_them(bench, tmp_path, monkeypatch):
-    from us_sim.standalone.ddsc import EndpointQos
+    from us_sim.standalone.middleware import EndpointQos
     from us_sim.standalone.transport import Participant
 
     package = tmp_path / "innocent"
