@@ -64,6 +64,7 @@ class ProbeTracker(Device):
         self._source = live.values[OWN].source or self.scene.tracker.source.name
         self._tracking = tracking_of(self.scene, _filter(live.values))
         self._state = TrackingState.WAITING
+        self._taken_at = 0  # ns, when the last measurement was taken
         self._last: Measurement | None = None  # that was published
         self._is_contested = False
         self._poses = self.stream(PoseStamped, "probe/pose")
@@ -106,8 +107,12 @@ class ProbeTracker(Device):
                 f"{FARTHEST:g} m: positions are in metres; it is not used",
             )
             return
+        now = self.now()
+        if now < self._taken_at:  # the clock was set back, as when a recording begins again
+            self._tracking.reset()
+        self._taken_at = now
         restarts = self._tracking.restarts.total()
-        probe = self._tracking.take(measurement, self.now())
+        probe = self._tracking.take(measurement, now)
         if self._tracking.restarts.total() > restarts:
             self.get_logger().info(
                 "the tracker's poses start anew, and so does the filter", throttle_duration_sec=5.0

@@ -173,7 +173,8 @@ class SessionRecorder(GuardedNode):
 
     def _discover(self) -> None:
         self._tell_splits()
-        for topic, types in self.get_topic_names_and_types() if self.discovers else ():
+        has_time = bool(self.get_clock().now().nanoseconds)  # simulated time has begun
+        for topic, types in self.get_topic_names_and_types() if self.discovers and has_time else ():
             if not self._is_wanted(topic):
                 continue
             for type_name in types:
