@@ -422,7 +422,7 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
             status.message
             for report in reports
             for status in report.status
-            if status.name == "/session_recorder" and status.level == DiagnosticStatus.WARN
+            if status.name == "/session_recorder" and status.level == DiagnosticStatus.ERROR
         ]
 
     bench.spin_until(lambda: any("No space left on device" in text for text in told()))

@@ -78,7 +78,7 @@ class SessionPlayer(GuardedNode):
             self._say_progress,
         )
         self._playhead = self._playback.head
-        self._start = self.create_timer(START_S, self._begin, clock=self._playback.clock)
+        self._start = self.create_timer(START_S, self._begin)
         offer_player_services(self, self._playback, lambda: self._settings, self._stop)
 
     @property
@@ -110,11 +110,13 @@ class SessionPlayer(GuardedNode):
         return ""
 
     def _begin(self) -> None:
+        if not self._playback.now:
+            return
         self._start.cancel()
         self._playback.restart()
         if sought := round(1e9 * self._settings.time):
             self._go_to(sought)
-        self.create_timer(0.002, self._tick, clock=self._playback.clock)
+        self.create_timer(0.002, self._tick)
         self._playback.begin()
 
     def _tick(self) -> None:

@@ -67,12 +67,40 @@ class AnnotatedImageSettings(Settings):
     )
 
 
+@dataclass(frozen=True)
+class CompressedSettings(Settings):
+    """How image_transport's plugin ``compressed`` encodes a topic; names and defaults are its."""
+
+    live = True
+
+    format: str = setting(
+        description="JPEG, which is small, or PNG, which loses nothing",
+        choices=("jpeg", "png"),
+        default="jpeg",
+    )
+    jpeg_quality: int = setting(
+        Quantity("number", 1, 100), "of JPEG: higher is better and larger", default=95
+    )
+    png_level: int = setting(
+        Quantity("number", 0, 9), "of PNG: higher is smaller and slower", default=3
+    )
+
+
+COMPRESSED = {
+    topic: f"{topic.replace('/', '.')}.compressed."
+    for topic in ("ultrasound/image", "ultrasound/image_annotated")
+}
+"""Topics that have such a companion, each with the prefix of its parameters."""
+
+
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
     """Settings of a scene that are parameters, too, each with the prefix of their names."""
     yield "", type(probe_of(scene))
     yield "acoustics.", SoundSettings
     for label in scene.imaging.acoustics.tissues:
         yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
+    for prefix in COMPRESSED.values():
+        yield prefix, CompressedSettings
     yield "m_mode.", type(scene.m_mode)
     if scene.tissue is not None:
         yield "strain.", type(scene.strain)

@@ -76,7 +76,7 @@ class Playback:
     """Does as a player's parameters and services say.
 
     The player publishes ``/clock`` where its parameter ``clock`` asks for it, and then goes by the
-    computer's clock itself.
+    computer's clock itself; else by its node's, also where that is set back.
 
     Args:
         node: that plays; the state is told in its diagnostics.
@@ -103,6 +103,7 @@ class Playback:
         self.first, self.length, self.step = first, length, step
         self.head = Playhead(settings().rate)
         self.has_begun = self.is_stopped = False
+        self._latest = 0  # ns, of `now`
         self.delay = round(1e9 * settings().delay)
         duration = round(1e9 * settings().playback_duration)
         self._select(round(1e9 * settings().start_offset), duration, until=-1)
@@ -114,13 +115,17 @@ class Playback:
         self.clock = Clock() if settings().clock else node.get_clock()
         if settings().clock:
             self._clock = node.stream(ClockMessage, "/clock")
-            node.create_timer(1.0 / settings().clock, self.tell_time, clock=self.clock)
+            node.create_timer(1.0 / settings().clock, self.tell_time)
         node.add_post_set_parameters_callback(self._seek)
 
     @property
     def now(self) -> int:
-        """ns, of the clock that the player goes by."""
-        return int(self.clock.now().nanoseconds)
+        """ns, of the clock that the player goes by; 0 where simulated time has not begun."""
+        now = int(self.clock.now().nanoseconds)
+        if now < self._latest:
+            self.head.go_to(self.head.position(self._latest), now)
+        self._latest = now
+        return now
 
     @property
     def position(self) -> int:
