@@ -81,8 +81,11 @@ def main(args: Sequence[str] | None = None) -> int:
     before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
     said, sys.stderr = sys.stderr, cast(TextIO, _Lasting(sys.stderr))
     try:
-        parsed = _parser().parse_args(args)
-        return int(parsed.command(parsed) or 0)
+        from us_sim.run.ros_arguments import keeping_ros_arguments
+
+        with keeping_ros_arguments(sys.argv[1:] if args is None else args) as own:
+            parsed = _parser().parse_args(own)
+            return int(parsed.command(parsed) or 0)
     except UsSimError as error:
         _say(str(error))
         return 1
@@ -139,7 +142,9 @@ def _parser() -> ChosenParser:
     from us_sim.command.options import ChosenParser
 
     parser = ChosenParser(
-        prog="us-sim", description="Interactive simulation of compression ultrasonography."
+        prog="us-sim",
+        description="Interactive simulation of compression ultrasonography.",
+        epilog="What follows --ros-args is for all nodes, as of `ros2 run`: -r __ns:=/left.",
     )
     parser.add_argument("--version", action="version", version=f"us-sim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
