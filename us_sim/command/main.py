@@ -142,9 +142,7 @@ def _parser() -> ChosenParser:
     from us_sim.command.options import ChosenParser
 
     parser = ChosenParser(
-        prog="us-sim",
-        description="Interactive simulation of compression ultrasonography.",
-        epilog="What follows --ros-args is for all nodes, as of `ros2 run`: -r __ns:=/left.",
+        prog="us-sim", description="Interactive simulation of compression ultrasonography."
     )
     parser.add_argument("--version", action="version", version=f"us-sim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
