@@ -314,6 +314,9 @@ ANOTHER_CLOCK_S = 10.0
 class Health:
     """Counts of a node's work, published on ``diagnostics`` at 1 Hz.
 
+    Its level is ERROR while a fault keeps the node from its work and after an exception that nobody
+    expected, WARN while something is wrong and after bad input, and else OK.
+
     Latency is the age of what goes out by its stamp. It counts from the arrival of what a message
     was made from under simulated time, which goes in steps, and where stamps are of another clock,
     as those of a recording are; the latter is said once.
@@ -332,6 +335,7 @@ class Health:
         self._next: dict[str, tuple[float, float]] = {}  # s, when to say it again, and then when
         self._last_problem = self._last_kind = ""
         self.warning = ""  # what is wrong for as long as it is
+        self.fault = ""  # likewise, where it keeps the node from its work
         self._failures_told = 0
         self._clock_differs = False
         self._last_total = 0
@@ -412,9 +416,10 @@ class Health:
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])
             values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
-        wrong = self._last_problem or self.warning
+        wrong = self.fault or self._last_problem or self.warning
+        level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK,
+            level=DiagnosticStatus.ERROR if self.fault else level,
             name=self._node.get_fully_qualified_name(),
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],

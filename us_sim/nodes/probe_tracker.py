@@ -162,17 +162,17 @@ class ProbeTracker(Device):
         state = self._tracking.state(self.now())
         if state is self._state:
             return
-        lost = "the probe is lost" if state is TrackingState.LOST else ""
-        if lost and (why := poses_ended(self)):
-            lost = why
+        self.health.warning = self.health.fault = ""
+        if state is TrackingState.LOST and (why := poses_ended(self)):
+            self.health.warning = why
             self.get_logger().info(f"{why}: the probe stays where it is")
-        elif lost:
+        elif state is TrackingState.LOST:
+            self.health.fault = "the probe is lost"
             self.get_logger().warning("the probe is lost: no pose of it can be used any more")
         elif state is TrackingState.TRACKED and self._state is not TrackingState.COASTING:
             self.get_logger().info("the probe is tracked")
         self._state = state
         self.health.state = "waiting for poses" if state is TrackingState.WAITING else state.value
-        self.health.warning = lost
         self._say_status()
 
     def _say_status(self) -> None:

@@ -236,10 +236,9 @@ class SessionRecorder(GuardedNode):
             new = topic.follow(self._offered(topic.name, self._types[topic.name]))
             if new and self._bag is not None:
                 self._bag.add_topic(topic.name, self._types[topic.name], new)
-        if self._bag is None:
-            return
-        self.health.warning = self._bag.problem
-        self._tell_losses(self._bag)
+        self.health.fault = "" if self._bag is None else self._bag.problem
+        if self._bag is not None:
+            self._tell_losses(self._bag)
 
     def _tell_losses(self, bag: WriteBehind) -> None:
         lost = bag.losses.by_topic()

@@ -132,6 +132,7 @@ class SampleInfo(NamedTuple):
     source_timestamp: int  # ns since 1970, when it was written, by the writer's clock
     received_timestamp: int  # ns since 1970, when it was taken here
     publication_handle: int  # this process's number for the writer; 0 where it has none
+    sequence: int | None = None  # the sample's number among its writer's, where it is told
 
 
 class RequestHeader(NamedTuple):

@@ -46,6 +46,9 @@ from .zenoh_names import (
 )
 
 _HEARTBEAT = 0.5  # s, of latched publishers, so that a sample that was lost is noticed
+_SETTLING = 0.1  # s; tokens come by the router, sooner than the link to their session is up
+_PAUSE = 0.01  # s, between two tries
+_LONGEST_TRY = 10.0  # s, to reach a service that is said to be there
 
 
 class Zenoh:
@@ -60,6 +63,7 @@ class Zenoh:
         self._lock = threading.RLock()
         self._closed = False
         self._alive: dict[str, Entity] = {}  # by token
+        self._since: dict[str, float] = {}  # when tokens of others came
         self._announced: dict[int, GraphNode] = {}
         self._node_tokens: dict[int, Any] = {}
         self._open: weakref.WeakSet[_Endpoint] = weakref.WeakSet()
@@ -131,11 +135,18 @@ class Zenoh:
             self._alive.pop(entity.token, None)
 
     def count(self, role: str, like: Entity) -> int:
-        """The number of entities in a role for the same topic or service, with the same type."""
+        """The number of entities in a role for the same topic or service, with the same type.
+
+        Those that are too new to be reached are left out.
+        """
+        settled = time.monotonic() - _SETTLING
         with self._lock:
             return sum(
-                each.kind == role and each.name == like.name and each.type_name == like.type_name
-                for each in self._alive.values()
+                each.kind == role
+                and each.name == like.name
+                and each.type_name == like.type_name
+                and self._since.get(token, settled) <= settled
+                for token, each in self._alive.items()
             )
 
     def nodes(self) -> list[GraphNode]:
@@ -190,8 +201,10 @@ class Zenoh:
                 return
             if sample.kind == zenoh.SampleKind.PUT:
                 self._alive[token] = entity
+                self._since.setdefault(token, time.monotonic())
             else:
                 self._alive.pop(token, None)
+                self._since.pop(token, None)
 
 
 _contexts: weakref.WeakSet[Zenoh] = weakref.WeakSet()
@@ -317,7 +330,7 @@ class _Receiver(_Endpoint):
         if self.closed or not origin or received.payload is None:
             return None
         sequence, sent, gid = origin
-        info = SampleInfo(sent, time.time_ns(), 0)
+        info = SampleInfo(sent, time.time_ns(), 0, sequence)
         is_sample = isinstance(self, Reader)
         self._waiting.append(
             (received.payload.to_bytes(), info if is_sample else RequestHeader(gid, sequence, info))
@@ -408,11 +421,26 @@ class ServiceClient(_Receiver):
         with self._sending:
             self._sequence += 1
             sequence = self._sequence
-        self._declared.get(
-            self._replied, payload=data, attachment=self._attachment(sequence, self._gid)
-        )
+        self._ask(data, self._attachment(sequence, self._gid), time.monotonic() + _LONGEST_TRY)
         return sequence
 
-    def _replied(self, reply: Any) -> None:
-        if reply.ok is not None and self._keep(reply.ok) is not None:
-            self._notify()
+    def _ask(self, data: bytes, origin: bytes, deadline: float) -> None:
+        """Send a request; once more if it was not sent on to a service that is there."""
+        started, answered = time.monotonic(), False
+
+        def reply(received: Any) -> None:
+            nonlocal answered
+            answered = True
+            if received.ok is not None and self._keep(received.ok) is not None:
+                self._notify()
+
+        def ended() -> None:
+            now = time.monotonic()
+            was_refused = not answered and now - started < _SETTLING
+            if was_refused and now < deadline and self.service_is_ready():
+                time.sleep(_PAUSE)
+                self._ask(data, origin, deadline)
+
+        if not self.closed:
+            handler = zenoh.handlers.Callback(reply, ended)
+            self._declared.get(handler, payload=data, attachment=origin)

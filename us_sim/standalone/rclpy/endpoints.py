@@ -493,7 +493,7 @@ class Subscription(Receiver):
         origin = {
             "source_timestamp": info.source_timestamp,
             "received_timestamp": info.received_timestamp,
-            "publication_sequence_number": None,
+            "publication_sequence_number": info.sequence,
             "reception_sequence_number": None,
         }
         return partial(self.callback, message, origin)
