@@ -1,5 +1,7 @@
 """A session simulated again from its recording alone: the same bytes."""
 
+from csv import DictReader
+
 import pytest
 from command import us_sim
 
@@ -37,6 +39,19 @@ def test_a_session_gives_its_own_bytes_again(first, tmp_path):
         assert one[topic] == other[topic], topic
     for image in (first / "images").iterdir():
         assert image.read_bytes() == (tmp_path / "again" / "images" / image.name).read_bytes()
+
+
+def test_areas_are_those_at_rest_before_the_probe_presses(first, tmp_path):
+    result = us_sim("bag", "extract", first / "session.mcap", "--areas", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    with (tmp_path / "areas.csv").open(encoding="utf-8") as stream:
+        rows = [
+            {name: float(value or "nan") for name, value in r.items()} for r in DictReader(stream)
+        ]
+    assert rows[0]["vein_mm2"] == rows[0]["vein_at_rest_mm2"] > 5.0
+    deepest = max(rows, key=lambda row: row["depth_mm"])
+    assert deepest["depth_mm"] == pytest.approx(7.0, abs=0.1)
+    assert deepest["vein_mm2"] < 0.8 * deepest["vein_at_rest_mm2"]
 
 
 def test_a_live_session_gives_an_image_for_every_pose_that_came(demo, tmp_path):
