@@ -289,6 +289,31 @@ def test_losses_are_told(bench, quiet, monkeypatch):
     assert 0 < len(texts(file)) < 10
 
 
+@newer_than_jazzy
+def test_losses_are_recorded_under_the_name_that_rosbag2_uses(bench, quiet, monkeypatch):
+    may_write = threading.Event()
+    write = BagWriter.write
+    monkeypatch.setattr(
+        BagWriter, "write", lambda *arguments: (may_write.wait(30), write(*arguments))
+    )
+    lost = "/events/rosbag2_messages_lost"
+    recorder, note, _, file = quiet(max_cache_size=1000, also=[lost])
+    bench.spin_until(lambda: bench.peer.count_subscribers(lost) > 0)
+    try:
+        say(bench, recorder, note, *("x" * 93 for _ in range(30)))
+        received = recorder.health.received
+    finally:
+        may_write.set()
+    bench.spin_until(lambda: recorder.health.received > received)  # which is an event
+    end(bench, recorder)
+    bag, told = read_bag(file), 0
+    for message in bag.messages([lost]):
+        for each in bag.deserialize(message).messages_lost_statistics:
+            assert each.topic_name == "/note"
+            told += each.messages_lost_in_recorder
+    assert 0 < told <= bag.lost()["/note"]
+
+
 @over_dds
 def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_path):
     file = tmp_path / "session.mcap"

@@ -119,8 +119,8 @@ _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
 LOST = "events/rosbag2_messages_lost"
-NOT_THE_SESSION = ("/rosout", "/parameter_events", LOST)
-"""Topics that are not recorded; losses are in the recording's metadata."""
+NOT_THE_SESSION = ("/rosout", "/parameter_events")
+"""Topics that are not recorded."""
 SHARED = ("/tf", "/tf_static")
 """Topics that a recorder takes outside its namespace, too: frames may be common to all."""
 OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.from_drivers)

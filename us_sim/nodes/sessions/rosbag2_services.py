@@ -182,7 +182,12 @@ class RecorderEvents:
             self._split.publish(event)
 
     def lost(self, losses: Mapping[str, Loss]) -> None:
-        """Messages were lost since this was said last."""
+        """Messages were lost since this was said last.
+
+        Events that were lost themselves make no further event: it may be lost, too.
+        """
+        own = self._node.resolve_topic_name(LOST)
+        losses = {topic: loss for topic, loss in losses.items() if topic != own}
         if self._lost is None or not losses:
             return
         event = self._msg.MessagesLostEvent(node_name=self._node.get_fully_qualified_name())
