@@ -212,7 +212,16 @@ def measure_nwires(folder: Path, report: ReportFolder) -> Section:
             ("corner of the image, from that of Plus", farthest, float("nan")),
         ):
             findings.append(
-                Finding("nwires", name, quantity, "mm", error=error, floor=best, fitted_on=fit)
+                Finding(
+                    "nwires",
+                    name,
+                    quantity,
+                    "mm",
+                    error=error,
+                    floor=best,
+                    fitted_on=fit,
+                    headline=quantity.startswith("3-D"),
+                )
             )
     volume = _volume(folder)
     findings += [
