@@ -20,7 +20,7 @@ from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.stuck_cylinder import StuckCylinder
 from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
-from us_sim.evaluation.timing import medians_in_turn
+from us_sim.evaluation.timing import medians_in_turn, steps
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.model import TissueModel
@@ -160,7 +160,7 @@ def sticking(counts: tuple[int, int], stiffenings: Sequence[float]) -> Platens:
     """Platens to which the cylinder sticks, of so many cells across and along it."""
     curves = {}
     coarse = np.array([0.01, 0.03, *np.arange(0.05, 0.66, 0.05), COMPRESSIONS[-1]])
-    for stiffening in stiffenings:
+    for stiffening in steps("silicone", stiffenings, "cylinders"):
         forces = StuckCylinder(RADIUS, HEIGHT, counts, stiffening).press(coarse.tolist())
         ratio = np.interp(COMPRESSIONS, coarse, forces / slipping_force(coarse, stiffening))
         curves[stiffening] = ratio * slipping_force(COMPRESSIONS, stiffening)
