@@ -363,7 +363,9 @@ def measure_hydrogel(folder: Path, report: ReportFolder) -> Section:
             measured=_length(o.beads.displacement[chosen & o.judged]) / _MICRON,
             error=o.part(chosen, method) / _MICRON,
             floor=o.part_floor(chosen) / _MICRON,
-            fitted_on="" if method in ("harmonic", "springs") else "beads inside, other side of the axis",
+            fitted_on=""
+            if method in ("harmonic", "springs")
+            else "beads inside, other side of the axis",
             ms=meshes[1].ms if o is outcomes[-1] and method == _BEST else float("nan"),
             headline=o is outcomes[-1] and part == "all",
         )
