@@ -78,11 +78,10 @@ class ProbeTracker(Device):
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
         device = self.scene.tracker.frame
-        static = self.latched(TFMessage, "tf_static")
         if self._source != "tf" and device != PATIENT:
             place, _ = tracker_poses_of(self.scene)
             placed = transform_message(place, TimeMessage(), PATIENT, device)
-            static.publish(TFMessage(transforms=[placed]))
+            self.latched(TFMessage, "tf_static").publish(TFMessage(transforms=[placed]))
         self._status = self.latched(DiagnosticStatus, "probe/status")
         self.latched(MarkerArray, "probe/marker").publish(self._transducer())
         self._input: TrackerInput = TRACKERS.load(self._source)(
