@@ -19,7 +19,7 @@ from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
 from us_sim.run.monitored import Monitored, alone_on_domain
-from us_sim.run.plan import RECORDER, Request, plan_of
+from us_sim.run.plan import RECORDER, Request, enclave_of, plan_of
 from us_sim.run.processes import HUNG_STOP_S, INTERRUPTED, ending
 from us_sim.run.supervision import going_on
 from us_sim.run.watch import Restarts, SupervisionSettings, Watch
@@ -97,6 +97,7 @@ class Supervised:
             executable=process.node,
             name=process.node,
             parameters=[process.all_parameters],
+            ros_arguments=["--enclave", enclave_of(process.node)],
             output="screen",
             on_exit=partial(self.ended, process.node),
             **({} if process.node == RECORDER else COMPILES),

@@ -127,13 +127,15 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_corner() -> None:
-    """Keep the tests' DDS on this host and out of other simulations' domain."""
+    """Keep the tests on this host and out of other simulations' domain and zenoh router."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     worker = os.environ.get(_WORKER, "")
     own = 1 + (os.getppid() if worker else os.getpid()) % 100
     # The workers must not hear each other: the second one is on the next domain.
     domain = int(os.environ.get("ROS_DOMAIN_ID") or own) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(domain)
+    router = f'connect/endpoints=["tcp/127.0.0.1:{17_500 + domain}"]'
+    os.environ.setdefault("ZENOH_CONFIG_OVERRIDE", router)
 
 
 @pytest.fixture(scope="session")

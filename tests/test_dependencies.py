@@ -8,6 +8,7 @@ import re
 import runpy
 import shlex
 import sys
+import tomllib
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -129,6 +130,25 @@ def test_a_workspace_of_ros_has_all_that_it_asks_for(set_up):
     apt = {name.removeprefix("python3-") for name in names if name.startswith("python3-")}
     assert workspace <= pip | {APT.get(name, name) for name in apt}
     assert "opencv-python-headless" in pip  # apt's is too old for markers
+
+
+def test_so_has_an_environment_of_robostack(set_up):
+    asked = dict(map(split, set_up("install")["install_requires"]))
+    pixi = tomllib.loads((ROOT / "pixi.toml").read_text(encoding="utf-8"))
+    found = pixi["dependencies"] | pixi["pypi-dependencies"]
+    found["opencv-python-headless"] = found.pop("opencv")
+    found["matplotlib"] = found.pop("matplotlib-base")
+    assert {name: found[name].partition(",")[0] for name in asked} == asked
+    for each in ElementTree.parse(ROOT / "package.xml").iter("exec_depend"):
+        of_base = not each.text.startswith(("rosbag2_", "tf2_", "visualization_"))
+        name = f"ros-jazzy-{each.text.replace('_', '-')}"
+        assert each.text.startswith("python3-") or of_base or name in found
+
+
+def split(requirement):
+    """The name of pip in a requirement, and its version."""
+    name = plain(requirement)
+    return name, requirement[len(name) :]
 
 
 def test_an_opencv_that_finds_no_markers_is_refused(monkeypatch):

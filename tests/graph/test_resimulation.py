@@ -1,5 +1,7 @@
 """A session simulated again from its recording alone: the same bytes."""
 
+from csv import DictReader
+
 import pytest
 from command import us_sim
 
@@ -30,12 +32,26 @@ def test_a_session_gives_its_own_bytes_again(first, tmp_path):
     result = us_sim("render", "--session", alone, "--out", tmp_path / "again", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "images may differ" not in result.stderr
+    assert "pairs are equal" in result.stdout
     one, other = payloads(alone), payloads(tmp_path / "again" / "session.mcap")
     assert one.keys() == other.keys()
     for topic in one:
         assert one[topic] == other[topic], topic
     for image in (first / "images").iterdir():
         assert image.read_bytes() == (tmp_path / "again" / "images" / image.name).read_bytes()
+
+
+def test_areas_are_those_at_rest_before_the_probe_presses(first, tmp_path):
+    result = us_sim("bag", "extract", first / "session.mcap", "--areas", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    with (tmp_path / "areas.csv").open(encoding="utf-8") as stream:
+        rows = [
+            {name: float(value or "nan") for name, value in r.items()} for r in DictReader(stream)
+        ]
+    assert rows[0]["vein_mm2"] == rows[0]["vein_at_rest_mm2"] > 5.0
+    deepest = max(rows, key=lambda row: row["depth_mm"])
+    assert deepest["depth_mm"] == pytest.approx(7.0, abs=0.1)
+    assert deepest["vein_mm2"] < 0.8 * deepest["vein_at_rest_mm2"]
 
 
 def test_a_live_session_gives_an_image_for_every_pose_that_came(demo, tmp_path):
@@ -57,3 +73,10 @@ def test_a_parameter_that_is_given_counts(first, tmp_path):
     one, other = payloads(first / "session.mcap"), payloads(out / "session.mcap")
     assert one["/probe/pose"] == other["/probe/pose"]
     assert one["/tissue/nodes"] != other["/tissue/nodes"]
+    files = first / "session.mcap", out / "session.mcap"
+    result = us_sim("bag", "diff", *files)
+    assert result.returncode == 1, result.stderr
+    rows = {line.split("  ")[0]: line for line in result.stdout.splitlines()}
+    assert "90    90" in rows["/probe/pose"]
+    assert "vein (mm²)" in rows["areas of vessels"]
+    assert us_sim("bag", "diff", files[0], files[0]).returncode == 0

@@ -352,3 +352,25 @@ def test_every_node_is_guarded():
     folder = Path(guarded_node.__file__).parent
     bare = [file.stem for file in folder.glob("*.py") if "(Node):" in file.read_text("utf-8")]
     assert bare == ["guarded_node"]
+
+
+def test_the_level_of_a_report_says_whether_the_node_does_its_work(bench, broken):
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+
+    def report():
+        count = len(reports)
+        broken.health.report()
+        bench.spin_until(lambda: len(reports) > count)
+        return reports[-1].status[0].level, reports[-1].status[0].message
+
+    bench.spin_until(lambda: reports)
+    broken.health.state = "working"
+    assert report() == (DiagnosticStatus.OK, "working")
+    broken.health.problem("pose", "a pose was no pose")
+    assert report() == (DiagnosticStatus.WARN, "a pose was no pose")
+    assert report() == (DiagnosticStatus.OK, "working")
+    broken.health.warning = "the newest pose is old"
+    broken.health.fault = "there is no device"
+    assert report() == (DiagnosticStatus.ERROR, "there is no device")
+    broken.health.fault = ""
+    assert report() == (DiagnosticStatus.WARN, "the newest pose is old")

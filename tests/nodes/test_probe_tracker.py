@@ -176,7 +176,7 @@ def test_closing_the_last_page_is_no_fault_of_a_tracker(bench, small_scene):
     now = tracker.get_clock().now().to_msg()
     hand.publish(pose_at(0.001, now.sec))
     bench.spin_until(lambda: tracker.health.state == "lost")
-    assert tracker.health.warning == "the probe is lost"  # it publishes, but nothing comes
+    assert tracker.health.fault == "the probe is lost"  # it publishes, but nothing comes
     hand.publish(pose_at(0.001, now.sec + 1))
     bench.spin_until(lambda: tracker.health.state == "tracked")
     viewer.destroy_publisher(hand)

@@ -125,6 +125,7 @@ def test_a_device_that_is_pulled_out_is_waited_for(bench, device):
         problems = node.health.problems("device")
         bench.spin_until(lambda before=problems: node.health.problems("device") > before + 1)
     assert node.health.state == "no device"
+    assert "plug it in" in node.health.fault
 
 
 def test_sentences_say_what_to_do(device, monkeypatch):

@@ -74,6 +74,7 @@ def test_where_there_is_none_one_sentence_says_so(tmp_path, monkeypatch):
 
 def test_the_type_that_a_sample_points_to_is_the_type_of_the_writer(real, monkeypatch):  # noqa: ARG001
     from us_sim.standalone import ddsc
+    from us_sim.standalone.middleware import EndpointQos
     from us_sim.standalone.transport import DiscoveryRange, Participant
 
     if not hasattr(ddsc.lib, "dds_get_entity_sertype"):
@@ -81,7 +82,7 @@ def test_the_type_that_a_sample_points_to_is_the_type_of_the_writer(real, monkey
     name = "std_msgs::msg::dds_::String_"
     told = ddsc.serialized_type
     with Participant(77, reach=DiscoveryRange("OFF")) as participant:
-        writer = participant.create_writer("rt/typed", name, ddsc.EndpointQos())
+        writer = participant.create_writer("rt/typed", name, EndpointQos())
         wanted = told(writer._handle, participant.handle, name).value
         older = OlderLibrary(ddsc.lib)
         monkeypatch.setattr(ddsc, "lib", older)

@@ -1,9 +1,21 @@
-"""The command `us-sim bag`: list, extract, repair and convert recordings."""
+"""The command `us-sim bag`: list, check, compare, extract, repair and convert recordings."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Iterable
 from pathlib import Path
+
+from us_sim.errors import UsSimError
+
+_EXTRACTED = {
+    "poses": "poses of each topic as CSV, and in TUM's format",
+    "wrench": "forces and torques of each topic as CSV",
+    "images": "images of each topic as PNG, with their scale",
+    "video": "images of each topic as MP4, with their scale in its comment",
+    "areas": "areas of vessels in the image plane as CSV",
+}
 
 
 def bag_options(bag: argparse.ArgumentParser) -> None:
@@ -16,11 +28,22 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
     )
     check.add_argument("file", type=Path, metavar="SESSION")
     check.set_defaults(command=_check)
+    diff = bag_commands.add_parser(
+        "diff", help="how far two recordings of the same poses are apart; status 0 if they are not"
+    )
+    diff.add_argument("one", type=Path, metavar="A")
+    diff.add_argument("other", type=Path, metavar="B")
+    diff.add_argument("--out", type=Path, help="folder for the numbers as CSV, and a picture")
+    diff.set_defaults(command=_diff)
     extract = bag_commands.add_parser(
-        "extract", help="write the files attached to a recording, such as its scene"
+        "extract",
+        help="write the files attached to a recording, such as its scene; or, with options, its "
+        "poses, wrenches, images and areas",
     )
     extract.add_argument("file", type=Path)
     extract.add_argument("--out", type=Path, required=True, help="folder to write to")
+    for name, text in _EXTRACTED.items():
+        extract.add_argument(f"--{name}", action="store_true", help=text)
     extract.set_defaults(command=_extract)
     repair = bag_commands.add_parser(
         "repair", help="all that can be read of a damaged or cut recording, as a new one"
@@ -57,12 +80,51 @@ def _check(args: argparse.Namespace) -> int:
     return int(not found.is_whole)
 
 
+def _diff(args: argparse.Namespace) -> int:
+    """As diff: 0 if they are equal, 1 if they differ, 2 if they cannot be compared."""
+    from us_sim.progress import end_late_bars, late_progress
+    from us_sim.recording.reader import read_bag
+    from us_sim.run.session_diff import diff, table, write
+
+    try:
+        found = diff(read_bag(args.one), read_bag(args.other), late_progress("bag diff"))
+        print(table(found))
+        for file in write(found, args.out) if args.out is not None else ():
+            print(file)
+    except UsSimError as error:
+        end_late_bars()
+        print(f"us-sim: {error}", file=sys.stderr)
+        return 2
+    return int(not found.is_none)
+
+
 def _extract(args: argparse.Namespace) -> int:
     from us_sim.recording.repair import extract
 
-    for file in extract(args.file, args.out):
-        print(file)
+    if not any(vars(args)[name] for name in _EXTRACTED):
+        for file in extract(args.file, args.out):
+            print(file)
+        return 0
+    from us_sim.progress import late_progress
+    from us_sim.recording.reader import read_bag
+    from us_sim.run import session_extract as parts
+
+    bag, out = read_bag(args.file), args.out
+    show = late_progress(f"bag extract {args.file.name}")
+    if args.poses:
+        _print_all(parts.write_poses(bag, out))
+    if args.wrench:
+        _print_all(parts.write_wrenches(bag, out))
+    if args.images or args.video:
+        _print_all(parts.write_images(bag, out, show, pictures=args.images, video=args.video))
+    if args.areas:
+        _print_all(parts.write_areas(bag, out, show))
     return 0
+
+
+def _print_all(files: Iterable[Path]) -> None:
+    for file in files:
+        print(file)
 
 
 def _repair(args: argparse.Namespace) -> int:

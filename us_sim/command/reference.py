@@ -152,7 +152,7 @@ def _node_list() -> str:
 
 def _nodes() -> Iterator[Section]:
     """The parameters of each node."""
-    from us_sim.nodes.settings import NODES, SceneNodeSettings
+    from us_sim.nodes.settings import COMPRESSED, NODES, CompressedSettings, SceneNodeSettings
     from us_sim.skin.settings import MembraneSettings
     from us_sim.slicing.settings import Imaging
 
@@ -185,6 +185,8 @@ def _nodes() -> Iterator[Section]:
                 "for those of [structures.NAME.flow](#structuresnameflow), while running. Their "
                 "defaults are the scene's."
             )
+            companions = _names(f"{prefix}KEY" for prefix in COMPRESSED.values())
+            text += [f"{companions}:", _parameters(CompressedSettings)]
         if node == "probe_tracker":
             text.append(
                 "`FILTER.KEY` for every key of every filter, such as `one_euro.minimum_cutoff`, "

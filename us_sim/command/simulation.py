@@ -24,7 +24,7 @@ from us_sim.command.options import (
     viewed,
     viewer,
 )
-from us_sim.errors import UsSimError
+from us_sim.errors import BagError, UsSimError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
@@ -195,8 +195,11 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
+    from us_sim.progress import late_progress
+    from us_sim.recording.reader import read_bag
     from us_sim.run.lockstep import render_scene
     from us_sim.run.resimulation import resimulation
+    from us_sim.run.session_diff import diff, table
 
     if any(each is not None for each in (args.scene, args.case, args.path, args.topic)):
         raise UsSimError(
@@ -209,11 +212,17 @@ def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
             print(note, file=sys.stderr)
         for node, values in parameters.items():
             again.parameters.setdefault(node, {}).update(values)
-        return render_scene(
+        render_scene(
             *(again.scene, again.path, args.out, again.parameters),
             topic=again.topic,
             truth=args.truth,
         )
+    made = args.out / "session.mcap"
+    try:
+        print(table(diff(read_bag(args.session), read_bag(made), late_progress("comparing"))))
+    except BagError as error:  # it is made, and may have nothing to be compared with
+        print(f"it is not compared: {error}")
+    return 0
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:

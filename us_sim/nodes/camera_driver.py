@@ -169,7 +169,9 @@ class CameraDriver(GuardedNode):
             self.health.state = self._state
         if problem:
             self.health.problem("camera", problem)
+            self.health.fault = problem
         if newest is not None:
+            self.health.fault = ""
             self._publish(*newest)
         if self._ended and not self.finished.done():
             self.health.state = "finished"

@@ -83,19 +83,19 @@ class GuardedNode(Node):
         self.arrived = time.monotonic_ns()
         """When what is being worked on came, ns of the monotonic clock."""
         self._said: dict[str, float] = {}
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         super().__init__(name, **kwargs)
         if self.get_clock().ros_time_is_active:
-            by_itself = Clock(clock_type=ClockType.STEADY_TIME)
-            self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock, clock=by_itself)
+            self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock)
 
     def _look_for_a_clock(self) -> None:
-        """Say that simulated time does not begin: no other timer of this node runs before."""
+        """Say that simulated time does not begin."""
         if self.get_clock().now().nanoseconds:
             self._clockless.cancel()
             return
         self.get_logger().warning(
-            "use_sim_time is true, and nothing has come on /clock: this node waits for it, also "
-            "with its reports; start what publishes it, or set use_sim_time to false"
+            "use_sim_time is true, and nothing has come on /clock: this node's time stands at 0; "
+            "start what publishes it, or set use_sim_time to false"
         )
 
     def refused(self, where: str, error: UsSimError) -> None:
@@ -168,9 +168,14 @@ class GuardedNode(Node):
         )
 
     def create_timer(self, timer_period_sec: float, callback: Any, *args: Any, **kw: Any) -> Any:
-        """As `rclpy.node.Node.create_timer`, guarded."""
+        """As `rclpy.node.Node.create_timer`, guarded, and by real time unless a clock is given.
+
+        Reports and whatever else serves the node itself go on while simulated time stands.
+        """
         entered = self._entered(f"timer {_name(callback)}", callback)
-        return super().create_timer(timer_period_sec, entered, *args, **kw)
+        return super().create_timer(
+            timer_period_sec, entered, *args, **{"clock": self._steady, **kw}
+        )
 
     def create_guard_condition(self, callback: Any, *args: Any, **kw: Any) -> Any:
         """As `rclpy.node.Node.create_guard_condition`, guarded."""
@@ -235,7 +240,9 @@ class Subscriptions:
         self._there = []
         if is_wanted:
             self._there = [
-                self._node.create_subscription(kind, topic, take, qos, raw=raw)
+                self._node.create_subscription(
+                    kind, topic, take, qos, raw=raw, qos_overriding_options=overridable()
+                )
                 for kind, topic, take, qos, raw in self._wanted
             ]
         return True
@@ -307,9 +314,12 @@ ANOTHER_CLOCK_S = 10.0
 class Health:
     """Counts of a node's work, published on ``diagnostics`` at 1 Hz.
 
-    Latency is the age of what goes out by its stamp. Where stamps are of another clock, as those
-    of a recording are, that is said once, and latency counts from the arrival of what a message
-    was made from.
+    Its level is ERROR while a fault keeps the node from its work and after an exception that nobody
+    expected, WARN while something is wrong and after bad input, and else OK.
+
+    Latency is the age of what goes out by its stamp. It counts from the arrival of what a message
+    was made from under simulated time, which goes in steps, and where stamps are of another clock,
+    as those of a recording are; the latter is said once.
 
     Args:
         node: whose clock, logger and timer are used.
@@ -325,10 +335,11 @@ class Health:
         self._next: dict[str, tuple[float, float]] = {}  # s, when to say it again, and then when
         self._last_problem = self._last_kind = ""
         self.warning = ""  # what is wrong for as long as it is
+        self.fault = ""  # likewise, where it keeps the node from its work
         self._failures_told = 0
         self._clock_differs = False
         self._last_total = 0
-        self._last_time = node.get_clock().now().nanoseconds
+        self._last_time = time.monotonic()
         self.state = "starting"
         self.received = 0
         self.dropped = 0
@@ -349,10 +360,11 @@ class Health:
             self._latencies.append(1e3 * self._age(nanoseconds_of(stamp)))
 
     def _age(self, stamp: int) -> float:
-        age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
-        if abs(age) < ANOTHER_CLOCK_S:
+        clock = self._node.get_clock()
+        age = 1e-9 * (clock.now().nanoseconds - stamp)
+        if abs(age) < ANOTHER_CLOCK_S and not clock.ros_time_is_active:
             return age
-        if not self._clock_differs:
+        if not self._clock_differs and not clock.ros_time_is_active:
             self._clock_differs = True
             self._node.get_logger().warning(
                 f"stamps are {abs(age):.1f} s {'old' if age > 0 else 'ahead'}, so they are of "
@@ -381,11 +393,10 @@ class Health:
 
     def report(self) -> None:
         """Publish the report: once a second, and at once when it is urgent."""
-        now = self._node.get_clock().now()
-        elapsed = max(now.nanoseconds - self._last_time, 1) * 1e-9
+        now = time.monotonic()
         total = max(self._published.values(), default=0)
-        rate = (total - self._last_total) / elapsed
-        self._last_time, self._last_total = now.nanoseconds, total
+        rate = (total - self._last_total) / max(now - self._last_time, 1e-9)
+        self._last_time, self._last_total = now, total
         failures: Counter[str] = Counter(getattr(self._node, "failures", ()))
         values = {
             "state": self.state,
@@ -405,9 +416,10 @@ class Health:
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])
             values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
-        wrong = self._last_problem or self.warning
+        wrong = self.fault or self._last_problem or self.warning
+        level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK,
+            level=DiagnosticStatus.ERROR if self.fault else level,
             name=self._node.get_fully_qualified_name(),
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
@@ -417,6 +429,6 @@ class Health:
             status.level = DiagnosticStatus.ERROR
         status.message = wrong or self.state
         message = DiagnosticArray(status=[status])
-        message.header.stamp = now.to_msg()
+        message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
         self._last_problem = ""

@@ -46,6 +46,8 @@ class PathPlayer(GuardedNode):
         path = find_bag(settings.path)
         self._path = read_path(path, settings.topic, option="its parameter `topic`")
         lockstep = settings.lockstep
+        # It stands for a device, whose poses come regularly however busy the computer is.
+        self.goes_first = not lockstep
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next, self._sent = 0, -1  # pose to be sent, and that which was sent last
@@ -71,7 +73,7 @@ class PathPlayer(GuardedNode):
             self._say_progress,
         )
         self._playhead = self._playback.head
-        self._starting = self.create_timer(CHECK_S, self._begin, clock=self._playback.clock)
+        self._starting = self.create_timer(CHECK_S, self._begin)
         if not lockstep:
             offer_player_services(self, self._playback, lambda: self._settings, self._stop)
         self.pose_count = len(self._path)
@@ -87,7 +89,7 @@ class PathPlayer(GuardedNode):
         return settings
 
     def _begin(self) -> None:
-        if not self._awaited.has_come():
+        if not self._awaited.has_come() or not self._playback.now:
             return
         self._starting.cancel()
         self.health.state = "playing"
@@ -177,8 +179,13 @@ class PathPlayer(GuardedNode):
             self._begin_again_or_end()
 
     def _hold(self, pose: int) -> None:
-        """Say a few times a second that a probe which is held still is still there."""
-        if pose >= 0 and time.monotonic() - self._sent_at > 1.0 / HELD:
+        """Say a few times a second that a probe which is held still is still there.
+
+        Nothing ages while the player holds the clock, too.
+        """
+        if pose < 0 or self._settings.clock:
+            return
+        if time.monotonic() - self._sent_at > 1.0 / HELD:
             self._send(pose)
 
     def _is_over(self) -> bool:

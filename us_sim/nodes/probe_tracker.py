@@ -64,6 +64,7 @@ class ProbeTracker(Device):
         self._source = live.values[OWN].source or self.scene.tracker.source.name
         self._tracking = tracking_of(self.scene, _filter(live.values))
         self._state = TrackingState.WAITING
+        self._taken_at = 0  # ns, when the last measurement was taken
         self._last: Measurement | None = None  # that was published
         self._is_contested = False
         self._poses = self.stream(PoseStamped, "probe/pose")
@@ -106,8 +107,12 @@ class ProbeTracker(Device):
                 f"{FARTHEST:g} m: positions are in metres; it is not used",
             )
             return
+        now = self.now()
+        if now < self._taken_at:  # the clock was set back, as when a recording begins again
+            self._tracking.reset()
+        self._taken_at = now
         restarts = self._tracking.restarts.total()
-        probe = self._tracking.take(measurement, self.now())
+        probe = self._tracking.take(measurement, now)
         if self._tracking.restarts.total() > restarts:
             self.get_logger().info(
                 "the tracker's poses start anew, and so does the filter", throttle_duration_sec=5.0
@@ -157,17 +162,17 @@ class ProbeTracker(Device):
         state = self._tracking.state(self.now())
         if state is self._state:
             return
-        lost = "the probe is lost" if state is TrackingState.LOST else ""
-        if lost and (why := poses_ended(self)):
-            lost = why
+        self.health.warning = self.health.fault = ""
+        if state is TrackingState.LOST and (why := poses_ended(self)):
+            self.health.warning = why
             self.get_logger().info(f"{why}: the probe stays where it is")
-        elif lost:
+        elif state is TrackingState.LOST:
+            self.health.fault = "the probe is lost"
             self.get_logger().warning("the probe is lost: no pose of it can be used any more")
         elif state is TrackingState.TRACKED and self._state is not TrackingState.COASTING:
             self.get_logger().info("the probe is tracked")
         self._state = state
         self.health.state = "waiting for poses" if state is TrackingState.WAITING else state.value
-        self.health.warning = lost
         self._say_status()
 
     def _say_status(self) -> None:

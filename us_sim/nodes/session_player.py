@@ -51,7 +51,8 @@ class SessionPlayer(GuardedNode):
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
         self._latched: set[str] = set()  # of them
-        exclude = {*settings.exclude, *(["/clock"] if settings.clock else [])}
+        exclude = {*map(self.resolve_topic_name, filter(None, settings.exclude))}
+        exclude |= {"/clock"} if settings.clock else set()
         offered = [topic for topic in self._bag.topics if topic.name not in exclude]
         left_out = [why for topic in offered if (why := self._offer(topic))]
         if not any(self._bag.topic(name).message_count for name in self._topics):
@@ -78,7 +79,7 @@ class SessionPlayer(GuardedNode):
             self._say_progress,
         )
         self._playhead = self._playback.head
-        self._start = self.create_timer(START_S, self._begin, clock=self._playback.clock)
+        self._start = self.create_timer(START_S, self._begin)
         offer_player_services(self, self._playback, lambda: self._settings, self._stop)
 
     @property
@@ -104,17 +105,19 @@ class SessionPlayer(GuardedNode):
             durability=durability,
         )
         try:
-            self._topics[topic.name] = self.create_publisher(kind, topic.name, qos)
+            self._topics[topic.name] = self.stream(kind, topic.name, qos)
         except (NameValidationException, ValueError):
             return f"{topic.name!r} (no topic of ROS 2 is called so)"
         return ""
 
     def _begin(self) -> None:
+        if not self._playback.now:
+            return
         self._start.cancel()
         self._playback.restart()
         if sought := round(1e9 * self._settings.time):
             self._go_to(sought)
-        self.create_timer(0.002, self._tick, clock=self._playback.clock)
+        self.create_timer(0.002, self._tick)
         self._playback.begin()
 
     def _tick(self) -> None:

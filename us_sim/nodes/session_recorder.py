@@ -173,7 +173,8 @@ class SessionRecorder(GuardedNode):
 
     def _discover(self) -> None:
         self._tell_splits()
-        for topic, types in self.get_topic_names_and_types() if self.discovers else ():
+        has_time = bool(self.get_clock().now().nanoseconds)  # simulated time has begun
+        for topic, types in self.get_topic_names_and_types() if self.discovers and has_time else ():
             if not self._is_wanted(topic):
                 continue
             for type_name in types:
@@ -235,10 +236,9 @@ class SessionRecorder(GuardedNode):
             new = topic.follow(self._offered(topic.name, self._types[topic.name]))
             if new and self._bag is not None:
                 self._bag.add_topic(topic.name, self._types[topic.name], new)
-        if self._bag is None:
-            return
-        self.health.warning = self._bag.problem
-        self._tell_losses(self._bag)
+        self.health.fault = "" if self._bag is None else self._bag.problem
+        if self._bag is not None:
+            self._tell_losses(self._bag)
 
     def _tell_losses(self, bag: WriteBehind) -> None:
         lost = bag.losses.by_topic()

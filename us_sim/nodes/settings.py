@@ -67,12 +67,40 @@ class AnnotatedImageSettings(Settings):
     )
 
 
+@dataclass(frozen=True)
+class CompressedSettings(Settings):
+    """How image_transport's plugin ``compressed`` encodes a topic; names and defaults are its."""
+
+    live = True
+
+    format: str = setting(
+        description="JPEG, which is small, or PNG, which loses nothing",
+        choices=("jpeg", "png"),
+        default="jpeg",
+    )
+    jpeg_quality: int = setting(
+        Quantity("number", 1, 100), "of JPEG: higher is better and larger", default=95
+    )
+    png_level: int = setting(
+        Quantity("number", 0, 9), "of PNG: higher is smaller and slower", default=3
+    )
+
+
+COMPRESSED = {
+    topic: f"{topic.replace('/', '.')}.compressed."
+    for topic in ("ultrasound/image", "ultrasound/image_annotated")
+}
+"""Topics that have such a companion, each with the prefix of its parameters."""
+
+
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
     """Settings of a scene that are parameters, too, each with the prefix of their names."""
     yield "", type(probe_of(scene))
     yield "acoustics.", SoundSettings
     for label in scene.imaging.acoustics.tissues:
         yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
+    for prefix in COMPRESSED.values():
+        yield prefix, CompressedSettings
     yield "m_mode.", type(scene.m_mode)
     if scene.tissue is not None:
         yield "strain.", type(scene.strain)
@@ -91,8 +119,8 @@ _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
 LOST = "events/rosbag2_messages_lost"
-NOT_THE_SESSION = ("/rosout", "/parameter_events", LOST)
-"""Topics that are not recorded; losses are in the recording's metadata."""
+NOT_THE_SESSION = ("/rosout", "/parameter_events")
+"""Topics that are not recorded."""
 SHARED = ("/tf", "/tf_static")
 """Topics that a recorder takes outside its namespace, too: frames may be common to all."""
 OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.from_drivers)
@@ -171,7 +199,7 @@ class PathPlayerSettings(PlayerSettings):
 class SessionPlayerSettings(PlayerSettings):
     """Of ``session_player``."""
 
-    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+    exclude: tuple[str, ...] = setting(description="topics to leave out", default=())
 
 
 @dataclass(frozen=True)

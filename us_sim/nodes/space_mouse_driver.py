@@ -86,9 +86,9 @@ class SpaceMouseDriver(GuardedNode):
             message.header.frame_id = self._frame
             self._joys.publish(message)
             self.health.published("spacenav/joy", message.header.stamp)
-            self.health.state = self._name
+            self.health.state, self.health.fault = self._name, ""
         if problem:
-            self.health.state = "no device"
+            self.health.state, self.health.fault = "no device", problem
             self.health.problem("device", problem)
 
 

@@ -41,7 +41,7 @@ from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.frame_budget import frame_limit, shortest, usable_cores
+from us_sim.tissue.solvers.frame_budget import PERIOD, frame_limit, shortest, usable_cores
 from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
@@ -342,6 +342,7 @@ class TissueDeformer(SceneNode):
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
         self._live = LiveTissue(self)
+        self._waited = 0.0  # s, that the next pose will have, if poses come at 60 Hz
         mesh = self._live.tissue.model.mesh
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
@@ -351,9 +352,8 @@ class TissueDeformer(SceneNode):
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
         if not self.lockstep:
-            sending = shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
-            limit = frame_limit(sending, usable_cores())
-            self._live.tissue.limit_frames(limit)
+            self._sending = shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
+            limit = self._limit_frame()
             self.get_logger().info(f"a frame may take {1e3 * limit:.1f} ms")
             self.create_timer(GO_ON_S, self._go_on)
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
@@ -371,12 +371,26 @@ class TissueDeformer(SceneNode):
     def _deform(self, message: PoseStamped) -> None:
         self._came += 1
         self._last = message
+        if self.lockstep:
+            self._frame(message)
+            return
+        self._limit_frame()
         self._frame(message)
+        took = 1e-9 * (time.monotonic_ns() - self.arrived)
+        self._waited = min(max(0.0, self._waited + took - PERIOD), PERIOD)
+
+    def _limit_frame(self) -> float:
+        """s, that the next frame may take: a longer one is made up for by those after it."""
+        limit = frame_limit(self._sending, usable_cores(), self._waited)
+        self._live.tissue.limit_frames(limit)
+        return limit
 
     def _go_on(self) -> None:
         """Finish the last frame while no pose comes."""
         idle, self._came = self._came == 0, 0
+        self._waited = 0.0 if idle else self._waited
         if idle and self._last is not None and not self._live.tissue.is_settled:
+            self._limit_frame()
             self._frame(self._last, again=True)
 
     def _frame(self, message: PoseStamped, again: bool = False) -> None:

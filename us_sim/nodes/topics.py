@@ -113,9 +113,13 @@ skin/marker: visualization_msgs/Marker
 ultrasound/image: sensor_msgs/Image
     slice_interpolator -> openigtlink_bridge, image_writer, path_player, volume_reconstructor,
     viewer | `mono8`, in frame `probe`: columns along the array, rows along the depth
+ultrasound/image/compressed: sensor_msgs/CompressedImage [on_demand]
+    slice_interpolator | the same as JPEG or PNG, as image_transport's plugin `compressed` makes it
 ultrasound/image_annotated: sensor_msgs/Image [on_demand]
     slice_interpolator | `rgb8`, for the eye: with a depth scale, outlines of structures, and its
     age
+ultrasound/image_annotated/compressed: sensor_msgs/CompressedImage [on_demand]
+    slice_interpolator | likewise
 ultrasound/labels: sensor_msgs/Image [on_demand]
     slice_interpolator -> image_writer | `mono8`: the number of the volume's label at each pixel of
     the image, 0 for nothing

@@ -66,9 +66,7 @@ def resimulation(session: Path, folder: Path, volume: Path | None = None) -> Res
             f"{session} has no scene attached, so it cannot be simulated from itself: name the "
             f"scene, and play it with `us-sim render SCENE --path {session}`"
         )
-    _require_files(session, attached, volume)
-    extract(session, folder / "attached")
-    scene = load_scene(folder / "attached" / "scene.yaml", volume=volume)
+    scene = scene_within(session, attached, folder / "attached", volume)
     path = path_of(scene, session)
     write_path(folder / POSES, path, sidecar=False)
     parameters = _parameters(session, attached, scene)
@@ -81,6 +79,28 @@ def resimulation(session: Path, folder: Path, volume: Path | None = None) -> Res
         parameters,
         [*_other_versions(session, attached)],
     )
+
+
+def scene_within(
+    session: Path,
+    attached: Mapping[str, BagAttachment],
+    folder: Path,
+    volume: Path | None = None,
+) -> Scene:
+    """The scene that is attached to a session, of files that are as they were.
+
+    Args:
+        session: its recording.
+        attached: to it, a scene among them.
+        folder: gets the attached files; new or empty.
+        volume: where the scene's volume is now.
+
+    Raises:
+        BagError, UsSimError: as of `resimulation`.
+    """
+    _require_files(session, attached, volume)
+    extract(session, folder)
+    return load_scene(folder / "scene.yaml", volume=volume)
 
 
 def _text(attached: Mapping[str, BagAttachment], name: str) -> str:

@@ -11,10 +11,10 @@ from __future__ import annotations
 import ctypes as ct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from .libddsc import DdsError, load
+from .middleware import UNSPECIFIED, EndpointQos
 
 INFINITY = 2**63 - 1
 ANY_STATE = 0x7F
@@ -235,71 +235,11 @@ def serialized_type(writer: int, participant: int, type_name: str) -> ct.c_void_
             lib.dds_delete(entity)
 
 
-_UNSPECIFIED = (0, INFINITY)
 _LONGEST_BLOCK = 100_000_000  # ns; DDS's own default, where rmw_cyclonedds would block for ever
-
-
-@dataclass(frozen=True)
-class EndpointQos:
-    """The policies of one endpoint, with the numbers that rclpy's enumerations have.
-
-    A duration of 0 is "not specified", which is infinite, as in rmw.
-    """
-
-    RELIABLE: ClassVar[int] = 1
-    BEST_EFFORT: ClassVar[int] = 2
-    TRANSIENT_LOCAL: ClassVar[int] = 1
-    VOLATILE: ClassVar[int] = 2
-    KEEP_LAST: ClassVar[int] = 1
-    KEEP_ALL: ClassVar[int] = 2
-    AUTOMATIC: ClassVar[int] = 1
-    MANUAL_BY_TOPIC: ClassVar[int] = 3
-
-    reliability: int = RELIABLE
-    durability: int = VOLATILE
-    history: int = KEEP_LAST
-    depth: int = 10
-    deadline: int = 0  # ns
-    lifespan: int = 0  # ns
-    liveliness: int = AUTOMATIC
-    liveliness_lease_duration: int = 0  # ns
 
 
 _DDS_DURABILITY = (EndpointQos.VOLATILE, EndpointQos.TRANSIENT_LOCAL)
 _DDS_LIVELINESS = (EndpointQos.AUTOMATIC, 2, EndpointQos.MANUAL_BY_TOPIC)
-
-# The values of each policy that are not left to the middleware, its default first.
-_KNOWN = {
-    "reliability": (EndpointQos.RELIABLE, EndpointQos.BEST_EFFORT),
-    "durability": _DDS_DURABILITY,
-    "history": (EndpointQos.KEEP_LAST, EndpointQos.KEEP_ALL),
-    "liveliness": (EndpointQos.AUTOMATIC, EndpointQos.MANUAL_BY_TOPIC),
-}
-
-
-def qos_of_profile(profile: Any) -> EndpointQos:
-    """The policies to ask for, given rclpy's profile (or anything with its attributes).
-
-    SYSTEM_DEFAULT is reliable, volatile, keep last 1 and automatic.
-
-    Raises:
-        DdsError: a policy is UNKNOWN or BEST_AVAILABLE, or the depth is negative.
-    """
-    depth = int(profile.depth)
-    if depth < 0:
-        raise DdsError(f"a history depth of {depth} cannot be kept; give at least 1")
-    policies = {}
-    for name, known in _KNOWN.items():
-        policies[name] = int(getattr(profile, name)) or known[0]
-        if policies[name] not in known:
-            raise DdsError(
-                f"the {name} policy {getattr(profile, name)!r} cannot be asked for; choose one "
-                f"that says what this endpoint needs"
-            )
-    for name in ("deadline", "lifespan", "liveliness_lease_duration"):
-        value = getattr(profile, name)
-        policies[name] = _specified(int(getattr(value, "nanoseconds", value)))
-    return EndpointQos(depth=depth or 1, **policies)
 
 
 @contextmanager
@@ -376,4 +316,4 @@ def user_data(handle: int | None) -> dict[str, str]:
 
 
 def _specified(duration: int) -> int:
-    return 0 if duration in _UNSPECIFIED else duration
+    return 0 if duration in UNSPECIFIED else duration

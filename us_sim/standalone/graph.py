@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes as ct
 import threading
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from .cdr import CdrError, deserialize, serialize
 from .ddsc import (
     BuiltinEndpoint,
     BuiltinParticipant,
-    EndpointQos,
     RawSampleInfo,
     check,
     lib,
@@ -28,6 +27,7 @@ from .ddsc import (
 )
 from .interfaces import type_hash
 from .messages import message_class
+from .middleware import EndpointQos, GraphEndpoint, GraphNode
 from .transport import Participant
 
 _BUILTIN_TOPICS = {
@@ -38,30 +38,6 @@ _BUILTIN_TOPICS = {
 _TOPIC = "ros_discovery_info"
 _TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 _DDS_TYPE = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
-
-
-@dataclass(frozen=True)
-class GraphEndpoint:
-    """A reader or writer in the domain, this process's included."""
-
-    topic: str  # DDS name, like the type's
-    type_name: str
-    is_writer: bool
-    qos: EndpointQos
-    gid: bytes  # 16 bytes, like the participant's
-    participant: bytes
-    user_data: dict[str, str]  # such as ``typehash``, ``serviceid`` and ``clientid``
-
-
-@dataclass(frozen=True)
-class GraphNode:
-    """A ROS node and the gids of its endpoints."""
-
-    namespace: str
-    name: str
-    reader_gids: tuple[bytes, ...] = ()
-    writer_gids: tuple[bytes, ...] = ()
-    participant: bytes = b""  # its gid; filled in for nodes that are announced
 
 
 class Graph:

@@ -182,9 +182,15 @@ def packages() -> list[str]:
     return sorted({name.split("/")[0] for name in names})
 
 
+def dds_name(name: str) -> str:
+    """The name of a type in DDS: ``sensor_msgs::msg::dds_::Image_`` is sensor_msgs/msg/Image."""
+    package, folder, short = name.split("/")
+    return f"{package}::{folder}::dds_::{short}_"
+
+
 @cache
 def type_hash(name: str) -> str:
-    """The ``RIHS01_…`` hash of a message, request or response (REP 2016).
+    """The ``RIHS01_…`` hash of a message, service, request or response (REP 2016).
 
     Raises:
         InterfaceError: there is no such type.
@@ -210,7 +216,38 @@ def _typestore() -> Any:
             # The parser only takes names in msg/, so give it one and move the result.
             parsed = get_types_from_msg(text, f"{package}/msg/Moved")[f"{package}/msg/Moved"]
             store.fielddefs[name] = parsed
+        store.fielddefs.update(_service_fields(service))
     return store
+
+
+def _service_fields(service: str) -> dict[str, Any]:
+    """A service as a type, and its event, as rosidl describes both (REP 2016)."""
+
+    def field(name: str, kind: str) -> tuple[str, Any]:
+        return name, (Nodetype.NAME, kind)
+
+    def at_most_one(name: str, kind: str) -> tuple[str, Any]:
+        return name, (Nodetype.SEQUENCE, ((Nodetype.NAME, kind), 1))
+
+    request, response, event = (f"{service}_{part}" for part in ("Request", "Response", "Event"))
+    return {
+        event: (
+            [],
+            [
+                field("info", "service_msgs/msg/ServiceEventInfo"),
+                at_most_one("request", request),
+                at_most_one("response", response),
+            ],
+        ),
+        service: (
+            [],
+            [
+                field("request_message", request),
+                field("response_message", response),
+                field("event_message", event),
+            ],
+        ),
+    }
 
 
 def _without_char(description: Any) -> Any:

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from .middleware import MiddlewareError
+
 OLDEST, TOO_NEW = (0, 10), (12, 0)
 """Versions whose structures are as `ddsc` has them: those of ROS 2 Jazzy (0.10.5) to 11."""
 
@@ -19,8 +21,8 @@ _VERSION = re.compile(r"ddsc\b.*?(\d+)\.(\d+)\.\d+")
 _ROS = Path("/opt/ros")
 
 
-class DdsError(Exception):
-    """The transport refuses a request."""
+class DdsError(MiddlewareError):
+    """Cyclone DDS refuses a request, or is not to be had."""
 
 
 def load(needed: Iterable[str], environment: Mapping[str, str] = os.environ) -> Any:

@@ -11,24 +11,17 @@ import struct
 import time
 from collections.abc import Callable
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
-from .interfaces import type_hash
-from .transport import Participant, SampleInfo
+from .interfaces import dds_name, type_hash
+from .middleware import RequestHeader, SampleInfo
+from .transport import Participant
 
 _HEADER = struct.Struct("<Qq")
 _LONGEST_WAIT = 0.1  # s, for a client's reader to be discovered, as rmw_cyclonedds waits
 
 _endpoint_numbers = count(1)
 _request_numbers = count(1)
-
-
-class RequestHeader(NamedTuple):
-    """Which request of which client, and when."""
-
-    client: int  # the client's number
-    sequence: int  # the request's number
-    info: SampleInfo
 
 
 class _ServiceEndpoint:
@@ -44,7 +37,6 @@ class _ServiceEndpoint:
             type_name: ``rcl_interfaces/srv/GetParameters``.
             qos: rclpy's QoSProfile or an EndpointQos.
         """
-        package, folder, name = type_name.split("/")
         number = next(_endpoint_numbers)
         identity = participant.gid[:12] + number.to_bytes(4, "big")
         own_id = ".".join(f"{byte:x}" for byte in identity)
@@ -52,7 +44,7 @@ class _ServiceEndpoint:
         def arguments(prefix: str, suffix: str, part: str) -> tuple[str, str, Any, str]:
             return (
                 f"{prefix}{service}{suffix}",
-                f"{package}::{folder}::dds_::{name}_{part}_",
+                dds_name(f"{type_name}_{part}"),
                 qos,
                 f"{self._key}={own_id};typehash={type_hash(f'{type_name}_{part}')};",
             )

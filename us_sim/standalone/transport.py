@@ -5,7 +5,7 @@ and samples are the bytes of `us_sim.standalone.cdr`. The hosts that a domain re
 Jazzy's environment: ROS_AUTOMATIC_DISCOVERY_RANGE (SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT),
 ROS_STATIC_PEERS, and CYCLONEDDS_URI, which is applied last.
 
->>> from us_sim.standalone.ddsc import EndpointQos
+>>> from us_sim.standalone.middleware import EndpointQos
 >>> from us_sim.standalone.transport import DiscoveryRange, Participant
 >>> DiscoveryRange.from_environment({"ROS_STATIC_PEERS": "10.0.0.5;pc2"})
 DiscoveryRange(name='SUBNET', static_peers=('10.0.0.5', 'pc2'))
@@ -24,22 +24,20 @@ import atexit
 import ctypes as ct
 import logging
 import os
-import socket
 import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
-from . import ddsc
+from . import ddsc, middleware
 from .ddsc import (
     INFINITY,
     DdsError,
-    EndpointQos,
     IoVector,
     RawSampleInfo,
     check,
@@ -47,36 +45,13 @@ from .ddsc import (
     guid_of,
     lib,
     participant_qos,
-    qos_of_profile,
     user_data,
 )
+from .middleware import EndpointQos, SampleInfo, qos_of_profile
 
-_RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 
-
-@dataclass(frozen=True)
-class DiscoveryRange:
-    """Where other participants are looked for."""
-
-    name: str = "SUBNET"  # or LOCALHOST, OFF, SYSTEM_DEFAULT
-    static_peers: tuple[str, ...] = ()  # addresses that are asked in addition
-
-    @classmethod
-    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> DiscoveryRange:
-        """The range that the environment asks for; SUBNET by default.
-
-        Raises:
-            DdsError: ROS_AUTOMATIC_DISCOVERY_RANGE has another value.
-        """
-        name = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
-        if environment.get("ROS_LOCALHOST_ONLY") == "1":
-            name = "LOCALHOST"
-        if name not in _RANGES:
-            raise DdsError(
-                f"ROS_AUTOMATIC_DISCOVERY_RANGE is {name!r}; set it to one of {', '.join(_RANGES)}"
-            )
-        peers = environment.get("ROS_STATIC_PEERS", "").split(";")
-        return cls(name, tuple(peer.strip() for peer in peers if peer.strip()))
+class DiscoveryRange(middleware.DiscoveryRange):
+    """Where other participants are looked for, and how Cyclone DDS is told so."""
 
     def configuration(self) -> str:
         """Cyclone DDS's XML for this range."""
@@ -140,10 +115,11 @@ def acquire_domain(domain_id: int, reach: DiscoveryRange) -> None:
     with _lock:
         domain = _domains.get(domain_id)
         if domain is None:
+            hint = middleware.loopback_fault() or "check CYCLONEDDS_URI if it is set"
             configuration = f"{reach.configuration()},{os.environ.get('CYCLONEDDS_URI', '')}"
             handle = check(
                 lib.dds_create_domain(domain_id, configuration.encode()),
-                f"DDS domain {domain_id} cannot be set up; {_setup_hint()}",
+                f"DDS domain {domain_id} cannot be set up; {hint}",
             )
             _domains[domain_id] = _Domain(handle, reach)
         elif domain.reach != reach:
@@ -153,20 +129,6 @@ def acquire_domain(domain_id: int, reach: DiscoveryRange) -> None:
             )
         else:
             domain.users += 1
-
-
-def _setup_hint() -> str:
-    """A hint at the likely reason why DDS cannot be set up here."""
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            probe.connect(("127.0.0.1", 9))
-    except OSError as error:
-        return (
-            f"this computer's loopback interface has no IPv4 ({error.strerror}): give it the "
-            f"address 127.0.0.1/8 and bring it up"
-        )
-    return "check CYCLONEDDS_URI if it is set"
 
 
 def release_domain(domain_id: int) -> None:
@@ -273,12 +235,6 @@ class _IncompatibleQos(ct.Structure):
         ("total_count_change", ct.c_int32),
         ("last_policy", ct.c_uint32),
     )
-
-
-class SampleInfo(NamedTuple):
-    source_timestamp: int  # ns since 1970, when it was written, by the writer's clock
-    received_timestamp: int  # ns since 1970, when it was taken here
-    publication_handle: int  # this process's number for the writer
 
 
 class Endpoint:

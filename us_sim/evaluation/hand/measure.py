@@ -464,7 +464,6 @@ class _Following:
         take as long as `frame_limit` says, as in the node, which needs 0.5 ms to send its result.
         """
         self._solver.reset()
-        self._solver.frame_limit = frame_limit(0.0005, usable_cores())
         poses = self._motion.poses
         rows, latency = [], []
         now, done = 0.0, -1
@@ -474,6 +473,8 @@ class _Following:
                 newest, now = done + 1, (done + 1) / RATE
             if newest >= len(poses):
                 break
+            waited = max(0.0, now - newest / RATE)
+            self._solver.frame_limit = frame_limit(0.0005, usable_cores(), waited)
             row = self._frame(newest)
             now += 1e-3 * row[-1]
             done = newest

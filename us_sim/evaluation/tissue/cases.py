@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.block import EXTENT, block, graded_planes
-from us_sim.geometry.collider import Capsule, Collider, Sphere
+from us_sim.geometry.collider import Capsule, Collider, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
@@ -103,6 +103,13 @@ _ALL = (
         Capsule(0.025, 0.04),
         _press(0.012) + _tilt(0.012, math.radians(20)),
         (-0.05, 0.05, 0.03),
+    ),
+    Scene(
+        "flat_10mm",
+        "a flat face with rounded edges pressed by 10 mm",
+        RoundedBox(0.05, 0.03, 0.06, 0.006),
+        _press(0.01),
+        (-0.04, 0.04, 0.03),
     ),
     *(
         Scene(

@@ -63,8 +63,9 @@ class Awaited:
         if not self._publisher.get_subscription_count():
             return f"somebody to subscribe to {self._publisher.topic_name}"
         for topic in self._settings.await_topics:
+            topic = node.resolve_topic_name(topic)
             if not node.count_publishers(topic):
-                return f"{node.resolve_topic_name(topic)} to be published"
+                return f"{topic} to be published"
         for topic in map(node.resolve_topic_name, self._settings.await_recorded):
             listeners = node.get_subscriptions_info_by_topic(topic)
             if RECORDER not in {info.node_name for info in listeners}:
@@ -76,7 +77,7 @@ class Playback:
     """Does as a player's parameters and services say.
 
     The player publishes ``/clock`` where its parameter ``clock`` asks for it, and then goes by the
-    computer's clock itself.
+    computer's clock itself; else by its node's, also where that is set back.
 
     Args:
         node: that plays; the state is told in its diagnostics.
@@ -103,6 +104,7 @@ class Playback:
         self.first, self.length, self.step = first, length, step
         self.head = Playhead(settings().rate)
         self.has_begun = self.is_stopped = False
+        self._latest = 0  # ns, of `now`
         self.delay = round(1e9 * settings().delay)
         duration = round(1e9 * settings().playback_duration)
         self._select(round(1e9 * settings().start_offset), duration, until=-1)
@@ -114,13 +116,17 @@ class Playback:
         self.clock = Clock() if settings().clock else node.get_clock()
         if settings().clock:
             self._clock = node.stream(ClockMessage, "/clock")
-            node.create_timer(1.0 / settings().clock, self.tell_time, clock=self.clock)
+            node.create_timer(1.0 / settings().clock, self.tell_time)
         node.add_post_set_parameters_callback(self._seek)
 
     @property
     def now(self) -> int:
-        """ns, of the clock that the player goes by."""
-        return int(self.clock.now().nanoseconds)
+        """ns, of the clock that the player goes by; 0 where simulated time has not begun."""
+        now = int(self.clock.now().nanoseconds)
+        if now < self._latest:
+            self.head.go_to(self.head.position(self._latest), now)
+        self._latest = now
+        return now
 
     @property
     def position(self) -> int:

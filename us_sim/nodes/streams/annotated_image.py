@@ -17,6 +17,7 @@ from us_sim.nodes.messages import colour_image_message, nanoseconds_of
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode, poses_ended
 from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
+from us_sim.nodes.streams.compressed import Compressed
 from us_sim.nodes.streams.stream import FrameStream
 from us_sim.scene.building import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
@@ -26,6 +27,7 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import OVERLAYS
 
+_TOPIC = "ultrasound/image_annotated"
 REMEMBERED = 256  # poses whose arrival is kept for the images at them
 
 
@@ -137,7 +139,8 @@ class AnnotatedImage:
             for name, given in node.scene.structures.items()
             if not given.file and (given.label or name) in numbers
         }
-        self._publisher = node.stream(Image, "ultrasound/image_annotated")
+        self._publisher = node.stream(Image, _TOPIC)
+        self._compressed = Compressed(node, _TOPIC)
         self._came = self._missing = False
         self._stamp = _NEVER
         self.show_probe(probe)
@@ -148,8 +151,8 @@ class AnnotatedImage:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether somebody subscribes."""
-        return bool(self._publisher.get_subscription_count() > 0)
+        """Whether somebody subscribes, maybe to the compressed companion."""
+        return bool(self._publisher.get_subscription_count() > 0) or self._compressed.is_wanted
 
     @property
     def state(self) -> str:
@@ -250,8 +253,10 @@ class AnnotatedImage:
         if shown.beside:
             plain = image[:, ::-1] if shown.flip else image
             picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])
-        self._publisher.publish(colour_image_message(picture, self._stamp, "probe"))
-        self._node.health.published("ultrasound/image_annotated")
+        message = colour_image_message(picture, self._stamp, "probe")
+        self._publisher.publish(message)
+        self._node.health.published(_TOPIC)
+        self._compressed.send(message)
 
     def _outline(self, frame: Frame) -> None:
         if self._is_outlined:

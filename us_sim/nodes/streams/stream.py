@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image
 from us_sim.nodes.messages import colour_image_message, field_message, image_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.nodes.streams.compressed import Compressed
 from us_sim.settings.setting import Settings
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
@@ -135,14 +136,25 @@ class SettableStream(FrameStream, Generic[M]):
 
 
 class BModeStream(FrameStream):
-    """``ultrasound/image``, whose age counts as the node's latency."""
+    """``ultrasound/image``, whose age counts as the node's latency, and its companion."""
 
     topic = "ultrasound/image"
 
+    def __init__(self, node: SceneNode) -> None:
+        self._compressed = Compressed(node, self.topic)
+        super().__init__(node)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether somebody subscribes to one of both."""
+        return super().is_wanted or self._compressed.is_wanted
+
     def show(self, frame: Frame, stamp: Time) -> None:
         """Send the picture, under the stamp of its pose."""
-        self._publisher.publish(self._message(frame, stamp))
+        message = self._message(frame, stamp)
+        self._publisher.publish(message)
         self._node.health.published(self.topic, stamp)
+        self._compressed.send(message)
 
     def _message(self, frame: Frame, stamp: Time) -> Image:
         return image_message(frame.pixels, stamp, "probe")

@@ -18,8 +18,7 @@ from threading import TIMEOUT_MAX, RLock
 from types import FrameType
 from typing import Any
 
-from ..graph import Graph, GraphNode
-from ..transport import DdsError, Participant
+from ..middleware import GraphNode, MiddlewareError, connect, implementation
 from ._arguments import parse_arguments
 from .exceptions import NotInitializedException, RCLError
 from .logging import configure, get_logger, release
@@ -152,10 +151,9 @@ class Context(AbstractContextManager["Context"]):
             self._arguments = parse_arguments(sys.argv if args is None else args)
             self._domain_id = _domain_from_environment() if domain_id is None else domain_id
             try:
-                self._participant = Participant(self._domain_id, self._arguments.enclave)
-            except DdsError as error:
+                self._middleware = connect(self._domain_id, self._arguments.enclave)
+            except MiddlewareError as error:
                 raise RCLError(f"failed to initialize rcl: {error}") from None
-            self._graph = Graph(self._participant)
             self._initialized = self._valid = True
             add_context(self)
             if initialize_logging:
@@ -198,8 +196,7 @@ class Context(AbstractContextManager["Context"]):
     def destroy(self) -> None:
         """Leave the network; endpoints that nodes still hold do nothing from now on."""
         if self._initialized:
-            self._graph.close()
-            self._participant.close()
+            self._middleware.close()
 
     __del__ = destroy
 
@@ -282,7 +279,7 @@ class Context(AbstractContextManager["Context"]):
         """Tell others which nodes there are, and with which endpoints."""
         with self._lock:
             if not self._postponing:
-                self._graph.announce(self._nodes.values())
+                self._middleware.announce(self._nodes.values())
 
 
 def _refuse_security() -> None:
@@ -351,5 +348,8 @@ def remove_ros_args(args: Sequence[str] | None = None) -> list[str]:
 
 
 def get_rmw_implementation_identifier() -> str:
-    """Which middleware this speaks: the mapping of ROS onto DDS is Cyclone's."""
-    return "rmw_cyclonedds_cpp"
+    """Which middleware this speaks."""
+    try:
+        return implementation()
+    except MiddlewareError as error:
+        raise RCLError(str(error)) from None

@@ -1,6 +1,6 @@
 """Publishers and all that executors call back: subscriptions, clients, services, timers, guards.
 
-Nodes make them. DDS readers tell from the transport's thread that data may be waiting; executors
+Nodes make them. The middleware tells from a thread of its own that data may be waiting; executors
 take it in their own.
 """
 
@@ -18,9 +18,7 @@ from threading import Lock
 from typing import Any
 
 from ..cdr import CdrError, deserialize, serialize
-from ..interfaces import type_hash
-from ..services import RequestHeader, ServiceClient, ServiceServer
-from ..transport import DdsError, Participant
+from ..middleware import MiddlewareError, Owner, RequestHeader
 from .context import Context, get_default_context
 from .exceptions import Destroyable, NoTypeSupportImportedException, RCLError
 from .logging import get_logger
@@ -256,9 +254,10 @@ def require_message_class(cls: Any) -> None:
 
 @dataclass(frozen=True)
 class NodeLink:
-    """A node's context, logger name and wake-up, without keeping the node alive."""
+    """A node's context, name, logger name and wake-up, without keeping the node alive."""
 
     context: Context
+    owner: Owner
     logger_name: str
     wake: Callable[[], None]
 
@@ -266,7 +265,7 @@ class NodeLink:
 def open_endpoint(
     kind: str, link: NodeLink, msg_type: Any, topic: str, full_name: str, qos: QoSProfile
 ) -> Any:
-    """A DDS writer for a "publisher", or reader for a "subscription".
+    """The middleware's endpoint for a "publisher" or a "subscription".
 
     Args:
         topic: the topic's name as the node wrote it.
@@ -277,29 +276,28 @@ def open_endpoint(
         RCLError: the quality of service is refused.
     """
     require_message_class(msg_type)
-    package, folder, name = msg_type.__msgtype__.split("/")
+    middleware = link.context._middleware
     if kind == "publisher":
-        create: Any = Participant.create_writer
+        create: Any = middleware.create_publisher
         other = "subscription"
         effect = "requesting incompatible QoS. No messages will be sent to it"
     else:
-        create = Participant.create_reader
+        create = middleware.create_subscription
         other = "publisher"
         effect = "offering incompatible QoS. No messages will be received from it"
     logger = get_logger(link.logger_name)
     try:
         return create(
-            link.context._participant,
-            full_name[1:] if qos.avoid_ros_namespace_conventions else f"rt{full_name}",
-            f"{package}::{folder}::dds_::{name}_",
+            link.owner,
+            full_name,
+            msg_type.__msgtype__,
             qos,
-            f"typehash={type_hash(msg_type.__msgtype__)};",
-            on_incompatible=lambda policy: logger.warning(
+            lambda policy: logger.warning(
                 f"New {other} discovered on topic '{topic}', {effect}. "
                 f"Last incompatible policy: {policy}"
             ),
         )
-    except DdsError as error:
+    except MiddlewareError as error:
         raise RCLError(f"failed to create {kind}: {error}") from None
 
 
@@ -419,7 +417,7 @@ class Publisher(Connected):
             raise RCLError("Failed to publish: publisher's context is invalid")
         try:
             accepted = self._endpoint.write(msg)
-        except DdsError as error:
+        except MiddlewareError as error:
             raise RCLError(f"Failed to publish: {error}") from None
         if not accepted:
             self._logger.warning(
@@ -495,7 +493,7 @@ class Subscription(Receiver):
         origin = {
             "source_timestamp": info.source_timestamp,
             "received_timestamp": info.received_timestamp,
-            "publication_sequence_number": None,
+            "publication_sequence_number": info.sequence,
             "reception_sequence_number": None,
         }
         return partial(self.callback, message, origin)
@@ -519,8 +517,8 @@ class Client(Receiver):
         qos_profile: QoSProfile,
         callback_group: CallbackGroup,
     ) -> None:
-        endpoint = ServiceClient(
-            link.context._participant, full_name, srv_type.__msgtype__, qos_profile
+        endpoint = link.context._middleware.create_client(
+            link.owner, full_name, srv_type.__msgtype__, qos_profile
         )
         super().__init__(link, full_name, endpoint, qos_profile, callback_group)
         self.context = link.context
@@ -608,8 +606,8 @@ class Service(Receiver):
         callback_group: CallbackGroup,
         qos_profile: QoSProfile,
     ) -> None:
-        endpoint = ServiceServer(
-            link.context._participant, full_name, srv_type.__msgtype__, qos_profile
+        endpoint = link.context._middleware.create_service(
+            link.owner, full_name, srv_type.__msgtype__, qos_profile
         )
         super().__init__(link, full_name, endpoint, qos_profile, callback_group)
         self.srv_type = srv_type

@@ -18,8 +18,8 @@ from itertools import chain
 from operator import attrgetter
 from typing import Any
 
-from ..graph import Graph, GraphEndpoint, GraphNode
 from ..messages import message_class
+from ..middleware import GraphEndpoint, GraphNode, Middleware, Owner, numbers
 from ._arguments import parse_arguments
 from ._names import (
     NAMESPACE,
@@ -199,7 +199,8 @@ class Node(NodeParameters):
 
         path = self._rcl_namespace.strip("/").replace("/", ".")
         logger_name = f"{path}.{self._rcl_name}" if path else self._rcl_name
-        self._rcl_link = NodeLink(self._context, logger_name, _waker_of(self))
+        owner = Owner(next(numbers), self._rcl_namespace, self._rcl_name)
+        self._rcl_link = NodeLink(self._context, owner, logger_name, _waker_of(self))
         self._publishers: list[Publisher] = []
         self._subscriptions: list[Subscription] = []
         self._clients: list[Client] = []
@@ -467,8 +468,8 @@ class Node(NodeParameters):
         return name, namespace
 
     @property
-    def _rcl_graph(self) -> Graph:
-        return self._context._graph
+    def _rcl_graph(self) -> Middleware:
+        return self._context._middleware
 
     def _rcl_resolve(self, name: str, kind: int, only_expand: bool) -> str:
         try:
@@ -549,7 +550,8 @@ class Node(NodeParameters):
             gids = [owner._gids for owner in owners]
             readers = tuple(gid for ours, _ in gids for gid in ours)
             writers = tuple(gid for _, ours in gids for gid in ours)
-            known = GraphNode(self._rcl_namespace, self._rcl_name, readers, writers)
+            number, namespace, name = self._rcl_link.owner
+            known = GraphNode(namespace, name, readers, writers, number=number)
             self._context._set_node(self._rcl_link, known)
         self._rcl_wake_executor()
 

@@ -68,7 +68,7 @@ class FemNonlinearSettings(SolverSettings):
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
-        "parameter: live, what the rate leaves, and up to three times that until the forces are "
+        "parameter: live, what the rate leaves, and up to half as much again until the forces are "
         "balanced; in lockstep no limit, lest results depend on the machine",
         default=None,
     )
@@ -287,12 +287,12 @@ class FemNonlinear(TissueSolver):
             if newton.residual_norm <= goal:  # what is left is the error of the displacement
                 goal = 0.0
             budget.begin_step()
-            limit = min(budget.iterations_left, newton.iteration_limit)
+            limit = min(budget.iterations_left, budget.step_iterations, newton.iteration_limit)
             taken = newton.step(limit, goal, start)
             budget.end_step(newton.iterations)
             start = None
             stagnated = not taken and newton.has_stagnated
-            is_over = budget.is_over(balanced=not self._exceeds(self.settings.frame_tolerance))
+            is_over = budget.is_over(balanced=not self._exceeds(self.most_unbalanced))
             if is_over and budget.is_shorter_than_a_step:
                 actions.append(
                     f"frame_budget is {1e3 * (budget.time_limit or 0.0):.3g} ms, but one step "
@@ -334,10 +334,12 @@ class FemNonlinear(TissueSolver):
                 break
             start: NDArray[np.float64] | None = self._predict(nearer)
             for _ in range(TUNING.load_step_newton_steps):
-                newton.step(newton.iteration_limit, 0.0, start)
-                budget.spend(newton.iterations)
+                budget.begin_step()
+                newton.step(min(budget.step_iterations, newton.iteration_limit), 0.0, start)
+                budget.end_step(newton.iterations)
                 start = None
-                if newton.residual_norm <= TUNING.load_step_tolerance * newton.contact_norm:
+                done = newton.residual_norm <= TUNING.load_step_tolerance * newton.contact_norm
+                if done or budget.is_late:
                     break
 
     def _predict(self, pose: Pose) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 
@@ -24,6 +25,7 @@ class FrameBudget:
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
+        self._iteration_time = 0.0  # s, of the last step that was measured
         self.reset()
 
     def reset(self) -> None:
@@ -67,8 +69,12 @@ class FrameBudget:
         spent = self._allowed - self.iterations_left
         if spent > TUNING.load_step_iterations * self._allowed:
             return False
-        limit = self.time_limit
-        return limit is None or self._clock() <= self._began + TUNING.load_step_time * limit
+        return not self.is_late
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time that is left is for the pose itself, and no longer for load steps."""
+        return self._iterations_within(TUNING.load_step_time) < TUNING.least_iterations
 
     def spend(self, iterations: int) -> None:
         """Subtract the iterations of a Newton step, and its fixed cost."""
@@ -83,13 +89,27 @@ class FrameBudget:
         self.spend(iterations)
         now = self._clock()
         self.step_time, self._now = now - self._now, now
+        self._iteration_time = self.step_time / (iterations + TUNING.newton_step_cost)
+
+    @property
+    def step_iterations(self) -> int:
+        """Iterations with which the next step ends in time, at the speed of the last one."""
+        in_time = self._iterations_within(1.0)
+        if in_time < TUNING.least_iterations and not self._is_strict:
+            in_time = self._iterations_within(TUNING.overtime)
+        return max(in_time, TUNING.least_iterations)
 
     def is_over(self, *, balanced: bool) -> bool:
-        """Whether the frame's time is; a live frame that is not balanced has longer."""
-        if self.time_limit is None:
-            return False
+        """Whether another step would end late; a live frame that is not balanced has longer."""
         factor = 1.0 if balanced or self._is_strict else TUNING.overtime
-        return self._now - self._began > self.time_limit * factor
+        return self._iterations_within(factor) < TUNING.least_iterations
+
+    def _iterations_within(self, factor: float) -> int:
+        """Iterations of a step that ends after this many times the frame's time."""
+        if self.time_limit is None:
+            return sys.maxsize
+        left = self._began + factor * self.time_limit - self._clock()
+        return int(left / max(self._iteration_time, 1e-9)) - TUNING.newton_step_cost
 
     @property
     def is_shorter_than_a_step(self) -> bool:
@@ -97,16 +117,21 @@ class FrameBudget:
         return self._is_strict and self.step_time > (self.time_limit or math.inf)
 
 
-def frame_limit(sending: float, cores: int) -> float:
+PERIOD = 1 / 60
+"""s, from pose to pose."""
+
+
+def frame_limit(sending: float, cores: int, waited: float = 0.0) -> float:
     """s, that a frame may take, so that poses at 60 Hz are kept up with.
 
     Args:
         sending: s, that it takes to send its result.
         cores: that the nodes of the simulation share.
+        waited: s, that its pose has, since an earlier frame took longer.
     """
     # Of a period one node may use so much; the rest is for what else its core does.
     share = 0.87 if cores > 1 else 0.5
-    return max(share / 60 - sending, 0.002)
+    return max(share * PERIOD - sending - waited, 0.002)
 
 
 def usable_cores() -> int:

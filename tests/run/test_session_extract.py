@@ -1,0 +1,186 @@
+"""Parts of a recording as files, read by programs that are not ours."""
+
+import csv
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from rosbags.highlevel import AnyReader
+from session_files import EPOCH, PERIOD, TYPES, image, press, write
+
+from us_sim.command.main import main
+from us_sim.recording.reader import read_bag
+from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.writer import BagWriter
+from us_sim.run.session_extract import add_comment
+
+SPACING = (0.4e-3, 0.25e-3)  # m, of columns and of rows
+
+
+def extracted(bag, out, *options):
+    return main(["bag", "extract", str(bag), "--out", str(out), *options])
+
+
+@pytest.fixture
+def scaled(tmp_path):
+    """A session of images whose scale is known: 40 of them, the last 20 at half the rate."""
+    store = jazzy_definitions()
+    to_probe = np.zeros((4, 4))
+    to_probe[0, 0], to_probe[2, 1], to_probe[3, 3] = *SPACING, 1.0
+    layout = store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    array = store.types["std_msgs/msg/Float64MultiArray"](layout=layout, data=to_probe.ravel())
+    matrix = store.serialize_cdr(array, "std_msgs/msg/Float64MultiArray", little_endian=True)
+    with BagWriter(tmp_path / "s.mcap", sidecar=False) as bag:
+        bag.add_topic("/ultrasound/image", TYPES["/ultrasound/image"])
+        bag.add_topic("/ultrasound/image_to_probe", "std_msgs/msg/Float64MultiArray")
+        bag.write("/ultrasound/image_to_probe", matrix, EPOCH)
+        for k in range(40):
+            stamp = EPOCH + (k + max(k - 20, 0)) * PERIOD
+            bag.write("/ultrasound/image", image(stamp, np.full((48, 64), 6 * k)), stamp + 1)
+    return tmp_path / "s.mcap"
+
+
+def test_real_poses_are_what_rosbags_decodes(shared_data, tmp_path):
+    folder = shared_data / "ros2-jazzy/bags/probe_path_mcap"
+    assert extracted(folder, tmp_path, "--poses") == 0
+    with AnyReader([folder]) as reader:
+        chosen = [each for each in reader.connections if each.topic == "/tracker/pose"]
+        decoded = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen)]
+    poses = [(each.pose.position, each.pose.orientation) for each in decoded]
+    numbers = [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for p, q in poses]
+    lines = (tmp_path / "tracker_pose.tum").read_text().splitlines()
+    assert [tuple(map(float, line.split()[1:])) for line in lines] == numbers
+    stamps = [(each.header.stamp.sec, each.header.stamp.nanosec) for each in decoded]
+    assert [tuple(map(int, line.split()[0].split("."))) for line in lines] == stamps
+    with (tmp_path / "tracker_pose.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [tuple(float(row[n]) for n in ("x_m", "y_m", "z_m")) for row in rows] == [
+        each[:3] for each in numbers
+    ]
+
+
+def test_poses_that_are_not_finite_are_in_the_csv_alone(tmp_path):
+    messages = [each for each in press(10) if each[0] == "/probe/pose"]
+    at = len(messages[3][1]) - 7 * 8
+    data = messages[3][1]
+    messages[3][1] = data[:at] + struct.pack("<d", np.nan) + data[at + 8 :]
+    assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--poses") == 0
+    assert len((tmp_path / "probe_pose.tum").read_text().splitlines()) == 9
+    assert len((tmp_path / "probe_pose.csv").read_text().splitlines()) == 11
+
+
+def test_wrenches_are_in_newtons(tmp_path):
+    assert extracted(write(tmp_path / "s.mcap", press(60)), tmp_path, "--wrench") == 0
+    with (tmp_path / "probe_wrench.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    forces = [float(row["fz_n"]) for row in rows]
+    assert forces == pytest.approx(-8 * np.sin(np.pi * np.arange(60) / 60))
+    assert rows[1]["stamp_s"] == "1700000000.016666667"
+
+
+def test_images_are_what_was_recorded_with_their_scale(scaled, tmp_path):
+    assert extracted(scaled, tmp_path / "out", "--images") == 0
+    files = sorted((tmp_path / "out" / "ultrasound_image").iterdir())
+    assert len(files) == 40
+    for k, file in enumerate(files):
+        with Image.open(file) as picture:
+            assert (np.array(picture) == 6 * k).all()
+            across, down = (0.0254 / each for each in picture.info["dpi"])
+            # PNG has whole pixels a metre.
+            assert (across, down) == pytest.approx(SPACING, rel=1e-3)
+            assert "pixel spacing 0.4 mm across, 0.25 mm down" in picture.info["Description"]
+    assert cv2.imread(str(files[7]), cv2.IMREAD_UNCHANGED).shape == (48, 64)
+    with (tmp_path / "out" / "ultrasound_image.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert (rows[1]["image"], rows[1]["stamp_s"]) == ("000001.png", "1700000000.016666667")
+
+
+def test_a_video_lasts_as_long_as_it_was(scaled, tmp_path):
+    assert extracted(scaled, tmp_path / "out", "--video") == 0
+    file = tmp_path / "out" / "ultrasound_image.mp4"
+    video = cv2.VideoCapture(str(file))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(60.0, rel=1e-3)
+    levels = []
+    while True:
+        is_there, frame = video.read()
+        if not is_there:
+            break
+        assert frame.shape == (48, 64, 3)
+        levels.append(float(frame.mean()))
+    # 20 images of one period, 19 of two, and the last.
+    shown = [6 * k for k in range(40) for _ in range(2 if 20 <= k < 39 else 1)]
+    assert levels == pytest.approx(shown, abs=4)
+    content = file.read_bytes()
+    assert content.count(b"pixel spacing 0.4 mm across, 0.25 mm down") == 1
+
+
+def test_a_pause_is_a_second_in_the_video(tmp_path):
+    messages = []
+    for k in range(30):
+        stamp = EPOCH + k * PERIOD + (3600 * 10**9 if k > 10 else 0)
+        data = bytes(image(stamp, np.full((8, 8), k)))
+        messages.append(["/ultrasound/image", data, stamp, stamp, k])
+    assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--video") == 0
+    video = cv2.VideoCapture(str(tmp_path / "ultrasound_image.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 29 + 60
+
+
+def test_a_comment_is_only_put_where_it_is_sure_to_be_right(tmp_path):
+    for content in (b"", b"no boxes at all", struct.pack(">I4s", 8, b"moov"), bytes(64)):
+        (tmp_path / "x.mp4").write_bytes(content)
+        add_comment(tmp_path / "x.mp4", "scale")
+        assert (tmp_path / "x.mp4").read_bytes() == content
+
+
+def test_real_images_have_no_scale_that_nobody_recorded(shared_data, tmp_path):
+    folder = shared_data / "ros2-jazzy/bags/probe_path_mcap"
+    assert extracted(folder, tmp_path, "--images") == 0
+    files = sorted((tmp_path / "camera_image_raw").iterdir())
+    assert len(files) == 68
+    with Image.open(files[0]) as picture:
+        assert picture.size == (64, 48)
+        assert "dpi" not in picture.info
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--poses", "holds no poses"),
+        ("--wrench", "holds no wrench"),
+        ("--images", "holds no image"),
+        ("--areas", "has no scene attached"),
+    ],
+)
+def test_what_a_recording_has_not(tmp_path, capsys, option, said):
+    with BagWriter(tmp_path / "s.mcap", sidecar=False) as bag:
+        bag.add_topic("/note", "std_msgs/msg/String")
+    assert extracted(tmp_path / "s.mcap", tmp_path / "out", option) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_images_that_are_no_pictures(tmp_path, capsys):
+    messages = [each for each in press(3) if each[0] == "/ultrasound/image"]
+    for message in messages:
+        message[1] = message[1].replace(b"mono8", b"bayer")
+    assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--images") == 1
+    assert "the image is bayer; it must be mono8" in capsys.readouterr().err
+
+
+def test_nothing_is_overwritten(scaled, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert extracted(scaled, out, "--images", "--video") == 0
+    for option in ("--images", "--video"):
+        assert extracted(scaled, out, option) == 1
+        assert "exists already: choose another folder with --out" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert extracted(scaled, tmp_path / "file", "--images") == 1
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_attached_files_as_before_without_an_option(tmp_path):
+    session = write(tmp_path / "s.mcap", press(3), {"note.txt": b"hello"})
+    assert extracted(session, tmp_path / "out") == 0
+    assert (tmp_path / "out" / "note.txt").read_bytes() == b"hello"
+    assert read_bag(session).attachments().keys() == {"note.txt"}

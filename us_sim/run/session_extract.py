@@ -1,0 +1,317 @@
+"""Poses, wrenches, images and areas of a recording as files that other programs read."""
+
+from __future__ import annotations
+
+import csv
+import math
+import struct
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from us_sim.errors import BagError
+from us_sim.nodes.messages import colour_pixels_from, pixels_from
+from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
+from us_sim.recording.reader import Bag
+from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.topic import BagTopic
+from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
+from us_sim.run.resimulation import scene_within
+from us_sim.run.session_summary import read_session
+
+AREAS = 200  # images of which areas are measured, evenly over the session
+_IMAGE = "sensor_msgs/msg/Image"
+_LONGEST_PAUSE = 1.0  # s, that a video stands still
+_RATES = (1.0, 240.0)  # images a second of a video
+_MILLIMETRE = 1e-3
+Progress = Callable[[float, str], None]
+
+
+def write_poses(bag: Bag, folder: Path) -> Iterator[Path]:
+    """Every PoseStamped topic, or else every body of others, as CSV and in TUM's format.
+
+    TUM's (``timestamp tx ty tz qx qy qz qw``, s and m) has no poses that are not finite; the CSV
+    has all, with the time at which they were recorded, and their frame.
+
+    Raises:
+        BagError: there are no poses, a file exists, or cannot be written.
+    """
+    stamped = [topic.name for topic in bag.topics if topic.type_name == POSE_STAMPED]
+    bodies = stamped or [name for names in bodies_in(bag).values() for name in names]
+    if not bodies:
+        raise BagError(f"{bag.path} holds no poses; leave out --poses")
+    for name in bodies:
+        rows = list(pose_rows(bag, name))
+        head = ("stamp_s", "recorded_s", "frame", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+        table = [(_s(row.stamp), _s(row.log_time), row.frame_id, *row.pose) for row in rows]
+        yield _write_csv(folder / f"{_file_name(name)}.csv", head, table)
+        lines = [
+            " ".join([_s(row.stamp), *map(repr, row.pose)])
+            for row in rows
+            if all(map(math.isfinite, row.pose))
+        ]
+        yield _written(folder / f"{_file_name(name)}.tum", "".join(f"{line}\n" for line in lines))
+
+
+def write_wrenches(bag: Bag, folder: Path) -> Iterator[Path]:
+    """Every WrenchStamped topic as CSV, N and N m.
+
+    Raises:
+        BagError: there is none, a file exists, or cannot be written.
+    """
+    names = [topic.name for topic in bag.topics if topic.type_name == WRENCH_STAMPED]
+    if not names:
+        raise BagError(f"{bag.path} holds no wrench; leave out --wrench")
+    for name in names:
+        record = read_wrenches(bag.path, name)
+        head = ("stamp_s", "frame", *(f"f{axis}_n" for axis in "xyz"), "tx_nm", "ty_nm", "tz_nm")
+        rows = zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True)
+        table = [(_s(stamp), record.frame_id, *wrench) for stamp, wrench in rows]
+        yield _write_csv(folder / f"{_file_name(name)}.csv", head, table)
+
+
+def write_images(
+    bag: Bag, folder: Path, progress: Progress, *, pictures: bool, video: bool
+) -> Iterator[Path]:
+    """Every topic of images as PNG files, as MP4, or both; and a CSV with the stamp of each.
+
+    PNG files hold their scale as resolution, and it, stamp, topic and frame as texts; an MP4 holds
+    scale, rate and first stamp as its comment. A video has a constant rate, the usual one of the
+    images: they are shown when they were stamped, but none for longer than a second.
+
+    Args:
+        bag: with images of ``mono8`` or ``rgb8``.
+        folder: gets a folder for each topic, and a video.
+        progress: takes the fraction done, and the topic.
+        pictures: write PNG files.
+        video: write an MP4.
+
+    Raises:
+        BagError: there is no image, its encoding is another, a file exists, or cannot be written.
+    """
+    topics = [topic for topic in bag.topics if topic.type_name == _IMAGE and topic.message_count]
+    if not topics:
+        raise BagError(f"{bag.path} holds no image; leave out --images and --video")
+    for topic in topics:
+        stem = folder / _file_name(topic.name)
+        scale = _scale(bag, topic)
+        stamps = _stamps(bag, topic)
+        beats, rate = _beats(stamps)
+        facts = [f"topic {topic.name}", *_facts(scale)]
+        film = _Film(stem.with_suffix(".mp4"), rate) if video else None
+        rows = []
+        for number, message in enumerate(bag.messages([topic.name])):
+            progress(min(number / topic.message_count, 0.999), topic.name)
+            decoded: Any = bag.deserialize(message)
+            pixels = _pixels(decoded)
+            name = f"{number:06d}.png"
+            rows.append((name if pictures else number, _s(stamps[number])))
+            if pictures:
+                told = [f"stamp {_s(stamps[number])} s", f"frame {decoded.header.frame_id}", *facts]
+                _write_png(stem / name, pixels, scale, told)
+            if film is not None:
+                film.show(pixels, beats[number])
+        yield _write_csv(stem.with_suffix(".csv"), ("image", "stamp_s"), rows)
+        if pictures:
+            yield stem
+        if film is not None:
+            told = [f"first stamp {_s(stamps[0])} s", f"{rate:.6g} images/s", *facts]
+            yield film.finish("; ".join(told))
+    progress(1.0, "")
+
+
+def write_areas(bag: Bag, folder: Path, progress: Progress) -> Iterator[Path]:
+    """Areas of vessels in the image plane, now and in the same plane of the tissue at rest.
+
+    Raises:
+        BagError: the session has no scene, no vessels, or other files than then; or a file exists.
+        UsSimError: the scene cannot be read.
+    """
+    attached = bag.attachments()
+    if "scene.yaml" not in attached:
+        raise BagError(f"{bag.path} has no scene attached, so nobody knows where vessels are")
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as place:
+        scene = scene_within(bag.path, attached, Path(place, "attached"))
+        session = read_session(bag.path)
+        areas = session.lumen_areas(scene, AREAS, lambda done: progress(done, "areas"))
+    if areas is None:
+        raise BagError(f"{bag.path}: no image of it cuts a vessel that can be measured")
+    head = ["time_s", "depth_mm"]
+    columns: list[NDArray[np.float64]] = [areas.time, 1e3 * areas.depth]
+    for name in areas.area:
+        head += [f"{name}_mm2", f"{name}_at_rest_mm2"]
+        columns += [1e6 * areas.area[name], 1e6 * areas.at_rest[name]]
+    table = np.column_stack(columns).tolist()
+    yield _write_csv(
+        folder / "areas.csv", head, [["" if v != v else round(v, 6) for v in row] for row in table]
+    )
+
+
+def _file_name(topic: str) -> str:
+    kept = "".join(c if c.isalnum() or c in "._-" else "_" for c in topic.strip("/"))
+    return kept or "topic"
+
+
+def _s(nanoseconds: int) -> str:
+    """Seconds with all nine digits, which a float has not since 1970."""
+    sign = "-" if nanoseconds < 0 else ""
+    return f"{sign}{abs(nanoseconds) // 10**9}.{abs(nanoseconds) % 10**9:09d}"
+
+
+def _write_csv(file: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> Path:
+    with _new(file, encoding="utf-8", newline="") as stream:
+        csv.writer(stream).writerows([head, *rows])
+    return file
+
+
+def _written(file: Path, text: str) -> Path:
+    with _new(file, encoding="utf-8") as stream:
+        stream.write(text)
+    return file
+
+
+def _new(file: Path, **options: Any) -> Any:
+    """A file that was not there, opened for writing."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return file.open("x" if options else "xb", **options)
+    except FileExistsError:
+        raise BagError(f"{file} exists already: choose another folder with --out") from None
+    except OSError as error:
+        raise BagError(f"{file} cannot be written: {error.strerror}") from None
+
+
+def _scale(bag: Bag, topic: BagTopic) -> tuple[float, float] | None:
+    """m from column to column and from row to row, where the recording says so."""
+    name = f"{topic.name.rpartition('/')[0]}/image_to_probe"
+    if not any(each.name == name for each in bag.topics):
+        return None
+    for message in bag.messages([name]):
+        values = np.array(bag.deserialize(message).data, float)
+        if values.shape == (16,) and np.isfinite(values).all():
+            across, down = np.linalg.norm(values.reshape(4, 4)[:3, :2], axis=0)
+            return (float(across), float(down)) if across > 0 and down > 0 else None
+    return None
+
+
+def _facts(scale: tuple[float, float] | None) -> list[str]:
+    if scale is None:
+        return []
+    across, down = (each / _MILLIMETRE for each in scale)
+    return [f"pixel spacing {across:.6g} mm across, {down:.6g} mm down"]
+
+
+def _stamps(bag: Bag, topic: BagTopic) -> list[int]:
+    read = stamp_reader(bag, topic)
+    if read is None:
+        raise BagError(f"{bag.path} defines {topic.type_name} as ROS 2 does not: it has no header")
+    try:
+        return [read(message.data) or 0 for message in bag.messages([topic.name])]
+    except (struct.error, IndexError):
+        raise BagError(f"{bag.path} holds a message on {topic.name} that is no image") from None
+
+
+def _beats(stamps: list[int]) -> tuple[list[int], float]:
+    """Images of a constant rate that each is shown for, and that rate."""
+    steps = np.diff(np.array(stamps, np.float64)) * 1e-9
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    rate = float(np.clip(1.0 / usual, *_RATES)) if usual > 0 else 25.0
+    ends = np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE)) * rate
+    shown = np.diff(np.round(ends), prepend=0.0).astype(int)
+    return [*shown.tolist(), 1], rate
+
+
+def _pixels(message: Any) -> NDArray[np.uint8]:
+    return colour_pixels_from(message) if message.encoding == "rgb8" else pixels_from(message)
+
+
+def _write_png(
+    file: Path, pixels: NDArray[np.uint8], scale: tuple[float, float] | None, facts: list[str]
+) -> None:
+    texts = PngInfo()
+    texts.add_itxt("Description", "; ".join(facts))
+    texts.add_itxt("Software", "us_sim")
+    dpi = {"dpi": tuple(0.0254 / each for each in scale)} if scale is not None else {}
+    with _new(file) as stream:
+        Image.fromarray(pixels).save(stream, "PNG", pnginfo=texts, compress_level=3, **dpi)
+
+
+class _Film:
+    """An MP4 in the making; its size is that of the first image."""
+
+    def __init__(self, file: Path, rate: float) -> None:
+        self._file, self._rate = file, rate
+        self._size = (0, 0)
+        self._writer: cv2.VideoWriter | None = None
+
+    def show(self, pixels: NDArray[np.uint8], times: int) -> None:
+        """Add an image so many times; one of another size is cut, or gets a black border."""
+        if self._writer is None:
+            _new(self._file).close()
+            rows, columns = pixels.shape[:2]
+            self._size = (columns + columns % 2, rows + rows % 2)  # as the format wants it
+            codec = cv2.VideoWriter.fourcc(*"mp4v")
+            self._writer = cv2.VideoWriter(str(self._file), codec, self._rate, self._size)
+            if not self._writer.isOpened():
+                self._file.unlink(missing_ok=True)
+                raise BagError(
+                    f"this OpenCV cannot write {self._file}: install opencv-python-headless with "
+                    f"pip, which has FFmpeg, or leave out --video"
+                )
+        width, height = self._size
+        whole = np.zeros((height, width, 3), np.uint8)
+        part = pixels[:height, :width]
+        whole[: part.shape[0], : part.shape[1]] = (
+            part[..., None] if part.ndim == 2 else (part[..., ::-1])
+        )
+        for _ in range(times):
+            self._writer.write(whole)
+
+    def finish(self, comment: str) -> Path:
+        """Close the file, with a comment."""
+        if self._writer is not None:
+            self._writer.release()
+            add_comment(self._file, comment)
+        return self._file
+
+
+def add_comment(file: Path, text: str) -> None:
+    """Put a comment among the facts of an MP4, as FFmpeg's and most players' ``comment``.
+
+    Nothing is done where FFmpeg wrote the boxes of its facts in another way than at the end of the
+    file, each within the one before: ``moov``, ``udta``, ``meta``, ``ilst``.
+    """
+    content = bytearray(file.read_bytes())
+    data = struct.pack(">4sII", b"data", 1, 0) + text.encode()  # 1: UTF-8
+    item = b"\xa9cmt" + struct.pack(">I", len(data) + 4) + data
+    item = struct.pack(">I", len(item) + 4) + item
+    begin, places = 0, []
+    for name, head in ((b"moov", 8), (b"udta", 8), (b"meta", 12), (b"ilst", 8)):
+        place = _box_at_the_end(content, begin, name)
+        if place is None:
+            return
+        places.append(place)
+        begin = place + head
+    for place in places:
+        (size,) = struct.unpack_from(">I", content, place)
+        struct.pack_into(">I", content, place, size + len(item))
+    file.write_bytes(content + item)
+
+
+def _box_at_the_end(content: bytearray, begin: int, name: bytes) -> int | None:
+    """Where the last of the boxes from there on begins, if it has that name."""
+    while begin + 8 <= len(content):
+        size, kind = struct.unpack_from(">I4s", content, begin)
+        if size < 8:
+            return None
+        if begin + size == len(content):
+            return begin if kind == name else None
+        begin += size
+    return None

@@ -1,0 +1,187 @@
+"""The names and bytes by which rmw_zenoh's nodes know each other: keys, tokens, attachments.
+
+They are those of rmw_zenoh_cpp 0.2 (ROS 2 Jazzy), as its design.md, liveliness_utils.cpp and
+attachment_helpers.cpp have them; see https://github.com/ros2/rmw_zenoh.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import astuple, dataclass
+
+from .middleware import EndpointQos
+from .xxh3 import xxh3_128
+
+NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
+
+DEFAULT_DEPTH = 42
+"""What a depth of 0 stands for."""
+
+_SPACE = "@ros2_lv"
+_OF_NODE, _OF_ENDPOINT = 9, 13  # the parts of a token
+_DEFAULT_QOS = EndpointQos(depth=DEFAULT_DEPTH)
+_INFINITE = (9223372036, 854775807)  # rmw_time_t: s, ns
+_ATTACHMENT = struct.Struct("<qqB16s")
+_GID_SIZE = 16
+
+
+def all_tokens(domain: int) -> str:
+    """The key expression of every token in a domain."""
+    return f"{_SPACE}/{domain}/**"
+
+
+def key_of(domain: int, name: str, type_name: str, type_hash: str) -> str:
+    """The key on which a topic's samples, or a service's requests, travel.
+
+    >>> key_of(0, "/robot1/chatter", "std_msgs::msg::dds_::String_", "RIHS01_df66")
+    '0/robot1/chatter/std_msgs::msg::dds_::String_/RIHS01_df66'
+    """
+    return f"{domain}/{name.strip('/')}/{type_name}/{type_hash}"
+
+
+def attachment(sequence: int, timestamp: int, gid: bytes) -> bytes:
+    """What goes with a sample: its number, when it was sent (ns since 1970), and who sent it.
+
+    In zenoh's serialization: two signed numbers of 64 bits, then the bytes after their number.
+    """
+    return _ATTACHMENT.pack(sequence, timestamp, len(gid), gid)
+
+
+def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
+    """The number, time and gid in an attachment; None if it is none of rmw_zenoh's."""
+    if len(data) != _ATTACHMENT.size:
+        return None
+    sequence, timestamp, size, gid = _ATTACHMENT.unpack(data)
+    return (sequence, timestamp, gid) if size == _GID_SIZE else None
+
+
+@dataclass(frozen=True)
+class Entity:
+    """A node, or an endpoint of one, as its liveliness token tells of it."""
+
+    domain: int
+    session: str  # zenoh's id, in hexadecimal
+    node_number: int
+    number: int  # its own; a node's is node_number
+    kind: str
+    enclave: str
+    namespace: str
+    node: str
+    name: str = ""  # of the topic or service; nodes have none, nor what follows
+    type_name: str = ""  # as in DDS
+    type_hash: str = ""
+    qos: EndpointQos = _DEFAULT_QOS
+
+    @property
+    def token(self) -> str:
+        """The key that is alive as long as the entity is."""
+        *parts, _ = astuple(self)
+        text = [_mangled(str(part)) for part in parts[: _OF_NODE - 1]]
+        if self.kind != NODE:
+            text += [*(_mangled(part) for part in parts[_OF_NODE - 1 :]), qos_text(self.qos)]
+        return "/".join([_SPACE, *text])
+
+    @property
+    def gid(self) -> bytes:
+        """Its sixteen bytes."""
+        return xxh3_128(self.token.encode())
+
+    @property
+    def key(self) -> str:
+        """The key of its topic or service."""
+        return key_of(self.domain, self.name, self.type_name, self.type_hash)
+
+
+def read_token(token: str) -> Entity | None:
+    """The entity that a token tells of; None if it is none of rmw_zenoh's."""
+    parts = [part.replace("%", "/") for part in token.split("/")]
+    if len(parts) not in (_OF_NODE, _OF_ENDPOINT) or parts[0] != _SPACE or not all(parts):
+        return None
+    _, domain, session, node_number, number, kind, *names = parts
+    if kind not in (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT):
+        return None
+    try:
+        qos = read_qos(names.pop()) if kind != NODE else _DEFAULT_QOS
+        enclave, namespace, node, *topic = names
+        name, type_name, type_hash = topic or ("", "", "")
+        return Entity(
+            int(domain),
+            session,
+            int(node_number),
+            int(number),
+            kind,
+            enclave,
+            namespace,
+            node,
+            name,
+            type_name,
+            type_hash,
+            qos,
+        )
+    except (ValueError, IndexError, TypeError):
+        return None
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def qos_text(qos: EndpointQos) -> str:
+    """Reliability:durability:history,depth:deadline:lifespan:liveliness,lease; empty if default.
+
+    >>> qos_text(EndpointQos(depth=7, reliability=EndpointQos.BEST_EFFORT, deadline=2_000_000_001))
+    '2::,7:2,1:,:,,'
+    """
+
+    def text(name: str) -> str:
+        value = getattr(qos, name)
+        return "" if value == getattr(_DEFAULT_QOS, name) else str(value)
+
+    def duration(nanoseconds: int) -> str:
+        if not nanoseconds:
+            return ","
+        both = zip(divmod(nanoseconds, 10**9), _INFINITE, strict=True)
+        return ",".join("" if part == infinite else str(part) for part, infinite in both)
+
+    return (
+        f"{text('reliability')}:{text('durability')}:{text('history')},{text('depth')}:"
+        f"{duration(qos.deadline)}:{duration(qos.lifespan)}:"
+        f"{text('liveliness')},{duration(qos.liveliness_lease_duration)}"
+    )
+
+
+def read_qos(text: str) -> EndpointQos:
+    """The policies in a token.
+
+    Raises:
+        ValueError, IndexError: it is not what `qos_text` makes.
+    """
+    reliability, durability, history, deadline, lifespan, liveliness = (
+        [int(part) if part else None for part in group.split(",")] for group in text.split(":")
+    )
+
+    def duration(parts: list[int | None]) -> int:
+        if parts == [None, None]:
+            return 0
+        seconds, nanoseconds = (
+            infinite if part is None else part
+            for part, infinite in zip(parts, _INFINITE, strict=True)
+        )
+        return seconds * 10**9 + nanoseconds
+
+    given = {
+        "reliability": reliability[0],
+        "durability": durability[0],
+        "history": history[0],
+        "depth": history[1],
+        "liveliness": liveliness[0],
+    }
+    return EndpointQos(
+        **{
+            name: getattr(_DEFAULT_QOS, name) if value is None else value
+            for name, value in given.items()
+        },
+        deadline=duration(deadline),
+        lifespan=duration(lifespan),
+        liveliness_lease_duration=duration(liveliness[1:]),
+    )
