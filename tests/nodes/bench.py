@@ -1,7 +1,7 @@
 """A bench for one node: its own context and executor, bounded spins, no launch system."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -14,11 +14,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 
 class Bench:
-    """Nodes under test, and one node that talks to them."""
+    """Nodes under test, and one node that talks to them; ROS arguments are for all of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, args: Sequence[str] = ()) -> None:
         self.context = Context()
-        rclpy.init(context=self.context, args=[])
+        rclpy.init(context=self.context, args=list(args))
         self.executor = SingleThreadedExecutor(context=self.context)
         self._nodes: list[Node] = []
         self.peer = self.add(Node("bench", context=self.context))

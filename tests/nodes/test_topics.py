@@ -5,6 +5,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from bench import Bench
 from rclpy.qos import DurabilityPolicy
 
 from us_sim.nodes.camera_driver import CameraDriver
@@ -29,7 +30,7 @@ ROS_OWN = {"/rosout", "/parameter_events", "/clock"}
 TRACKER_KEYS = {
     "tf": "frame: world, body: stylus",
     "path": f"file: {Path(shared_path('bags/press_and_slide.mcap'))}",
-    "openigtlink": "body: stylus, openigtlink: {port: 1}",
+    "openigtlink": "frame: camera, body: stylus, openigtlink: {port: 1}",
 }
 
 
@@ -133,6 +134,59 @@ def test_what_records_and_plays_every_topic_reports_too(bench, tmp_path):
     recorder = bench.make(SessionRecorder, file=str(tmp_path / "session.mcap"), topics=["/none"])
     played = {endpoint for endpoint in endpoints_of(player) if endpoint[0] != "tracker/pose"}
     assert played | set(endpoints_of(recorder)) == told({"session_player", "session_recorder"})
+
+
+@pytest.fixture
+def all_nodes(scenes, tmp_path):
+    """A function that makes one of each node that needs no device, in a bench."""
+
+    def make(bench):
+        scene = scenes("pose")
+        bag = tmp_path / "bag.mcap"
+        shutil.copy(shared_path("bags/press_and_slide.mcap"), bag)
+        kinds = (ProbeTracker, TissueDeformer, SkinDeformer, SliceInterpolator, HapticRenderer)
+        nodes = [bench.make(kind, scene=scene) for kind in kinds]
+        return [
+            *nodes,
+            bench.make(PathPlayer, path=str(bag), lockstep=True, clock=1.0),
+            bench.make(SessionPlayer, path=str(bag)),
+            bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"), topics=["/none"]),
+            bench.make(OpenIGTLinkBridge, scene=scene, port=0),
+            bench.make(CameraDriver, source="/dev/no_camera"),
+            bench.make(SpaceMouseDriver),
+            bench.add(SessionMonitor(context=bench.context)),
+        ]
+
+    return make
+
+
+def test_every_topic_has_overrides_of_its_quality_of_service(bench, all_nodes):
+    for node in all_nodes(bench):
+        for direction, endpoints in (
+            ("publisher", node.publishers),
+            ("subscription", node.subscriptions),
+        ):
+            for topic in {each.topic_name for each in endpoints} - ROS_OWN:
+                for policy in ("reliability", "history", "depth"):
+                    name = f"qos_overrides.{topic}.{direction}.{policy}"
+                    assert node.has_parameter(name), (node.get_name(), name)
+
+
+def test_every_topic_can_be_remapped_and_is_in_the_namespace(all_nodes):
+    """Nothing of a simulator in a namespace is outside but what ROS itself has there."""
+    moved = [f"{topic.name}:=moved/{topic.name}" for topic in TOPICS]
+    rules = [word for rule in ("__ns:=/left", *moved) for word in ("-r", rule)]
+    bench = Bench(["--ros-args", *rules])
+    try:
+        for node in all_nodes(bench):
+            names = {each.topic_name for each in (*node.publishers, *node.subscriptions)}
+            if node.get_name() == "session_player":
+                names.discard("/tracker/pose")  # as it is called in the bag
+            assert names - ROS_OWN
+            for name in names - ROS_OWN:
+                assert name.startswith("/left/moved/"), (node.get_name(), name)
+    finally:
+        bench.close()
 
 
 def test_every_node_is_in_the_table_and_no_other():

@@ -72,6 +72,7 @@ class Monitor:
         self.set = {}
         self.node.take_set = lambda: self.set
         self.node.follow = lambda _: None
+        self.node.resolve_topic_name = lambda topic: f"/{topic}"
 
     def spin(self, _=0.1):
         for node, pid in self.group.pids.items():

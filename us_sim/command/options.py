@@ -181,8 +181,13 @@ def scene_name(args: argparse.Namespace, default: str | None = None) -> str:
 
 
 def add_network_option(parser: argparse.ArgumentParser) -> None:
-    """Whether other machines are talked to."""
+    """Whether other machines are talked to, and what ROS itself is told."""
     parser.add_argument("--network", action="store_true", help="talk beyond this host")
+    parser.add_argument(  # taken by `us_sim.command.main`, for there may be more after `--`
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        help="for all nodes, as of `ros2 run`: -r __ns:=/left, -r FROM:=TO, -p NAME:=VALUE",
+    )
 
 
 def add_supervision_options(parser: argparse.ArgumentParser) -> None:

@@ -240,7 +240,9 @@ class Subscriptions:
         self._there = []
         if is_wanted:
             self._there = [
-                self._node.create_subscription(kind, topic, take, qos, raw=raw)
+                self._node.create_subscription(
+                    kind, topic, take, qos, raw=raw, qos_overriding_options=overridable()
+                )
                 for kind, topic, take, qos, raw in self._wanted
             ]
         return True

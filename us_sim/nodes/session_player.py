@@ -52,7 +52,8 @@ class SessionPlayer(GuardedNode):
         self.health = Health(self, str(path))
         self._topics: dict[str, Publisher] = {}
         self._latched: set[str] = set()  # of them
-        exclude = {*settings.exclude, *(["/clock"] if settings.clock else [])}
+        exclude = {*map(self.resolve_topic_name, filter(None, settings.exclude))}
+        exclude |= {"/clock"} if settings.clock else set()
         offered = [topic for topic in self._bag.topics if topic.name not in exclude]
         left_out = [why for topic in offered if (why := self._offer(topic))]
         if not any(self._bag.topic(name).message_count for name in self._topics):
@@ -105,7 +106,7 @@ class SessionPlayer(GuardedNode):
             durability=durability,
         )
         try:
-            self._topics[topic.name] = self.create_publisher(kind, topic.name, qos)
+            self._topics[topic.name] = self.stream(kind, topic.name, qos)
         except (NameValidationException, ValueError):
             return f"{topic.name!r} (no topic of ROS 2 is called so)"
         return ""

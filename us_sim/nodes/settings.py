@@ -199,7 +199,7 @@ class PathPlayerSettings(PlayerSettings):
 class SessionPlayerSettings(PlayerSettings):
     """Of ``session_player``."""
 
-    exclude: tuple[str, ...] = setting(description="full names to leave out", default=())
+    exclude: tuple[str, ...] = setting(description="topics to leave out", default=())
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from us_sim.run.plan import (
     viewer_process,
 )
 from us_sim.run.processes import ProcessGroup, keep_on_this_host
+from us_sim.run.ros_arguments import ros_arguments
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import IMAGER, Supervisor, say
 from us_sim.run.watch import SupervisionSettings, Watch
@@ -274,6 +275,11 @@ def demo(
             or hung, images were not recorded.
     """
     keep_on_this_host(network=network)
+    if ros_arguments():
+        raise UsSimError(
+            "--ros-args: the demo's report is of topics under their usual names: use `us-sim run "
+            "--record FILE` where they have others"
+        )
     scene = load_scene(name, volume=volume)
     file = path or (Path(scene.path) if scene.path is not None else None)
     if file is None:

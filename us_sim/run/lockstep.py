@@ -181,7 +181,7 @@ def _processes(
     recorder: dict[str, object] = {
         "file": str(out / "session.mcap"),
         "compression": "zstd",
-        "exclude": ["/diagnostics"],
+        "exclude": ["diagnostics"],
         "max_cache_size": 0,  # lose nothing, wait for the disk
         **scene_settings(scene),
         "path": str(full_path(path)),

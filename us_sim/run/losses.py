@@ -101,15 +101,15 @@ def files_of(recording: Path) -> list[Path]:
     return [file for _, file in sorted(found)]
 
 
-def images_in(files: Sequence[Path]) -> int:
-    """The images in recordings; a file that cannot be read has none."""
+def images_in(files: Sequence[Path], name: str = f"/{IMAGES}") -> int:
+    """The images in recordings, by their topic's name; a file that cannot be read has none."""
     count = 0
     for file in files:
         try:
             topics = read_bag(file).topics
         except BagError:
             continue
-        count += sum(topic.message_count for topic in topics if topic.name == f"/{IMAGES}")
+        count += sum(topic.message_count for topic in topics if topic.name == name)
     return count
 
 

@@ -17,6 +17,7 @@ from filelock import FileLock, Timeout
 
 from us_sim.errors import UsSimError
 from us_sim.run.plan import NodeProcess, enclave_of
+from us_sim.run.ros_arguments import namespace, ros_arguments
 
 if TYPE_CHECKING:
     from rclpy.context import Context
@@ -32,13 +33,16 @@ def domain() -> str:
 
 
 @contextlib.contextmanager
-def alone_on_domain(namespace: str = "") -> Iterator[None]:
-    """Have the domain to oneself, as far as simulations in this namespace and on this host go.
+def alone_on_domain(space: str | None = None) -> Iterator[None]:
+    """Have the domain to oneself, as far as simulations in a namespace and on this host go.
+
+    Args:
+        space: the namespace; None is that of ``--ros-args``.
 
     Raises:
         UsSimError: another simulation has it.
     """
-    names = ".".join([domain(), *filter(None, namespace.split("/"))])
+    names = ".".join([domain(), *filter(None, (space or namespace()).split("/"))])
     with _abstract_socket(names) if sys.platform == "linux" else _file(names):
         yield
 
@@ -82,7 +86,8 @@ def _file(names: str) -> Iterator[None]:
 def _taken(by: str) -> UsSimError:
     return UsSimError(
         f"another simulation{by} runs already on ROS domain {domain()} of this host: end it, or "
-        f"set ROS_DOMAIN_ID to another number for this one"
+        f"set ROS_DOMAIN_ID to another number for this one, or give it a namespace of its own "
+        f"(--ros-args -r __ns:=/left)"
     )
 
 
@@ -100,9 +105,9 @@ def ros_context(number: int | None = None) -> Context:
     from rclpy.signals import SignalHandlerOptions
 
     context, silent = Context(), SignalHandlerOptions.NO
-    enclave = ["--ros-args", "--enclave", enclave_of("session_control")]
+    given = ["--ros-args", "--enclave", enclave_of("session_control"), *ros_arguments()]
     try:
-        rclpy.init(args=enclave, context=context, domain_id=number, signal_handler_options=silent)
+        rclpy.init(args=given, context=context, domain_id=number, signal_handler_options=silent)
     except Exception as error:  # what rcl raises differs between its versions
         raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
     return context
@@ -158,7 +163,9 @@ class Monitored:
         until = time.monotonic() + DISCOVERY_S
         while time.monotonic() < until:
             self.spin()
-        if taken := sorted(set(names) & set(self.node.get_node_names())):
+        own = self.node.get_namespace()
+        there = {name for name, space in self.node.get_node_names_and_namespaces() if space == own}
+        if taken := sorted(set(names) & there):
             raise UsSimError(
                 f"{taken[0]} runs already on ROS domain {domain()}: "
                 f"end that simulation, or set ROS_DOMAIN_ID to another number for this one"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import posixpath
 import secrets
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,7 @@ import yaml
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
+from us_sim.run.ros_arguments import namespace, ros_arguments
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
@@ -64,8 +66,8 @@ class NodeProcess:
         return [sys.executable, "-P", "-m", module_of(self.node), *self.arguments()]
 
     def arguments(self) -> list[str]:
-        """ROS arguments: its enclave, and its parameters."""
-        arguments = ["--ros-args", "--enclave", enclave_of(self.node)]
+        """ROS arguments: its enclave, those that all nodes get, and its parameters."""
+        arguments = ["--ros-args", "--enclave", enclave_of(self.node), *ros_arguments()]
         for name, value in self.all_parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments
@@ -183,7 +185,8 @@ def plan_of(request: Request) -> Plan:
     played = "" if request.path is None else str(full_path(request.path))
     settings: dict[str, object]
     if request.path is not None and request.everything:
-        running = ["/diagnostics", "/session/scenes", "/session/thumbnails", "/session/bags"]
+        running = ["diagnostics", "session/scenes", "session/thumbnails", "session/bags"]
+        running += [f"/{name}" for name in running]  # of a session without namespace
         settings = {"path": played, "exclude": running, **request.playing}
         processes.append(NodeProcess("session_player", settings))
         return Plan(processes, duration=request.duration, player="session_player")
@@ -192,7 +195,7 @@ def plan_of(request: Request) -> Plan:
         if request.path is not None:
             settings["path"] = played
         if request.video is not None:
-            settings["exclude"] = ["/camera/image_raw"]  # the video is there already
+            settings["exclude"] = ["camera/image_raw"]  # the video is there already
         processes.append(NodeProcess(RECORDER, settings, recorder))
     driver = taken("camera_driver") if request.video is not None else {}
     processes += [
@@ -299,7 +302,12 @@ def player_settings(
 
 def _awaited(topics: Sequence[str], recorder: SessionRecorderSettings | None) -> dict[str, object]:
     """Parameters that have a player wait for these topics, and for a recorder to record them."""
-    recorded = [topic for topic in topics if recorder and recorder.records(f"/{topic}")]
+    space = namespace()
+    recorded = [
+        topic
+        for topic in topics
+        if recorder and recorder.records(posixpath.join(space, topic), space)
+    ]
     return {"await_topics": topics, "await_recorded": recorded or [""]}  # [] has no type
 
 

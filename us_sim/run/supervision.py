@@ -17,6 +17,7 @@ from us_sim.run.losses import IMAGES, Loss, Outcome, Recordings, images_in
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
 from us_sim.run.processes import ProcessGroup, ending
+from us_sim.run.ros_arguments import namespace
 from us_sim.run.watch import START_LIMIT_S, Restarts, SupervisionSettings, Watch
 
 LIVES_S = 10.0
@@ -185,10 +186,11 @@ class Supervisor:
     def outcome(self, startup: float) -> Outcome:
         """How it went, once all has ended."""
         files = self.recordings.files()
-        recorded = images_in(files)
+        images = self._monitor.node.resolve_topic_name(IMAGES)
+        recorded = images_in(files, images)
         # How many images were to be recorded is only known where all that were made were.
         recorder = recorder_of(self._plan.processes)
-        all_were = recorder and recorder.at_once and recorder.records(f"/{IMAGES}")
+        all_were = recorder and recorder.at_once and recorder.records(images, namespace())
         is_known = all_were and self._changes == 1
         made = self._monitor.node.count(IMAGER, IMAGES) if is_known else recorded
         poses = None if self._plan.loops else self._plan.poses

@@ -63,8 +63,9 @@ class Awaited:
         if not self._publisher.get_subscription_count():
             return f"somebody to subscribe to {self._publisher.topic_name}"
         for topic in self._settings.await_topics:
+            topic = node.resolve_topic_name(topic)
             if not node.count_publishers(topic):
-                return f"{node.resolve_topic_name(topic)} to be published"
+                return f"{topic} to be published"
         for topic in map(node.resolve_topic_name, self._settings.await_recorded):
             listeners = node.get_subscriptions_info_by_topic(topic)
             if RECORDER not in {info.node_name for info in listeners}:

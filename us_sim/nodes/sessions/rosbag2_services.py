@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.sessions.playback import Playback
 from us_sim.nodes.settings import LOST, PlayerSettings
 from us_sim.recording.write_behind import Loss
@@ -158,7 +160,7 @@ class RecorderEvents:
 
     SPLIT = "events/write_split"
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: GuardedNode) -> None:
         self._node = node
         self._msg: Any = None
         self._split: Any = None
@@ -168,9 +170,9 @@ class RecorderEvents:
         except ImportError:
             return
         self._msg = msg
-        self._split = node.create_publisher(msg.WriteSplitEvent, self.SPLIT, 1)
+        self._split = node.stream(msg.WriteSplitEvent, self.SPLIT, QoSProfile(depth=1))
         if hasattr(msg, "MessagesLostEvent"):  # newer than Jazzy
-            self._lost = node.create_publisher(msg.MessagesLostEvent, LOST, 10)
+            self._lost = node.stream(msg.MessagesLostEvent, LOST)
 
     def split(self, closed: str, opened: str) -> None:
         """A file was closed, and another one begun; none when the recording ended."""
