@@ -61,10 +61,11 @@ def main(folder, hours=2.0):
     if not file.exists():
         write(file, round(hours * 3600 * 60))
     opened, seeks = measure(file)
+    median = 1e3 * seeks[len(seeks) // 2]
     print(
         f"{os.path.getsize(file) / 1e6:.0f} MB: opened in {opened[0]:.3f} s, {opened[1]:.3f} s of "
-        f"the processor's; of {len(seeks)} seeks the median took {1e3 * seeks[len(seeks) // 2]:.1f} "
-        f"ms of it, the slowest {1e3 * seeks[-1]:.1f}"
+        f"the processor's; of {len(seeks)} seeks the median took {median:.1f} ms "
+        f"of it, the slowest {1e3 * seeks[-1]:.1f}"
     )
 
 
