@@ -10,7 +10,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from us_sim.nodes.settings import NODES
+from us_sim.nodes.settings import NODES, PLAYERS
 from us_sim.nodes.topics import TOPICS
 
 FILE = Path(__file__).resolve().parents[1] / "config" / "policy.xml"
@@ -38,6 +38,8 @@ def policy() -> str:
         heard = {topic.name for topic in TOPICS if node in topic.subscribers}
         if node == "session_player":  # all that a recording may hold
             published |= every
+        if node in PLAYERS:
+            published.add("/clock")
         if node == "session_recorder":
             heard |= every
         _allow(profile, "topic", "publish", published | {"/rosout", "/parameter_events"})
