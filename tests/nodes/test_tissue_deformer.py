@@ -1,6 +1,7 @@
 """The tissue node: mesh latched, nodes and wrench with the pose's stamp, solver switched live."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -320,3 +321,21 @@ def test_a_scene_without_tissue_is_refused(bench, tmp_path):
     )
     with pytest.raises(SceneError, match="tissue: "):
         bench.make(TissueDeformer, scene=str(file))
+
+
+def test_a_late_frame_leaves_the_next_less_time_for_a_period_at_most(
+    bench, small_scene, monkeypatch
+):
+    node = bench.make(TissueDeformer, scene=str(small_scene), solver="fem_nonlinear")
+    nodes = bench.collect(PointCloud2, "tissue/nodes")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/nodes") > 0)
+    press(bench, bench.publisher(PoseStamped, "probe/pose"), nodes, 0.002, 1)
+    limits = []
+    monkeypatch.setattr(SwitchableTissue, "limit_frames", lambda _, limit: limits.append(limit))
+    for took in (0.0, 0.022, -1.0, 10.0, 0.0):  # s, that each frame takes besides
+        node.arrived = time.monotonic_ns() - round(1e9 * took)
+        node._deform(pose_at(0.002, 2))
+    usual, second, third, fourth, last = limits[-5:]
+    assert third <= second + 1 / 60 - 0.022
+    assert fourth >= max(usual, second, third)
+    assert last == 0.002

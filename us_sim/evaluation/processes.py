@@ -168,7 +168,7 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     node = Arrivals(viewer=viewer, context=context)
     thread = threading.Thread(target=_spin, args=(node, context), daemon=True)
     thread.start()
-    go_first()  # the graph's wait for a core is measured, not the listener's
+    go_first(2)  # the graph's wait for a core is measured, not the listener's for the nodes
     try:
         yield node
     finally:

@@ -46,6 +46,8 @@ class PathPlayer(GuardedNode):
         path = find_bag(settings.path)
         self._path = read_path(path, settings.topic, option="its parameter `topic`")
         lockstep = settings.lockstep
+        # It stands for a device, whose poses come regularly however busy the computer is.
+        self.goes_first = not lockstep
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next, self._sent = 0, -1  # pose to be sent, and that which was sent last

@@ -58,14 +58,17 @@ def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
     gc.collect()
 
 
-def go_first() -> str:
+def go_first(priority: int = 1) -> str:
     """Let all present threads of this process go before ordinary ones, and none that they start.
+
+    Args:
+        priority: among realtime programs; the lowest, so that drivers of devices may go before.
 
     Returns:
         How they run from now on: ``realtime``, or ``ordinary`` where that is not allowed.
     """
-    lowest = 1  # drivers of devices may go before
-    able = hasattr(os, "sched_setscheduler") and _schedule(os.SCHED_RR, lowest)
+    tried = range(priority, 0, -1) if hasattr(os, "sched_setscheduler") else ()
+    able = any(_schedule(os.SCHED_RR, each) for each in tried)
     return "realtime" if able else "ordinary"
 
 

@@ -388,8 +388,8 @@ class TissueDeformer(SceneNode):
     def _go_on(self) -> None:
         """Finish the last frame while no pose comes."""
         idle, self._came = self._came == 0, 0
+        self._waited = 0.0 if idle else self._waited
         if idle and self._last is not None and not self._live.tissue.is_settled:
-            self._waited = 0.0
             self._limit_frame()
             self._frame(self._last, again=True)
 

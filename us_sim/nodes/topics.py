@@ -59,7 +59,8 @@ tf: tf2_msgs/TFMessage
     probe_tracker -> probe_tracker | published: the probe in `patient`, if somebody subscribes;
     heard: source `tf`
 tf_static: tf2_msgs/TFMessage [latched]
-    drivers -> probe_tracker | frames that do not move; source `tf`
+    probe_tracker -> probe_tracker | published: the tracker's frame in `patient`, where it has one;
+    heard: frames that do not move, source `tf`
 camera/image_raw: sensor_msgs/Image
     camera_driver -> probe_tracker | what a camera sees of the markers on the probe; source `camera`
 camera/image_raw/compressed: sensor_msgs/CompressedImage
