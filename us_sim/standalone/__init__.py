@@ -1,4 +1,4 @@
-"""ROS 2's Python interface where ROS 2 is not installed: `rclpy` and message packages over DDS."""
+"""ROS 2's Python interface where ROS 2 is not installed: `rclpy`, messages, DDS or zenoh."""
 
 from __future__ import annotations
 

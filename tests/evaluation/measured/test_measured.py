@@ -14,7 +14,10 @@ def _study(name, folder, found):
     def measure(data, made):
         made.picture(name).touch()
         found.append((data, made.report.parent, made.quick))
-        return Section(f"About {name}", "text", [Finding(name, "a case", "depth", "mm", 2.0, 2.5)])
+        main = Finding(name, "a case", "depth", "mm", 2.0, 2.5)
+        return Section(
+            f"About {name}", "text", [main, Finding(name, "layer", "depth", "mm", headline=False)]
+        )
 
     return Study(name, folder, f"https://example.org/{name}@1", "MIT", "By A.", measure)
 
@@ -34,9 +37,12 @@ def test_studies_without_data_are_left_out_and_say_from_where_to_fetch_them(tmp_
     (data / "gel-data").mkdir(parents=True)
     assert report.evaluate_measured(out, True, MeasuredData(data=data)) == 0
     assert found == [(data / "gel-data", out, True)]
-    (row,) = csv.DictReader((out / "measured.csv").open())
+    row, layer = csv.DictReader((out / "measured.csv").open())
     assert (row["study"], row["measured"], row["predicted"]) == ("gel", "2", "2.5")
     text = (out / "measured.md").read_text()
+    assert "a case" in text
+    assert layer["case"] == "layer"
+    assert "layer" not in text
     left_out = text[text.index("## Left out") :]
     assert "https://example.org/steel@1" in left_out
     assert "gel" not in left_out

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from us_sim.evaluation.measured.vein import PUBLISHED, VENOUS, mean_pressure, measure_vein, press
+from us_sim.evaluation.measured.vein import (
+    MODULI,
+    PUBLISHED,
+    VENOUS,
+    mean_pressure,
+    measure_vein,
+    press,
+    round_vein_pressure,
+)
 from us_sim.evaluation.report import ReportFolder
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.model import TissueModel
@@ -32,10 +40,22 @@ def test_a_vein_of_higher_pressure_closes_at_a_higher_one():
     assert np.isnan(low.at(0.0, low.interface))
 
 
+def test_a_round_vein_closes_a_little_as_lames_solution_says():
+    # Of an incompressible solid: the radius falls by p / 2 mu of itself (Lame, 1852).
+    shear = 10e3 / 3.0
+    assert round_vein_pressure(10e3, (1 - 1e-4) ** 2) == pytest.approx(2e-4 * shear, rel=1e-3)
+
+
+def test_softer_tissue_lets_the_vein_close_at_less():
+    hard, soft = (press(VENOUS["lying"], 10, moduli) for moduli in MODULI.values())
+    assert soft.at(0.5, soft.interface) < hard.at(0.5, hard.interface) - 3.0
+
+
 def test_the_study_needs_no_data_and_reports_each_posture(tmp_path):
     section = measure_vein(tmp_path / "none", ReportFolder("measured", tmp_path, True))
     assert (tmp_path / "measured_vein.png").exists()
-    assert {finding.case for finding in section.findings} == set(PUBLISHED)
+    cases = {finding.case for finding in section.findings}
+    assert cases == {f"{name}, moduli {moduli}" for name in PUBLISHED for moduli in MODULI}
     for finding in section.findings:
         assert finding.error == pytest.approx(finding.predicted - finding.measured)
     assert "lying" in section.text

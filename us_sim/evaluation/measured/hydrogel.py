@@ -12,13 +12,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.sparse.linalg import LinearOperator
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import LinearOperator, splu
 
 from us_sim.errors import SolverError
 from us_sim.evaluation.block import conjugate_gradients
@@ -34,6 +35,8 @@ from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.tissue.model import TissueModel
+from us_sim.tissue.solvers.msds import MsdsSettings, spring_tissue
+from us_sim.tissue.solvers.msds_implicit import MsdsImplicitSettings
 from us_sim.tissue.solvers.newton import Newton
 
 Array = NDArray[np.float64]
@@ -47,15 +50,20 @@ _NEAREST, _NEAREST_OF_HALF = 45, 16
 """Beads of a quadratic fit at a face's node, and of the affine fit of the noise floor."""
 _PLANE = slice(0, 2)  # x and y
 _LAYERS = 1e-6 * np.array([30.0, 48.0, 60.0, 72.0, 80.0, 86.0])  # m, borders
+_MOST_STEPS = 200
 _TOLERANCE = 1e-5  # residual norm over that of the harmonic start
 _FRAMES, _FRAME_TOLERANCE = 30, 1e-3
-_BEST = "nonlinear, graded"
+_METHODS = ("linear", "nonlinear", "springs", "springs and volume")
+_SHOWN = ("linear", "nonlinear")  # layer by layer
+_BEST, _RIVAL = "nonlinear, graded", "linear, graded"
 _AXIS = 205.2e-6  # m, along x
 _FITTING_MESH, _MESH = 24e-6, 16e-6  # m
 _UNIT = 1e4
 """1/m, unit of softening in a fit: the modulus falls e-fold over 100 um."""
-_SIMPLEX = np.array([[0.45, 0.0], [0.48, 0.0], [0.45, 1.0]])  # Poisson's ratio, softening
-_BOUNDS = ((0.0, 0.498), (-2.0, 10.0))
+_START, _STEP = np.array([0.45, 0.0]), np.array([0.03, 1.0])  # Poisson's ratio, softening
+_BOUNDS = np.array([[0.0, 0.498], [-2.0, 10.0]])
+_OF_SPRINGS = 0.25  # Poisson's ratio of springs alone
+_SLABS = 10  # along y, between which errors are taken to be independent
 
 
 def noise_floor(beads: Beads, random: np.random.Generator) -> Array:
@@ -130,6 +138,43 @@ class PrescribedBox:
         _balance(newton, _TOLERANCE * newton.residual_norm)
         return newton.displacement.T.copy()
 
+    def springs(self, ratio: float, softening: float = 0.0, *, volume: bool = False) -> Array:
+        """(N, 3) m, equilibrium of springs: those of `msds`, or with volume of `msds_implicit`.
+
+        The other arguments are those of `nonlinear`, and its error.
+        """
+        nodes, still = self.mesh.nodes, np.zeros_like(self.faces)
+        chosen = MsdsImplicitSettings() if volume else MsdsSettings()
+        springs, term = spring_tissue(self._model(ratio, softening), chosen)
+        free = np.repeat(~self.fixed, 3)
+
+        def residual(field: Array) -> Array:
+            force = springs.forces(nodes + field, still) + term.forces(nodes + field, still)
+            return np.asarray(force.ravel()[free])
+
+        field = self.harmonic
+        force = residual(field)
+        goal = _TOLERANCE * np.linalg.norm(force)
+        for _ in range(_MOST_STEPS):
+            if np.linalg.norm(force) <= goal:
+                return field
+            # Gauss and Newton's step, since the energy is a sum of squares
+            factors = [part.factor(nodes + field)[:, free] for part in (springs, term)]
+            step = np.zeros(field.size)
+            step[free] = splu(csc_array(sum(f.T @ f for f in factors))).solve(force)
+            for length in 0.5 ** np.arange(8):
+                tried = field + length * step.reshape(-1, 3)
+                if np.linalg.norm(residual(tried)) < np.linalg.norm(force):
+                    break
+            field, force = tried, residual(tried)
+        raise _unbalanced(float(np.linalg.norm(force)), float(goal))
+
+    def solved(self, method: str, ratio: float, softening: float) -> Array:
+        """(N, 3) m, by one of `_METHODS`."""
+        if method.startswith("springs"):
+            return self.springs(ratio, softening, volume=method != "springs")
+        return (self.linear if method == "linear" else self.nonlinear)(ratio, softening)
+
     def frame_ms(self, ratio: float, softening: float) -> float:
         """ms of processor time, median, where the faces take many frames to their places."""
         newton, step = self._newton(ratio, softening), self.harmonic.T / _FRAMES
@@ -164,8 +209,11 @@ class PrescribedBox:
         return replace(made, young_modulus=made.young_modulus * fall)
 
     def _newton(self, ratio: float, softening: float) -> Newton:
+        return Newton(self._model(ratio, softening))
+
+    def _model(self, ratio: float, softening: float) -> TissueModel:
         materials, nothing = self._materials(ratio, softening), np.zeros(0, dtype=np.int32)
-        return Newton(TissueModel(self.mesh, materials, self.fixed, Sphere(0.03), nothing))
+        return TissueModel(self.mesh, materials, self.fixed, Sphere(0.03), nothing)
 
     def _solved(self, product: Callable[[Array], Array]) -> Array:
         free = np.repeat(~self.fixed, 3).astype(float)
@@ -178,12 +226,16 @@ class PrescribedBox:
 
 
 def _balance(newton: Newton, goal: float) -> None:
-    for _ in range(60):
+    for _ in range(_MOST_STEPS):
         if newton.residual_norm <= goal:
             return
         newton.step(newton.iteration_limit)
-    raise SolverError(
-        f"the hydrogel's balance was not found: its residual stays at {newton.residual_norm:.2g} N "
+    raise _unbalanced(newton.residual_norm, goal)
+
+
+def _unbalanced(residual: float, goal: float) -> SolverError:
+    return SolverError(
+        f"the hydrogel's balance was not found: its residual stays at {residual:.2g} N "
         f"where {goal:.2g} N is asked for; its faces move too far for its mesh"
     )
 
@@ -207,6 +259,15 @@ class Outcome:
     def part_floor(self, chosen: NDArray[np.bool_], axes: slice = slice(None)) -> float:
         """m, the same of the noise floor."""
         return _length(self.floor[chosen & self.judged, axes])
+
+    def apart(self, method: str, other: str) -> tuple[float, float, float]:
+        """m, by how much more one method errs than another, with the standard error of that, and
+        how far their predictions are apart, all of the judged beads.
+        """
+        one, two = (self.errors[name][self.judged] for name in (method, other))
+        slabs = np.array_split(np.argsort(self.beads.places[self.judged, 1]), _SLABS)
+        more = np.array([_length(one[slab]) - _length(two[slab]) for slab in slabs])
+        return float(more.mean()), float(more.std(ddof=1) / _SLABS**0.5), _length(one - two)
 
     @property
     def parts(self) -> dict[str, NDArray[np.bool_]]:
@@ -247,25 +308,37 @@ def outcome(case: Case, floor: Array, spacing: float) -> Outcome:
     """Fit on one side of a case's beads, on a coarse mesh, and predict all on a finer one."""
     coarse, box = case.box(_FITTING_MESH), case.box(spacing)
     fields, fitted = {"harmonic": box.harmonic}, {}
-    for method, solve_coarse, solve in (
-        ("linear", coarse.linear, box.linear),
-        ("nonlinear", coarse.nonlinear, box.nonlinear),
-    ):
+    for method, graded in product(_METHODS, (False, True)):
+        free = np.array([method != "springs", graded])
+        start = np.where(free, _START, (_OF_SPRINGS, 0.0))
 
-        def misfit(x: Array, solve: Callable[[float, float], Array] = solve_coarse) -> float:
-            softening = _UNIT * x[1] if len(x) > 1 else 0.0
-            error = case.error(coarse, solve(float(x[0]), softening))
+        def parameters(
+            x: Array, free: NDArray[np.bool_] = free, start: Array = start
+        ) -> tuple[float, float]:
+            all_of_them = start.copy()
+            all_of_them[free] = x
+            return float(all_of_them[0]), _UNIT * float(all_of_them[1])
+
+        def misfit(
+            x: Array,
+            method: str = method,
+            parameters: Callable = parameters,  # type: ignore[type-arg]
+        ) -> float:
+            error = case.error(coarse, coarse.solved(method, *parameters(x)))
             return 1e6 * _length(error[~case.judged])
 
-        for name, free in ((method, 1), (f"{method}, graded", 2)):
-            found = minimize(
-                *(misfit, _SIMPLEX[0, :free]),
+        best = start[free]
+        if len(best):
+            simplex = np.vstack([best, best + np.diag(_STEP[free])])
+            best = minimize(
+                *(misfit, best),
                 method="Nelder-Mead",
-                bounds=_BOUNDS[:free],
-                options={"initial_simplex": _SIMPLEX[: free + 1, :free], "xatol": 5e-3},
-            )
-            fitted[name] = float(found.x[0]), _UNIT * float(found.x[1]) if free > 1 else 0.0
-            fields[name] = solve(*fitted[name])
+                bounds=_BOUNDS[free],
+                options={"initial_simplex": simplex, "xatol": 5e-3},
+            ).x
+        name = f"{method}, graded" if graded else method
+        fitted[name] = parameters(best)
+        fields[name] = box.solved(method, *fitted[name])
     errors = {name: case.error(box, field) for name, field in fields.items()}
     places = case.beads.places
     ratios = {name: box.volume_ratio(field, places) for name, field in fields.items()}
@@ -290,8 +363,11 @@ def measure_hydrogel(folder: Path, report: ReportFolder) -> Section:
             measured=_length(o.beads.displacement[chosen & o.judged]) / _MICRON,
             error=o.part(chosen, method) / _MICRON,
             floor=o.part_floor(chosen) / _MICRON,
-            fitted_on="" if method == "harmonic" else "beads inside, other side of the axis",
+            fitted_on=""
+            if method in ("harmonic", "springs")
+            else "beads inside, other side of the axis",
             ms=meshes[1].ms if o is outcomes[-1] and method == _BEST else float("nan"),
+            headline=o is outcomes[-1] and part == "all",
         )
         for o in outcomes
         for part, chosen in o.parts.items()
@@ -304,6 +380,14 @@ def measure_hydrogel(folder: Path, report: ReportFolder) -> Section:
         count=str(len(beads.places)),
         inside=str(len(outcomes[-1].beads.places)),
         table=_table(outcomes),
+        methods=_method_table(outcomes),
+        top=f"{case.top / _MICRON:.0f}",
+        tie=", ".join(
+            f"{more / _MICRON:.3f} ± {deviation / _MICRON:.3f}"
+            for more, deviation, _ in (outcomes[-1].apart(_RIVAL, _BEST),)
+        ),
+        apart=f"{outcomes[-1].apart(_RIVAL, _BEST)[2] / _MICRON:.3f}",
+        slabs=str(_SLABS),
         fitted=_fitted_table(outcomes),
         meshes=_mesh_table(meshes),
     )
@@ -328,12 +412,13 @@ class _Mesh:
 
 
 def _table(outcomes: list[Outcome]) -> str:
+    shown = ["harmonic", *(f"{method}{more}" for method in _SHOWN for more in ("", ", graded"))]
     rows = []
     for o in outcomes:
         for part, chosen in o.parts.items():
             floor = o.part_floor(chosen)
             moved = _length(o.beads.displacement[chosen & o.judged])
-            errors = [o.part(chosen, method) for method in o.errors]
+            errors = [o.part(chosen, method) for method in shown]
             rows.append(
                 (
                     *(f"{o.top / _MICRON:.0f}", part, str(int((chosen & o.judged).sum()))),
@@ -346,7 +431,17 @@ def _table(outcomes: list[Outcome]) -> str:
             )
     head = ("box to, µm", "layer, µm", "beads", "det F", "nonlinear: det F", "graded: det F")
     ratios = ("nonlinear over floor", "graded over floor", "the same in plane")
-    return markdown_table((*head, "moved", "floor", *outcomes[0].errors, *ratios), rows)
+    return markdown_table((*head, "moved", "floor", *shown, *ratios), rows)
+
+
+def _method_table(outcomes: list[Outcome]) -> str:
+    """Error of the whole box, in µm and over the floor."""
+    rows = []
+    for method in outcomes[0].errors:
+        whole = [(o.part(o.parts["all"], method), o.part_floor(o.parts["all"])) for o in outcomes]
+        rows.append((method, *(f"{e / _MICRON:.2f} ({e / floor:.2f})" for e, floor in whole)))
+    heads = (f"box to {o.top / _MICRON:.0f} µm" for o in outcomes)
+    return markdown_table(("model", *heads), rows)
 
 
 def _fitted_table(outcomes: list[Outcome]) -> str:
@@ -354,7 +449,7 @@ def _fitted_table(outcomes: list[Outcome]) -> str:
         (
             f"{o.top / _MICRON:.0f}",
             name,
-            f"{ratio:.3f}",
+            "" if name.split(",")[0] == "springs" else f"{ratio:.3f}",
             f"{1 / softening / _MICRON:.0f}" if softening else "",
         )
         for o in outcomes
@@ -408,6 +503,8 @@ def _draw_errors(outcomes: list[Outcome], file: Path) -> None:
         "harmonic": ("0.6", "o-"),
         "linear": ("#9ecae1", "o-"),
         "linear, graded": ("#3182bd", "s-"),
+        "springs and volume": ("#a1d99b", "o-"),
+        "springs and volume, graded": ("#31a354", "s-"),
         "nonlinear": ("#fdae6b", "o-"),
         _BEST: ("#d7301f", "s-"),
     }
@@ -421,7 +518,8 @@ def _draw_errors(outcomes: list[Outcome], file: Path) -> None:
             middles = (borders[:-1] + borders[1:]) / 2 / _MICRON
             for name, (colour, look) in looks.items():
                 errors = [o.part(layer, name) / _MICRON for layer in layers]
-                panel.plot(errors, middles, look, ms=4, color=colour, label=name)
+                size = 7 if name == _RIVAL else 4  # the other lies on it
+                panel.plot(errors, middles, look, ms=size, color=colour, label=name)
             floor = np.array([o.part_floor(layer) / _MICRON for layer in layers])
             panel.plot(floor, middles, "k--", label="noise floor")
             panel.plot(1.5 * floor, middles, "k:", label="1.5 times that")

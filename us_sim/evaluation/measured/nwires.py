@@ -212,7 +212,16 @@ def measure_nwires(folder: Path, report: ReportFolder) -> Section:
             ("corner of the image, from that of Plus", farthest, float("nan")),
         ):
             findings.append(
-                Finding("nwires", name, quantity, "mm", error=error, floor=best, fitted_on=fit)
+                Finding(
+                    "nwires",
+                    name,
+                    quantity,
+                    "mm",
+                    error=error,
+                    floor=best,
+                    fitted_on=fit,
+                    headline=quantity.startswith("3-D"),
+                )
             )
     volume = _volume(folder)
     findings += [
@@ -311,7 +320,12 @@ def _volume(folder: Path) -> _Volumes:
 def _draw(
     file: Path, recording: Recording, matrices: Mapping[str, Array], volumes: _Volumes
 ) -> None:
-    with picture(file, 11.0, 3.6, "N-wires: errors on the validation recording, and volumes") as f:
+    with picture(
+        file,
+        11.0,
+        3.6,
+        "N-wires: errors of calibrations on the validation recording; volumes, brightest voxels",
+    ) as f:
         errors, ours, plus = f.subplots(1, 3)
         for name, matrix in matrices.items():
             mm = 1e3 * np.sort(recording.to_middles(matrix), axis=None)
@@ -324,7 +338,7 @@ def _draw(
             (plus, volumes.plus, "Plus' volume"),
         ):
             panel.imshow(grey.max(axis=2).T, cmap="gray", vmin=0, vmax=255)
-            panel.set_title(f"{title}, greatest grey", fontsize=10)
+            panel.set_title(f"{title}, seen along z", fontsize=10)
             panel.axis("off")
 
 

@@ -49,7 +49,8 @@ def evaluate_measured(out: Path, quick: bool, settings: MeasuredData | None = No
         ]
     findings = [finding for section in sections for finding in section.findings]
     folder.write_rows("measured", findings)
-    table = markdown_table(list(findings[0].values), [finding.cells for finding in findings])
+    shown = [finding for finding in findings if finding.headline]
+    table = markdown_table(list(findings[0].values), [finding.cells for finding in shown])
     return folder.finish(
         table,
         (),

@@ -20,7 +20,7 @@ from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.stuck_cylinder import StuckCylinder
 from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
-from us_sim.evaluation.timing import medians_in_turn
+from us_sim.evaluation.timing import medians_in_turn, steps
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.model import TissueModel
@@ -35,6 +35,7 @@ _FITTED = 0.05  # Compression up to which a modulus is fitted
 _STIFFENED = 0.60  # Compression at which a stiffening is fitted
 _EARLY = 0.50  # The same, for a prediction of that at 60 %
 _SMALL, _LARGE = (0.1, 0.2, 0.3), (0.4, 0.5, 0.66)  # Compressions at which forces are predicted
+_HEADLINES = (0.3, 0.66)  # Those that the report's first table has
 _COLUMNS = (*_SMALL, *_LARGE[:-1], _STIFFENED, _LARGE[-1])
 # Compressions of the findings, by that at which the stiffening was fitted
 _TOLD = {None: (*_SMALL, _LARGE[-1]), _STIFFENED: _LARGE, _EARLY: (_STIFFENED,)}
@@ -159,7 +160,7 @@ def sticking(counts: tuple[int, int], stiffenings: Sequence[float]) -> Platens:
     """Platens to which the cylinder sticks, of so many cells across and along it."""
     curves = {}
     coarse = np.array([0.01, 0.03, *np.arange(0.05, 0.66, 0.05), COMPRESSIONS[-1]])
-    for stiffening in stiffenings:
+    for stiffening in steps("silicone", stiffenings, "cylinders"):
         forces = StuckCylinder(RADIUS, HEIGHT, counts, stiffening).press(coarse.tolist())
         ratio = np.interp(COMPRESSIONS, coarse, forces / slipping_force(coarse, stiffening))
         curves[stiffening] = ratio * slipping_force(COMPRESSIONS, stiffening)
@@ -235,6 +236,7 @@ def measure_silicone(folder: Path, report: ReportFolder) -> Section:
             floor=_scatter(made, compression),
             fitted_on=f"specimen A: {_fitted_on(stiffened)}",
             ms=ms[stiffened is not None],
+            headline=compression in _HEADLINES and stiffened != _EARLY,
         )
         for (platens, stiffened), errors in medians.items()
         for compression, error in errors.items()

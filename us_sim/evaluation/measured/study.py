@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import nan
 from pathlib import Path
 
-from us_sim.evaluation.report import ReportFolder, Row
+from us_sim.evaluation.report import ReportFolder, Row, not_a_column
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class Finding(Row):
     floor: float = nan  # error that the measurement itself has, in the same unit
     fitted_on: str = ""  # data that parameters were fitted on; empty where none were
     ms: float = nan  # of an interactive frame of the same model
+    headline: bool = not_a_column(True)  # whether the report's first table has it
 
 
 @dataclass(frozen=True)

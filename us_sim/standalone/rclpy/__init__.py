@@ -1,4 +1,4 @@
-"""The subset of rclpy that this project's nodes use, over DDS, without ROS 2.
+"""The subset of rclpy that this project's nodes use, without ROS 2.
 
 `us_sim.standalone.install()` makes it importable as `rclpy` where the real one is not installed.
 Names, arguments, defaults and errors are those of rclpy 7.1 (Jazzy).

@@ -284,6 +284,8 @@ class FemNonlinear(TissueSolver):
         newton, budget = self._newton, self._budget
         while self._exceeds(tolerance) and budget.iterations_left > 0:
             goal = tolerance * newton.contact_norm if start is None else 0.0
+            if newton.residual_norm <= goal:  # what is left is the error of the displacement
+                goal = 0.0
             budget.begin_step()
             limit = min(budget.iterations_left, budget.step_iterations, newton.iteration_limit)
             taken = newton.step(limit, goal, start)
