@@ -84,8 +84,8 @@ probe/pose: geometry_msgs/PoseStamped
     volume_reconstructor | the probe in `patient`: registered, checked, filtered; once for each
     measurement
 probe/status: diagnostic_msgs/DiagnosticStatus [latched]
-    probe_tracker | `waiting`, `tracked`, `coasting` or `lost`, each time that changes; then also
-    where the probe was last
+    probe_tracker -> viewer | `waiting`, `tracked`, `coasting` or `lost`, each time that changes;
+    then also where the probe was last
 probe/marker: visualization_msgs/MarkerArray [latched]
     probe_tracker -> viewer | a transducer as the scene's probe is shaped, and the outline of its
     image, in frame `probe`
@@ -117,8 +117,8 @@ ultrasound/image: sensor_msgs/Image
 ultrasound/image/compressed: sensor_msgs/CompressedImage [on_demand]
     slice_interpolator | the same as JPEG or PNG, as image_transport's plugin `compressed` makes it
 ultrasound/image_annotated: sensor_msgs/Image [on_demand]
-    slice_interpolator | `rgb8`, for the eye: with a depth scale, outlines of structures, and its
-    age
+    slice_interpolator -> viewer | `rgb8`, for the eye: with a depth scale, outlines of structures,
+    and its age
 ultrasound/image_annotated/compressed: sensor_msgs/CompressedImage [on_demand]
     slice_interpolator | likewise
 ultrasound/labels: sensor_msgs/Image [on_demand]
@@ -150,13 +150,14 @@ ultrasound/image_to_probe: std_msgs/Float64MultiArray [latched]
 session/marker: std_msgs/String
     drivers | a text that marks a moment of the recording
 session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
-    session_control | scenes and cases that can be loaded: name, description, what loads it, and
-    more
+    session_control -> viewer | scenes and cases that can be loaded: name, description, what loads
+    it, and more
 session/thumbnails: sensor_msgs/CompressedImage [latched] [on_demand]
-    session_control | JPEG of what the probe sees in each of them; the frame is what loads it
+    session_control -> viewer | JPEG of what the probe sees in each of them; the frame is what loads
+    it
 session/bags: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
-    session_control | bags that can be played: those of the folder `us-sim` runs in, and installed
-    ones
+    session_control -> viewer | bags that can be played: those of the folder `us-sim` runs in, and
+    installed ones
 events/write_split: rosbag2_interfaces/WriteSplitEvent
     session_recorder | a file of the recording was ended, and which one was begun
 events/rosbag2_messages_lost: rosbag2_interfaces/MessagesLostEvent
@@ -166,7 +167,7 @@ diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
     openigtlink_bridge, composed, path_player, session_player, session_recorder, camera_driver,
     space_mouse_driver, session_monitor, volume_reconstructor, session_control, viewer ->
-    session_monitor | once a second: state, rate, latency, what was dropped or refused; of
+    session_monitor, viewer | once a second: state, rate, latency, what was dropped or refused; of
     `session_monitor` which nodes ended or hung
 """
 
