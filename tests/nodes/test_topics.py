@@ -30,7 +30,7 @@ ROS_OWN = {"/rosout", "/parameter_events", "/clock"}
 TRACKER_KEYS = {
     "tf": "frame: world, body: stylus",
     "path": f"file: {Path(shared_path('bags/press_and_slide.mcap'))}",
-    "openigtlink": "body: stylus, openigtlink: {port: 1}",
+    "openigtlink": "frame: camera, body: stylus, openigtlink: {port: 1}",
 }
 
 

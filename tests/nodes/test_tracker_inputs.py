@@ -120,6 +120,38 @@ def transform(parent, child, z, second):
     return TFMessage(transforms=[message])
 
 
+def test_tf_leads_from_the_device_to_the_patient_and_to_the_probe(bench, tracker):
+    """A tool of the device is where the probe is, by the transforms alone."""
+    turned = "{position: [0.1, 0.2, 0.3], orientation: [0, 0, 1, 0]}"
+    node, poses = tracker(f"{{source: pose, frame: camera, registration: {turned}}}")
+    static = bench.collect(TFMessage, "tf_static", latched=True)
+    moving = bench.collect(TFMessage, "tf")
+    publisher = bench.publisher(PoseStamped, "tracker/pose")
+    bench.spin_until(lambda: static and node._transforms.get_subscription_count())
+    publisher.publish(pose_at(0.05, 1, frame="camera", x=0.01))
+    bench.spin_until(lambda: poses and moving)
+    (device,), (probe,) = static[0].transforms, moving[0].transforms
+    assert (device.header.frame_id, device.child_frame_id) == ("patient", "camera")
+    assert (probe.header.frame_id, probe.child_frame_id) == ("patient", "probe")
+    half_a_turn = np.diag([-1.0, -1.0, 1.0])
+    np.testing.assert_allclose(
+        place_of(device) + half_a_turn @ [0.01, 0, 0.05], place_of(probe), atol=1e-12
+    )
+
+
+def place_of(transform):
+    p = transform.transform.translation
+    return np.array([p.x, p.y, p.z])
+
+
+def test_nothing_is_said_of_frames_that_a_tree_of_tf_may_hold(bench, tracker):
+    tracker("{source: tf, frame: world, body: stylus, registration: {position: [0, 0, 1]}}")
+    tracker("{source: pose}")
+    static = bench.collect(TFMessage, "tf_static", latched=True)
+    bench.spin_for(20)
+    assert not static
+
+
 def test_a_frame_of_tf_is_followed_through_the_tree(bench, tracker):
     node, poses = tracker("{source: tf, frame: world, body: stylus}")
     moving = bench.publisher(TFMessage, "tf")

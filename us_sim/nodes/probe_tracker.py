@@ -25,7 +25,13 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import poses_ended
 from us_sim.nodes.settings import ProbeTrackerSettings
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
-from us_sim.scene.building import collider_of, probe_of, source_settings, tracking_of
+from us_sim.scene.building import (
+    collider_of,
+    probe_of,
+    source_settings,
+    tracker_poses_of,
+    tracking_of,
+)
 from us_sim.settings.registry import FILTERS, TRACKERS
 from us_sim.slicing.probe.probe import image_outline
 from us_sim.tracking.filters import PoseFilter, create_filter
@@ -43,13 +49,15 @@ LEVELS = {
 
 
 class ProbeTracker(Device):
-    """A source's measurements in; ``probe/pose``, ``tf`` and ``probe/status`` out.
+    """A source's measurements in; ``probe/pose``, ``tf``, ``tf_static`` and ``probe/status`` out.
 
     The source is ``tracker.source`` of the scene, or the parameter ``source``, see
     `tracker_inputs`. A pose goes out once, with the stamp of its measurement. ``probe/status``,
     latched, says whether the probe is ``tracked``, ``coasting`` or ``lost``, each time that
     changes, and where it was last when it is tracked no more. ``probe/marker``, latched, is the
-    transducer to look at. The filter and its settings may change while running.
+    transducer to look at. ``tf_static`` has the device's frame in ``patient``, where it has one of
+    its own and tf is not the source: a driver's tree may hold it. The filter and its settings may
+    change while running.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -69,6 +77,11 @@ class ProbeTracker(Device):
         self._is_contested = False
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = self.stream(TFMessage, "tf")
+        device = self.scene.tracker.frame
+        if self._source != "tf" and device != PATIENT:
+            place, _ = tracker_poses_of(self.scene)
+            placed = transform_message(place, TimeMessage(), PATIENT, device)
+            self.latched(TFMessage, "tf_static").publish(TFMessage(transforms=[placed]))
         self._status = self.latched(DiagnosticStatus, "probe/status")
         self.latched(MarkerArray, "probe/marker").publish(self._transducer())
         self._input: TrackerInput = TRACKERS.load(self._source)(

@@ -25,6 +25,7 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
 from us_sim.share import find_bag
 
+DEPTH = 10  # messages that publishers keep
 _MOST_SAID = 10  # topics that are left out, of which a person is told each
 
 START_S = 0.5  # for subscribers to find the publishers before the first message
@@ -100,7 +101,7 @@ class SessionPlayer(GuardedNode):
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
-            depth=10,
+            depth=DEPTH,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=durability,
         )
@@ -181,17 +182,16 @@ class SessionPlayer(GuardedNode):
     def _go_to(self, position: int, at: int | None = None) -> None:
         """Have the messages from there on wait, and show a moment of them even if it is paused.
 
-        What is kept for those who come later is sent again from the start.
+        The last of what is kept for those who come later is sent again.
         """
         self._damage.clear()
-        self._sent = 0
-        self._messages = iter(self._bag.messages(list(self._topics), self._damage))
+        since = self._first + position if position > 0 else None
+        if since is not None:
+            for message in self._bag.latest(self._latched, since, DEPTH):
+                self._topics[message.topic].publish(message.data)
+        self._sent = 0 if since is None else self._count  # what is passed over counts as played
+        self._messages = iter(self._bag.messages(list(self._topics), self._damage, since))
         self._waiting = self._next()
-        while self._waiting is not None and self._waiting.log_time - self._first < position:
-            if self._waiting.topic in self._latched:
-                self._topics[self._waiting.topic].publish(self._waiting.data)
-            self._sent += 1
-            self._waiting = self._next()
         self._shown = position + _SHOWN if position and at is None else 0
         self._playhead.go_to(position, self._playback.now if at is None else at)
 

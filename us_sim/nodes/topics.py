@@ -59,7 +59,8 @@ tf: tf2_msgs/TFMessage
     probe_tracker -> probe_tracker | published: the probe in `patient`, if somebody subscribes;
     heard: source `tf`
 tf_static: tf2_msgs/TFMessage [latched]
-    drivers -> probe_tracker | frames that do not move; source `tf`
+    probe_tracker -> probe_tracker | published: the tracker's frame in `patient`, where it has one;
+    heard: frames that do not move, source `tf`
 camera/image_raw: sensor_msgs/Image
     camera_driver -> probe_tracker | what a camera sees of the markers on the probe; source `camera`
 camera/image_raw/compressed: sensor_msgs/CompressedImage
@@ -163,7 +164,7 @@ events/rosbag2_messages_lost: rosbag2_interfaces/MessagesLostEvent
     has not
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
-    openigtlink_bridge, path_player, session_player, session_recorder, camera_driver,
+    openigtlink_bridge, composed, path_player, session_player, session_recorder, camera_driver,
     space_mouse_driver, session_monitor, volume_reconstructor, session_control, viewer ->
     session_monitor | once a second: state, rate, latency, what was dropped or refused; of
     `session_monitor` which nodes ended or hung

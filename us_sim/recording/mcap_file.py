@@ -18,19 +18,18 @@ from __future__ import annotations
 import contextlib
 import heapq
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import numpy as np
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, ChunkIndex, Metadata, Schema
-from mcap.summary import Summary
+from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from us_sim.errors import BagError
+from us_sim.recording.mcap_index import Index, Run, Runs, read_index
 from us_sim.recording.mcap_records import (
     AFTER_THE_DATA,
     DAMAGE,
@@ -55,21 +54,11 @@ from us_sim.recording.topic import (
 )
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _TIME = struct.Struct("<Q8x")  # log time, place in its chunk
 _CHANNEL = struct.Struct("<H4x")  # and the length of the table that follows
 
 _LARGEST_OVERLAP = 1 << 30  # bytes of messages that wait until no earlier one can come
 _PLACES_TOLD = 3
-
-
-class _Run(NamedTuple):
-    """A stretch of the file that holds messages: a chunk, or a message outside of chunks."""
-
-    start: int  # ns, lowest log time in it
-    offset: int  # bytes, of its first record's opcode
-    end: int  # ns, highest log time in it
-    chunk: Chunk | None
 
 
 class _Place(NamedTuple):
@@ -94,7 +83,7 @@ class McapFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: Counter[int] = Counter()
-        self._runs: list[_Run] = []
+        self._scanned: list[tuple[Run, list[int]]] = []  # of a file without index, with channels
         self._attachments: list[_Place] = []
         self._notes: list[_Place] = []
         self.start: int | None = None
@@ -102,10 +91,10 @@ class McapFile:
         with path.open("rb") as stream:
             if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise BagError(f"{self._label} is not an MCAP file: it does not start as one")
-            summary = _summary(stream)
-            self.is_indexed = summary is not None
-            if summary is not None:
-                self._take(summary)
+            index = read_index(stream)
+            self.is_indexed = index is not None
+            if index is not None:
+                self._take(index)
             else:
                 self._scan(stream)
         self.topics = self._topics()
@@ -132,12 +121,15 @@ class McapFile:
             else:
                 yield BagNote(record.name, record.metadata)
 
-    def messages(self, topics: Collection[str], damage: list[Fault] | None) -> Iterator[BagMessage]:
+    def messages(
+        self, topics: Collection[str], damage: list[Fault] | None, since: int | None = None
+    ) -> Iterator[BagMessage]:
         """The messages of these topics in the order of their log times.
 
         Args:
             topics: their names.
             damage: takes at the end the faults of chunks that were left out.
+            since: lowest log time, ns, of those that are wanted; None for all.
 
         Raises:
             BagError: a chunk is damaged, and ``damage`` is None.
@@ -155,7 +147,7 @@ class McapFile:
         pending: list[tuple[int, int, int, BagMessage]] = []
         held = 0
         with self._path.open("rb") as stream:
-            for run in self._runs:
+            for run in self._runs.since(since):
                 while pending and pending[0][0] < run.start:
                     message = heapq.heappop(pending)[-1]
                     held -= len(message.data)
@@ -166,6 +158,8 @@ class McapFile:
                         if channel not in wanted:
                             continue
                         read += 1
+                        if since is not None and log_time < since:
+                            continue
                         outside += not run.start <= log_time <= run.end
                         data = bytes(content[_MESSAGE.size :])
                         message = BagMessage(*wanted[channel], log_time, sent, data, sequence)
@@ -181,7 +175,7 @@ class McapFile:
                     )
         while pending:
             yield heapq.heappop(pending)[-1]
-        if read < total:
+        if read < total and since is None:
             lost = f"{total - read} of its {total} messages cannot be read"
             told = [fault.text for fault in broken[:_PLACES_TOLD]]
             more = len(broken) - len(told)
@@ -197,6 +191,42 @@ class McapFile:
             text = f"{self._label} has {outside} messages at other times than its index says"
             damage.append(Fault(f"{text}, so that seeking misses them"))
 
+    def latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
+        """The last messages of each of these topics before a time; sound ones alone.
+
+        Args:
+            topics: their names.
+            before: log time, ns.
+            count: messages of each channel of a topic.
+        """
+        found: list[BagMessage] = []
+        wanted = [id for id, channel in self._channels.items() if channel.topic in topics]
+        with self._path.open("rb") as stream:
+            for id in wanted:
+                kept: list[tuple[int, int, int, BagMessage]] = []  # as they are ordered
+                for number in self._runs.holding(id, before):
+                    run = self._runs[number]
+                    if len(kept) == count and run.end < kept[0][0]:
+                        break  # as do all that end earlier
+                    with contextlib.suppress(*DAMAGE):
+                        kept += self._before(stream, run, id, before)
+                    kept = sorted(kept, key=lambda each: each[:3])[-count:]
+                found += [message for *_, message in kept]
+        return found
+
+    def _before(
+        self, stream: BinaryIO, run: Run, id: int, before: int
+    ) -> Iterator[tuple[int, int, int, BagMessage]]:
+        """A channel's messages in a run before a time, with what they are ordered by."""
+        topic = self._channels[id].topic
+        kind = _type_name(self._schemas.get(self._channels[id].schema_id))
+        for place, content in enumerate(_messages(stream, run)):
+            channel, sequence, time, sent = _MESSAGE.unpack_from(content)
+            if channel == id and time < before:
+                data = bytes(content[_MESSAGE.size :])
+                message = BagMessage(topic, kind, time, sent, data, sequence)
+                yield time, run.offset, place, message
+
     def _tell(self, damage: list[Fault] | None, place: str) -> None:
         """Note damage, or raise it as a BagError."""
         text = f"{self._label} is damaged in {place}"
@@ -210,26 +240,15 @@ class McapFile:
             stream.seek(place.offset + HEADER.size)
             return memoryview(stream.read(place.length - HEADER.size))
 
-    def _take(self, summary: Summary) -> None:
+    def _take(self, index: Index) -> None:
         """Take the index of a whole file."""
-        assert summary.statistics is not None
-        self._schemas = summary.schemas
-        self._channels = summary.channels
-        self._counts.update(summary.statistics.channel_message_counts)
-        self._runs = sorted(
-            _Run(
-                each.message_start_time,
-                each.chunk_start_offset,
-                each.message_end_time,
-                _indexed(each),
-            )
-            for each in summary.chunk_indexes
-        )
-        self._attachments = [_Place(e.offset, e.length, e.name) for e in summary.attachment_indexes]
-        self._notes = [_Place(e.offset, e.length, e.name) for e in summary.metadata_indexes]
-        if summary.statistics.message_count:
-            self.start = summary.statistics.message_start_time
-            self.end = summary.statistics.message_end_time
+        self._schemas, self._channels, self._runs = index.schemas, index.channels, index.runs
+        self._counts.update(index.statistics.channel_message_counts)
+        self._attachments = [_Place(e.offset, e.length, e.name) for e in index.attachments]
+        self._notes = [_Place(e.offset, e.length, e.name) for e in index.metadata]
+        if index.statistics.message_count:
+            self.start = index.statistics.message_start_time
+            self.end = index.statistics.message_end_time
 
     def _scan(self, stream: BinaryIO) -> None:
         """Walks the records of a file that has no usable summary."""
@@ -266,7 +285,14 @@ class McapFile:
                 end = record.end
         elif (chunk := cut_chunk_at(stream, position, size)) is not None:
             self._take_chunk(stream, chunk)
-        self._runs.sort()
+        runs = [run for run, _ in self._scanned]
+        self._runs = Runs(
+            np.array([run[:3] for run in runs], np.uint64).reshape(-1, 3),
+            [run.chunk for run in runs],
+            held=np.array(
+                [(k, id) for k, (_, ids) in enumerate(self._scanned) for id in ids], np.int64
+            ).reshape(-1, 2),
+        )
         for id in self._counts.keys() - self._channels.keys():
             missing[id] += self._counts.pop(id)  # of a topic whose name is lost
         stream.seek(max(0, size - len(MCAP0_MAGIC)))
@@ -291,7 +317,7 @@ class McapFile:
         if record.opcode != Opcode.MESSAGE:
             return True
         channel, *_ = _MESSAGE.unpack_from(record.content)
-        return channel in self._channels and not any(run.chunk for run in self._runs[-1:])
+        return channel in self._channels and not any(run.chunk for run, _ in self._scanned[-1:])
 
     def _take_chunk(self, stream: BinaryIO, chunk: Chunk) -> dict[int, tuple[int, int]]:
         """Index a chunk; for each channel the messages and their lowest log time."""
@@ -308,7 +334,7 @@ class McapFile:
                     self._learn(opcode, content)
         if tables:
             first = min(time for _, time in tables.values())
-            self._runs.append(_Run(first, chunk.offset, last, chunk))
+            self._scanned.append((Run(first, chunk.offset, last, chunk), [*tables]))
         return tables
 
     def _take_record(self, record: Record) -> None:
@@ -320,8 +346,8 @@ class McapFile:
         elif opcode == Opcode.METADATA:
             self._notes.append(_Place(record.offset, length, parsed(Metadata, content).name))
         elif opcode == Opcode.MESSAGE:
-            time = self._count(content)[1]
-            self._runs.append(_Run(time, record.offset, time, None))
+            channel, time = self._count(content)
+            self._scanned.append((Run(time, record.offset, time, None), [channel]))
         else:
             self._learn(opcode, content)
 
@@ -365,43 +391,7 @@ class McapFile:
         return tuple(topics.values())
 
 
-def _summary(stream: BinaryIO) -> Summary | None:
-    """The summary of a file that has a sound one, with statistics and an index of its messages."""
-    size = stream.seek(0, 2)
-    stream.seek(max(0, size - _FOOTER.size - len(MCAP0_MAGIC)))
-    tail = stream.read()
-    if len(tail) != _FOOTER.size + len(MCAP0_MAGIC) or not tail.endswith(MCAP0_MAGIC):
-        return None
-    _, _, start, _, crc = _FOOTER.unpack_from(tail)
-    if not 0 < start < size:
-        return None
-    if crc:
-        stream.seek(start)
-        # The checksum covers the summary and the footer up to the checksum itself.
-        if zlib.crc32(stream.read(size - start - len(MCAP0_MAGIC) - 4)) != crc:
-            return None
-    stream.seek(0)
-    try:
-        summary = SeekingReader(stream).get_summary()
-    except DAMAGE:
-        return None
-    if summary is None or summary.statistics is None:
-        return None
-    statistics, chunks = summary.statistics, summary.chunk_indexes
-    indexed = len(chunks) == statistics.chunk_count and (chunks or not statistics.message_count)
-    within = all(chunk.chunk_start_offset + chunk.chunk_length <= start for chunk in chunks)
-    described = summary.channels.keys() >= statistics.channel_message_counts.keys()
-    return summary if indexed and within and described else None
-
-
-def _indexed(index: ChunkIndex) -> Chunk:
-    """A chunk as the summary tells of it."""
-    end = index.chunk_start_offset + index.chunk_length
-    packed = end - index.compressed_size
-    return Chunk(index.chunk_start_offset, packed, end, index.compression, index.uncompressed_size)
-
-
-def _messages(stream: BinaryIO, run: _Run) -> Iterator[memoryview]:
+def _messages(stream: BinaryIO, run: Run) -> Iterator[memoryview]:
     """The content of each message of a run."""
     if run.chunk is not None:
         for opcode, content in records_in(stream, run.chunk):

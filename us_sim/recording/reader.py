@@ -153,32 +153,63 @@ class Bag:
         return lost
 
     def messages(
-        self, topics: Collection[str] | None = None, damage: list[Fault] | None = None
+        self,
+        topics: Collection[str] | None = None,
+        damage: list[Fault] | None = None,
+        since: int | None = None,
     ) -> Iterator[BagMessage]:
         """The messages of all topics or of these, in the order of their log times.
 
         Args:
             topics: their names; None for all.
             damage: takes the faults of damaged parts, which are then left out.
+            since: the lowest log time of those that are wanted, ns; what is before is not read
+                where there is an index. None for all.
 
         Raises:
             BagError: the bag has no such topic, or is damaged and ``damage`` is None.
         """
         names = {self.topic(name).name for name in topics} if topics is not None else self._topics
-        streams = [storage.messages(names, damage) for storage in self._storages]
+        streams = [storage.messages(names, damage, since) for storage in self._storages]
         for message in heapq.merge(*streams, key=lambda message: message.log_time):
-            if self._decompress_messages:
-                try:
-                    data = unpack(message.data, "zstd", LARGEST_CHUNK)
-                except zstandard.ZstdError as error:
-                    raise BagError(f"{self.path} is damaged: {error}") from None
-                if len(data) > LARGEST_CHUNK:
-                    raise BagError(
-                        f"{self.path} cannot be read: a message on {message.topic} has more than "
-                        f"{LARGEST_CHUNK} bytes when it is unpacked"
-                    )
-                message = message._replace(data=data)
-            yield message
+            yield self._unpacked(message)
+
+    def latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
+        """The last messages of each of these topics before a time, in the order of log times.
+
+        Args:
+            topics: their names.
+            before: log time, ns.
+            count: messages of each topic.
+
+        Raises:
+            BagError: the bag has no such topic, or is damaged.
+        """
+        names = {self.topic(name).name for name in topics}
+        found = [each for s in self._storages for each in s.latest(names, before, count)]
+        found.sort(key=lambda message: message.log_time)
+        left = Counter(dict.fromkeys(names, count))
+        last = []
+        for message in reversed(found):
+            left[message.topic] -= 1
+            if left[message.topic] >= 0:
+                last.append(self._unpacked(message))
+        return last[::-1]
+
+    def _unpacked(self, message: BagMessage) -> BagMessage:
+        """The message, decompressed where each one is compressed by itself."""
+        if not self._decompress_messages:
+            return message
+        try:
+            data = unpack(message.data, "zstd", LARGEST_CHUNK)
+        except zstandard.ZstdError as error:
+            raise BagError(f"{self.path} is damaged: {error}") from None
+        if len(data) > LARGEST_CHUNK:
+            raise BagError(
+                f"{self.path} cannot be read: a message on {message.topic} has more than "
+                f"{LARGEST_CHUNK} bytes when it is unpacked"
+            )
+        return message._replace(data=data)
 
     def deserialize(self, message: BagMessage) -> Any:
         """The message as a rosbags dataclass, by the definition that the bag carries.

@@ -88,8 +88,9 @@ class SqliteFile:
         self,
         topics: Collection[str],
         damage: list[Fault] | None,  # noqa: ARG002 (what SQLite finds damaged ends it)
+        since: int | None = None,
     ) -> Iterator[BagMessage]:
-        """The messages of these topics in the order of their log times.
+        """The messages of these topics, since a log time (ns), in the order of their log times.
 
         Raises:
             BagError: the database is damaged.
@@ -99,14 +100,39 @@ class SqliteFile:
         query = (
             "SELECT topics.name, timestamp, data FROM messages "
             "JOIN topics ON topics.id = messages.topic_id "
-            f"WHERE topics.name IN ({marks}) AND {_USABLE} ORDER BY timestamp, messages.id"
+            f"WHERE topics.name IN ({marks}) AND {_USABLE} AND timestamp >= ? "
+            "ORDER BY timestamp, messages.id"
         )
+        first = -(2**63) if since is None else max(min(since, 2**63 - 1), -(2**63))
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                for name, time, data in database.execute(query, tuple(types)):
+                for name, time, data in database.execute(query, (*types, first)):
                     yield BagMessage(name, types[name], time, time, data)
         except _DAMAGE as error:
             raise BagError(f"{self._label} is damaged: {error}") from None
+
+    def latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
+        """The last messages of each of these topics before a log time, ns.
+
+        Raises:
+            BagError: the database is damaged.
+        """
+        query = (
+            "SELECT timestamp, data FROM messages JOIN topics ON topics.id = messages.topic_id "
+            f"WHERE topics.name = ? AND {_USABLE} AND timestamp < ? "
+            "ORDER BY timestamp DESC, messages.id DESC LIMIT ?"
+        )
+        found = []
+        try:
+            with closing(sqlite3.connect(self._uri, uri=True)) as database:
+                for topic in self.topics:
+                    if topic.name in topics:
+                        asked = (topic.name, max(min(before, 2**63 - 1), -(2**63)), count)
+                        for time, data in database.execute(query, asked):
+                            found.append(BagMessage(topic.name, topic.type_name, time, time, data))
+        except _DAMAGE as error:
+            raise BagError(f"{self._label} is damaged: {error}") from None
+        return found[::-1]
 
 
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError, TypeError, AttributeError, MemoryError)

@@ -68,7 +68,7 @@ class FemNonlinearSettings(SolverSettings):
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
-        "parameter: live, what the rate leaves, and up to half as much again until the forces are "
+        "parameter: live, what the rate leaves, and up to a quarter more until the forces are "
         "balanced; in lockstep no limit, lest results depend on the machine",
         default=None,
     )
@@ -284,6 +284,8 @@ class FemNonlinear(TissueSolver):
         newton, budget = self._newton, self._budget
         while self._exceeds(tolerance) and budget.iterations_left > 0:
             goal = tolerance * newton.contact_norm if start is None else 0.0
+            if newton.residual_norm <= goal:  # what is left is the error of the displacement
+                goal = 0.0
             budget.begin_step()
             limit = min(budget.iterations_left, budget.step_iterations, newton.iteration_limit)
             taken = newton.step(limit, goal, start)

@@ -232,7 +232,7 @@ class Newton:
             raised = max(4 * self._damping, TUNING.damping)
             self._damping = min(raised, TUNING.most_damping)
         else:
-            self._damping = self._damping / 4 if self._damping > TUNING.least_damping else 0.0
+            self._damping = self._damping / 4 if self._damping > TUNING.damping else 0.0
         return length > 0.0
 
     def update_relief(self) -> None:
@@ -315,7 +315,9 @@ class Newton:
                 first_norm = max(norm, self.residual_norm * (start is None))
                 # Just hit, the forces are far more than they will be.
                 first_norm = min(first_norm, self._carried_norm or first_norm)
-                tolerance = max(TUNING.forcing_term * first_norm, TUNING.goal_fraction * goal)
+                late = start is None and damping == 0.0 and not self._carried_norm
+                term = TUNING.late_forcing_term if late else TUNING.forcing_term
+                tolerance = max(term * first_norm, TUNING.goal_fraction * goal)
             if norm <= tolerance or self.iterations >= iterations:
                 return step, False
             active, directions, stiffness = contact.springs_after(moved)

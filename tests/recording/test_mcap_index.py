@@ -1,0 +1,157 @@
+"""The index of MCAP files against mcap's own reader, and reading from a time on."""
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from us_sim.recording import mcap_file
+from us_sim.recording.mcap_index import read_index
+from us_sim.recording.reader import read_bag
+from us_sim.recording.writer import BagWriter
+
+EPOCH = 1_700_000_000_000_000_000
+HI = bytes.fromhex("00010000 03000000 686900")
+STRING = "std_msgs/msg/String"
+
+
+def session(path, compression="none", count=400):
+    """Messages of two topics, and of a third one that is rare."""
+    with BagWriter(path, compression=compression, chunk_size=500, sidecar=False) as bag:
+        for topic in ("/a", "/b", "/rare"):
+            bag.add_topic(topic, STRING)
+        for k in range(count):
+            topic = "/rare" if k % 150 == 7 else "/b" if k % 5 == 0 else "/a"
+            bag.write(topic, HI + bytes([k % 256]), EPOCH + k * 10**7, EPOCH + k, k)
+    return path
+
+
+def foreign(path, compression=CompressionType.LZ4, use_chunking=True):
+    """A file of mcap's own writer, whose chunks overlap in time."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=400, compression=compression, use_chunking=use_chunking)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        topics = [writer.register_channel(name, "cdr", schema) for name in ("/a", "/b", "/rare")]
+        for k in range(300):
+            time = EPOCH + (k + 9 * (k % 4)) * 10**7
+            writer.add_message(topics[2 if k % 90 == 8 else k % 2], time, HI + bytes([k % 256]), k)
+        writer.finish()
+    return path
+
+
+FILES = {
+    "ours": session,
+    "zstd": lambda path: session(path, "zstd"),
+    "lz4 by mcap": foreign,
+    "zstd by mcap": lambda path: foreign(path, CompressionType.ZSTD),
+    "without chunks": lambda path: foreign(path, CompressionType.NONE, use_chunking=False),
+}
+
+
+@pytest.fixture(params=[*FILES, "cut"])
+def file(request, tmp_path):
+    if request.param == "cut":
+        made = session(tmp_path / "s.mcap")
+        made.write_bytes(made.read_bytes()[:-2000])
+        return made
+    return FILES[request.param](tmp_path / "s.mcap")
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name != "without chunks"])
+def test_the_index_is_that_which_mcap_reads(tmp_path, name):
+    path = FILES[name](tmp_path / "s.mcap")
+    with path.open("rb") as stream:
+        expected = make_reader(stream).get_summary()
+        found = read_index(stream)
+    assert found.statistics == expected.statistics
+    assert found.channels == expected.channels
+    assert found.schemas == expected.schemas
+    assert found.attachments == expected.attachment_indexes
+    assert found.metadata == expected.metadata_indexes
+    chunks = sorted(
+        expected.chunk_indexes, key=lambda each: (each.message_start_time, each.chunk_start_offset)
+    )
+    assert len(chunks) == len(found.runs) > 9
+    for run, each in zip(found.runs.since(None), chunks, strict=True):
+        end = each.chunk_start_offset + each.chunk_length
+        assert run[:3] == (
+            each.message_start_time,
+            each.chunk_start_offset,
+            each.message_end_time,
+        )
+        assert run.chunk == (
+            *(each.chunk_start_offset, end - each.compressed_size, end),
+            *(each.compression, each.uncompressed_size, True),
+        )
+    for channel in expected.channels:
+        held = {k for k, each in enumerate(chunks) if channel in each.message_index_offsets}
+        assert set(found.runs.holding(channel, 2**63)) == held
+
+
+def test_real_indexes_are_read(shared_data):
+    for path in shared_data.glob("ros2-jazzy/bags/probe_path_[cm]*/*.mcap"):
+        with path.open("rb") as stream:
+            expected = make_reader(stream).get_summary()
+            found = read_index(stream)
+        assert found.statistics == expected.statistics
+        assert len(found.runs) == len(expected.chunk_indexes) > 0
+
+
+def test_messages_since_a_time_are_those_of_all_from_there_on(file):
+    bag = read_bag(file)
+    every = list(bag.messages())
+    times = [message.log_time for message in every]
+    for since in (0, times[0], times[1] - 1, times[100], times[200] + 1, times[-1], times[-1] + 1):
+        assert list(bag.messages(since=since)) == [m for m in every if m.log_time >= since]
+        of_b = [m for m in every if m.log_time >= since and m.topic == "/b"]
+        assert list(bag.messages(["/b"], since=since)) == of_b
+
+
+def test_the_latest_messages_are_those_before_a_time(file):
+    bag = read_bag(file)
+    every = list(bag.messages())
+    for before in (0, every[0].log_time, every[9].log_time, every[170].log_time, 2**62):
+        for count in (1, 3):
+            found = bag.latest(["/rare", "/b"], before, count)
+            for topic in ("/rare", "/b"):
+                earlier = [m for m in every if m.topic == topic and m.log_time < before]
+                assert [m for m in found if m.topic == topic] == earlier[-count:]
+
+
+def test_a_database_is_read_from_a_time_on(shared_data):
+    bag = read_bag(shared_data / "ros2-jazzy/bags/probe_path_sqlite3")
+    every = list(bag.messages())
+    since = every[500].log_time
+    assert list(bag.messages(since=since)) == [m for m in every if m.log_time >= since]
+    assert (
+        bag.latest(["/spacenav/joy"], since, 2)
+        == [m for m in every if m.topic == "/spacenav/joy" and m.log_time < since][-2:]
+    )
+
+
+def test_seeking_reads_one_chunk(tmp_path, monkeypatch):
+    bag = read_bag(session(tmp_path / "s.mcap"))
+    read = []
+    records_in = mcap_file.records_in
+    monkeypatch.setattr(
+        mcap_file, "records_in", lambda *given: (read.append(given[1]), records_in(*given))[1]
+    )
+    since = EPOCH + 250 * 10**7
+    assert next(bag.messages(since=since)).log_time == since
+    assert len(read) == 1
+    (last,) = bag.latest(["/rare"], since)
+    assert last.log_time == EPOCH + 157 * 10**7
+    assert len(read) == 2
+
+
+def test_a_damaged_chunk_before_a_time_does_not_matter(tmp_path):
+    path = session(tmp_path / "s.mcap")
+    content = bytearray(path.read_bytes())
+    content[content.index(HI + bytes([100]))] ^= 1
+    path.write_bytes(content)
+    bag, damage = read_bag(path), []
+    since = EPOCH + 250 * 10**7
+    assert len(list(bag.messages(damage=damage, since=since))) == 150
+    assert damage == []
+    assert len(list(bag.messages(damage=damage, since=0))) < 400
+    assert "is damaged in its chunk" in damage[0].text
