@@ -10,7 +10,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from us_sim.nodes.settings import NODES
+from us_sim.nodes.settings import COMPOSABLE, NODES, PLAYERS
 from us_sim.nodes.topics import TOPICS
 
 FILE = Path(__file__).resolve().parents[1] / "config" / "policy.xml"
@@ -28,8 +28,9 @@ def policy() -> str:
     enclaves = ET.SubElement(root, "enclaves")
     profiles: dict[str, ET.Element] = {}
     every = {topic.name for topic in TOPICS}
-    for node in sorted({*NODES, *TOGETHER}):
-        name = TOGETHER.get(node, node)
+    placed = [(node, TOGETHER.get(node, node)) for node in sorted({*NODES, *TOGETHER})]
+    placed += [(node, "composed") for node in COMPOSABLE]
+    for node, name in placed:
         if name not in profiles:
             enclave = ET.SubElement(enclaves, "enclave", path=f"/us_sim/{name}")
             profiles[name] = ET.SubElement(enclave, "profiles")
@@ -38,6 +39,8 @@ def policy() -> str:
         heard = {topic.name for topic in TOPICS if node in topic.subscribers}
         if node == "session_player":  # all that a recording may hold
             published |= every
+        if node in PLAYERS:
+            published.add("/clock")
         if node == "session_recorder":
             heard |= every
         _allow(profile, "topic", "publish", published | {"/rosout", "/parameter_events"})

@@ -7,6 +7,7 @@ A node that ends or hangs is said and started again, as often as ``restarts`` an
 import asyncio
 import contextlib
 import signal
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -36,6 +37,7 @@ ARGUMENTS = {
     "path": ("", "bag with a probe path to play; empty: poses come from outside"),
     "record": ("", "MCAP file to record to; empty: nothing is recorded"),
     "volume": ("", "volume file that replaces the scene's"),
+    "composed": ("false", "true: the scene's nodes are in one process"),
     "view": (
         "false",
         "true: a page in a browser shows the simulation, and moves the probe where no path is "
@@ -60,11 +62,13 @@ def session(context):
     if record is not None and record.exists():
         raise UsSimError(f"{record} exists already: choose another name or remove it")
     path = find_bag(given["path"]) if given["path"] else None
-    if given["view"] not in ("true", "false"):
-        raise UsSimError(f"view:={given['view']}: must be true or false")
+    for name in ("view", "composed"):
+        if given[name] not in ("true", "false"):
+            raise UsSimError(f"{name}:={given[name]}: must be true or false")
     view = ViewerSettings() if given["view"] == "true" else None
     by_hand = view is not None and path is None
-    plan = plan_of(Request(scene, record=record, path=path, view=view, by_hand=by_hand))
+    request = Request(scene, record=record, path=path, view=view, by_hand=by_hand)
+    plan = plan_of(replace(request, composed=given["composed"] == "true"))
     supervised = Supervised(plan, settings, context.launch_configurations.get("ros_namespace", ""))
     left_out = [part for part in scene.parts() if not part.needed]
     return [
@@ -95,9 +99,10 @@ class Supervised:
         self.actions[process.node] = Node(
             package="us_sim",
             executable=process.node,
-            name=process.node,
+            # A rule for the name of a process is one for all nodes in it.
+            name=None if process.parts else process.node,
             parameters=[process.all_parameters],
-            ros_arguments=["--enclave", enclave_of(process.node)],
+            ros_arguments=["--enclave", enclave_of(process.node), *process.arguments_of_parts()],
             output="screen",
             on_exit=partial(self.ended, process.node),
             **({} if process.node == RECORDER else COMPILES),

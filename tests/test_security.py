@@ -35,7 +35,8 @@ def test_every_executable_has_an_enclave_of_its_own(security):
     assert len(executables) > 10
     assert set(enclaves) == {enclave_of(node) for node in (*executables, "session_control")}
     for node in executables:
-        (profile,) = enclaves[enclave_of(node)].iter("profile")
+        profile, *parts = enclaves[enclave_of(node)].iter("profile")
+        assert bool(parts) == (node == "composed")  # whose nodes share its process
         assert (profile.get("ns"), profile.get("node")) == ("/", node)
     assert NodeProcess("viewer").arguments()[:3] == ["--ros-args", "--enclave", "/us_sim/viewer"]
 

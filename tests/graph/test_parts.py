@@ -95,3 +95,24 @@ def test_the_dry_run_says_what_is_left_out_and_why(played_scene, tmp_path):
         for line in lines
     )
     assert any(line.split()[:2] == ["runs", "tissue_deformer"] for line in lines)
+
+
+def test_all_nodes_of_a_scene_in_one_process_record_every_image(played_scene, tmp_path):
+    recording = tmp_path / "session.mcap"
+    path = yaml.safe_load(played_scene.read_text())["path"]
+    given = ("--path", path, "--record", recording, "--composed")
+    result = us_sim("run", played_scene, *given)
+    assert result.returncode == 0, result.stderr
+    bag = read_bag(recording)
+    reports = [bag.deserialize(each) for each in bag.messages(["/diagnostics"])]
+    pids = {
+        status.name.strip("/"): value.value
+        for report in reports
+        for status in report.status
+        for value in status.values
+        if value.key == "pid"
+    }
+    together = {"composed", "probe_tracker", "tissue_deformer", "skin_deformer"}
+    assert len({pids[node] for node in (*together, "slice_interpolator")}) == 1
+    assert len({pids[node] for node in ("composed", "session_recorder", "path_player")}) == 3
+    assert bag.topic("/ultrasound/image").message_count > 10

@@ -88,6 +88,10 @@ class RunSettings(Settings):
 
     record: Path | None = setting(description="record the session to this MCAP", default=None)
     duration: float | None = setting(Quantity("time", 1e-3, 1e7), "end after so long", default=None)
+    composed: bool = setting(
+        description="have the scene's nodes in one process: less memory, more latency",
+        default=False,
+    )
 
     def check(self) -> None:
         """Refuse a recording that cannot be made, before anything is started."""
@@ -140,6 +144,7 @@ def _request(
         path=args.path,
         topic=args.topic,
         duration=asked.duration,
+        composed=asked.composed,
         view=viewed(args),
     )
 
@@ -230,7 +235,7 @@ def view_options(parser: argparse.ArgumentParser) -> None:
         "scene", nargs="?", help="scene file, or name of an installed one; default: upper_arm"
     )
     add_viewer_options(parser)
-    add_setting_options(parser, RunSettings, ("record",))
+    add_setting_options(parser, RunSettings, ("record", "composed"))
     add_path_option(
         parser, "play this bag's probe path, and hold the probe at its end until it is taken"
     )
@@ -255,11 +260,12 @@ def _view(args: argparse.Namespace) -> int:
 
     parameters = node_parameters(args.param)
     if args.attach:
-        asked = (args.scene, args.case, args.volume, args.path, args.tracker or None)
-        if "record" in args or any(each is not None for each in asked):
+        given = (args.scene, args.case, args.volume, args.path)
+        is_any = args.tracker or args.composed or any(each is not None for each in given)
+        if "record" in args or is_any:
             raise UsSimError(
                 "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
-                "--record and --tracker, or leave out --attach"
+                "--record, --composed and --tracker, or leave out --attach"
             )
         from us_sim.run.live import view_running
 
@@ -273,10 +279,12 @@ def _view(args: argparse.Namespace) -> int:
         from us_sim.run.plan import Request
         from us_sim.scene.reading import load_scene
 
+        asked = read_settings(args, RunSettings, ("record", "composed"))
         request = Request(
             load_scene(scene_name(args, "upper_arm"), volume=args.volume),
             parameters,
-            record=read_settings(args, RunSettings, ("record",)).record,
+            record=asked.record,
+            composed=asked.composed,
             path=args.path,
             topic=args.topic,
             view=viewer(args),

@@ -343,6 +343,24 @@ class SceneNodeSettings(Settings):
     )
 
 
+COMPOSABLE = (
+    *("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"),
+    *("haptic_renderer", "openigtlink_bridge"),
+)
+"""Nodes that a scene may need, which can be in one process."""
+
+
+@dataclass(frozen=True)
+class ComposedSettings(Settings):
+    """Of ``composed``."""
+
+    nodes: tuple[str, ...] = setting(
+        description="names of the nodes in this process, whose parameters are given as "
+        "`-p NODE:NAME:=VALUE`",
+        default=(),
+    )
+
+
 @dataclass(frozen=True)
 class ProbeTrackerSettings(Settings):
     """Of ``probe_tracker``."""
@@ -492,6 +510,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "slice_interpolator": (SceneNodeSettings, PoseAgeSettings, AnnotatedImageSettings, Imaging),
     "haptic_renderer": (SceneNodeSettings,),
     "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),
+    "composed": (ComposedSettings,),
     "path_player": (PathPlayerSettings, AwaitedSettings),
     "session_player": (SessionPlayerSettings,),
     "session_recorder": (SessionRecorderSettings,),

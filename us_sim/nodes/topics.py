@@ -164,7 +164,7 @@ events/rosbag2_messages_lost: rosbag2_interfaces/MessagesLostEvent
     has not
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
-    openigtlink_bridge, path_player, session_player, session_recorder, camera_driver,
+    openigtlink_bridge, composed, path_player, session_player, session_recorder, camera_driver,
     space_mouse_driver, session_monitor, volume_reconstructor, session_control, viewer ->
     session_monitor | once a second: state, rate, latency, what was dropped or refused; of
     `session_monitor` which nodes ended or hung

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -20,7 +19,6 @@ from us_sim.run.monitored import refuse_unknown, ros_context
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
-    module_of,
     parameters_file,
     player_settings,
     recorder_of,
@@ -45,11 +43,11 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
     from rclpy.parameter import Parameter
 
     require_texts(parameters)
-    kind = "".join(word.capitalize() for word in name.split("_"))
-    make = getattr(importlib.import_module(module_of(name)), kind)
+    from us_sim.nodes.composed import node_class
+
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]
     try:
-        return make(context=context, parameter_overrides=overrides)
+        return node_class(name)(context=context, parameter_overrides=overrides)
     except ParameterException as error:
         raise UsSimError(" ".join(str(error).split())) from error
 

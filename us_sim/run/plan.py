@@ -57,6 +57,7 @@ class NodeProcess:
     given: dict[str, object] = field(default_factory=dict)  # by a person; take precedence
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
     kept: dict[str, object] = field(default_factory=dict)  # set while it ran; take precedence
+    parts: tuple[NodeProcess, ...] = ()  # other nodes in the same process
 
     def __post_init__(self) -> None:
         require_texts(self.all_parameters)
@@ -70,7 +71,16 @@ class NodeProcess:
         arguments = ["--ros-args", "--enclave", enclave_of(self.node), *ros_arguments()]
         for name, value in self.all_parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
-        return arguments
+        return arguments + self.arguments_of_parts()
+
+    def arguments_of_parts(self) -> list[str]:
+        """Those that set the parameters of other nodes in the process."""
+        return [
+            word
+            for part in self.parts
+            for name, value in part.all_parameters.items()
+            for word in ("-p", f"{part.node}:{name}:={json.dumps(value)}")
+        ]
 
     @property
     def all_parameters(self) -> dict[str, object]:
@@ -109,6 +119,7 @@ class Request:
     view: ViewerSettings | None = None  # address of the page that shows it; None is no page
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
+    composed: bool = False  # the scene's nodes are in one process
     kept: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # set as nodes ran
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
 
@@ -139,7 +150,7 @@ class Plan:
 
     @property
     def nodes(self) -> list[str]:
-        return [process.node for process in self.processes]
+        return [each.node for process in self.processes for each in (process, *process.parts)]
 
     def with_free_port(self) -> Plan:
         """The same plan, checked before anything is made for it.
@@ -198,12 +209,16 @@ def plan_of(request: Request) -> Plan:
             settings["exclude"] = ["camera/image_raw"]  # the video is there already
         processes.append(NodeProcess(RECORDER, settings, recorder))
     driver = taken("camera_driver") if request.video is not None else {}
-    processes += [
+    nodes = [
         replace(process, kept=dict(request.kept.get(process.node, {})))
         for process in simulation_nodes(
             scene, parameters, played=request.by_hand or request.path is not None
         )
     ]
+    if request.composed:
+        names = [part.node for part in nodes]
+        nodes = [NodeProcess("composed", {"nodes": names}, parts=tuple(nodes))]
+    processes += nodes
     for process in processes:
         if process.node == RECORDER:
             process.parameters["parameters"] = parameters_file(processes)
@@ -284,7 +299,11 @@ def scene_settings(scene: Scene) -> dict[str, object]:
 
 def parameters_file(processes: Sequence[NodeProcess]) -> str:
     """The parameters of nodes as ROS reads them with ``--params-file``."""
-    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
+    document = {
+        each.node: {"ros__parameters": each.all_parameters}
+        for process in processes
+        for each in (process.parts or (process,))
+    }
     text: str = yaml.safe_dump(document, sort_keys=False)
     return text
 

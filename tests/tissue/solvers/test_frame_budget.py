@@ -32,7 +32,7 @@ def steps_until_over(balanced_after, *, strict=None, live=None):
         budget.end_step(iterations)
         if budget.is_over(balanced=number >= balanced_after):
             break
-    limit = strict or 1.5 * (live or math.inf)
+    limit = strict or 1.25 * (live or math.inf)
     assert clock.now - 100.0 <= limit + 1e-9 or number == 1
     return number
 
@@ -46,8 +46,8 @@ def steps_until_over(balanced_after, *, strict=None, live=None):
         ({"strict": 4.5, "live": 1.0}, 1000, 4),
         ({"strict": 0.5}, 1000, 1),  # the speed is not known before
         ({"live": 4.5}, 1, 4),
-        ({"live": 4.5}, 6, 6),  # live, longer for a balance,
-        ({"live": 4.5}, 1000, 7),  # but no more than half as long again
+        ({"live": 4.5}, 5, 5),  # live, longer for a balance,
+        ({"live": 4.5}, 1000, 6),  # but no more than a quarter
         ({}, 1000, 100),
     ],
 )

@@ -276,7 +276,7 @@ def _draw(file: Path, made: Mapping[tuple[str, str], Closing]) -> None:
             moments = (0, len(closing.depth) // 4, len(closing.depth) // 2, len(closing.depth) - 1)
             shown = [_cropped(closing.sections[m]) for m in moments]
             panel.imshow(np.vstack([np.hstack(shown[:2]), np.hstack(shown[2:])]), cmap="gray")
-            depths = ", ".join(f"{1e3 * closing.depth[m]:.0f}" for m in moments)
+            depths = ", ".join(f"{1e3 * closing.depth[m]:.3g}" for m in moments)
             panel.set_title(f"{name}: at {depths} mm", fontsize=9)
             panel.axis("off")
 

@@ -68,7 +68,7 @@ class FemNonlinearSettings(SolverSettings):
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
-        "parameter: live, what the rate leaves, and up to half as much again until the forces are "
+        "parameter: live, what the rate leaves, and up to a quarter more until the forces are "
         "balanced; in lockstep no limit, lest results depend on the machine",
         default=None,
     )
