@@ -354,10 +354,32 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
     for number in (7, 8, 11, None, 12, 12, 20):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert lost == [("/note", 2), ("/note", 7)]
+    for number in (1, 21, 2, 22):  # somebody else has begun, of whom the graph does not tell yet
+        topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
+    topic.follow([QoSProfile(depth=1)])  # and has ended again
+    for number in (30, 32):
+        topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
+    assert lost.pop() == ("/note", 1)
+    assert len(lost) == 2
     topic.follow([QoSProfile(depth=1), QoSProfile(depth=1)])  # whose numbers cannot be told apart
     for number in (30, 1, 31):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert len(lost) == 2
+
+
+def test_publishers_of_one_quality_are_not_taken_for_one(bench):
+    lost = []
+    topic = RecordedTopic(
+        bench.peer,
+        "/note",
+        String,
+        [QoSProfile(depth=1), QoSProfile(depth=1)],
+        lambda *_: None,
+        lambda *arguments: lost.append(arguments),
+    )
+    for number in (1, 500, 2, 501):
+        topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
+    assert not lost
 
 
 @standalone_only

@@ -48,12 +48,13 @@ class RecordedTopic:
         self.name = name
         self._node, self._type = node, message_type
         self._take, self._lost = take, lost
-        self._offered = dict.fromkeys(map(QosProfile.of, offered))
+        profiles = [QosProfile.of(profile) for profile in offered]
+        self._offered = dict.fromkeys(profiles)
         self._adopted = _adopted(self._offered)
         self._old: Subscription | None = None
         self._old_until = 0.0  # s, monotonic
         self._recent: dict[tuple[int, int], None] = {}
-        self._publishers = len(self._offered)
+        self._publishers = len(profiles)
         self._sequence: int | None = None
         self._subscription = self._subscribed()
 
@@ -110,9 +111,13 @@ class RecordedTopic:
     def _count(self, sequence: int | None) -> None:
         """Notice messages that are missing in the numbers of the only publisher.
 
-        Not every middleware gives numbers, and those of several publishers cannot be told apart.
+        Not every middleware gives numbers, and those of several publishers cannot be told apart: a
+        number that is lower is of another one, of which the graph will tell.
         """
         if sequence is None or self._publishers != 1:
+            return
+        if self._sequence is not None and sequence < self._sequence:
+            self._publishers = 0
             return
         if self._sequence is not None and sequence > self._sequence + 1:
             self._lost(self.name, sequence - self._sequence - 1)
