@@ -1,5 +1,6 @@
 """The table of topics is what the nodes publish and hear: no topic more, none less."""
 
+import ast
 import shutil
 from importlib import import_module
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 from bench import Bench
 from rclpy.qos import DurabilityPolicy
 
+from us_sim import viewer
 from us_sim.nodes.camera_driver import CameraDriver
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.image_writer import ImageWriter
@@ -187,6 +189,18 @@ def test_every_topic_can_be_remapped_and_is_in_the_namespace(all_nodes):
                 assert name.startswith("/left/moved/"), (node.get_name(), name)
     finally:
         bench.close()
+
+
+def test_the_viewer_names_the_topics_that_it_hears():
+    """It hears most of them only while a page is open."""
+    names = {topic.name for topic in TOPICS}
+    constants = {
+        node.value
+        for file in Path(viewer.__file__).parent.glob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    assert names & constants == {topic.name for topic in TOPICS if "viewer" in topic.subscribers}
 
 
 def test_every_node_is_in_the_table_and_no_other():
