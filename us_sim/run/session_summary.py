@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from us_sim.errors import BagError
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, lifted
 from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.nodes.topics import published_counts
 from us_sim.recording.reader import Bag, read_bag
@@ -31,8 +31,6 @@ STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/
 OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
 _HARDLY_CUT = 0.1
 """Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
-_STEEPEST = 0.2
-"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 MILLISECOND = 1e6  # in nanoseconds
 
 
@@ -135,7 +133,7 @@ class Session:
         whole = np.ones(found.shape[1:], dtype=bool)  # in the image
         for k, stamp in enumerate(chosen):
             pose = self.poses[stamp]
-            seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
+            seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(lifted(pose), self.rest)
             for i, labels in enumerate(seen):
                 found[i, :, k] = [pixel * (labels == numbers[name]).sum() for name in vessels]
                 whole[:, k] &= [not (labels[edge] == numbers[name]).any() for name in vessels]
@@ -220,12 +218,6 @@ def _edge(probe: Probe) -> NDArray[np.bool_]:
     """(rows, columns) the last pixels of an image that its beams reach."""
     reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
     return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
-
-
-def _lifted(pose: Pose) -> Pose:
-    """Where the probe would be in the same plane if it did not press."""
-    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
-    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
 def _areas(areas: LumenAreas) -> dict[str, Any]:
