@@ -154,10 +154,12 @@ class Simulation:
         self.scene = scene
         self._blas = ThreadpoolController()
         self._volumes: dict[int | None, tuple[Volume, TissueModel | None, Any]] = {}
-        self._made: tuple[Any, ...] | None = None
+        self._shape: tuple[Any, ...] | None = None
+        self._materials: tuple[Any, ...] | None = None
         self._solver: TissueSolver | None = None
         self._membrane = membrane_of(scene) if scene.skin and scene.imaging.contact else None
         self._strains: AxialStrain | None = None
+        self._mesh: TetrahedralMesh
         self.scanner: BMode
         self.volume: Volume
         self.reset()
@@ -192,12 +194,15 @@ class Simulation:
         """
         draw = draw or Draw()
         with self._blas.limit(limits=1, user_api="blas"):
-            made = draw.speckle, draw.thickness, draw.lumen_pressure, dict(draw.stiffness)
-            if made != self._made:
-                self._make(draw)
-                self._made = made
+            shape = draw.speckle, draw.thickness
+            materials = *shape, draw.lumen_pressure, dict(draw.stiffness)
+            if shape != self._shape:
+                self._make_scanner(draw)
+            if materials != self._materials:
+                self._make_tissue(draw)
             elif self._solver is not None:
                 self._solver.reset()
+            self._shape, self._materials = shape, materials
         if self._membrane is not None:
             self._membrane.reset()
         imaging = self.scene.imaging
@@ -233,14 +238,21 @@ class Simulation:
         nodes = self._solver.model.mesh.nodes if self._solver is not None else None
         return self.scanner.labels(lifted(pose), nodes)
 
-    def _make(self, draw: Draw) -> None:
-        scene, base, model, fractions = self.scene, *self._drawn_from(draw.speckle)
+    def _make_scanner(self, draw: Draw) -> None:
+        base, model, _ = self._drawn_from(draw.speckle)
         deeper = np.diag([1.0, 1.0, draw.thickness, 1.0])
         self.volume = dataclasses.replace(base, index_to_patient=deeper @ base.index_to_patient)
-        self.scanner = scanner_of(scene, self.volume)
+        self.scanner = scanner_of(self.scene, self.volume)
         if self._membrane is not None:
             surface = self._membrane.surface
             self.scanner.touch(surface.vertices, surface.triangles)
+        if model is not None:
+            self._mesh = mesh = _deeper(model.mesh, draw.thickness)
+            self.scanner.carry(mesh.nodes, mesh.tetrahedra)
+            self._strains = AxialStrain(mesh.nodes, mesh.tetrahedra)
+
+    def _make_tissue(self, draw: Draw) -> None:
+        scene, (_, model, fractions) = self.scene, self._drawn_from(draw.speckle)
         if model is None or scene.tissue is None:
             return
         materials = {
@@ -251,19 +263,15 @@ class Simulation:
             )
             for name, given in scene.tissue.materials.items()
         }
-        mesh = _deeper(model.mesh, draw.thickness)
-        constants = materials_of(scene, materials, mesh, self.volume, fractions)
-        model = dataclasses.replace(model, mesh=mesh, materials=constants)
+        constants = materials_of(scene, materials, self._mesh, self.volume, fractions)
+        model = dataclasses.replace(model, mesh=self._mesh, materials=constants)
         method = SOLVERS.load(scene.tissue.solver)
         settings = scene.solver_settings(scene.tissue.solver) or method.Settings()
         if self._solver is None:
-            self._solver = compiled_solver(
-                method, model, settings, late_progress("preparing the tissue")
-            )
+            show = late_progress("preparing the tissue")
+            self._solver = compiled_solver(method, model, settings, show)
         else:
             self._solver = method(model, settings)
-        self.scanner.carry(mesh.nodes, mesh.tetrahedra)
-        self._strains = AxialStrain(mesh.nodes, mesh.tetrahedra)
 
     def _drawn_from(
         self, speckle: int | None
