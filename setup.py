@@ -66,6 +66,7 @@ setup(
     author="us_sim developers",
     packages=find_packages(include=["us_sim", "us_sim.*"]),
     package_data={
+        "us_sim.environment": ["*.md"],
         "us_sim.evaluation": ["*/*.md"],
         "us_sim.viewer": ["assets/**/*", "panels/*.js"],
     },

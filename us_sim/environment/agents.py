@@ -138,3 +138,49 @@ class VisualServo:
         near = min(spots, key=lambda s: math.hypot(s.centre[0] - x, s.centre[1] - y))
         apart = math.hypot(near.centre[0] - x, near.centre[1] - y)
         return near if apart < 1.2 * math.sqrt(self._last.area) else None
+
+
+FEATURES = ("offset", "seen", "contact", "force", "one")
+"""Inputs of `LinearPolicy`: offset of the largest dark spot over the image's width, whether there
+is one, part of the face that touches, N along the axis over 10 N, and 1."""
+
+
+class LinearPolicy:
+    """An action along x and z that is linear in `FEATURES`.
+
+    Args:
+        weights: (2 * 5,), rows for x and z.
+    """
+
+    def __init__(self, weights: NDArray[np.float64]) -> None:
+        self._weights = np.reshape(weights, (2, len(FEATURES)))
+
+    def act(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """(6,) the next action."""
+        spots = dark_spots(observation["image"])
+        columns = observation["image"].shape[1]
+        offset = spots[0].centre[0] / (columns - 1) - 0.5 if spots else 0.0
+        touch, force = float(observation["contact"][0]), -float(observation["wrench"][2]) / 10.0
+        x, z = self._weights @ np.array([offset, bool(spots), touch, force, 1.0])
+        return np.array([x, 0.0, z, 0.0, 0.0, 0.0], np.float32).clip(-1.0, 1.0)
+
+
+class Wander:
+    """Smooth random motion over the skin, pressed and let go about every three seconds.
+
+    Args:
+        seed: decides it.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+        self._action = np.zeros(6)
+        self._steps = 0
+
+    def act(self, _: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """(6,) the next action: noise that keeps 95 % of itself, and a wave along the axis."""
+        self._action = 0.95 * self._action + 0.1 * self._random.standard_normal(6)
+        action = self._action.copy()
+        action[2] = 0.35 * math.cos(2 * math.pi * self._steps / 90) + 0.2 * action[2]
+        self._steps += 1
+        return action.clip(-1.0, 1.0).astype(np.float32)
