@@ -3,7 +3,7 @@
 pip install cma && python docs/learning.py
 
 It draws docs/learning.png, and prints the table of docs/learning.md. Training draws where the probe
-starts, and the comparison everything. It takes some 20 minutes on one core.
+starts, and the comparison everything. It takes some ten minutes on one core.
 """
 
 from __future__ import annotations
@@ -21,9 +21,13 @@ from us_sim.environment.environment import ScanEnvironment
 from us_sim.progress import Progress
 
 FOLDER = Path(__file__).parent
-GENERATIONS, POPULATION, EACH, TESTS, STEPS = 16, 8, 2, 40, 120
+GENERATIONS, POPULATION, EACH, TESTS, STEPS = 16, 8, 1, 24, 100
 SAME = {"thickness": 1.0, "speckle": 1, "stiffness": 1.0, "lumen_pressure": 1.0}
-SETTINGS = {"tissue": {"solver": "fem"}, "episode": {"steps": STEPS}}
+SETTINGS = {
+    "tissue": {"solver": "fem"},
+    "probe": {"image": [128, 128]},
+    "episode": {"steps": STEPS},
+}
 
 
 class Chance:

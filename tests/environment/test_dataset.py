@@ -1,4 +1,4 @@
-"""A data set is the same for any number of workers, goes on where it stopped, and tells failures."""
+"""A data set is the same for any number of workers, and goes on where it stopped."""
 
 import hashlib
 import io
