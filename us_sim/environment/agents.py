@@ -141,8 +141,8 @@ class VisualServo:
 
 
 FEATURES = ("offset", "seen", "contact", "force", "one")
-"""Inputs of `LinearPolicy`: offset of the largest dark spot over the image's width, whether there
-is one, part of the face that touches, N along the axis over 10 N, and 1."""
+"""Inputs of `LinearPolicy`: offset of the largest dark spot over a tenth of the image's width,
+whether there is one, part of the face that touches, N along the axis over 10 N, and 1."""
 
 
 class LinearPolicy:
@@ -159,7 +159,7 @@ class LinearPolicy:
         """(6,) the next action."""
         spots = dark_spots(observation["image"])
         columns = observation["image"].shape[1]
-        offset = spots[0].centre[0] / (columns - 1) - 0.5 if spots else 0.0
+        offset = 10.0 * (spots[0].centre[0] / (columns - 1) - 0.5) if spots else 0.0
         touch, force = float(observation["contact"][0]), -float(observation["wrench"][2]) / 10.0
         x, z = self._weights @ np.array([offset, bool(spots), touch, force, 1.0])
         return np.array([x, 0.0, z, 0.0, 0.0, 0.0], np.float32).clip(-1.0, 1.0)
