@@ -25,7 +25,7 @@ LAYERS = (
         (
             ("scene",),
             ("skin", "tissue", "slicing", "tracking"),
-            ("", "", "volume", "recording"),
+            ("scoring", "", "volume", "recording"),
             ("geometry",),
             ("settings",),
         ),
