@@ -282,9 +282,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
         if scanner is not None and seen:  # through air nothing is
             frame = scanner.frame(session.poses[stamp], session.nodes[stamp])
-            draw_outlines(
-                axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent
-            )
+            lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
+            draw_outlines(axes, frame, lumens, extent)
         where = _place(session.poses[stamp])
         axes.set_title(f"{title}: {_times([stamp], first)}, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)

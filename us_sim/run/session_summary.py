@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ class LumenAreas:
     area: dict[str, NDArray[np.float64]]  # (K,) m² by vessel
     # (K,) m² by vessel, in the same planes of the tissue at rest; NaN where it is hardly cut
     at_rest: dict[str, NDArray[np.float64]]
+    stamps: tuple[int, ...] = ()  # (K,) ns, of the images
 
     @property
     def pressed(self) -> int:
@@ -137,8 +138,9 @@ class Session:
             pose = self.poses[stamp]
             seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
             for i, labels in enumerate(seen):
-                found[i, :, k] = [pixel * (labels == numbers[name]).sum() for name in vessels]
-                whole[:, k] &= [not (labels[edge] == numbers[name]).any() for name in vessels]
+                inside = [np.isin(labels, numbers[name]) for name in vessels]
+                found[i, :, k] = [pixel * each.sum() for each in inside]
+                whole[:, k] &= [not each[edge].any() for each in inside]
             if progress is not None:
                 progress((k + 1) / len(chosen))
         now, rest = found
@@ -156,20 +158,16 @@ class Session:
             depth=np.array([self.poses[stamp].position[2] for stamp in chosen]),
             area={vessels[i]: now[i] for i in cut},
             at_rest={vessels[i]: rest[i] for i in cut},
+            stamps=tuple(chosen),
         )
 
-    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, int], BMode | None]:
-        """Labels of vessels by their names, veins first, and the scanner that finds them.
+    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, tuple[int, ...]], BMode | None]:
+        """Labels of vessels by their names, see `lumens_of`, and the scanner that finds them.
 
         There is no scanner without labels of vessels, or without tissue.
         """
         volume = volume_of(scene)
-        numbers = {
-            name: label
-            for kind in VESSELS
-            for label, name in volume.label_names.items()
-            if kind_of(name) == kind
-        }
+        numbers = lumens_of(volume.label_names)
         if volume.labels is None or not numbers or self.rest is None or self.tetrahedra is None:
             return {}, None
         scanner = scanner_of(scene, volume)
@@ -214,6 +212,21 @@ class Session:
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
             for topic, count in said.items()
         }
+
+
+def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
+    """Labels of the inside of each vessel, veins first; a ``vein thrombus`` fills part of ``vein``.
+
+    >>> lumens_of({5: "artery", 6: "vein", 8: "vein thrombus"})
+    {'vein': (6, 8), 'artery': (5,)}
+    """
+    labels = {name: label for label, name in label_names.items()}
+    return {
+        name: tuple(labels[part] for part in (name, f"{name} thrombus") if part in labels)
+        for kind in VESSELS
+        for name in labels
+        if kind_of(name) == kind
+    }
 
 
 def _edge(probe: Probe) -> NDArray[np.bool_]:

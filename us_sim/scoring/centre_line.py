@@ -20,6 +20,7 @@ class Cut(NamedTuple):
 
     along: float  # m, from the end that is first along the line's main axis
     angle: float  # rad, between the line and the plane, 0 to a right angle
+    lateral: float  # m, along the probe's face, from its middle
     point: NDArray[np.float64]  # (3,) m
 
 
@@ -83,5 +84,5 @@ class CentreLine:
             length = float(np.linalg.norm(way))
             angle = np.arcsin(min(abs(float(way @ pose.rotation[:, 1])) / length, 1.0))
             where = float(self.lengths[k] + part * length)
-            found = (z, Cut(where, float(angle), self.points[k] + part * way))
+            found = (z, Cut(where, float(angle), float(x), self.points[k] + part * way))
         return found[1] if found else None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
+from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.motion import Motion
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -85,6 +86,8 @@ class Section:
     at_rest: _Array  # (K,) m², in the same plane of the tissue at rest
     along: _Array  # (K,) m, of the place on the vessel's centre line
     angle: _Array  # (K,) rad, between the centre line and the image plane; a right angle is across
+    lateral: _Array  # (K,) m, of the vessel's middle at rest from the middle of the image
+    line: CentreLine
 
     @property
     def fraction(self) -> _Array:
