@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.metrics import Force, Metric, Scan, ScoreSettings, Section, metrics_of
 from us_sim.scoring.motion import Motion
 
@@ -76,7 +75,6 @@ def test_the_areas_of_a_vessel():
         np.zeros(4),
         np.deg2rad([90.0, 80.0, nan, 70.0]),
         np.zeros(4),
-        CentreLine(np.eye(2, 3)),
     )
     found = table(Scan(circle(), sections={"vein": section}))
     assert found["Mean Area at Rest", "vein"] == pytest.approx(56 / 3)

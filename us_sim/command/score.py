@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
+from us_sim.scoring.exercise import Exercise, Step, read_exercise
 from us_sim.scoring.metrics import Metric, Scan, ScoreSettings, metrics_of
 from us_sim.share import find_bag
 
@@ -33,6 +34,9 @@ def score_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--topic", metavar="NAME", help="of the poses, where there are several")
     parser.add_argument("--wrench", metavar="NAME", help="topic of the force on the probe")
+    parser.add_argument(
+        "--exercise", metavar="NAME", help="file of an exercise, or name of an installed one"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"write {', '.join(_FILES)} there")
     add_setting_options(parser, ScoreSettings)
     parser.set_defaults(command=_score)
@@ -42,15 +46,19 @@ def _score(args: argparse.Namespace) -> int:
     from us_sim.run.session_score import read_scan
 
     settings = read_settings(args, ScoreSettings)
+    exercise = read_exercise(args.exercise) if args.exercise is not None else None
     out: Path | None = args.out
     for file in _FILES if out is not None else ():
         if (out / file).exists():
             raise ScoreError(f"{out / file} exists already: choose another folder with --out")
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
-    score = Score(args.session.name, list(metrics_of(scan, settings)), scan)
+    steps = exercise.steps(scan) if exercise is not None else []
+    score = Score(args.session.name, list(metrics_of(scan, settings)), scan, exercise, steps)
     print(score.table())
     for sentence in scan.missing:
         print(f"left out: {sentence}")
+    if exercise is not None:
+        print(score.exercise_table())
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         score.write(out)
@@ -60,11 +68,13 @@ def _score(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class Score:
-    """The metrics of one recording, and their page."""
+    """The metrics of one recording, what was done of an exercise, and their page."""
 
     title: str
     metrics: Sequence[Metric]
     scan: Scan
+    exercise: Exercise | None = None
+    steps: Sequence[Step] = ()
 
     def table(self) -> str:
         """For a terminal, and for a page."""
@@ -72,6 +82,17 @@ class Score:
 
         rows = [(each.name, each.text, each.unit, each.roles) for each in self.metrics]
         return markdown_table(("metric", "value", "unit", "roles"), rows)
+
+    def exercise_table(self) -> str:
+        """What was to be done, whether it is, and what was seen; then the result."""
+        from us_sim.evaluation.report import markdown_table
+
+        assert self.exercise is not None
+        rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in self.steps]
+        done = sum(each.is_done for each in self.steps)
+        result = "passed" if done == len(self.steps) else "not passed"
+        table = markdown_table((self.exercise.name, "done", "seen"), rows)
+        return f"{table}\n\n{result}: {done} of {len(rows)} done"
 
     def write(self, folder: Path) -> None:
         """Write table, picture and page into a folder."""
@@ -82,6 +103,8 @@ class Score:
         missing = [f"- Left out: {sentence}." for sentence in self.scan.missing]
         parts = [
             f"# Score of {self.title}",
+            self.exercise.description if self.exercise else "",
+            self.exercise_table() if self.exercise else "",
             self.table(),
             "\n".join(missing),
             "![The probe's way over the skin; force and areas over time](score.png)",
@@ -120,10 +143,14 @@ class Score:
         else:
             shown = axes.scatter(x, y, c=force.at(motion.times), s=7, cmap="viridis", zorder=2)
             axes.figure.colorbar(shown, ax=axes, label="force, N", shrink=0.7)
-        for name, section in self.scan.sections.items():
-            line = _MM * section.line.points[:, :2].T
-            axes.plot(*line, color=_colour(name), lw=3, alpha=0.5, label=name, zorder=0)
-        if self.scan.sections:
+        for name, line in self.scan.lines.items():
+            way = _MM * line.points[:, :2].T
+            axes.plot(*way, color=_colour(name), lw=3, alpha=0.5, label=name, zorder=0)
+        for step in self.steps:
+            if step.target is not None:
+                look = {"color": "C2" if step.is_done else "C3", "marker": "o", "fillstyle": "none"}
+                axes.plot(*(_MM * step.target[:2]), ms=12, mew=2, **look)
+        if self.scan.lines:
             axes.legend(fontsize=8, frameon=False)
         axes.set(xlabel="x, mm", ylabel="y, mm", title="Way of the probe's face over the skin")
         axes.set_aspect("equal", adjustable="datalim")

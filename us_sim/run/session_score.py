@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
 from us_sim.run.resimulation import scene_within
 from us_sim.run.session_summary import lumens_of, read_session
 from us_sim.scene.building import probe_of, volume_of
-from us_sim.scoring.centre_line import CentreLine
+from us_sim.scoring.centre_line import CentreLine, places_of
 from us_sim.scoring.metrics import Force, Scan, Section
 from us_sim.scoring.motion import Motion
 from us_sim.volume.volume import Volume
@@ -64,12 +65,12 @@ def read_scan(
         frozen = sum(text.startswith(FROZEN) for _, text in bag.markers())
     else:
         missing.append("no marks on session/marker: images that were frozen are not counted")
-    sections = {}
     try:
-        sections = _sections(file, bag, path, progress)
+        truth = _truth(file, bag, path, progress)
     except BagError as error:
+        truth = {}
         missing.append(f"no areas of structures: {error}")
-    return Scan(motion, force, sections, frozen, tuple(missing))
+    return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 
 
 def _has(bag: Bag, name: str, kind: str) -> bool:
@@ -101,10 +102,10 @@ def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force
     return Force(_seconds(record.stamps[usable], begin), newtons[usable])
 
 
-def _sections(
+def _truth(
     file: Path, bag: Bag, path: ProbePath, progress: Callable[[float, str], None]
-) -> dict[str, Section]:
-    """Cross-sections of the vessels, at five images a second and at least two hundred in all.
+) -> dict[str, Any]:
+    """Sections, lines and thrombi of the vessels; of five images a second, and two hundred in all.
 
     Raises:
         BagError: there is no scene, tissue, image or vessel.
@@ -119,29 +120,33 @@ def _sections(
         session = read_session(file)
         samples = max(_SAMPLES, int(_RATE * path.duration))
         areas = session.lumen_areas(scene, samples, lambda done: progress(done, "areas"))
-        lines = centre_lines(volume_of(scene))
-    if areas is None:
-        raise BagError(f"no image of {file} cuts a vessel that can be measured")
+        lines, thrombi = vessels_in(volume_of(scene))
+    found: dict[str, Section] = {}
     width = probe_of(scene).width
-    poses = [session.poses[stamp] for stamp in areas.stamps]
-    times = _seconds(np.array(areas.stamps), int(path.stamps.min()))
-    found = {}
-    for name, area in areas.area.items():
-        if name not in lines:
-            continue
-        cuts = [lines[name].cut(pose, width) for pose in poses]
+    for name, area in areas.area.items() if areas is not None else ():
+        cuts = [lines[name].cut(session.poses[k], width) for k in areas.stamps if name in lines]
         places = [(c.along, c.angle, c.lateral) if c else (np.nan,) * 3 for c in cuts]
-        along, angle, lateral = np.array(places).T
-        found[name] = Section(times, area, areas.at_rest[name], along, angle, lateral, lines[name])
-    return found
+        if places:
+            times = _seconds(np.array(areas.stamps), int(path.stamps.min()))
+            found[name] = Section(times, area, areas.at_rest[name], *np.array(places).T)
+    return {"sections": found, "lines": lines, "thrombi": thrombi}
 
 
-def centre_lines(volume: Volume) -> dict[str, CentreLine]:
-    """The centre line of each vessel that is long enough to have one, by its name."""
+def vessels_in(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[float, float]]]:
+    """Centre lines of vessels by their names, and where along them a thrombus is (m, from, to).
+
+    A vessel that is not long has none.
+    """
+    lines: dict[str, CentreLine] = {}
+    thrombi: dict[str, tuple[float, float]] = {}
     if volume.labels is None:
-        return {}
-    lines = {
-        name: CentreLine.of(volume, np.isin(volume.labels, numbers))
-        for name, numbers in lumens_of(volume.label_names).items()
-    }
-    return {name: line for name, line in lines.items() if line is not None}
+        return lines, thrombi
+    for name, numbers in lumens_of(volume.label_names).items():
+        line = CentreLine.of(volume, np.isin(volume.labels, numbers))
+        if line is None:
+            continue
+        lines[name] = line
+        if len(numbers) > 1:
+            along = line.along(places_of(volume, volume.labels == numbers[1]))
+            thrombi[name] = float(along.min()), float(along.max())
+    return lines, thrombi

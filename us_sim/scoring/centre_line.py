@@ -7,12 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from us_sim.geometry.pose import Pose
 from us_sim.volume.volume import Volume
 
 _PIECE = 2e-3  # m, of the vessel's length, whose voxels give one point of the line
 _SMOOTHED = 5  # points, over which the line is straightened: a surface of voxels is uneven
+
+
+def places_of(volume: Volume, labels: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(N, 3) m, the centres of a volume's marked voxels (i, j, k), in frame ``patient``."""
+    matrix = volume.index_to_patient
+    return np.asarray(np.argwhere(labels) @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 class Cut(NamedTuple):
@@ -36,11 +43,9 @@ class CentreLine:
 
         The voxels are cut across their longest axis, and each piece gives its centroid.
         """
-        indices = np.argwhere(labels)
-        if len(indices) < 2:
+        places = places_of(volume, labels)
+        if len(places) < 2:
             return None
-        matrix = volume.index_to_patient
-        places = indices @ matrix[:3, :3].T + matrix[:3, 3]
         middle = places.mean(axis=0)
         axis = np.linalg.svd(np.cov((places - middle).T))[0][:, 0]
         axis *= np.sign(axis[np.argmax(np.abs(axis))])
@@ -60,6 +65,10 @@ class CentreLine:
         """(P,) m, of the way to each point."""
         steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def along(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N,) m along the line, of its points nearest to these (N, 3) m."""
+        return np.asarray(self.lengths[cKDTree(self.points).query(points)[1]])
 
     def at(self, along: float) -> NDArray[np.float64]:
         """The point (3,) m of a length along the line."""

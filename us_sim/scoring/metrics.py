@@ -87,7 +87,6 @@ class Section:
     along: _Array  # (K,) m, of the place on the vessel's centre line
     angle: _Array  # (K,) rad, between the centre line and the image plane; a right angle is across
     lateral: _Array  # (K,) m, of the vessel's middle at rest from the middle of the image
-    line: CentreLine
 
     @property
     def fraction(self) -> _Array:
@@ -102,6 +101,9 @@ class Scan:
     motion: Motion  # of the probe in frame ``patient``
     force: Force | None = None
     sections: Mapping[str, Section] = field(default_factory=dict)  # by the vessel's name
+    lines: Mapping[str, CentreLine] = field(default_factory=dict)  # of all vessels of the scene
+    # (from, to) m along the line of a vessel, by its name, where a thrombus is in it
+    thrombi: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     frozen: int | None = None  # images that were frozen
     missing: tuple[str, ...] = ()  # metrics that cannot be told, and why, in sentences
 
