@@ -23,9 +23,9 @@ LAYERS = (
     (
         "the domain, without ROS",
         (
-            ("scene",),
+            ("scene", "scoring"),
             ("skin", "tissue", "slicing", "tracking"),
-            ("scoring", "", "volume", "recording"),
+            ("", "", "volume", "recording"),
             ("geometry",),
             ("settings",),
         ),

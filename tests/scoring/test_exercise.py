@@ -12,7 +12,7 @@ from us_sim.scoring.metrics import Force, Scan, Section
 from us_sim.scoring.motion import Motion
 from us_sim.share import shared_roots
 
-POINTS = (0.01, 0.03, 0.05)  # m along a vein of 6 cm, of which 1 cm is left out at both ends
+POINTS = (0.01, 0.03, 0.05)  # m along a vein of 6 cm, of which 8 mm are left out at both ends
 LINE = CentreLine(np.linspace([0.002, -0.03, 0.013], [0.002, 0.03, 0.013], 61))
 PRESS = np.array([0.0, 0.5, 1.0, 0.5, 0.0])  # of the deepest, a second each
 
@@ -122,7 +122,7 @@ def test_a_vessel_is_followed_where_it_is_in_the_middle():
 
 
 def test_a_view_is_found_near_its_pose_with_its_vessels():
-    seen = scan()
+    seen = scan(left=(0.5, 0.5, 0.5))
     pose = {"position": LINE.points[30].tolist()}
     view = {"pose": type(read_exercise("view").assigned.pose)(**pose)}
     assert done("view", seen, **view) == [True]  # 4 s long

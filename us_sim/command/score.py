@@ -48,9 +48,9 @@ def _score(args: argparse.Namespace) -> int:
     settings = read_settings(args, ScoreSettings)
     exercise = read_exercise(args.exercise) if args.exercise is not None else None
     out: Path | None = args.out
-    for file in _FILES if out is not None else ():
-        if (out / file).exists():
-            raise ScoreError(f"{out / file} exists already: choose another folder with --out")
+    taken = [out / file for file in _FILES if (out / file).exists()] if out is not None else []
+    if taken:
+        raise ScoreError(f"{taken[0]} exists already: choose another folder with --out")
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
     steps = exercise.steps(scan) if exercise is not None else []
     score = Score(args.session.name, list(metrics_of(scan, settings)), scan, exercise, steps)
@@ -148,8 +148,8 @@ class Score:
             axes.plot(*way, color=_colour(name), lw=3, alpha=0.5, label=name, zorder=0)
         for step in self.steps:
             if step.target is not None:
-                look = {"color": "C2" if step.is_done else "C3", "marker": "o", "fillstyle": "none"}
-                axes.plot(*(_MM * step.target[:2]), ms=12, mew=2, **look)
+                x, y = _MM * step.target[:2]
+                axes.scatter(x, y, 150, "none", lw=2, edgecolors="C2" if step.is_done else "C3")
         if self.scan.lines:
             axes.legend(fontsize=8, frameon=False)
         axes.set(xlabel="x, mm", ylabel="y, mm", title="Way of the probe's face over the skin")

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from us_sim.errors import BagError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.run.session_summary import LumenAreas, Session
+from us_sim.run.session_summary import Session
 from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
+from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.drawing.overlay import Overlay

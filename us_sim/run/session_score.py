@@ -14,12 +14,11 @@ from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording,
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
 from us_sim.run.resimulation import scene_within
-from us_sim.run.session_summary import lumens_of, read_session
+from us_sim.run.session_summary import read_session
 from us_sim.scene.building import probe_of, volume_of
-from us_sim.scoring.centre_line import CentreLine, places_of
+from us_sim.scoring.lumen import vessels_in
 from us_sim.scoring.metrics import Force, Scan, Section
 from us_sim.scoring.motion import Motion
-from us_sim.volume.volume import Volume
 
 FROZEN = "frozen"
 """Begins the text on `session/marker` with which a page tells that its image was frozen."""
@@ -119,34 +118,10 @@ def _truth(
         scene = scene_within(file, attached, Path(place, "attached"))
         session = read_session(file)
         samples = max(_SAMPLES, int(_RATE * path.duration))
-        areas = session.lumen_areas(scene, samples, lambda done: progress(done, "areas"))
+        meter = session.measured_lumens(scene, samples, lambda done: progress(done, "areas"))
         lines, thrombi = vessels_in(volume_of(scene))
-    found: dict[str, Section] = {}
-    width = probe_of(scene).width
-    for name, area in areas.area.items() if areas is not None else ():
-        cuts = [lines[name].cut(session.poses[k], width) for k in areas.stamps if name in lines]
-        places = [(c.along, c.angle, c.lateral) if c else (np.nan,) * 3 for c in cuts]
-        if places:
-            times = _seconds(np.array(areas.stamps), int(path.stamps.min()))
-            found[name] = Section(times, area, areas.at_rest[name], *np.array(places).T)
-    return {"sections": found, "lines": lines, "thrombi": thrombi}
-
-
-def vessels_in(volume: Volume) -> tuple[dict[str, CentreLine], dict[str, tuple[float, float]]]:
-    """Centre lines of vessels by their names, and where along them a thrombus is (m, from, to).
-
-    A vessel that is not long has none.
-    """
-    lines: dict[str, CentreLine] = {}
-    thrombi: dict[str, tuple[float, float]] = {}
-    if volume.labels is None:
-        return lines, thrombi
-    for name, numbers in lumens_of(volume.label_names).items():
-        line = CentreLine.of(volume, np.isin(volume.labels, numbers))
-        if line is None:
-            continue
-        lines[name] = line
-        if len(numbers) > 1:
-            along = line.along(places_of(volume, volume.labels == numbers[1]))
-            thrombi[name] = float(along.min()), float(along.max())
-    return lines, thrombi
+    areas = meter.areas() if meter is not None else None
+    sections: dict[str, Section] = {}
+    if meter is not None and areas is not None:
+        sections = areas.sections(meter.poses, lines, probe_of(scene).width)
+    return {"sections": sections, "lines": lines, "thrombi": thrombi}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import ScoreError
 from us_sim.geometry.pose import Placement
 from us_sim.geometry.se3 import rotation_between
+from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.metrics import Scan, Section
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
@@ -73,7 +74,7 @@ class Compression(Task):
     structure: str = setting(description="vein to be compressed", default="vein")
     artery: str | None = setting(description="artery that must stay open", default=None)
     spacing: float = setting(_LENGTH, "between points along the vein", default=0.02)
-    margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.01)
+    margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.008)
     tolerance: float = setting(_LENGTH, "from a point, within which it counts", default=0.005)
     closed: float = setting(_PART, "part of its area that a closed vein may keep", default=0.1)
     open: float = setting(_PART, "part of its area that the artery must keep", default=0.5)
@@ -267,19 +268,26 @@ class Exercise(Settings):
         """The task with its settings."""
         return self.task.settings(EXERCISES)
 
+    def require(self, lines: Mapping[str, CentreLine]) -> None:
+        """Refuse vessels of which some that the task needs are missing.
+
+        Raises:
+            ScoreError: one sentence with the structure.
+        """
+        for name in self.assigned.structures:
+            if name not in lines:
+                known = unknown(name, lines) if lines else f"{name!r} is not known"
+                of = "the vessels of the scene" if lines else "a scan without a scene"
+                raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
+
     def steps(self, scan: Scan) -> list[Step]:
         """What is to be done, and what was seen of it.
 
         Raises:
-            ScoreError: the scene has no such structure, or the recording no scene.
+            ScoreError: as `require`.
         """
-        task: Task = self.assigned
-        for name in task.structures:
-            if name not in scan.lines:
-                known = unknown(name, scan.lines) if scan.lines else f"{name!r} is not known"
-                of = "the vessels of the scene" if scan.lines else "a recording without a scene"
-                raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
-        return list(task.steps(scan))
+        self.require(scan.lines)
+        return list(self.assigned.steps(scan))
 
 
 def read_exercise(name: str | Path) -> Exercise:

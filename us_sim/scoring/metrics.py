@@ -49,6 +49,12 @@ class Metric:
     roles: str = "Any = Probe"  # what it is of, as PerkTutor writes it
 
     @property
+    def label(self) -> str:
+        """Name, the structure that it is of, and unit."""
+        structure = self.roles.partition("Structure = ")[2]
+        return f"{self.name}{structure and f' of {structure}'}, {self.unit}"
+
+    @property
     def text(self) -> str:
         """The value as a person reads it; - where it is not known."""
         if not np.isfinite(self.value):

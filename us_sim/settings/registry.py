@@ -122,6 +122,7 @@ EXERCISES = Choice(
     "task of an exercise",
     key="kind",
     error=ScoreError,
+    needs=True,
     compression=f"{_EXERCISES}:Compression",
     keep_force=f"{_EXERCISES}:KeepForce",
     centre=f"{_EXERCISES}:Centre",
