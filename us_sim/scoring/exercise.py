@@ -76,7 +76,8 @@ class Compression(Task):
     spacing: float = setting(_LENGTH, "between points along the vein", default=0.02)
     margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.008)
     tolerance: float = setting(_LENGTH, "from a point, within which it counts", default=0.005)
-    closed: float = setting(_PART, "part of its area that a closed vein may keep", default=0.1)
+    # Below a fifth, the mesh holds a vein open: see `us_sim.evaluation.measured.vein`.
+    closed: float = setting(_PART, "part of its area that a closed vein may keep", default=0.2)
     open: float = setting(_PART, "part of its area that the artery must keep", default=0.5)
     enough: float = setting(
         Quantity(_FORCE, 0.1, 200.0),
