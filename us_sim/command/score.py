@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
@@ -108,8 +110,7 @@ class Score:
             self.table(),
             "\n".join(missing),
             "![The probe's way over the skin; force and areas over time](score.png)",
-            "Definitions: [docs/learning.md](../learning.md) of us_sim. "
-            "The values are in [score.csv](score.csv), too.",
+            "The values are in [score.csv](score.csv), too; `docs/scores.md` defines them.",
         ]
         text = "\n\n".join(filter(None, parts)) + "\n"
         (folder / "score.md").write_text(text, encoding="utf-8")
@@ -141,7 +142,9 @@ class Score:
         if force is None:
             axes.plot(x, y, color="C0", lw=1.2, zorder=2)
         else:
-            shown = axes.scatter(x, y, c=force.at(motion.times), s=7, cmap="viridis", zorder=2)
+            newtons = force.at(motion.times)
+            upwards = np.argsort(newtons)  # the strongest on top
+            shown = axes.scatter(x[upwards], y[upwards], 9, newtons[upwards], cmap="viridis")
             axes.figure.colorbar(shown, ax=axes, label="force, N", shrink=0.7)
         for name, line in self.scan.lines.items():
             way = _MM * line.points[:, :2].T

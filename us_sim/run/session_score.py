@@ -57,18 +57,19 @@ def read_scan(
         raise ScoreError(f"{file}: {path.topic}: {error}") from error
     missing = [path.note] if path.note else []
     if bag is None:
-        return Scan(motion, missing=(*missing, f"{file} holds poses alone: no force, no areas"))
+        return Scan(motion, missing=(*missing, f"force and areas: {file} holds poses alone"))
     force = _force(bag, wrench, begin, missing)
     frozen = None
-    if any(each.name == _MARKS for each in bag.topics) or bag.markers():
-        frozen = sum(text.startswith(FROZEN) for _, text in bag.markers())
+    if _has(bag, _MARKS, "std_msgs/msg/String"):
+        texts = [bag.deserialize(message).data for message in bag.messages([_MARKS])]
+        frozen = sum(text.startswith(FROZEN) for text in texts)
     else:
-        missing.append("no marks on session/marker: images that were frozen are not counted")
+        missing.append(f"images that were frozen: {file} has no marks on {_MARKS}")
     try:
         truth = _truth(file, bag, path, progress)
     except BagError as error:
         truth = {}
-        missing.append(f"no areas of structures: {error}")
+        missing.append(f"areas of structures: {error}")
     return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 
 
@@ -88,7 +89,7 @@ def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force
         chosen = preferred if len(preferred) == 1 else names
         if len(chosen) != 1:
             several = f"wrenches on {', '.join(names)}: name one with --wrench"
-            missing.append(f"no force: {bag.path} holds {several if names else 'no wrench'}")
+            missing.append(f"force: {bag.path} holds {several if names else 'no wrench'}")
             return None
         topic = chosen[0]
     record = read_wrenches(bag.path, topic)
@@ -96,7 +97,7 @@ def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force
     later = np.r_[True, record.stamps[1:] > np.maximum.accumulate(record.stamps)[:-1]]
     usable = np.isfinite(newtons) & later
     if np.count_nonzero(usable) < 2:
-        missing.append(f"no force: {record.topic} holds fewer than two wrenches that can be used")
+        missing.append(f"force: {record.topic} holds fewer than two wrenches that can be used")
         return None
     return Force(_seconds(record.stamps[usable], begin), newtons[usable])
 

@@ -94,7 +94,7 @@ class LumenAreas:
         """
         found: dict[str, Section] = {}
         for name in self.area.keys() & lines.keys():
-            cuts = [lines[name].cut(pose, width) for pose in poses]
+            cuts = [lines[name].cut(_lifted(pose), width) for pose in poses]
             places = [(c.along, c.angle, c.lateral) if c else (np.nan,) * 3 for c in cuts]
             found[name] = Section(
                 self.time, self.area[name], self.at_rest[name], *np.array(places).T
