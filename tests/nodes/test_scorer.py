@@ -26,7 +26,7 @@ def node(bench, small_scene, tmp_path):
 
 
 @pytest.fixture
-def scanned(bench, node, small_scene):  # noqa: ARG001 - publishers look for it
+def scanned(bench, node, small_scene):
     """Ten seconds at 10 mm/s and 5 N, and the vein's labels, half of them gone from 5 s on."""
     scene = load_scene(str(small_scene))
     labels = scanner_of(scene, volume_of(scene)).labels(Pose())
@@ -40,13 +40,14 @@ def scanned(bench, node, small_scene):  # noqa: ARG001 - publishers look for it
     scores = bench.collect(DiagnosticArray, "score", latched=True)
     for second in range(11):
         pose = pose_at(0.0, second + 1, x=0.01 * (second % 2))
-        stamp = pose.header.stamp
         poses.publish(pose)
-        wrenches.publish(wrench_message(np.array([0, 3.0, -4.0]), np.zeros(3), stamp, "probe"))
-        if second % 2 == 0:  # the pose at which the labels were found
-            bench.spin_for(3)
-            images.publish(image_message(half if second > 4 else labels, stamp, "probe"))
-            bench.spin_for(3)
+        wrench = wrench_message(np.array([0, 3.0, -4.0]), np.zeros(3), pose.header.stamp, "probe")
+        wrenches.publish(wrench)
+    bench.spin_until(lambda: bool(scores) and is_whole(scores[-1]))
+    for count, second in enumerate(range(0, 11, 2), 1):  # at the pose where they were found
+        stamp = pose_at(0.0, second + 1).header.stamp
+        images.publish(image_message(half if second > 4 else labels, stamp, "probe"))
+        bench.spin_until(lambda count=count: node.health.received == count)
     return scores, part
 
 
@@ -57,9 +58,7 @@ def values(score):
 def test_what_the_hand_did_is_told_as_numbers_and_steps(bench, scanned):
     scores, part = scanned
     area = "Smallest Part of the Area at Rest of vein, %"
-    bench.spin_until(
-        lambda: scores and float(values(scores[-1]).get(area, "100")) < 90 and is_whole(scores[-1])
-    )
+    bench.spin_until(lambda: float(values(scores[-1]).get(area, "100")) < 90)
     found = values(scores[-1])
     assert float(found["Path Length, mm"]) == pytest.approx(100.0)
     assert float(found["Peak Probe Force, N"]) == pytest.approx(5.0)
@@ -75,7 +74,6 @@ def is_whole(score):
 
 def test_clear_begins_anew(bench, scanned):
     scores, _ = scanned
-    bench.spin_until(lambda: bool(scores) and is_whole(scores[-1]))
     client = bench.peer.create_client(Trigger, "scorer/clear")
     bench.spin_until(client.service_is_ready)
     future = client.call_async(Trigger.Request())

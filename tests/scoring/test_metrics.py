@@ -55,6 +55,14 @@ def test_a_press_of_a_triangle():
     assert force.at(np.array([-1.0, 2.0, 7.0])) == pytest.approx([np.nan, 10, np.nan], nan_ok=True)
 
 
+def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
+    """It faces along the radius of a circle of 30 mm, 20 mm wide, and touches on half of it."""
+    force = Force(np.array([0.0, 1.999, 2.0, 4.0]), np.array([5.0, 5.0, 0.0, 0.0]))
+    found = table(Scan(circle(), force, width=0.02))
+    ring = np.pi * (40**2 - 20**2)
+    assert found["Area Scanned in Contact", "Probe"] == pytest.approx(ring / 2, rel=2e-3)
+
+
 def test_without_force_or_vessels_nothing_is_told_of_them():
     names = {name for name, _ in table(Scan(circle()))}
     assert not [name for name in names if "Force" in name or "Contact" in name or "Area" in name]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
-from us_sim.scoring.motion import Motion, sampled
+from us_sim.scoring.motion import Motion
 from us_sim.volume.sequences.slicer_transforms import read_slicer_sequences
 
 NEEDLE = 0.3  # m, TissueDamage.NEEDLE_LENGTH; it points along +z, as its evaluator has by default
@@ -20,6 +20,27 @@ MM, MM2 = 1e3, 1e6
 def motion(times, matrices):
     """Of the positions; ITK's matrices of images are no rotations."""
     return Motion(times, matrices[:, :3, 3], np.tile([0, 0, 0, 1], (len(times), 1)))
+
+
+def shown(times, time, tolerance=1e-3):
+    """The sample of rising ``times`` that 3D Slicer shows at a time.
+
+    Its sequence browser shows every device at the times of the first one: the sample within a
+    millisecond if its search meets one, else the last one before (`GetItemNumberFromIndexValue` of
+    vtkMRMLSequenceNode). PerkTutor measures what is shown, so of another device it counts the way
+    between those samples alone.
+    """
+    first, last = 0, len(times) - 1
+    if time <= times[first] + tolerance:
+        return first
+    if time >= times[last] - tolerance:
+        return last
+    while last - first > 1:
+        middle = (first + last) // 2
+        if abs(time - times[middle]) <= tolerance:
+            return middle
+        first, last = (middle, last) if time > times[middle] else (first, middle)
+    return first
 
 
 def lumbar(folder):
@@ -35,9 +56,9 @@ def lumbar(folder):
         (np.array([t for t, _ in rows[name]]), np.array([m for _, m in rows[name]]))
         for name in ("ProbeToRAS", "StylusTipToRAS")
     )
-    shown = stylus[1][sampled(stylus[0], probe[0])]
-    turned = shown @ np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    devices = {"ProbeToRAS": probe[1], "StylusTipToRAS": shown, "StylusTipRotation": turned}
+    seen = stylus[1][[shown(stylus[0], time) for time in probe[0]]]
+    turned = seen @ np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    devices = {"ProbeToRAS": probe[1], "StylusTipToRAS": seen, "StylusTipRotation": turned}
     return probe[0], devices, folder / "BodyModel.stl"
 
 

@@ -24,7 +24,7 @@ from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.lumen import LiveScan
 from us_sim.scoring.metrics import ScoreSettings, metrics_of
 
-_PERIOD = 0.2  # s of the probe's poses, after which areas are measured again
+_PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 _REMEMBERED = 64  # poses, for the image with the same stamp
 
 
@@ -73,7 +73,7 @@ class Scorer(SceneNode):
     def _take_labels(self, message: Image) -> None:
         stamp = nanoseconds_of(message.header.stamp)
         pose = self._poses.get(stamp)
-        if pose is not None and abs(self._seconds(stamp - self._measured)) >= _PERIOD:
+        if pose is not None and abs(stamp - self._measured) >= _PERIOD:
             self._measured = stamp
             self._live.add_labels(self._seconds(stamp), pose, pixels_from(message))
 

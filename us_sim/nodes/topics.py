@@ -148,10 +148,10 @@ ultrasound/image_to_probe: std_msgs/Float64MultiArray [latched]
     slice_interpolator -> openigtlink_bridge, volume_reconstructor, viewer | 4 × 4, from (column,
     row, 0, 1) of a pixel to metres in frame `probe`
 score: diagnostic_msgs/DiagnosticArray [latched]
-    scorer | once a second: metrics so far as values of the first status; one of each step of the
-    exercise follows, OK when it is done
+    scorer -> viewer | once a second: metrics so far as values of the first status; one of each step
+    of the exercise follows, OK when it is done
 session/marker: std_msgs/String
-    drivers | a text that marks a moment of the recording
+    viewer | a text that marks a moment of the recording; of a page that freezes its image `frozen`
 session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
     session_control -> viewer | scenes and cases that can be loaded: name, description, what loads
     it, and more

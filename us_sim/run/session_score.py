@@ -123,6 +123,7 @@ def _truth(
         lines, thrombi = vessels_in(volume_of(scene))
     areas = meter.areas() if meter is not None else None
     sections: dict[str, Section] = {}
+    width = probe_of(scene).width
     if meter is not None and areas is not None:
-        sections = areas.sections(meter.poses, lines, probe_of(scene).width)
-    return {"sections": sections, "lines": lines, "thrombi": thrombi}
+        sections = areas.sections(meter.poses, lines, width)
+    return {"sections": sections, "lines": lines, "thrombi": thrombi, "width": width}

@@ -218,4 +218,4 @@ class LiveScan:
         areas = self._meter.areas()
         width = self._scanner.probe.width
         sections = areas.sections(self._meter.poses, self.lines, width) if areas else {}
-        return Scan(motion, force, sections, self.lines, self._thrombi)
+        return Scan(motion, force, sections, self.lines, self._thrombi, width)

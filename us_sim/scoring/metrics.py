@@ -110,6 +110,7 @@ class Scan:
     lines: Mapping[str, CentreLine] = field(default_factory=dict)  # of all vessels of the scene
     # (from, to) m along the line of a vessel, by its name, where a thrombus is in it
     thrombi: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    width: float | None = None  # m, of the image, so of the probe's face
     frozen: int | None = None  # images that were frozen
     missing: tuple[str, ...] = ()  # metrics that cannot be told, and why, in sentences
 
@@ -120,6 +121,10 @@ def metrics_of(scan: Scan, settings: ScoreSettings | None = None) -> Iterator[Me
     yield from _of_motion(scan.motion)
     if scan.force is not None:
         yield from _of_force(scan.force, settings)
+        if scan.width is not None:
+            touching = scan.force.at(scan.motion.times) >= settings.contact_force
+            area = _MM2 * scan.motion.face_area(scan.width, touching)
+            yield Metric("Area Scanned in Contact", "mm^2", area)
     if scan.frozen is not None:
         yield Metric("Images Frozen", "count", scan.frozen)
     for name, section in scan.sections.items():

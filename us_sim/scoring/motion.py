@@ -23,6 +23,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from us_sim.errors import ScoreError
 
@@ -143,31 +144,11 @@ class Motion:
         area = _triangles(near[1:], far[1:], near[:-1]) + _triangles(far[1:], near[:-1], far[:-1])
         return float(area[inside[1:] & inside[:-1]].sum())
 
-
-def sampled(times: ArrayLike, at: ArrayLike, tolerance: float = 1e-3) -> NDArray[np.intp]:
-    """The sample (M,) that 3D Slicer shows at each time of ``at`` (M,), of rising ``times`` (K,).
-
-    Slicer's sequence browser shows every sequence at the times of its first one: the sample within
-    a millisecond if its search meets one, else the last one before (`GetItemNumberFromIndexValue`
-    of vtkMRMLSequenceNode). PerkTutor measures what is shown, so of a second device it counts the
-    way between those samples, which is less than its whole way.
-    """
-    known = np.asarray(times, float)
-    return np.array([_shown(known, float(time), tolerance) for time in np.asarray(at)], np.intp)
-
-
-def _shown(times: _Array, time: float, tolerance: float) -> int:
-    first, last = 0, len(times) - 1
-    if time <= times[first] + tolerance:
-        return first
-    if time >= times[last] - tolerance:
-        return last
-    while last - first > 1:
-        middle = (first + last) // 2
-        if abs(time - times[middle]) <= tolerance:
-            return middle
-        first, last = (middle, last) if time > times[middle] else (first, middle)
-    return first
+    def face_area(self, width: float, where: ArrayLike | None = None) -> float:
+        """Area m² that a probe's face of this width (m, along x) sweeps, likewise."""
+        half = 0.5 * width * Rotation.from_quat(self.orientations).apply([1.0, 0.0, 0.0])
+        side = Motion(self.times, self.positions - half, self.orientations)
+        return side.swept_area(self.positions + half, where)
 
 
 def _ends(where: ArrayLike | None) -> NDArray[np.bool_] | slice:
