@@ -69,7 +69,6 @@ class Zenoh:
         self._open: weakref.WeakSet[_Endpoint] = weakref.WeakSet()
         self.session = open_session()
         self._id = str(self.session.info.zid())
-        _contexts.add(self)
         self._watch = self.session.liveliness().declare_subscriber(
             all_tokens(domain_id), self._token_changed, history=True
         )
@@ -205,18 +204,6 @@ class Zenoh:
             else:
                 self._alive.pop(token, None)
                 self._since.pop(token, None)
-
-
-_contexts: weakref.WeakSet[Zenoh] = weakref.WeakSet()
-
-
-def _close_all() -> None:
-    for context in list(_contexts):
-        context.close()
-
-
-# Zenoh calls back from threads that Python waits for before it runs what `atexit` keeps.
-threading._register_atexit(_close_all)  # type: ignore[attr-defined]
 
 
 def _graph_node(node: Entity, readers: list[bytes], writers: list[bytes]) -> GraphNode:
