@@ -1,8 +1,8 @@
 """Sessions of zenoh as rmw_zenoh opens them, and a router where none runs.
 
 Sessions are peers that find each other through a router on this host and then speak directly.
-rmw_zenoh wants the router (port 7447) to be started by hand. Sessions here use that one, whenever it
-is started, and another (port 7448) that the first process has; when that ends, another process
+rmw_zenoh wants the router (port 7447) to be started by hand. Sessions here use that one, whenever
+it is started, and another (port 7448) that the first process has; when that ends, another process
 takes it over: links between peers stay meanwhile.
 
 ZENOH_SESSION_CONFIG_URI, ZENOH_ROUTER_CONFIG_URI and ZENOH_CONFIG_OVERRIDE mean what they mean to

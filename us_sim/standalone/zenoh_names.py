@@ -95,9 +95,10 @@ class Entity:
 def read_token(token: str) -> Entity | None:
     """The entity that a token tells of; None if it is none of rmw_zenoh's."""
     parts = [part.replace("%", "/") for part in token.split("/")]
-    if len(parts) not in (_OF_NODE, _OF_ENDPOINT) or parts[0] != _SPACE or not all(parts):
+    if len(parts) < _OF_NODE or parts[0] != _SPACE or not all(parts):
         return None
-    _, domain, session, node_number, number, kind, *names = parts
+    # From ROS 2 Lyrical on the backends of a buffer may follow, which count for no gid.
+    _, domain, session, node_number, number, kind, *names = parts[:_OF_ENDPOINT]
     if kind not in (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT):
         return None
     try:
