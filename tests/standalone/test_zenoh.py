@@ -319,8 +319,8 @@ def test_closing_from_a_callback_does_not_deadlock():
         context.create_subscription(PROBE, *TEXT, QOS, nothing)
 
 
-# Without being asked it says when it is up; at each line it names the nodes that it knows. It closes
-# nothing at its end, as a program may forget to.
+# Without being asked it says when it is up; at each line it names the nodes that it knows. It ends
+# without closing anything.
 MEMBER = """
 import sys
 from us_sim.standalone.middleware import GraphNode, connect
@@ -369,7 +369,7 @@ def test_another_process_takes_the_router_over_when_its_process_ends(way):
         until(lambda: all(m.sees() == ["second", "third"] for m in members[1:]))
         members.append(Member("fourth", port))
         until(lambda: all(m.sees() == ["fourth", "second", "third"] for m in members[1:]))
-        for member in members[1:]:  # at the end of its input it ends without closing anything
+        for member in members[1:]:
             member.process.communicate(timeout=20)
             assert member.process.returncode == 0
     finally:
