@@ -422,7 +422,8 @@ class Health:
             f"stamps are up to {ahead:.1f} ms ahead of this computer's clock, so no latency is "
             f"right: synchronise the computers' clocks, with chrony or PTP"
         )
-        wrong = self.fault or self._last_problem or self.warning or (skew if ahead > 0 else "")
+        synchronous = ahead < 1.0  # ms; on a local network chrony does better
+        wrong = self.fault or self._last_problem or self.warning or ("" if synchronous else skew)
         level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
         status = DiagnosticStatus(
             level=DiagnosticStatus.ERROR if self.fault else level,

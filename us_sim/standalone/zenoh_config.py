@@ -159,13 +159,14 @@ class _Keeper:
     def _run(self) -> None:
         # Python waits for the threads in which zenoh calls back, so closing from `atexit` is late.
         program = threading.main_thread()
+        program.join(_WATCH_EVERY)
         while program.is_alive():
-            program.join(_WATCH_EVERY)
             with self._lock:
                 self._sessions = sessions = [s for s in self._sessions if not s.is_closed()]
             is_lost = sessions and not any(each.info.routers_zid() for each in sessions)
             if self._config is not None and self._router is None and is_lost:
                 self._open()
+            program.join(_WATCH_EVERY)
         for each in self._sessions:
             each.close()
         if self._router is not None:
