@@ -243,9 +243,9 @@ def _members(
         counts = np.bincount(state.labels.ravel(), minlength=256)
         step["areas"] = {name: float(area * counts[n]) for n, name in labels.items()}
     if environment.scene.tissue is not None:
-        members["displacement.npy"] = _npy(state.displacement)
+        members["displacement.npy"] = _npy(state.displacement, 1e-6)
         if "strain" in environment.scene.episode.observe:
-            members["strain.npy"] = _npy(state.strain)
+            members["strain.npy"] = _npy(state.strain, 1e-4)
     return members | {"json": step}
 
 
@@ -254,9 +254,10 @@ def _png(image: NDArray[np.uint8]) -> bytes:
     return content.tobytes()
 
 
-def _npy(array: NDArray[np.float32]) -> bytes:
+def _npy(array: NDArray[np.float32], unit: float) -> bytes:
+    """An int16 array in a unit, as a file; a quarter of the bytes of float64, and no subnormals."""
     stream = io.BytesIO()
-    np.save(stream, array.astype(np.float16))  # 11 bits: 8 µm of 12 mm
+    np.save(stream, np.rint(array / unit).clip(-32768, 32767).astype(np.int16))
     return stream.getvalue()
 
 
