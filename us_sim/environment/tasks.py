@@ -102,10 +102,10 @@ class FindVein(_VesselTask):
         self._look(state)
         half = self._simulation.scanner.probe.width / 2
         distance = half if self.offset is None else min(abs(self.offset), half)
-        rests = state.contact >= _TOUCHING and self.fraction >= _OPEN
-        return -0.5 * distance / half - 0.5 * (not rests), self._hold(
-            rests and distance <= 2e-3, 10
-        )
+        is_open = self.fraction >= _OPEN
+        is_right = distance <= 2e-3 and is_open and state.contact >= _TOUCHING
+        reward = -0.5 * distance / half - 0.5 * (1.0 - state.contact * is_open)
+        return reward, self._hold(is_right, 10)
 
 
 class CompressVein(_VesselTask):
