@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import multiprocessing
+import signal
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -139,7 +140,9 @@ def _made(orders: Sequence[_Order], workers: int) -> Iterator[tuple[_Order, dict
         yield from ((order, _episode(order)) for order in orders)
         return
     context = multiprocessing.get_context("spawn")  # numba and threads are here already
-    with ProcessPoolExecutor(min(workers, len(orders)), mp_context=context) as pool:
+    # Ctrl-C is for this process, which lets the others finish their episodes.
+    ignore = signal.SIGINT, signal.SIG_IGN
+    with ProcessPoolExecutor(min(workers, len(orders)), context, signal.signal, ignore) as pool:
         waiting: dict[Future[dict[str, Any]], _Order] = {
             pool.submit(_episode, order): order for order in orders
         }
