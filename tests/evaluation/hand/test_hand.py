@@ -162,6 +162,20 @@ def test_live_the_newest_pose_wins(monkeypatch):
     assert set(point.live.frames.error) == {0.0}
 
 
+@pytest.mark.parametrize(
+    ("errors", "poses"),
+    [
+        ([0.9, 0.9, 0.9, 0.9], 0),
+        ([9.0, 0.9, 9.0, 0.9], 1),
+        ([9.0, 9.0, 0.9, 9.0], 3),  # the second is shown for two poses, of which one was skipped
+        ([9.0, np.nan, 0.9, 9.0], 1),
+    ],
+)
+def test_tissue_is_away_until_a_frame_that_is_near(errors, poses):
+    frames = Frames(number=np.array([4, 5, 7, 8]), error=np.array(errors))
+    assert Live(5, frames).away == pytest.approx(1e3 * poses / 60)
+
+
 def test_live_nothing_is_seen_before_it_came(monkeypatch):
     solver = Oracle(answer(), takes=0.001)
     live_by_its_own_clock(monkeypatch, solver)

@@ -68,8 +68,8 @@ class FemNonlinearSettings(SolverSettings):
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
-        "parameter: live, what the rate leaves, and up to a quarter more until the forces are "
-        "balanced; in lockstep no limit, lest results depend on the machine",
+        "parameter: live, what the rate leaves, and up to a quarter more until residual and error "
+        "are at most 0.01; in lockstep no limit, lest results depend on the machine",
         default=None,
     )
     most_iterations: int = setting(
@@ -292,7 +292,7 @@ class FemNonlinear(TissueSolver):
             budget.end_step(newton.iterations)
             start = None
             stagnated = not taken and newton.has_stagnated
-            is_over = budget.is_over(balanced=not self._exceeds(self.most_unbalanced))
+            is_over = budget.is_over(balanced=not self._exceeds(TUNING.overtime_tolerance))
             if is_over and budget.is_shorter_than_a_step:
                 actions.append(
                     f"frame_budget is {1e3 * (budget.time_limit or 0.0):.3g} ms, but one step "
