@@ -296,6 +296,8 @@ class StructureMarkers:
         triangles = self._settings.values["markers"].structure_triangles
         try:
             self._structures = list(structures_of(scene, volume_of(scene), self._mesh, triangles))
+            for made in self._structures:
+                made.surface.carry(self._mesh.nodes)  # or a frame would compile its kernel
         except UsSimError as error:
             self.state = str(error)
             self._node.health.problem("structures", f"{error}; no structure is shown")
