@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from us_sim.errors import BagError, ScoreError
+from us_sim.nodes.topics import FROZEN, MARKERS
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
@@ -20,11 +21,9 @@ from us_sim.scoring.lumen import vessels_in
 from us_sim.scoring.metrics import Force, Scan, Section
 from us_sim.scoring.motion import Motion
 
-FROZEN = "frozen"
-"""Begins the text on `session/marker` with which a page tells that its image was frozen."""
 _SAMPLES = 200  # images of which areas are measured, at least
 _RATE = 5.0  # and a second
-_POSES, _MARKS = "/probe/pose", "/session/marker"
+_POSES, _MARKS = "/probe/pose", f"/{MARKERS}"
 
 
 def read_scan(
@@ -83,7 +82,8 @@ def _seconds(stamps: np.ndarray, begin: int) -> np.ndarray:
 
 
 def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force | None:
-    names = [each.name for each in bag.topics if each.type_name == WRENCH_STAMPED]
+    topics = [each for each in bag.topics if each.type_name == WRENCH_STAMPED]
+    names = [each.name for each in topics if each.message_count]
     if topic is None:
         preferred = [name for name in names if name.endswith("probe/wrench")]
         chosen = preferred if len(preferred) == 1 else names
