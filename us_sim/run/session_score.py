@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.errors import BagError, ScoreError
+from us_sim.errors import BagError, ScoreError, UsSimError
 from us_sim.nodes.topics import FROZEN, MARKERS
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
@@ -66,9 +66,11 @@ def read_scan(
         missing.append(f"images that were frozen: {file} has no marks on {_MARKS}")
     try:
         truth = _truth(file, bag, path, progress)
-    except BagError as error:
+    except UsSimError as error:
         truth = {}
         missing.append(f"areas of structures: {error}")
+    if truth and not truth["sections"]:
+        missing.append(f"areas of structures: no image of {file} cuts a vessel of deformed tissue")
     return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 
 
@@ -108,7 +110,7 @@ def _truth(
     """Sections, lines and thrombi of the vessels; of five images a second, and two hundred in all.
 
     Raises:
-        BagError: there is no scene, tissue, image or vessel.
+        UsSimError: there is no scene or image, or a file of the scene is missing or another.
     """
     attached = bag.attachments()
     if "scene.yaml" not in attached:
