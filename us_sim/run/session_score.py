@@ -18,7 +18,7 @@ from us_sim.run.resimulation import scene_within
 from us_sim.run.session_summary import read_session
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scoring.lumen import vessels_in
-from us_sim.scoring.metrics import Force, Scan, Section
+from us_sim.scoring.metrics import Force, Scan
 from us_sim.scoring.motion import Motion
 
 _SAMPLES = 200  # images of which areas are measured, at least
@@ -121,11 +121,11 @@ def _truth(
         scene = scene_within(file, attached, Path(place, "attached"))
         session = read_session(file)
         samples = max(_SAMPLES, int(_RATE * path.duration))
-        meter = session.measured_lumens(scene, samples, lambda done: progress(done, "areas"))
         lines, thrombi = vessels_in(volume_of(scene))
-    areas = meter.areas() if meter is not None else None
-    sections: dict[str, Section] = {}
-    width = probe_of(scene).width
-    if meter is not None and areas is not None:
-        sections = areas.sections(meter.poses, lines, width)
-    return {"sections": sections, "lines": lines, "thrombi": thrombi, "width": width}
+        meter = session.measured_lumens(scene, samples, lambda part: progress(part, "areas"), lines)
+    return {
+        "sections": meter.sections() if meter is not None else {},
+        "lines": lines,
+        "thrombi": thrombi,
+        "width": probe_of(scene).width,
+    }
