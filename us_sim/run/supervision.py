@@ -142,7 +142,8 @@ class Supervisor:
                 self.keep(node, values)
         for node, status in ended.items():
             self._ended(node, status)
-        hung = self._watch.hung(self._running(), self._monitor.node.heard)
+        parts = {node: [part.node for part in process.parts] for node, process in self._processes.items()}
+        hung = self._watch.hung(self._running(), self._monitor.node.heard, parts)
         for node, how in hung.items():
             said = self._monitor.node.messages.get(node) or self._group.last_words(node)
             self._group.end(node)
