@@ -36,7 +36,7 @@ class SupervisionSettings(Settings):
     )
     silence: float = setting(
         Quantity("time", 2.0, 3600.0),
-        "without a report after which a node hangs; six times as long while it works",
+        "seconds without a report after which a node hangs; six times as long while it works",
         default=10.0,
     )
     standby: bool = setting(
@@ -53,7 +53,7 @@ STOPPED_S = 0.5  # for which a process may be stopped
 BUSY_SHARE = 0.5
 """Of the silence, in which a node that is busy has worked or waited for a processor."""
 BUSY_FACTOR = 6.0  # how many times as long a busy node may be silent: it may be compiling
-START_LIMIT_S = 300.0  # for the first report: the first run compiles
+START_LIMIT_S = 300.0  # for the first report
 
 
 @dataclass
@@ -130,11 +130,9 @@ class Watch:
     def _told(self, silence: _Silence) -> str:
         if silence.stopped >= STOPPED_S:
             return "was stopped (SIGSTOP)"
-        limit = self._limit
+        limit = self._limit if silence.reports else max(self._limit, START_LIMIT_S)
         if silence.busy > BUSY_SHARE * silence.silent:
             limit *= BUSY_FACTOR
-        if not silence.reports:
-            limit = max(limit, START_LIMIT_S)
         if silence.silent < limit:
             return ""
         return f"has not reported for {silence.silent:.0f} s"
