@@ -21,7 +21,7 @@ from us_sim.nodes.topics import TOPICS, Topic
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import Stamp, stamp_reader
 from us_sim.recording.topic import BagTopic, Fault
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import aligned, counted
 
 POSES = "probe/pose"
 DERIVED = {
@@ -150,7 +150,7 @@ def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) ->
         if poses is not None and poses.read_stamp and len(poses.stamps):
             findings += _pairing(each, poses, origin)
     damaged = sum(fault.messages for fault in faults)
-    if 0 < damaged and sum(each.missing or 0 for each in held) <= damaged:
+    if damaged > 0 and sum(each.missing or 0 for each in held) <= damaged:
         # The damaged parts held what is missing, and the poses of these stamps.
         findings = [finding for finding in findings if finding.kind not in ("loss", "stamp")]
     return BagCheck(bag, held, findings, size, time.monotonic() - began)
@@ -381,18 +381,14 @@ def table(found: BagCheck) -> list[tuple[str, ...]]:
 
 def report(found: BagCheck) -> str:
     """The table, and a line for each finding, for a person."""
-    rows = table(found)
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_TITLES))]
     rate = found.bytes / 1e6 / max(found.seconds, 1e-3)
     lines = [
         f"{found.bag.path}: {sum(len(each.logged) for each in found.topics)} messages, "
         f"{found.bytes / 1e6:.1f} MB, read in {found.seconds:.2f} s ({rate:.0f} MB/s)",
         "",
+        *aligned(table(found)),
+        "",
     ]
-    for name, *numbers in rows:
-        cells = [f"{cell:>{width}}" for cell, width in zip(numbers, widths[1:], strict=True)]
-        lines.append("  ".join([f"{name:<{widths[0]}}", *cells]))
-    lines.append("")
     lines += [
         f"{finding.kind if finding.matters else 'note'}: {finding.text}"
         for finding in found.findings
