@@ -90,13 +90,12 @@ class GuardedNode(Node):
 
     def _look_for_a_clock(self) -> None:
         """Say that simulated time does not begin."""
-        if self.get_clock().now().nanoseconds:
-            self._clockless.cancel()
-            return
-        self.get_logger().warning(
-            "use_sim_time is true, and nothing has come on /clock: this node's time stands at 0; "
-            "start what publishes it, or set use_sim_time to false"
-        )
+        self._clockless.cancel()
+        if not self.get_clock().now().nanoseconds:
+            self.get_logger().warning(
+                "use_sim_time is true, and nothing has come on /clock: this node's time stands at "
+                "0; start what publishes it, or set use_sim_time to false"
+            )
 
     def refused(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
