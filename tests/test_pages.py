@@ -24,7 +24,7 @@ from us_sim.volume.segmentation.settings import SegmentationSettings
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 WRITTEN = [page for page in PAGES if page.name not in ("README.md", "reference.md")]
-GROUPS = ("bag", "evaluate", "calibrate")
+GROUPS = ("bag", "calibrate", "evaluate", "param")
 """Commands that are followed by another."""
 
 

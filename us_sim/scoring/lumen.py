@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, lifted
 from us_sim.scoring.centre_line import CentreLine, places_of
 from us_sim.scoring.metrics import Force, Scan, Section
 from us_sim.scoring.motion import Motion
@@ -21,8 +21,6 @@ from us_sim.volume.volume import Volume
 VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
 _HARDLY_CUT = 0.1
 """Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
-_STEEPEST = 0.2
-"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 
 
 def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
@@ -94,7 +92,7 @@ class LumenAreas:
         """
         found: dict[str, Section] = {}
         for name in self.area.keys() & lines.keys():
-            cuts = [lines[name].cut(_lifted(pose), width) for pose in poses]
+            cuts = [lines[name].cut(lifted(pose), width) for pose in poses]
             places = [(c.along, c.angle, c.lateral) if c else (np.nan,) * 3 for c in cuts]
             found[name] = Section(
                 self.time, self.area[name], self.at_rest[name], *np.array(places).T
@@ -131,7 +129,7 @@ class LumenMeter:
 
     def add(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
         """Measure an image, of the labels (rows, columns) that it shows."""
-        seen = labels, self._scanner.labels(_lifted(pose), self._rest)
+        seen = labels, self._scanner.labels(lifted(pose), self._rest)
         inside = [[np.isin(each, n) for n in self._lumens.values()] for each in seen]
         self._time.append(time)
         self.poses.append(pose)
@@ -164,12 +162,6 @@ def _edge(probe: Probe) -> NDArray[np.bool_]:
     """(rows, columns) the last pixels of an image that its beams reach."""
     reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
     return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
-
-
-def _lifted(pose: Pose) -> Pose:
-    """Where the probe would be in the same plane if it did not press."""
-    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
-    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
 class LiveScan:
