@@ -132,8 +132,9 @@ class FemNonlinear(TissueSolver):
     )
     must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
-    # Of the residual and of the estimated error: then the displacement of 2,000 and 8,192 nodes is
-    # within 7 % in 95 of 100 frames that ended too early, and within 11 % in all.
+    # Of the residual and of the estimated error. Of 102 generated presses of 2,000 nodes by four
+    # probes, the first Newton step that came so far was within 7 % of the balance that followed in
+    # 72 and within 35 % in 98: neither number knows of tissue that is about to snap.
     most_unbalanced: ClassVar[float] = 0.1
 
     Settings = FemNonlinearSettings
