@@ -195,8 +195,8 @@ class Middleware(Protocol):
     endpoints: publishers ``write`` (False if the sample was dropped); the others ``take`` (bytes
     and their origin, or None) and call back after ``set_on_data``, from another thread; publishers
     and subscriptions tell their ``matched_count``; clients ``send_request`` and say
-    ``service_is_ready``; services ``send_response``, and
-    call ``on_foreign`` for a request that they cannot read.
+    ``service_is_ready``; services ``send_response``, and say ``on_unanswered`` why a request will
+    not be answered.
 
     Raises:
         MiddlewareError: a name or a quality of service is refused.
