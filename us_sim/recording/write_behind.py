@@ -63,7 +63,7 @@ def losses_between(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[
 
 
 _FLUSH = 0.5  # s, after which messages are handed to the operating system
-_RETRY = 1.0  # s, between looks at a disk that was full
+_RETRY = 1.0  # s, between checks of a disk that was full
 _BATCH = 512 * 1024  # bytes of messages for which it is worth to wake the thread
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from us_sim.errors import BagError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.run.session_summary import LumenAreas, Session
+from us_sim.run.session_summary import LumenAreas, Session, scanner_of_vessels
 from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
@@ -91,9 +91,9 @@ def draw_outlines(
     """Draw the outlines of labels over a frame's image whose extent is in mm."""
     left, right, bottom, top = extent
     scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
-    settle = partial(onto_border, frame)
+    refine = partial(onto_border, frame)
     for label, colour in colours.items():
-        for outline in label_outlines(frame.labels, label, settle=settle):
+        for outline in label_outlines(frame.labels, label, refine=refine):
             x, y = ((outline + 0.5) * scale + (left, top)).T
             axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
     axes.set(xlim=(left, right), ylim=(bottom, top))
@@ -189,7 +189,7 @@ def colour_pictures(
         for name in scene.flows
     }
     annotation = Annotation(scanner.probe, outlined)
-    aim = settings.depth or 0.5 * scanner.probe.depth
+    depth = settings.depth or 0.5 * scanner.probe.depth
     seen = stamps
     if areas is not None:
         named = {scene.structures[name].label or name for name in scene.flows} & {*areas.area}
@@ -199,14 +199,14 @@ def colour_pictures(
     titles = {stamp: title for title, stamp in _flow_moments(session, seen, blood).items()}
     pictures = {}
     for stamp in stamps:  # all of them, as a closed vein fills up
-        pose = _tilted(session.poses[stamp], aim)
+        pose = _tilted(session.poses[stamp], depth)
         frame = scanner.frame(pose, session.nodes[stamp], time=1e-9 * stamp)
         blood.at(frame)
         if stamp in titles:
             velocity = colour.estimate(blood, frame)
             overlay = Overlay(velocity, colour.scale, 0.9, outline=colour.outline)
             pixels = annotation.draw(
-                frame.pixels, frame.labels, overlay=overlay, settle=partial(onto_border, frame)
+                frame.pixels, frame.labels, overlay=overlay, refine=partial(onto_border, frame)
             )
             pictures[titles[stamp]] = Picture((stamp,), pixels)
     return pictures
@@ -246,12 +246,12 @@ def _flow_moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[
     return found
 
 
-def _tilted(pose: Pose, aim: float) -> Pose:
-    """A probe tilted about its array, aimed at the point ``aim`` m under this one."""
+def _tilted(pose: Pose, depth: float) -> Pose:
+    """A probe tilted about the point ``depth`` m under this one, and about its array."""
     half = math.radians(0.5 * TILT)
     turned = pose @ Pose(np.zeros(3), np.array([math.sin(half), 0.0, 0.0, math.cos(half)]))
-    there = pose.position + aim * pose.rotation[:, 2]
-    return Pose(there - aim * turned.rotation[:, 2], turned.orientation)
+    there = pose.position + depth * pose.rotation[:, 2]
+    return Pose(there - depth * turned.rotation[:, 2], turned.orientation)
 
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:
@@ -273,7 +273,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
     (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
     first = min(session.poses)
-    numbers, scanner = session.scanner_of_vessels(scene)
+    numbers, scanner = scanner_of_vessels(scene, session.rest, session.tetrahedra)
     images = session.images_at({stamp for _, stamp in moments})
     for i, (title, stamp) in enumerate(moments):
         axes = figure.add_subplot(grid[divmod(i, 3)])

@@ -117,7 +117,7 @@ class Session:
         of the same plane at rest, from the skin on. A vessel that no image cuts has none; of one
         that reaches the image's edge, now or at rest, nobody knows how large it is.
         """
-        numbers, scanner = self.scanner_of_vessels(scene)
+        numbers, scanner = scanner_of_vessels(scene, self.rest, self.tetrahedra)
         if scanner is None:
             return None
         vessels = list(numbers)
@@ -158,24 +158,6 @@ class Session:
             at_rest={vessels[i]: rest[i] for i in cut},
         )
 
-    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, int], BMode | None]:
-        """Labels of vessels by their names, veins first, and the scanner that finds them.
-
-        There is no scanner without labels of vessels, or without tissue.
-        """
-        volume = volume_of(scene)
-        numbers = {
-            name: label
-            for kind in VESSELS
-            for label, name in volume.label_names.items()
-            if kind_of(name) == kind
-        }
-        if volume.labels is None or not numbers or self.rest is None or self.tetrahedra is None:
-            return {}, None
-        scanner = scanner_of(scene, volume)
-        scanner.carry(self.rest, self.tetrahedra)
-        return numbers, scanner
-
     def summary(self, areas: LumenAreas | None) -> dict[str, Any]:
         """Everything as one JSON-like mapping; times in ms, areas in mm²."""
         stamps = self.images
@@ -214,6 +196,32 @@ class Session:
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
             for topic, count in said.items()
         }
+
+
+def scanner_of_vessels(
+    scene: Scene, rest: NDArray[np.float64] | None, tetrahedra: NDArray[np.int32] | None
+) -> tuple[dict[str, int], BMode | None]:
+    """Labels of vessels by their names, veins first, and the scanner that finds them.
+
+    There is no scanner without labels of vessels, or without tissue.
+
+    Args:
+        scene: that is scanned.
+        rest: (N, 3) m, the tissue's nodes.
+        tetrahedra: (M, 4).
+    """
+    volume = volume_of(scene)
+    numbers = {
+        name: label
+        for kind in VESSELS
+        for label, name in volume.label_names.items()
+        if kind_of(name) == kind
+    }
+    if volume.labels is None or not numbers or rest is None or tetrahedra is None:
+        return {}, None
+    scanner = scanner_of(scene, volume)
+    scanner.carry(rest, tetrahedra)
+    return numbers, scanner
 
 
 def _edge(probe: Probe) -> NDArray[np.bool_]:

@@ -500,7 +500,7 @@ class Subscription(Receiver):
 
 
 _logger = get_logger("rclpy")
-_PAUSE = 0.01  # s, between two looks at whether a service is there
+_PAUSE = 0.01  # s, between two checks whether a service is there
 
 
 class Client(Receiver):
