@@ -154,20 +154,10 @@ def test_strain_is_laid_over_the_annotated_image_with_what_the_press_is_like(ben
     assert "published ultrasound/strain" not in node.node.health.values
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "fact"),
-    [
-        ("strain.since", "then", "'then'"),
-        ("strain.interval", 0, "strain.interval"),
-        ("strain.window", 3.0, "strain.window"),
-        ("strain.window", 0.021, "21 mm"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(pressed, name, value, fact):
-    node = pressed()
-    result = node.node.set_parameters([Parameter(name, value=value)])[0]
+def test_a_window_that_the_image_does_not_hold_is_refused(pressed):
+    result = pressed().node.set_parameters([Parameter("strain.window", value=0.021)])[0]
     assert not result.successful
-    assert fact in result.reason
+    assert "21 mm" in result.reason
 
 
 def test_without_tissue_there_is_no_strain(bench, tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Iterator
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
@@ -130,6 +131,38 @@ def test_what_is_written_is_read_back_and_a_copy_is_the_same(kind, data):
     assert Reader("my.yaml").read(kind, document) == made
     assert dataclasses.replace(made) == made
     assert dataclasses.replace(made, **{n: getattr(made, n) for n in rules_of(kind)}) == made
+
+
+def wrong_values(kind: Any, rule: Rule) -> list[Any]:
+    """Values that a setting must refuse; none for what is not a number, text, truth or list."""
+    if get_origin(kind) in (Union, UnionType):
+        return [each for k in get_args(kind) for each in wrong_values(k, rule)]
+    if get_origin(kind) is tuple:
+        items = get_args(kind)
+        beside = [0] * (len(items) - 1) if items[-1] is not Ellipsis else []
+        return [True, *([each, *beside] for each in wrong_values(items[0], rule))]
+    if kind is bool:
+        return ["yes", 1]
+    if kind is str and (rule.choices or rule.choice):
+        return ["none of these", 1]
+    if kind not in (int, float):
+        return []
+    quantity = rule.quantity or Quantity("number")
+    beyond = math.nextafter(quantity.minimum, -math.inf), math.nextafter(quantity.maximum, math.inf)
+    between = [round(quantity.minimum) + 0.5] if kind is int else []
+    return [math.nan, math.inf, True, "many", "3 apples", *filter(math.isfinite, beyond), *between]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=1, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_what_will_not_do_is_refused_by_its_name(kind, data):
+    right = data.draw(values_of(kind))
+    for name, rule in rules_of(kind).items():
+        for wrong in wrong_values(kinds_of(kind)[name], rule):
+            with pytest.raises(kind.error) as refused:
+                kind(**{**right, name: wrong})
+            assert refused.value.key.partition("[")[0] == name
 
 
 @pytest.mark.parametrize("dimension", quantities._UNITS)

@@ -138,21 +138,6 @@ def test_what_cannot_be_tracked_is_said(shape, window, sentence):
         track(np.zeros((30, 9)), np.zeros(shape), window=window, search=2)
 
 
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"since": "then"}, "strain.since: 'then' is not one of rest, image"),
-        ({"interval": 0}, "strain.interval: 0 is outside 1 to 60"),
-        ({"colours": 0.0}, "strain.colours: 0 is outside"),
-        ({"window": 3}, "strain.window: 3 m is outside .* did you mean '3 mm'"),
-        ({"correlation": 1.5}, "strain.correlation"),
-    ],
-)
-def test_settings_out_of_range_are_refused(given, sentence):
-    with pytest.raises(ProbeError, match=sentence):
-        Strain(**given)
-
-
 def test_an_image_is_compared_with_the_one_so_many_before_of_the_same_probe_and_mesh():
     earlier = Earlier(lambda frame: frame.pixels)
 

@@ -37,8 +37,7 @@ from us_sim.tissue.model import Deformation, TissueModel
 
 Array = NDArray[np.float64]
 
-_PARTS = 12
-"""Parts of a triangle's sides, between which places of contact are sampled."""
+_PARTS = 12  # parts of a triangle's sides, between which places of contact are sampled
 
 
 @dataclass(frozen=True)

@@ -53,10 +53,8 @@ from us_sim.errors import UsSimError
 class Row:
     """Base of the dataclasses of which each instance is a row of a CSV file."""
 
-    digits: ClassVar[int] = 4
-    """Significant digits of the numbers in the file."""
-    decimals: ClassVar[int | None] = None
-    """Or the digits after their points."""
+    digits: ClassVar[int] = 4  # significant digits of the numbers in the file
+    decimals: ClassVar[int | None] = None  # or the digits after their points
 
     @property
     def values(self) -> dict[str, object]:

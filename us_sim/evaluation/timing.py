@@ -18,8 +18,7 @@ from us_sim.progress import Progress
 
 C = TypeVar("C")
 
-Tell = Callable[[float, str], None]
-"""Takes how many s of a case are over, and the present activity."""
+Tell = Callable[[float, str], None]  # takes how many s of a case are over, and the present activity
 
 
 def steps(

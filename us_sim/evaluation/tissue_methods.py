@@ -18,8 +18,7 @@ from us_sim.evaluation.independent_forces import (
 )
 from us_sim.evaluation.independent_residual import Residual, solid_residual, spring_residual
 
-Setting = Mapping[str, Any]
-"""Values of some of a solver's settings, by name."""
+Setting = Mapping[str, Any]  # values of some of a solver's settings, by name
 
 _EFFORT = (
     *("iterations", "steps", "threads", "contact_updates", "time_step"),

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 
-PATIENT = "patient"
-"""The frame of the tissue, and of the probe's poses."""
+PATIENT = "patient"  # the frame of the tissue, and of the probe's poses
 
 
 @dataclass(frozen=True, eq=False)

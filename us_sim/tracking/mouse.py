@@ -147,8 +147,7 @@ class SixDofMouse:
         return Pose(np.clip(pose.position, low, high), pose.orientation)
 
 
-FULL_DEFLECTION = 350.0
-"""The largest number that the device reports."""
+FULL_DEFLECTION = 350.0  # the largest number that the device reports
 
 _TRANSLATION, _ROTATION, _BUTTONS = 1, 2, 3  # numbers of reports
 # The device's axes are right, towards the person, and down. Forward is against its second.

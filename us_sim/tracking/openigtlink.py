@@ -36,8 +36,7 @@ from us_sim.tracking.settings import OpenIGTLinkSettings
 HEADER = struct.Struct(">H12s20sIIQQ")
 """Version, type, device, seconds, fraction of a second, size of the body, its checksum."""
 
-NAME_LENGTH = 20
-"""Bytes of a device's name, which is cut to that."""
+NAME_LENGTH = 20  # bytes of a device's name, which is cut to that
 
 POSE_KINDS = ("TRANSFORM", "TDATA", "QTDATA", "POSITION")
 """Types of message in which there are poses."""

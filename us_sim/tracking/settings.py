@@ -21,10 +21,8 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-BOARDS_OF_MARKERS = ("charuco", "grid")
-"""Kinds of flat boards that carry markers."""
-BOARDS = (*BOARDS_OF_MARKERS, "chessboard")
-"""The kinds of boards for calibrating a camera."""
+BOARDS_OF_MARKERS = ("charuco", "grid")  # kinds of flat boards that carry markers
+BOARDS = (*BOARDS_OF_MARKERS, "chessboard")  # the kinds of boards for calibrating a camera
 BOARD_LENGTH = Quantity("length", 0.0, 10.0)
 """Sides and distances on a board; 0 where the board has none such."""
 

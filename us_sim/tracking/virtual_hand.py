@@ -362,10 +362,8 @@ def _stance(
     return Stance(point, float(press[0]), half_turn(rotation), fan, rock)
 
 
-DEEPEST = 0.02
-"""m that a probe is pressed at most: a vein closes at half of it, and deeper hurts."""
-HIGHEST = 0.05
-"""m that it is lifted off at most."""
+DEEPEST = 0.02  # m that a probe is pressed at most: a vein closes at half of it, and deeper hurts
+HIGHEST = 0.05  # m that it is lifted off at most
 STEEPEST = math.radians(60)
 """rad that it is fanned or rocked at most: more, and its grip would lie on the skin."""
 

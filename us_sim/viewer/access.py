@@ -45,8 +45,7 @@ _POLICY = (
     "form-action 'none'",
     "frame-ancestors 'none'",
 )
-_SCRIPT = b"<script"
-"""As NiceGUI's page has it; texts from elsewhere are in it with ``<`` escaped."""
+_SCRIPT = b"<script"  # as NiceGUI's page has it; texts from elsewhere are in it with ``<`` escaped
 
 
 def is_loopback(host: str) -> bool:

@@ -27,12 +27,10 @@ from us_sim.viewer.stream import Packet
 Sent = tuple[Mapping[str, Any], bytes]
 """Header and payload of a frame, as the page was sent them; pictures are JPEG, with ``time``, s."""
 
-LARGEST = 2**28
-"""Bytes of a page's message: it keeps a third of that."""
+LARGEST = 2**28  # bytes of a page's message: it keeps a third of that
 MP4_RATE, GIF_RATE = 25.0, 12.5
 """Pictures a second, since the times of a page's images are never even."""
-_LONGEST = 60.0
-"""s; a page keeps ten."""
+_LONGEST = 60.0  # s; a page keeps ten
 _GIF_HEIGHT, _GIF_COLOURS = 480, 64
 """Speckle cannot be compressed: at full size ten seconds were a hundred megabytes."""
 _US_IMAGE, _US_MULTI_FRAME = "1.2.840.10008.5.1.4.1.1.6.1", "1.2.840.10008.5.1.4.1.1.3.1"

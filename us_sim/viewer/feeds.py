@@ -52,8 +52,7 @@ from us_sim.viewer.surfaces import (
     welded,
 )
 
-_QUALITY = 90
-"""Of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were."""
+_QUALITY = 90  # of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter of what they were
 _STRAIN_RATE = 12.0
 """Hz: strain takes longer than positions, and its colours are read and not followed."""
 _NODES, _STRUCTURES = "tissue/nodes", "tissue/structures"

@@ -38,10 +38,8 @@ from us_sim.viewer.feeds import RestMesh
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
 
-HOME_PRESS = 1e-3
-"""m: where the probe begins it touches, so that there is an image."""
-LIFTED = -0.01
-"""m."""
+HOME_PRESS = 1e-3  # m: where the probe begins it touches, so that there is an image
+LIFTED = -0.01  # m
 
 _FARTHEST, _FULL = 10.0, 2.0 * math.pi
 _TO = {"point": 3, "x": 1, "y": 1, "press": 1, "rotation": 1, "fan": 1, "rock": 1}
@@ -342,8 +340,7 @@ class ViewerSurface:
 MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
 """Poses a second: on two cores the simulator and the browser share them, and a page shows no more
 images than that."""
-RESTING = 5.0
-"""Poses a second; images are called stale after half a second."""
+RESTING = 5.0  # poses a second; images are called stale after half a second
 STREAMING, LATEST = 3.0, 1.45
 """From pose to pose: how long after a command the next is expected, and then waited for. A timer's
 pose just before it would hold up the command's own."""

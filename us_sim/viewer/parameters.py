@@ -23,14 +23,10 @@ from typing import Any
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.spelling import shown
 
-_DIGITS = 12
-"""Of a number that is shown: fewer than a float has, so that rounding is not seen."""
-_AT_THE_END = 1e-11
-"""How far from the end of its range, relatively, a number may be by rounding."""
-_NAMES = {"m mode": "M-mode", "nyquist": "Nyquist"}
-"""That are written otherwise than other words."""
-_WHOLE = 2**63
-"""Whole numbers from here on do not fit into a parameter."""
+_DIGITS = 12  # of a number that is shown: fewer than a float has, so that rounding is not seen
+_AT_THE_END = 1e-11  # how far from the end of its range, relatively, a number may be by rounding
+_NAMES = {"m mode": "M-mode", "nyquist": "Nyquist"}  # that are written otherwise than other words
+_WHOLE = 2**63  # whole numbers from here on do not fit into a parameter
 
 
 class Kind(Enum):

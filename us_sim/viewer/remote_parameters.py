@@ -23,12 +23,9 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.settings.quantity import units_of
 from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
 
-ANSWER_S = 10.0
-"""How long an answer is waited for: a node that makes images anew may need seconds."""
-_SERVICES_S = 5.0
-"""How long a node may take to offer its services."""
-_EVERY_S = 0.5
-"""How often the graph is searched for nodes that come, go, or are started again."""
+ANSWER_S = 10.0  # how long an answer is waited for: a node that makes images anew may need seconds
+_SERVICES_S = 5.0  # how long a node may take to offer its services
+_EVERY_S = 0.5  # how often the graph is searched for nodes that come, go, or are started again
 _EVENTS = "/parameter_events"
 _OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 """Parameters that rclpy itself declares, or prefixes of them: not what a page is for."""

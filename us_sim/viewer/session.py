@@ -138,8 +138,7 @@ CONTROL = "session_control"
 _EVERY_S = 0.5
 SILENT_S = 3.0
 """Without a word, after which nobody answers for the simulation: it says something every second."""
-ANSWER_S = 10.0
-"""For it to answer, which it may do late while it reads a scene."""
+ANSWER_S = 10.0  # for it to answer, which it may do late while it reads a scene
 
 
 class ViewerSession(SessionBoard):

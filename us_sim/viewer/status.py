@@ -24,18 +24,14 @@ from geometry_msgs.msg import WrenchStamped
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
 from us_sim.nodes.qos import STREAM
 
-GONE_S = 3.0
-"""Without a report, after which a node counts as gone: each reports every second."""
-FORGOTTEN_S = 60.0
-"""After which a node that is gone is not shown any more."""
+GONE_S = 3.0  # without a report, after which a node counts as gone: each reports every second
+FORGOTTEN_S = 60.0  # after which a node that is gone is not shown any more
 HISTORY_S = 60.0
-FORCES_A_SECOND = 10
-"""Points of the force that are kept: the largest of each interval."""
+FORCES_A_SECOND = 10  # points of the force that are kept: the largest of each interval
 PLOTTED = ("rate_hz", "latency_p50_ms", "latency_p99_ms", "residual", "difference_max_mm")
 """Values of diagnostics whose histories are kept."""
 
-Point = tuple[float, float]
-"""s of the monotonic clock, and the value then."""
+Point = tuple[float, float]  # s of the monotonic clock, and the value then
 
 
 class Level(Enum):

@@ -35,10 +35,8 @@ from us_sim.viewer.session import SessionBoard
 from us_sim.viewer.status import StatusBoard
 
 _LENGTH = struct.Struct("<I")
-_ALIGNMENT = 8
-"""Bytes: the payload begins at a multiple, so that the page can read it as numbers."""
-_LONGEST = 65536
-"""Characters of a page's message."""
+_ALIGNMENT = 8  # bytes: the payload begins at a multiple, so that the page can read it as numbers
+_LONGEST = 65536  # characters of a page's message
 _numbers = itertools.count(1)
 
 

@@ -121,8 +121,7 @@ def problem_with(name: str) -> str | None:
     return None
 
 
-Colour = tuple[float, float, float]
-"""Red, green and blue, 0 to 1."""
+Colour = tuple[float, float, float]  # red, green and blue, 0 to 1
 
 _COLOURS: dict[str, Colour] = {
     "artery": (0.85, 0.15, 0.15),

@@ -125,8 +125,7 @@ class LabelMap:
     labels: NDArray[np.uint8]  # (i, j, k)
     names: Mapping[int, str]
     colours: Mapping[int, Colour] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    """On how they came about, a sentence each."""
+    remarks: tuple[str, ...] = ()  # on how they came about, a sentence each
 
     def __post_init__(self) -> None:
         names = dict(self.names)

@@ -89,9 +89,19 @@ def test_springs_are_hookes_law_where_strains_are_small(ratio):
     assert _length(alone - box.linear(0.25)) < 0.5 * _length(alone - box.linear(0.45))
 
 
-def test_beads_of_the_real_gel_are_predicted(shared_file):
+@pytest.fixture(scope="module")
+def real_file(shared_file):
+    return shared_file(f"hydrogel-indentation/{FILE}")
+
+
+@pytest.fixture(scope="module")
+def beads(real_file):
+    """Those of the real gel; to link them takes seconds."""
+    return read_beads(real_file)
+
+
+def test_beads_of_the_real_gel_are_predicted(beads):
     """Fitted on one side of the axis, judged on the other, by the noise of the measurement."""
-    beads = read_beads(shared_file("hydrogel-indentation/" + FILE))
     floor = noise_floor(beads, np.random.default_rng(1))
     low = outcome(Case(beads, 60e-6), floor, 24e-6)
     whole = low.parts["all"]
@@ -110,10 +120,8 @@ def test_beads_of_the_real_gel_are_predicted(shared_file):
     assert graded < 0.6 * uniform
 
 
-def test_links_are_those_that_were_made_by_another_program(shared_file):
-    file = shared_file(f"hydrogel-indentation/{FILE}")
-    beads = read_beads(file)
-    with gzip.open(file.with_name("linked_beads.csv.gz"), "rt") as stream:
+def test_links_are_those_that_were_made_by_another_program(real_file, beads):
+    with gzip.open(real_file.with_name("linked_beads.csv.gz"), "rt") as stream:
         other = np.genfromtxt(stream, delimiter=",", names=True)
     places = np.stack([other[name] for name in ("xA_px", "yA_px", "zA_px")], axis=1)
     moved = np.stack([other[name] for name in ("ux_px", "uy_px", "uz_px")], axis=1)

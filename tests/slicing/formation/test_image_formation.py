@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.errors import ProbeError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.formation.image_formation import GreyLevels, ImageFormation
@@ -110,34 +109,6 @@ def test_black_stays_black():
     )
     black = np.zeros((64, 48), dtype=np.uint8)
     assert not ImageFormation(PROBE, imaging).form([black] * 3, np.ones(24, np.float32)).any()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"gain": 61}, r"imaging.gain: 61 dB is outside -60 to 60 dB"),
-        ({"gain": "6 mm"}, "imaging.gain: '6 mm' is not a level in dB"),
-        ({"gain": float("nan")}, "imaging.gain: nan is not finite"),
-        ({"time_gain": 3.0}, "imaging.time_gain: must be a list, not 3.0"),
-        ({"time_gain": [0, 99]}, r"imaging.time_gain\[1\]: 99 dB is outside"),
-        ({"dynamic_range": 5}, "imaging.dynamic_range: 5 dB is outside 10 to 120 dB"),
-        ({"elevation_planes": 2.5}, "imaging.elevation_planes: 2.5 is not a whole number"),
-        ({"elevation_planes": 16}, "imaging.elevation_planes: 16 is outside 1 to 15"),
-        ({"elevation_width": 3}, "imaging.elevation_width: .* did you mean '3 mm'"),
-        ({"lateral_resolution": -1e-3}, "imaging.lateral_resolution: -0.001 m is outside"),
-        ({"axial_resolution": "5 cm"}, "imaging.axial_resolution: 0.05 m is outside"),
-        ({"contact": 1}, "imaging.contact: must be true or false, not 1"),
-        ({"reverberation": 1}, "imaging.reverberation: 1 dB is outside -60 to 0 dB"),
-    ],
-)
-def test_a_setting_out_of_its_range_is_refused(change, words):
-    with pytest.raises(ProbeError, match=words):
-        Imaging(**change)
-
-
-def test_units_may_be_written():
-    imaging = Imaging(gain="6 dB", elevation_width="3 mm", time_gain=["1 dB", 2])
-    assert (imaging.gain, imaging.elevation_width, imaging.time_gain) == (6.0, 0.003, (1.0, 2.0))
 
 
 def test_every_setting_says_what_it_is():

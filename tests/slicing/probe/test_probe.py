@@ -348,18 +348,10 @@ def test_wires_appear_at_their_millimetre(name):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: ConvexProbe(2e-3, 1.0, 0.1), "probe.radius: 0.002 m is outside 0.003 to 0.3 m"),
-        (lambda: ConvexProbe(0.05, 3.2, 0.1), "probe.opening_angle: 3.2 rad is outside"),
-        (lambda: ConvexProbe(0.05, 60.0, 0.1), "did you mean '60 deg'"),
-        (lambda: ConvexProbe(0.05, 1.0, float("nan")), "probe.depth: nan is not finite"),
         (lambda: ConvexProbe(0.05, 1.0, 0.1, 0, 5), "probe.image: the image has 0 columns"),
-        (lambda: ConvexProbe(0.05, 1.0, 0.1, lines=0), "probe.lines: 0 is outside 1 to 4096"),
-        (lambda: ConvexProbe(0.05, 1.0, 0.1, lines=1.5), "probe.lines: 1.5 is not a whole number"),
-        (lambda: LinearProbe(0.04, 0.1, 5, 5, samples=0), "probe.samples: 0 is outside"),
-        (lambda: LinearProbe(0.04, 0.1, 5, 5, focus=0.0), "probe.focus: 0 m is outside"),
+        (lambda: LinearProbe(0.04, 0.06, 4, 4097), "4097 rows"),
+        (lambda: LinearProbe(0.04, 0.06, 4, 2.5), "2.5 rows"),
         (lambda: LinearProbe(0.1, 0.05).with_square_pixels(4096), "8192 columns"),
-        (lambda: SectorProbe(0.3, 1.5, 0.1), "probe.aperture: 0.3 m is outside 0.003 to 0.2 m"),
-        (lambda: SectorProbe(0.02, 3.0, 0.1), "probe.opening_angle: 3 rad is outside"),
         (
             lambda: SectorProbe(0.02, 90 * DEGREE, 0.1, radius=0.02),
             r"probe.aperture: 20 mm is less than the 40 mm .* over 90 degrees .* 20 mm behind it",
@@ -402,24 +394,6 @@ def test_to_pixel_undoes_pixels():
     found = plane.pixels() @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]
     column, row = np.meshgrid(np.arange(7), np.arange(5))
     np.testing.assert_allclose(found, np.stack([column, row, 0 * row], -1), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"aperture": 0.002}, "probe.aperture: 0.002 m is outside 0.003 to 0.2 m"),
-        ({"aperture": float("nan")}, "probe.aperture: nan is not finite"),
-        ({"depth": 0.5}, "probe.depth: 0.5 m is outside 0.005 to 0.4 m"),
-        ({"depth": "deep"}, "probe.depth: 'deep' is not a length"),
-        ({"columns": 0}, "0 columns"),
-        ({"rows": 4097}, "4097 rows"),
-        ({"rows": 2.5}, "2.5 rows"),
-    ],
-)
-def test_a_probe_that_cannot_be_is_refused(change, words):
-    good = {"aperture": 0.04, "depth": 0.06, "columns": 4, "rows": 3}
-    with pytest.raises(ProbeError, match=words):
-        LinearProbe(**{**good, **change})
 
 
 @pytest.mark.parametrize(

@@ -39,22 +39,14 @@ from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
 MAIN_TISSUE = "arm"
-METHOD = "fem_nonlinear"
-"""The method whose converged frames are the answer."""
-APPROACH = 0.5
-"""s, in which the probe comes to where a motion begins: these frames do not count."""
-CONVERGED = 1e-5
-"""Residual at which a pose is left for the next."""
-TRUSTED = 1e-3
-"""Residual of the answer above which nothing is compared with it."""
-HELD = 1e-6
-"""m that a fixed node may move before nothing is compared with it either."""
-ENOUGH = 0.9
-"""Fraction of the frames that must be compared before their errors are reported."""
-HOLD = 60
-"""Frames in which the probe stays at its last pose."""
-OWN_EVERY = 5
-"""Frames, of which one is converged by itself."""
+METHOD = "fem_nonlinear"  # the method whose converged frames are the answer
+APPROACH = 0.5  # s, in which the probe comes to where a motion begins: these frames do not count
+CONVERGED = 1e-5  # residual at which a pose is left for the next
+TRUSTED = 1e-3  # residual of the answer above which nothing is compared with it
+HELD = 1e-6  # m that a fixed node may move before nothing is compared with it either
+ENOUGH = 0.9  # fraction of the frames that must be compared before their errors are reported
+HOLD = 60  # frames in which the probe stays at its last pose
+OWN_EVERY = 5  # frames, of which one is converged by itself
 
 _QUICK_MOTIONS = (
     (MAIN_TISSUE, "free", "brisk", 2.0),

@@ -48,8 +48,7 @@ from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.progress import Progress
 from us_sim.recording.hand_motion import HASTES, KINDS, RATE
 
-JUDGED = "fem_nonlinear"
-"""The method that the targets are for."""
+JUDGED = "fem_nonlinear"  # the method that the targets are for
 
 _LOWEST = 1e-3  # mm; smaller errors are drawn there
 _HEAD = (

@@ -185,8 +185,7 @@ def _costs(scan: TubeScan, count: int) -> list[Point]:
 
 
 _SIDES = (24e-3, 80e-3, 40e-3)  # m, of the block
-RADIUS, DEPTH = 3e-3, 20e-3
-"""m, of the vessel, and of its axis, which runs along y."""
+RADIUS, DEPTH = 3e-3, 20e-3  # m, of the vessel, and of its axis, which runs along y
 
 FLOW = FlowSettings(
     "arterial", (0.0, 1.0, 0.0), peak_velocity=0.8, mean_velocity=0.1, pressure=40e3

@@ -79,10 +79,8 @@ class Point(Row):
 class Artefact(ABC):
     """An effect in images that is measured; `us_sim.evaluation.image.report` lists them."""
 
-    name: ClassVar[str]
-    """The first column of its rows: a word, or several with underscores."""
-    title: ClassVar[str]
-    """The heading of its part of the report."""
+    name: ClassVar[str]  # the first column of its rows: a word, or several with underscores
+    title: ClassVar[str]  # the heading of its part of the report
 
     @abstractmethod
     def points(self, quick: bool) -> list[Point]:
@@ -130,8 +128,7 @@ PROBES: dict[str, Probe] = {
     "sector": SectorProbe(aperture=0.02, opening_angle=np.radians(80), depth=0.07),
 }
 
-GREY = 170
-"""Of all voxels."""
+GREY = 170  # of all voxels
 
 
 def voxel_grid(

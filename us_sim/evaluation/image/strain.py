@@ -398,8 +398,7 @@ class Reference:
         return np.asarray(self._basis.get_dofs(facets).all(component))
 
 
-PRESS = 0.05
-"""Of the height."""
+PRESS = 0.05  # of the height
 
 
 @cache

@@ -40,11 +40,9 @@ if TYPE_CHECKING:
     from us_sim.evaluation.latency.arrivals import Arrivals
 
 
-RATE = 60.0
-"""Poses a second."""
+RATE = 60.0  # poses a second
 
-COARSE, FINE = (20, 10, 10), (32, 16, 16)
-"""Nodes of the meshes in x, y and z."""
+COARSE, FINE = (20, 10, 10), (32, 16, 16)  # nodes of the meshes in x, y and z
 
 PLACED = ("processes", "one process", "lockstep")
 """One process for each node; all nodes in one process, each in a thread; or one pose at a time."""
@@ -80,11 +78,9 @@ class Case:
         return ", ".join([*parts, "as ordinary programs"] if not self.realtime else parts)
 
 
-LIVE = Case(mesh=FINE, seconds=300.0)
-"""The case of the limits for a live simulation."""
+LIVE = Case(mesh=FINE, seconds=300.0)  # the case of the limits for a live simulation
 
-DEMO = Case("fem_nonlinear")
-"""The method and mesh of the demo."""
+DEMO = Case("fem_nonlinear")  # the method and mesh of the demo
 
 
 def cases(quick: bool) -> list[Case]:
@@ -118,11 +114,9 @@ def _beside(case: Case) -> list[Case]:
     return [busy, replace(busy, realtime=False)]
 
 
-HAND = 0.1
-"""m/s of a hand, by which a delay becomes a distance."""
+HAND = 0.1  # m/s of a hand, by which a delay becomes a distance
 
-Heard = Sequence[tuple[int, int]]
-"""Stamps and times of arrival, ns."""
+Heard = Sequence[tuple[int, int]]  # stamps and times of arrival, ns
 
 
 @dataclass(frozen=True)

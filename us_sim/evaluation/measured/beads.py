@@ -34,8 +34,7 @@ _REACH = 2.5  # pixels, from the expected place
 _NEIGHBOURS, _LEAST_NEIGHBOURS = 24, 8  # and how many of them must be linked to expect a place
 _NEAREST = 20
 _SWEEPS = 200
-_WELL_LINKED = 0.7
-"""Part of a bead's neighbours that must be linked, or its own link may be wrong."""
+_WELL_LINKED = 0.7  # part of a bead's neighbours that must be linked, or its own link may be wrong
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,7 @@ from us_sim.tissue.solvers.newton import Newton
 Array = NDArray[np.float64]
 
 _MICRON = 1e-6
-_BAND = 6e-6
-"""m, from a face: beads nearer give the face's displacement, and are not compared."""
+_BAND = 6e-6  # m, from a face: beads nearer give the face's displacement, and are not compared
 _SIDES = np.array([[45.2e-6, 48e-6], [365.2e-6, 368e-6]])  # m, of all boxes along x and y
 _BOTTOM, _TOPS = 24e-6, (60e-6, 72e-6, 92e-6)  # m
 _NEAREST, _NEAREST_OF_HALF = 45, 16
@@ -58,8 +57,7 @@ _SHOWN = ("linear", "nonlinear")  # layer by layer
 _BEST, _RIVAL = "nonlinear, graded", "linear, graded"
 _AXIS = 205.2e-6  # m, along x
 _FITTING_MESH, _MESH = 24e-6, 16e-6  # m
-_UNIT = 1e4
-"""1/m, unit of softening in a fit: the modulus falls e-fold over 100 um."""
+_UNIT = 1e4  # 1/m, unit of softening in a fit: the modulus falls e-fold over 100 um
 _START, _STEP = np.array([0.45, 0.0]), np.array([0.03, 1.0])  # Poisson's ratio, softening
 _BOUNDS = np.array([[0.0, 0.498], [-2.0, 10.0]])
 _OF_SPRINGS = 0.25  # Poisson's ratio of springs alone

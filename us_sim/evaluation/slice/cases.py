@@ -111,8 +111,7 @@ class Case:
         return found
 
 
-MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")
-"""The case by which methods are compared."""
+MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")  # the case by which methods are compared
 
 
 def cases(quick: bool) -> list[Case]:

@@ -104,8 +104,7 @@ RESOLUTION = 1e-3
 MARGIN = 2e-3
 """m, from the border of the swept region; nearer, few frames were averaged: not compared."""
 
-SHIFT_STEP = 0.63e-3
-"""m, between the shifts that are tried; about two pixels of the liver sweep."""
+SHIFT_STEP = 0.63e-3  # m, between the shifts that are tried; about two pixels of the liver sweep
 
 _SHIFTS = SHIFT_STEP * np.arange(-3, 4)
 

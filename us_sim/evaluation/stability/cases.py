@@ -47,8 +47,7 @@ COLLIDERS: dict[str, Collider] = {
 }
 """Colliders by name, for a tissue 0.1 m wide; they are as much larger or smaller as others are."""
 
-LAYOUTS = ("inclusion", "skin", "half", "scattered")
-"""Where a mesh is stiffer by the contrast."""
+LAYOUTS = ("inclusion", "skin", "half", "scattered")  # where a mesh is stiffer by the contrast
 
 SPRINGS = ("algorithm_1", "fitted", "fitted with volume")
 """Spring constants of methods that have springs, and whether tetrahedra keep their volumes."""
@@ -346,10 +345,8 @@ MESHES: dict[str, Callable[[], TetrahedralMesh]] = {
 """The tissues by name."""
 
 
-HOLD = 30
-"""Frames in which the probe stays where its motion ended."""
-SMALL = 1e-3
-"""Residual that must be reached by then."""
+HOLD = 30  # frames in which the probe stays where its motion ended
+SMALL = 1e-3  # residual that must be reached by then
 
 
 def held_cases(count: int, seed: int) -> list[StabilityCase]:

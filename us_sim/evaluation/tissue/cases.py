@@ -24,8 +24,7 @@ from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.model import TissueModel, face_nodes
 
-MAIN_SCENE = "press_25mm"
-"""The scene that is pressed on every mesh."""
+MAIN_SCENE = "press_25mm"  # the scene that is pressed on every mesh
 
 _STEP = 0.0025  # m, of the probe in a frame
 _SPHERE = Sphere(0.03)

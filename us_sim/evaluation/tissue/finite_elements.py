@@ -151,8 +151,7 @@ _OWN, _LINEAR = 5.0, 45.0
 """Parts of lambda + mu over mu: `own` is all up to Poisson's ratio 0.4, `linear` the rest up to
 0.49. What is beyond is `own` again, for without it Newton's method finds no way at 0.4999."""
 
-_SIGN = np.zeros((3, 3, 3))
-"""The sign of each permutation of three axes."""
+_SIGN = np.zeros((3, 3, 3))  # the sign of each permutation of three axes
 _SIGN[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 _SIGN[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 

@@ -39,8 +39,7 @@ _SWAY = ((0.25, 0.035, 0.25), (0.9, 0.009, 0.12), (2.3, 0.0012, 0.015))
 """Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor."""
 
 _Path = Callable[[Array], Array]
-FilterTrial = tuple[str, Settings | None, str]
-"""A filter's name, its settings, and those in words."""
+FilterTrial = tuple[str, Settings | None, str]  # a filter's name, its settings, and those in words
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,7 @@ from us_sim.evaluation.tracking.measure import (
 )
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
-_QUICK_SEQUENCES = {SMALL: 5, LARGE: 3}
-"""Sequences of views a case, by the size of the images."""
+_QUICK_SEQUENCES = {SMALL: 5, LARGE: 3}  # sequences of views a case, by the size of the images
 
 _OF_VIEWS = ("views", "found", "flipped", "mm", "95 %", "degrees", "95 %")
 

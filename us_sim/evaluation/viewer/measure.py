@@ -221,10 +221,8 @@ class Browser:
 
 STREAMED = ("image", "skin_mesh", "skin", "structures_mesh", "structures", "probe", "hand")
 """Contents of the page when it is opened."""
-COMMAND_RATE = 60.0
-"""Commands a second of a hand that moves."""
-PRESS, PRESS_PERIOD = 0.006, 2.0
-"""m and s of the press that it repeats."""
+COMMAND_RATE = 60.0  # commands a second of a hand that moves
+PRESS, PRESS_PERIOD = 0.006, 2.0  # m and s of the press that it repeats
 
 
 class Taker:

@@ -39,11 +39,9 @@ class Slicer(ABC):
         ValueError: fewer than one thread.
     """
 
-    skipped: int = 0
-    """Inverted or flat tetrahedra on the latest image, which were left out."""
+    skipped: int = 0  # inverted or flat tetrahedra on the latest image, which were left out
 
-    Settings: ClassVar[type[Settings]] = Settings
-    """The class of this method's settings."""
+    Settings: ClassVar[type[Settings]] = Settings  # the class of this method's settings
 
     def __init__(
         self,

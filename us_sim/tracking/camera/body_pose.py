@@ -127,8 +127,7 @@ def _by_nearness(found: list[BodyPose], before: Pose) -> list[BodyPose]:
     return sorted(found, key=lambda each: rotation_angle(each.pose, before))
 
 
-CORNER_DEVIATION = 0.1
-"""Pixels, of a corner's coordinates in a sharp image with little noise."""
+CORNER_DEVIATION = 0.1  # pixels, of a corner's coordinates in a sharp image with little noise
 
 _FLAT = 1e-3  # thickness of a body, of its extent, up to which one homography shows all of it
 _DISTINCT = np.radians(1.0)

@@ -69,17 +69,12 @@ class WhileShown(Element, component="while_shown.js"):
             self._refresh()
 
 
-_BY_FACTORS = 50.0
-"""From the smallest number to the largest: beyond, a slider goes by factors."""
-_WIDE = 1000.0
-"""Likewise: beyond, a slider covers what is near the present value."""
-_AROUND = 100.0
-"""Times the present value, and a hundredth of it, where a slider goes by factors."""
-_ROOM = 4.0
-"""Times the present value, where a slider begins at zero."""
+_BY_FACTORS = 50.0  # from the smallest number to the largest: beyond, a slider goes by factors
+_WIDE = 1000.0  # likewise: beyond, a slider covers what is near the present value
+_AROUND = 100.0  # times the present value, and a hundredth of it, where a slider goes by factors
+_ROOM = 4.0  # times the present value, where a slider begins at zero
 _STEPS = 600
-_NOTHING = 1e-12
-"""Of the range: a smaller value is zero on a slider."""
+_NOTHING = 1e-12  # of the range: a smaller value is zero on a slider
 
 
 @dataclass(frozen=True)

@@ -35,15 +35,12 @@ COMMON = (
     "contact",
 )
 """Parameters of ``slice_interpolator`` that stand first."""
-PARAMETERS_S, STATUS_S = 0.2, 0.5
-"""How often parameters and states are brought up to date."""
+PARAMETERS_S, STATUS_S = 0.2, 0.5  # how often parameters and states are brought up to date
 TISSUE = "tissue_deformer"
 METHOD = ("solver", "compare_with")
 MATERIALS, STIFFNESS = "materials.", ".young_modulus"
-RECENT_S = 20.0
-"""How long it is said that a setting was set back."""
-PROBLEM_S = 60.0
-"""How long the last problem of a node that is well again is shown."""
+RECENT_S = 20.0  # how long it is said that a setting was set back
+PROBLEM_S = 60.0  # how long the last problem of a node that is well again is shown
 HELD_BACK_S = 0.15
 """The newest force waits for the next turn: until then a larger one may take its place."""
 

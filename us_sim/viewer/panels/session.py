@@ -22,10 +22,8 @@ ANOTHER = (
     "Ends the scene that runs, and starts this one; what was set in either comes back when it is "
     "loaded"
 )
-EVERY_S = 0.3
-"""How often the panels are brought up to date."""
-BY_HAND = ("", "pose")
-"""Trackers of scenes that differ from others in more than their tracker."""
+EVERY_S = 0.3  # how often the panels are brought up to date
+BY_HAND = ("", "pose")  # trackers of scenes that differ from others in more than their tracker
 
 
 class _Cases:
@@ -139,8 +137,7 @@ def build_cases(simulator: Simulator) -> None:
     _Cases(simulator)
 
 
-SETTLE_S = 1.5
-"""For what a person asked for to be so; until then controls stay as they were set."""
+SETTLE_S = 1.5  # for what a person asked for to be so; until then controls stay as they were set
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
 KINDS = {"path": "Probe's path", "recording": "All as recorded"}
 KINDS_TOLD = (

@@ -15,16 +15,13 @@ from us_sim.tissue.elasticity.material import KINDS, Material, kind_of
 from us_sim.tissue.mesh.tetrahedral_mesh import KINDS as KINDS_OF_MESH
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
-AROUND = "tissue"
-"""Name of what is in no structure: label 0, or all of a volume without labels."""
+AROUND = "tissue"  # name of what is in no structure: label 0, or all of a volume without labels
 
-SLIDE = 8e-3
-"""m, that the proposed path slides and comes back where nothing else is said."""
+SLIDE = 8e-3  # m, that the proposed path slides and comes back where nothing else is said
 
 _LONGEST_NAME = 80
 _FACES = ("top", "bottom", "left", "right", "front", "back", "sides")
-RESERVED = (AROUND, *_FACES)
-"""Names that no structure has."""
+RESERVED = (AROUND, *_FACES)  # names that no structure has
 
 
 def check_name(name: str) -> str | None:

@@ -35,8 +35,7 @@ _REGIONS = "SequenceOfUltrasoundRegions"
 Progress = Callable[[float, str], None]
 Keep = NDArray[np.bool_] | None
 """(rows, columns) the part of every image that is kept; None: all of it."""
-Voxels = Callable[[Keep, Progress | None], NDArray[np.uint8]]
-"""Reads the voxels (i, j, k)."""
+Voxels = Callable[[Keep, Progress | None], NDArray[np.uint8]]  # reads the voxels (i, j, k)
 Images = Callable[[Keep], Iterator[NDArray[np.uint8]]]
 """Reads the images (rows, columns), one after another."""
 Sides = Callable[[Keep], Iterator[list[NDArray[np.uint8]]]]

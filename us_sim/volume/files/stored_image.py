@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 
-LARGEST_VOLUME = 1 << 29
-"""Numbers in the largest image that is read: 1024 × 1024 × 512."""
+LARGEST_VOLUME = 1 << 29  # numbers in the largest image that is read: 1024 × 1024 × 512
 
 _STEP = 1 << 20
 _ZLIB_OR_GZIP = 32 + zlib.MAX_WBITS

@@ -23,8 +23,7 @@ from us_sim.volume.reconstruction.settings import Compounding, ImagePart, LiveBo
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
-Progress = Callable[[float, str], None]
-"""Is told the fraction done, and the work in progress."""
+Progress = Callable[[float, str], None]  # is told the fraction done, and the work in progress
 
 Rest = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Takes the index of a frame and points (N, 3) m of it; where these lie while nothing presses."""

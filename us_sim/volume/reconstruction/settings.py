@@ -85,8 +85,7 @@ class ImagePart(Settings):
             raise self.refused("clip", "must have columns and rows above zero")
 
 
-LIVE_COMPOUNDINGS = ("mean", "max", "latest")
-"""Those that need no image twice."""
+LIVE_COMPOUNDINGS = ("mean", "max", "latest")  # those that need no image twice
 
 _PLACE = Quantity("length", -100.0, 100.0)
 VOLUME_ENDINGS = (".nrrd", ".mha", ".nii", ".nii.gz")

@@ -44,8 +44,7 @@ _LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
 
 NO_TIME = "no Timestamp"
 NO_IMAGE = "ImageStatus is not OK"
-NO_FIELDS = "no field in the header"
-"""Why frames cannot be used."""
+NO_FIELDS = "no field in the header"  # why frames cannot be used
 
 
 @dataclass(frozen=True)

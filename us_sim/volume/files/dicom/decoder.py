@@ -20,8 +20,7 @@ MISSING, UNKNOWN, WRONG = "missing", "unknown", "wrong"
 """Kinds of failures: a library is not installed, the syntax is not read, the images are damaged."""
 
 _EXTENDED = "1.2.840.10008.1.2.4.51"  # JPEG of up to 12 bits
-DECODER_DEPENDENCIES = {_EXTENDED: ("python-gdcm",)}
-"""As pydicom asks of who decodes."""
+DECODER_DEPENDENCIES = {_EXTENDED: ("python-gdcm",)}  # as pydicom asks of who decodes
 
 
 def is_available(syntax: str) -> bool:
