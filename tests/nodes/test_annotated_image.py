@@ -39,7 +39,7 @@ structures: [vein, artery]
 
 @dataclass
 class Shown:
-    """What an annotated image takes of a frame."""
+    """The part of a frame that an annotated image uses."""
 
     pixels: np.ndarray
     labels: np.ndarray | None = None
