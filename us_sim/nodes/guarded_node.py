@@ -319,7 +319,8 @@ class Health:
 
     Latency is the age of what goes out by its stamp. It counts from the arrival of what a message
     was made from under simulated time, which goes in steps, and where stamps are of another clock,
-    as those of a recording are; the latter is said once.
+    as those of a recording are; the latter is said once. An age below zero is a clock that is
+    wrong, on this computer or another one.
 
     Args:
         node: whose clock, logger and timer are used.
@@ -416,7 +417,13 @@ class Health:
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])
             values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
-        wrong = self.fault or self._last_problem or self.warning
+        ahead = -min(self._latencies, default=0.0)
+        skew = (
+            f"stamps are up to {ahead:.1f} ms ahead of this computer's clock, so no latency is "
+            f"right: synchronise the computers' clocks, with chrony or PTP"
+        )
+        synchronous = ahead < 1.0  # ms; on a local network chrony does better
+        wrong = self.fault or self._last_problem or self.warning or ("" if synchronous else skew)
         level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
         status = DiagnosticStatus(
             level=DiagnosticStatus.ERROR if self.fault else level,

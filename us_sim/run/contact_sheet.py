@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from us_sim.errors import BagError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.run.session_summary import LumenAreas, Session, scanner_of_vessels
+from us_sim.run.session_summary import Session
 from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
+from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.drawing.overlay import Overlay
@@ -247,7 +248,7 @@ def _flow_moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[
 
 
 def _tilted(pose: Pose, depth: float) -> Pose:
-    """A probe tilted about the point ``depth`` m under this one, and about its array."""
+    """A probe tilted about its array and about the point ``depth`` m under this one."""
     half = math.radians(0.5 * TILT)
     turned = pose @ Pose(np.zeros(3), np.array([math.sin(half), 0.0, 0.0, math.cos(half)]))
     there = pose.position + depth * pose.rotation[:, 2]
@@ -273,7 +274,7 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
     (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
     first = min(session.poses)
-    numbers, scanner = scanner_of_vessels(scene, session.rest, session.tetrahedra)
+    numbers, scanner = session.scanner_of_vessels(scene)
     images = session.images_at({stamp for _, stamp in moments})
     for i, (title, stamp) in enumerate(moments):
         axes = figure.add_subplot(grid[divmod(i, 3)])
@@ -282,9 +283,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
         if scanner is not None and seen:  # through air nothing is
             frame = scanner.frame(session.poses[stamp], session.nodes[stamp])
-            draw_outlines(
-                axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent
-            )
+            lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
+            draw_outlines(axes, frame, lumens, extent)
         where = _place(session.poses[stamp])
         axes.set_title(f"{title}: {_times([stamp], first)}, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)

@@ -20,8 +20,10 @@ from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagMessage
 from us_sim.run.resimulation import scene_within
-from us_sim.run.session_summary import scanner_of_vessels
+from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scoring.lumen import VESSELS
 from us_sim.settings.spelling import counted
+from us_sim.tissue.elasticity.material import kind_of
 
 AREAS = 40  # pairs of which areas are compared, evenly over the session
 Progress = Callable[[float, str], None]
@@ -258,18 +260,24 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
     attached = one.attachments()
     if "scene.yaml" not in attached:
         raise BagError(f"{one.path} has no scene attached")
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
+        scene = scene_within(one.path, attached, Path(folder, "attached"))
+        volume = volume_of(scene)
+        vessels = {
+            label: name for label, name in volume.label_names.items() if kind_of(name) in VESSELS
+        }
+        if volume.labels is None or not vessels:
+            return None
+        scanner = scanner_of(scene, volume)
     latched: dict[str, Any] = {
         message.topic: one.deserialize(message)
         for message in one.messages(["/tissue/rest", "/tissue/tetrahedra"])
     }
     if len(latched) < 2:
         raise BagError(f"{one.path} has no mesh")
-    mesh = vectors_from(latched["/tissue/rest"]), tetrahedra_from(latched["/tissue/tetrahedra"])
-    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
-        scene = scene_within(one.path, attached, Path(folder, "attached"))
-        numbers, scanner = scanner_of_vessels(scene, *mesh)
-    if scanner is None:
-        return None
+    scanner.carry(
+        vectors_from(latched["/tissue/rest"]), tetrahedra_from(latched["/tissue/tetrahedra"])
+    )
     common = sorted(_stamps(one, _NODES) & _stamps(other, _NODES) & _stamps(one, _POSES))
     picked = np.unique(np.linspace(0, len(common) - 1, min(AREAS, len(common))).astype(int))
     chosen = {common[k] for k in picked}
@@ -280,16 +288,15 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
         for bag, topic in ((one, _POSES), (one, _NODES), (other, _NODES))
     )
     pixel = 1e6 * float(np.prod(scanner.probe.pixel_spacing))
-    found = Difference("areas of vessels", tuple(f"{name} (mm²)" for name in numbers))
+    found = Difference("areas of vessels", tuple(f"{name} (mm²)" for name in vessels.values()))
     for stamp in sorted(chosen):
         pose = pose_from(poses[stamp])
         if mine[stamp].data.tobytes() == yours[stamp].data.tobytes():
-            apart = (0.0,) * len(numbers)
+            apart = (0.0,) * len(vessels)
         else:
             seen = [scanner.labels(pose, vectors_from(each[stamp])) for each in (mine, yours)]
             apart = tuple(
-                pixel * abs(int((seen[0] == label).sum()) - int((seen[1] == label).sum()))
-                for label in numbers.values()
+                pixel * abs(int((seen[0] == k).sum()) - int((seen[1] == k).sum())) for k in vessels
             )
         found.stamps.append(stamp)
         found.apart.append(apart)

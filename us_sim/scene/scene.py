@@ -14,6 +14,7 @@ from typing import Any
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
+from us_sim.scene.episode import EpisodeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
@@ -234,10 +235,18 @@ class Scene(Settings):
     tracker: TrackerSettings = setting(
         description="where poses come from", default=TrackerSettings()
     )
+    episode: EpisodeSettings = setting(
+        description="how robots and learners move the probe, and what differs between episodes",
+        default=EpisodeSettings(),
+    )
     path: str | None = setting(
         description="bag with a probe path, for the demo", default=None, file=True
     )
     description: str = setting(description="for a person", default="")
+    exercise: str | None = setting(
+        description="file of an exercise, or name of an installed one, which `scorer` follows",
+        default=None,
+    )
     case: str | None = setting(
         description="case, or its name, from which all is taken that the scene does not say",
         default=None,
@@ -265,6 +274,7 @@ class Scene(Settings):
             _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
             Part("slice_interpolator", True, self._imaged()),
             *self._felt(),
+            *([Part("scorer", True, f"the exercise is {self.exercise}")] if self.exercise else []),
         ]
 
     @property

@@ -64,13 +64,12 @@ class Zenoh:
         self._lock = threading.RLock()
         self._closed = False
         self._alive: dict[str, Entity] = {}  # by token
-        self._since: dict[str, float] = {}  # when tokens of others came
+        self._since: dict[tuple[str, str], dict[str, float]] = {}  # by kind and key, then token
         self._announced: dict[int, GraphNode] = {}
         self._node_tokens: dict[int, Any] = {}
         self._open: weakref.WeakSet[_Endpoint] = weakref.WeakSet()
         self.session = open_session()
         self._id = str(self.session.info.zid())
-        _contexts.add(self)
         self._watch = self.session.liveliness().declare_subscriber(
             all_tokens(domain_id), self._token_changed, history=True
         )
@@ -128,27 +127,23 @@ class Zenoh:
     def declare(self, entity: Entity) -> Any:
         """Have an entity known to others for as long as the returned token is declared."""
         with self._lock:
-            self._alive[entity.token] = entity
+            self._know(entity.token, entity, since=0.0)
         return self.session.liveliness().declare_token(entity.token)
 
-    def forget(self, entity: Entity) -> None:
+    def _know(self, token: str, entity: Entity, since: float) -> None:
+        self._alive[token] = entity
+        self._since.setdefault((entity.kind, entity.key), {}).setdefault(token, since)
+
+    def forget(self, token: str, entity: Entity) -> None:
         with self._lock:
-            self._alive.pop(entity.token, None)
+            self._alive.pop(token, None)
+            self._since.get((entity.kind, entity.key), {}).pop(token, None)
 
-    def count(self, role: str, like: Entity) -> int:
-        """The number of entities in a role for the same topic or service, with the same type.
-
-        Those that are too new to be reached are left out.
-        """
+    def count(self, role: str, key: str) -> int:
+        """The number of entities in a role on a key that are old enough to be reached."""
         settled = time.monotonic() - _SETTLING
         with self._lock:
-            return sum(
-                each.kind == role
-                and each.name == like.name
-                and each.type_name == like.type_name
-                and self._since.get(token, settled) <= settled
-                for token, each in self._alive.items()
-            )
+            return sum(since <= settled for since in self._since.get((role, key), {}).values())
 
     def nodes(self) -> list[GraphNode]:
         with self._lock:
@@ -189,6 +184,7 @@ class Zenoh:
                 return
             self._closed = True
             self._alive.clear()
+            self._since.clear()
             self._announced.clear()
         for endpoint in list(self._open):
             endpoint.closed = True
@@ -201,23 +197,9 @@ class Zenoh:
             if self._closed or entity is None or entity.session == self._id:
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self._alive[token] = entity
-                self._since.setdefault(token, time.monotonic())
+                self._know(token, entity, time.monotonic())
             else:
-                self._alive.pop(token, None)
-                self._since.pop(token, None)
-
-
-_contexts: weakref.WeakSet[Zenoh] = weakref.WeakSet()
-
-
-def _close_all() -> None:
-    for context in list(_contexts):
-        context.close()
-
-
-# Zenoh calls back from threads that Python waits for before it runs what `atexit` keeps.
-threading._register_atexit(_close_all)  # type: ignore[attr-defined]
+                self.forget(token, entity)
 
 
 def _graph_node(node: Entity, readers: list[bytes], writers: list[bytes]) -> GraphNode:
@@ -232,6 +214,7 @@ class _Endpoint:
         self.closed = False
         self._middleware = middleware
         self._entity = entity
+        self._key = entity.key
         self._declared = self._declare(middleware.session, entity)
         self._token = middleware.declare(entity)
         self.gids: tuple[list[bytes], list[bytes]] = ([], [])
@@ -246,7 +229,7 @@ class _Endpoint:
         if self.closed:
             return
         self.closed = True
-        self._middleware.forget(self._entity)
+        self._middleware.forget(self._entity.token, self._entity)
         self._token.undeclare()
         self._declared.undeclare()
 
@@ -297,7 +280,7 @@ class Writer(_Endpoint):
         return True
 
     def matched_count(self) -> int:
-        return 0 if self.closed else self._middleware.count(SUBSCRIPTION, self._entity)
+        return 0 if self.closed else self._middleware.count(SUBSCRIPTION, self._key)
 
 
 class _Receiver(_Endpoint):
@@ -368,7 +351,7 @@ class Reader(_Receiver):
             self._notify()
 
     def matched_count(self) -> int:
-        return 0 if self.closed else self._middleware.count(PUBLISHER, self._entity)
+        return 0 if self.closed else self._middleware.count(PUBLISHER, self._key)
 
 
 class ServiceServer(_Receiver):
@@ -426,7 +409,7 @@ class ServiceClient(_Receiver):
         )
 
     def service_is_ready(self) -> bool:
-        return not self.closed and self._middleware.count(SERVICE, self._entity) > 0
+        return not self.closed and self._middleware.count(SERVICE, self._key) > 0
 
     def send_request(self, data: bytes) -> int:
         """Send a serialized request; returns its sequence number."""
