@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile
 
 from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.qos import EVERY, STREAM, overridable
+from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
@@ -100,9 +100,7 @@ class SceneNode(GuardedNode):
     ) -> None:
         """Subscribe to every message of ``topic``."""
         qos = qos or (EVERY if self.lockstep else STREAM)
-        self.create_subscription(
-            message_type, topic, callback, qos, qos_overriding_options=overridable(), **options
-        )
+        self.create_subscription(message_type, topic, callback, qos, **options)
 
 
 LEAD_TOPIC = "tracker/pose"
