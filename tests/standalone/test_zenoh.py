@@ -146,6 +146,27 @@ def test_a_request_of_rmw_zenoh_is_answered_with_its_own_number(ours, raw):
     assert abs(sent - time.time_ns()) < 60e9
 
 
+def test_a_hundred_requests_may_wait_for_their_answers(ours, raw):
+    server = ours.create_service(PROBE, *GO, EndpointQos(depth=500))
+    told: list[str] = []
+    server.on_unanswered = told.append
+    querier = raw.declare_querier(TRIGGER_KEY, target=zenoh.QueryTarget.ALL_COMPLETE)
+
+    def ask(number):
+        return querier.get(payload=b"", attachment=attachment(number, 1, bytes(16)))
+
+    number = iter(range(500))
+    open_requests = [until(lambda: ask(next(number)) and server.take())[1]]
+    replies = [ask(1000 + each) for each in range(120)]
+    while open_requests[-1].sequence != 1119:
+        open_requests.append(until(server.take)[1])
+    given_up = len(open_requests) - 100
+    until(lambda: len(told) == given_up)
+    answered = [server.send_response(b"done", each) for each in open_requests]
+    assert answered == [False] * given_up + [True] * 100
+    assert [len(list(each)) for each in replies[-100:]] == [1] * 100
+
+
 def test_a_service_of_rmw_zenoh_is_found_and_called(ours, raw):
     client = ours.create_client(PROBE, *GO, QOS)
     assert not client.service_is_ready()
