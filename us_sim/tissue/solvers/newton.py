@@ -202,7 +202,7 @@ class Newton:
         """Take a step with a factor, with damping and with points deep in the probe, as only some
         frames do.
         """
-        self.set_pose(Pose(position=[0.0, 0.0, 2 * self.contact.probe.deep]))
+        self.set_pose(Pose(np.array([0.0, 0.0, 2 * self.contact.probe.deep])))
         self._needs_factor, self.may_factor, self._damping = True, True, TUNING.damping
         self.step(2)
         self.reset()
