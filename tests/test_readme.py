@@ -1,4 +1,4 @@
-"""What the README shows works as it is written there."""
+"""The README's examples work as they are written there."""
 
 import re
 import shlex
@@ -23,7 +23,8 @@ def test_the_script_runs_an_episode():
 
 
 VERBS = (
-    *("demo", "run", "view", "render", "play", "bag", "info", "to-rerun"),
+    *("demo", "run", "view", "render", "play", "param"),
+    *("bag", "info", "check", "diff", "extract", "to-rerun"),
     *("evaluate", "tissue", "stability", "hand", "slice", "tracking", "latency", "image"),
     "measured",
     *("calibrate", "camera", "pivot", "landmarks", "probe", "time", "print-marker", "reference"),
@@ -33,7 +34,7 @@ VERBS = (
 COMMANDS = sorted(
     {
         tuple(shlex.split(command)[1:])
-        for command in re.findall(r"(?:`|&& |^)(us-sim [^`\n|&]*)", README, re.MULTILINE)
+        for command in re.findall(r"(?:`|&& |^)(us-sim [^`\n|&#]*)", README, re.MULTILINE)
     }
 )
 

@@ -1,6 +1,6 @@
 """A node that goes on whatever comes in, refuses bad input, and reports its health.
 
-What a node reports about itself once a second: rate, latency, drops, state.
+The report, once a second: rate, latency, drops, state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from us_sim.recording.schemas import jazzy_definitions
 
 
 def require_sequences(data: bytes, message_type: Any) -> None:
-    """Look at the sequences of a serialized message, where its type is one of Jazzy's with any.
+    """Check the sequences of a serialized message, where its type is one of Jazzy's with any.
 
     Raises:
         Exception: what rosbags raises, where the bytes are no such message.
@@ -90,13 +90,12 @@ class GuardedNode(Node):
 
     def _look_for_a_clock(self) -> None:
         """Say that simulated time does not begin."""
-        if self.get_clock().now().nanoseconds:
-            self._clockless.cancel()
-            return
-        self.get_logger().warning(
-            "use_sim_time is true, and nothing has come on /clock: this node's time stands at 0; "
-            "start what publishes it, or set use_sim_time to false"
-        )
+        self._clockless.cancel()
+        if not self.get_clock().now().nanoseconds:
+            self.get_logger().warning(
+                "use_sim_time is true, and nothing has come on /clock: this node's time stands at "
+                "0; start what publishes it, or set use_sim_time to false"
+            )
 
     def refused(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
@@ -158,7 +157,13 @@ class GuardedNode(Node):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Any:
-        """As `rclpy.node.Node.create_subscription`, guarded."""
+        """As `rclpy.node.Node.create_subscription`, guarded.
+
+        The quality of service of a relative topic may be overridden by parameters; absolute ones
+        are ROS's own, and what a recorder adopts.
+        """
+        if not topic.startswith("/"):
+            options.setdefault("qos_overriding_options", overridable())
         if not options.pop("raw", False):
             callback = decoded(msg_type, callback)
         where = self.resolve_topic_name(topic)
@@ -240,9 +245,7 @@ class Subscriptions:
         self._there = []
         if is_wanted:
             self._there = [
-                self._node.create_subscription(
-                    kind, topic, take, qos, raw=raw, qos_overriding_options=overridable()
-                )
+                self._node.create_subscription(kind, topic, take, qos, raw=raw)
                 for kind, topic, take, qos, raw in self._wanted
             ]
         return True
