@@ -210,7 +210,7 @@ def _record(order: _Order, path: Path) -> dict[str, Any]:
             action = agent.act(observation)
             members = _members(environment, observation, labels)
             observation, reward, done, truncated, info = environment.step(action)
-            step = members.pop("json") | {"action": np.round(action, 6).tolist()}
+            step = members.pop("json") | {"action": action.tolist()}
             if order.task:
                 step |= {"reward": reward, "is_success": done, **environment.task.facts()}
                 is_success = is_success or done
