@@ -198,9 +198,11 @@ class Simulation:
         with self._blas.limit(limits=1, user_api="blas"):
             shape = draw.speckle, draw.thickness
             materials = *shape, draw.lumen_pressure, dict(draw.stiffness)
-            if shape != self._shape:
+            last = self._shape, self._materials
+            self._shape = self._materials = None  # where something cannot be made
+            if shape != last[0]:
                 self._make_scanner(draw)
-            if materials != self._materials:
+            if materials != last[1]:
                 self._make_tissue(draw)
             elif self._solver is not None:
                 self._solver.reset()
