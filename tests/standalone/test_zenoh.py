@@ -353,10 +353,17 @@ for line in sys.stdin:
 """
 
 
-class Member:
-    """A process with a node in the domain, and a router if it is the first one."""
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
-    def __init__(self, name: str, port: int) -> None:
+
+class Member:
+    """A process with a node in the domain, and a router on the last port if it is the first one."""
+
+    def __init__(self, name: str, *ports: int) -> None:
+        routers = json.dumps([f"tcp/127.0.0.1:{port}" for port in ports])
         self.process = subprocess.Popen(
             [sys.executable, "-c", MEMBER, str(DOMAIN), name],
             stdin=subprocess.PIPE,
@@ -366,7 +373,7 @@ class Member:
             | {
                 "RMW_IMPLEMENTATION": ZENOH,
                 "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                "ZENOH_CONFIG_OVERRIDE": f'connect/endpoints=["tcp/127.0.0.1:{port}"]',
+                "ZENOH_CONFIG_OVERRIDE": f"connect/endpoints={routers}",
             },
         )
         assert self.process.stdout.readline() == "up\n"
@@ -379,9 +386,7 @@ class Member:
 
 @pytest.mark.parametrize("way", [signal.SIGTERM, signal.SIGKILL])
 def test_another_process_takes_the_router_over_when_its_process_ends(way):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     members = [Member(name, port) for name in ("first", "second", "third")]
     try:
         until(lambda: all(m.sees() == ["first", "second", "third"] for m in members))
@@ -397,6 +402,18 @@ def test_another_process_takes_the_router_over_when_its_process_ends(way):
         for member in members:
             member.process.kill()
             member.process.communicate()
+
+
+def test_the_router_of_rmw_zenoh_may_start_later():
+    theirs = free_port()
+    member = Member("first", theirs, free_port())
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{theirs}"]')
+    router = zenoh.open(config)
+    until(lambda: list(router.info.peers_zid()))
+    router.close()
+    member.process.communicate(timeout=20)
 
 
 def test_a_session_with_range_off_meets_nobody(ours, monkeypatch):
