@@ -1,4 +1,4 @@
-"""The pages beside the README: their commands and keys exist, their links lead somewhere."""
+"""The README and the pages beside it: commands, keys and links exist, and its code works."""
 
 import re
 import shlex
@@ -22,7 +22,8 @@ from us_sim.volume.segmentation.settings import SegmentationSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-WRITTEN = [page for page in PAGES if page.name not in ("README.md", "reference.md")]
+WRITTEN = [page for page in PAGES if page.name != "reference.md"]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 GROUPS = ("bag", "evaluate", "calibrate")
 """Commands that are followed by another."""
 
@@ -46,7 +47,7 @@ def test_every_command_and_option_exists(page, capsys):
             main([*verbs, "--help"])
         assert ended.value.code == 0, words
         help_text = capsys.readouterr().out
-        for option in (word for word in words if word.startswith("--")):
+        for option in (word.strip("[]") for word in words if word.strip("[").startswith("--")):
             assert option in help_text, words
 
 
@@ -86,9 +87,17 @@ def test_every_piece_of_a_scene_can_be_read(page):
         Reader(str(page), error=SceneError).read(Scene, document)
 
 
+def test_the_readmes_script_makes_an_image():
+    (script,) = (c for c in re.findall(r"```python\n(.*?)```", README, re.S) if "rclpy" not in c)
+    names: dict = {}
+    exec(script, names)
+    assert names["image"].shape == (512, 512)
+    assert names["image"].std() > 20
+    assert names["deformation"].force[2] < 0
+
+
 def test_the_readmes_node_moves_the_probe(tmp_path):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (code,) = (c for c in re.findall(r"```python\n(.*?)```", text, re.S) if "rclpy" in c)
+    (code,) = (c for c in re.findall(r"```python\n(.*?)```", README, re.S) if "rclpy" in c)
     file = tmp_path / "my_tracker.py"
     file.write_text(code)
     bench = Bench()
