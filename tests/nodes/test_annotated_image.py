@@ -40,7 +40,7 @@ structures: [vein, artery]
 
 @dataclass
 class Shown:
-    """What an annotated image takes of a frame."""
+    """The parts of a frame that an annotated image takes."""
 
     pixels: np.ndarray
     labels: np.ndarray | None = None

@@ -332,7 +332,7 @@ def test_a_recording_is_paused_gone_along_and_ends_when_it_may(bench, tmp_path):
 
 
 def ask(bench, player, service, **fields):
-    """What one of a player's services answers."""
+    """The answer of one of a player's services."""
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", service).lower()
     kind = getattr(pytest.importorskip("rosbag2_interfaces.srv"), service)
     client = bench.peer.create_client(kind, f"/{player.get_name()}/{name}")

@@ -45,7 +45,7 @@ newer_than_jazzy = pytest.mark.skipif(
 
 
 def call(bench, service, name, **fields):
-    """What one of the recorder's services answers."""
+    """The answer of one of the recorder's services."""
     client = bench.peer.create_client(service, f"/session_recorder/{name}")
     bench.spin_until(client.service_is_ready)
     answer = client.call_async(service.Request(**fields))

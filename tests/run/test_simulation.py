@@ -1,4 +1,4 @@
-"""What a running simulation does as its control is set, without any process."""
+"""A running simulation as its control is set, without any process."""
 
 import shutil
 from dataclasses import replace

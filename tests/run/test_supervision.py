@@ -1,4 +1,4 @@
-"""What the supervisor does with nodes that end, without any process."""
+"""The supervisor of nodes that end, without any process."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -58,7 +58,7 @@ class Group:
 
 
 class Monitor:
-    """What nodes report, on paper: each at once."""
+    """Reports of nodes, on paper: each at once."""
 
     def __init__(self, group):
         self.group = group
