@@ -34,8 +34,11 @@ NO_WHEELS = (
     "python_version >= '3.14' or (sys_platform != 'darwin' and platform_machine != 'x86_64' "
     "and platform_machine != 'AMD64')"
 )
-ZENOH = "eclipse-zenoh>=1.10,<2"
-STANDALONE = [f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}", f"{ZENOH}; {NO_WHEELS}"]
+ZENOH = ["eclipse-zenoh>=1.10,<2", "xxhash>=3"]
+STANDALONE = [
+    f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}",
+    *(f"{each}; {NO_WHEELS}" for each in ZENOH),
+]
 """The middleware that stands in for ROS 2, which brings its own."""
 
 
@@ -103,10 +106,10 @@ setup(
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
         "viewer": ["nicegui>=3.6,<4"],
-        "zenoh": [ZENOH],
+        "zenoh": ZENOH,
         "test": [
             "axe-playwright-python>=0.1.4",
-            ZENOH,
+            *ZENOH,
             "fast-simplification>=0.1.7",
             "hypothesis>=6.100",
             "meshio>=5.3",

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 DOMAIN_MAY_NOT = ("rclpy", "_msgs", "_interfaces")
-STANDALONE_MAY = {"cyclonedds", "numpy", "rosbags", "yaml", "zenoh"}
+STANDALONE_MAY = {"cyclonedds", "numpy", "rosbags", "yaml", "xxhash", "zenoh"}
 
 
 @pytest.fixture(scope="module")

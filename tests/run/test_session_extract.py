@@ -14,7 +14,6 @@ from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.writer import BagWriter
-from us_sim.run.session_extract import add_comment
 
 SPACING = (0.4e-3, 0.25e-3)  # m, of columns and of rows
 
@@ -112,8 +111,9 @@ def test_a_video_lasts_as_long_as_it_was(scaled, tmp_path):
     # 20 images of one period, 19 of two, and the last.
     shown = [6 * k for k in range(40) for _ in range(2 if 20 <= k < 39 else 1)]
     assert levels == pytest.approx(shown, abs=4)
-    content = file.read_bytes()
-    assert content.count(b"pixel spacing 0.4 mm across, 0.25 mm down") == 1
+    with file.with_suffix(".csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert {(row["column_spacing_mm"], row["row_spacing_mm"]) for row in rows} == {("0.4", "0.25")}
 
 
 def test_a_pause_is_a_second_in_the_video(tmp_path):
@@ -127,13 +127,6 @@ def test_a_pause_is_a_second_in_the_video(tmp_path):
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 29 + 60
 
 
-def test_a_comment_is_only_put_where_it_is_sure_to_be_right(tmp_path):
-    for content in (b"", b"no boxes at all", struct.pack(">I4s", 8, b"moov"), bytes(64)):
-        (tmp_path / "x.mp4").write_bytes(content)
-        add_comment(tmp_path / "x.mp4", "scale")
-        assert (tmp_path / "x.mp4").read_bytes() == content
-
-
 def test_real_images_have_no_scale_that_nobody_recorded(shared_data, tmp_path):
     folder = shared_data / "ros2-jazzy/bags/probe_path_mcap"
     assert extracted(folder, tmp_path, "--images") == 0
@@ -142,6 +135,8 @@ def test_real_images_have_no_scale_that_nobody_recorded(shared_data, tmp_path):
     with Image.open(files[0]) as picture:
         assert picture.size == (64, 48)
         assert "dpi" not in picture.info
+    with (tmp_path / "camera_image_raw.csv").open() as stream:
+        assert next(csv.DictReader(stream))["row_spacing_mm"] == ""
 
 
 @pytest.mark.parametrize(

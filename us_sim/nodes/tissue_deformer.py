@@ -41,7 +41,7 @@ from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.frame_budget import PERIOD, frame_limit, shortest, usable_cores
+from us_sim.tissue.solvers.frame_budget import Pace, shortest
 from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
@@ -342,7 +342,6 @@ class TissueDeformer(SceneNode):
         if self.scene.tissue is None:
             raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
         self._live = LiveTissue(self)
-        self._waited = 0.0  # s, that the next pose will have, if poses come at 60 Hz
         mesh = self._live.tissue.model.mesh
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
@@ -352,9 +351,8 @@ class TissueDeformer(SceneNode):
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
         rest.publish(self._cloud(mesh.nodes, ALWAYS))
         if not self.lockstep:
-            self._sending = shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS)))
-            limit = self._limit_frame()
-            self.get_logger().info(f"a frame may take {1e3 * limit:.1f} ms")
+            self._pace = Pace(shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS))))
+            self.get_logger().info(f"a frame may take {1e3 * self._pace.limit:.1f} ms")
             self.create_timer(GO_ON_S, self._go_on)
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
         self._structures = StructureMarkers(self, mesh) if self.scene.structures else None
@@ -374,23 +372,18 @@ class TissueDeformer(SceneNode):
         if self.lockstep:
             self._frame(message)
             return
-        self._limit_frame()
+        self._live.tissue.limit_frames(self._pace.limit)
         self._frame(message)
-        took = 1e-9 * (time.monotonic_ns() - self.arrived)
-        self._waited = min(max(0.0, self._waited + took - PERIOD), PERIOD)
-
-    def _limit_frame(self) -> float:
-        """s, that the next frame may take: a longer one is made up for by those after it."""
-        limit = frame_limit(self._sending, usable_cores(), self._waited)
-        self._live.tissue.limit_frames(limit)
-        return limit
+        self._pace.spend(1e-9 * (time.monotonic_ns() - self.arrived))
 
     def _go_on(self) -> None:
         """Finish the last frame while no pose comes."""
         idle, self._came = self._came == 0, 0
-        self._waited = 0.0 if idle else self._waited
-        if idle and self._last is not None and not self._live.tissue.is_settled:
-            self._limit_frame()
+        if not idle:
+            return
+        self._pace.reset()
+        if self._last is not None and not self._live.tissue.is_settled:
+            self._live.tissue.limit_frames(self._pace.limit)
             self._frame(self._last, again=True)
 
     def _frame(self, message: PoseStamped, again: bool = False) -> None:

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, UsSimError, printable
-from us_sim.geometry.pose import Pose
-from us_sim.nodes.messages import pixels_from, tetrahedra_from, vectors_from
+from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagMessage
@@ -291,7 +290,7 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
     pixel = 1e6 * float(np.prod(scanner.probe.pixel_spacing))
     found = Difference("areas of vessels", tuple(f"{name} (mm²)" for name in vessels.values()))
     for stamp in sorted(chosen):
-        pose = _pose(poses[stamp])
+        pose = pose_from(poses[stamp])
         if mine[stamp].data.tobytes() == yours[stamp].data.tobytes():
             apart = (0.0,) * len(vessels)
         else:
@@ -303,11 +302,6 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
         found.apart.append(apart)
         found.identical += not any(apart)
     return found
-
-
-def _pose(message: Any) -> Pose:
-    p, q = message.pose.position, message.pose.orientation
-    return Pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
 def _stamps(bag: Bag, topic: str) -> set[int]:

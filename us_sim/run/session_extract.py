@@ -80,11 +80,11 @@ def write_wrenches(bag: Bag, folder: Path) -> Iterator[Path]:
 def write_images(
     bag: Bag, folder: Path, progress: Progress, *, pictures: bool, video: bool
 ) -> Iterator[Path]:
-    """Every topic of images as PNG files, as MP4, or both; and a CSV with the stamp of each.
+    """Every topic of images as PNG files, as MP4, or both; and a CSV with stamp and scale of each.
 
-    PNG files hold their scale as resolution, and it, stamp, topic and frame as texts; an MP4 holds
-    scale, rate and first stamp as its comment. A video has a constant rate, the usual one of the
-    images: they are shown when they were stamped, but none for longer than a second.
+    PNG files hold their scale as resolution, and it, stamp, topic and frame as texts. A video has a
+    constant rate, the usual one of the images: they are shown when they were stamped, but none for
+    longer than a second.
 
     Args:
         bag: with images of ``mono8`` or ``rgb8``.
@@ -104,7 +104,10 @@ def write_images(
         scale = _scale(bag, topic)
         stamps = _stamps(bag, topic)
         beats, rate = _beats(stamps)
-        facts = [f"topic {topic.name}", *_facts(scale)]
+        spacing = [f"{each / _MILLIMETRE:.6g}" for each in scale or ()]
+        facts = [f"topic {topic.name}"]
+        if scale:
+            facts.append("pixel spacing {} mm across, {} mm down".format(*spacing))
         film = _Film(stem.with_suffix(".mp4"), rate) if video else None
         rows = []
         for number, message in enumerate(bag.messages([topic.name])):
@@ -112,18 +115,18 @@ def write_images(
             decoded: Any = bag.deserialize(message)
             pixels = _pixels(decoded)
             name = f"{number:06d}.png"
-            rows.append((name if pictures else number, _s(stamps[number])))
+            rows.append((name if pictures else number, _s(stamps[number]), *(spacing or ("", ""))))
             if pictures:
                 told = [f"stamp {_s(stamps[number])} s", f"frame {decoded.header.frame_id}", *facts]
                 _write_png(stem / name, pixels, scale, told)
             if film is not None:
                 film.show(pixels, beats[number])
-        yield _write_csv(stem.with_suffix(".csv"), ("image", "stamp_s"), rows)
+        head = ("image", "stamp_s", "column_spacing_mm", "row_spacing_mm")
+        yield _write_csv(stem.with_suffix(".csv"), head, rows)
         if pictures:
             yield stem
         if film is not None:
-            told = [f"first stamp {_s(stamps[0])} s", f"{rate:.6g} images/s", *facts]
-            yield film.finish("; ".join(told))
+            yield film.finish()
     progress(1.0, "")
 
 
@@ -201,13 +204,6 @@ def _scale(bag: Bag, topic: BagTopic) -> tuple[float, float] | None:
     return None
 
 
-def _facts(scale: tuple[float, float] | None) -> list[str]:
-    if scale is None:
-        return []
-    across, down = (each / _MILLIMETRE for each in scale)
-    return [f"pixel spacing {across:.6g} mm across, {down:.6g} mm down"]
-
-
 def _stamps(bag: Bag, topic: BagTopic) -> list[int]:
     read = stamp_reader(bag, topic)
     if read is None:
@@ -274,44 +270,8 @@ class _Film:
         for _ in range(times):
             self._writer.write(whole)
 
-    def finish(self, comment: str) -> Path:
-        """Close the file, with a comment."""
+    def finish(self) -> Path:
+        """Close the file."""
         if self._writer is not None:
             self._writer.release()
-            add_comment(self._file, comment)
         return self._file
-
-
-def add_comment(file: Path, text: str) -> None:
-    """Put a comment among the facts of an MP4, as FFmpeg's and most players' ``comment``.
-
-    Nothing is done where FFmpeg wrote the boxes of its facts in another way than at the end of the
-    file, each within the one before: ``moov``, ``udta``, ``meta``, ``ilst``.
-    """
-    content = bytearray(file.read_bytes())
-    data = struct.pack(">4sII", b"data", 1, 0) + text.encode()  # 1: UTF-8
-    item = b"\xa9cmt" + struct.pack(">I", len(data) + 4) + data
-    item = struct.pack(">I", len(item) + 4) + item
-    begin, places = 0, []
-    for name, head in ((b"moov", 8), (b"udta", 8), (b"meta", 12), (b"ilst", 8)):
-        place = _box_at_the_end(content, begin, name)
-        if place is None:
-            return
-        places.append(place)
-        begin = place + head
-    for place in places:
-        (size,) = struct.unpack_from(">I", content, place)
-        struct.pack_into(">I", content, place, size + len(item))
-    file.write_bytes(content + item)
-
-
-def _box_at_the_end(content: bytearray, begin: int, name: bytes) -> int | None:
-    """Where the last of the boxes from there on begins, if it has that name."""
-    while begin + 8 <= len(content):
-        size, kind = struct.unpack_from(">I4s", content, begin)
-        if size < 8:
-            return None
-        if begin + size == len(content):
-            return begin if kind == name else None
-        begin += size
-    return None

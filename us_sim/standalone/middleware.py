@@ -271,8 +271,9 @@ def _import(name: str) -> None:
 
         return
     try:
+        import xxhash  # noqa: F401
         import zenoh  # noqa: F401
     except ImportError as error:
         raise MiddlewareError(
-            f"zenoh is not to be had ({error}): run pip install eclipse-zenoh"
+            f"zenoh cannot be used ({error}): run pip install eclipse-zenoh xxhash"
         ) from error

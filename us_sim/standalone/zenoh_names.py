@@ -9,8 +9,9 @@ from __future__ import annotations
 import struct
 from dataclasses import astuple, dataclass
 
+import xxhash
+
 from .middleware import EndpointQos
-from .xxh3 import xxh3_128
 
 NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
 
@@ -83,8 +84,8 @@ class Entity:
 
     @property
     def gid(self) -> bytes:
-        """Its sixteen bytes."""
-        return xxh3_128(self.token.encode())
+        """The hash of its token: 16 bytes, the lowest first."""
+        return xxhash.xxh3_128_digest(self.token.encode())[::-1]
 
     @property
     def key(self) -> str:

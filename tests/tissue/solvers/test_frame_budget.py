@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from us_sim.tissue.solvers.fem_nonlinear import Recovery
-from us_sim.tissue.solvers.frame_budget import FrameBudget, frame_limit
+from us_sim.tissue.solvers.frame_budget import LEAST, PERIOD, FrameBudget, Pace
 
 IDENTITY = np.eye(3)
 
@@ -133,8 +135,35 @@ def test_a_restart_holds_for_one_frame():
     assert [recovery.take_restart(), recovery.take_restart()] == [True, False]
 
 
-def test_a_node_with_a_core_to_itself_may_use_more_of_a_period_and_never_none():
-    assert frame_limit(0.0, 1) < frame_limit(0.0, 2) < 1 / 60
-    assert frame_limit(0.001, 2) == pytest.approx(frame_limit(0.0, 2) - 0.001)
-    assert frame_limit(0.001, 2, waited=0.004) == pytest.approx(frame_limit(0.0, 2) - 0.005)
-    assert frame_limit(1.0, 2) > 0.0
+def test_one_core_leaves_a_frame_half_a_period_and_two_more():
+    assert Pace(0.001, cores=1).limit == pytest.approx(PERIOD / 2 - 0.001)
+    assert Pace(0.0, cores=1).limit < Pace(0.0, cores=2).limit < PERIOD
+
+
+@given(st.lists(st.floats(0.0, 0.2), max_size=50), st.floats(0.0, 0.05))
+def test_no_frame_gets_more_than_the_first_nor_nothing(durations, sending):
+    pace = Pace(sending, cores=2)
+    first = pace.limit
+    for duration in durations:
+        pace.spend(duration)
+        assert LEAST <= pace.limit <= first
+    pace.reset()
+    assert pace.limit == first
+
+
+@given(st.lists(st.floats(0.0, 1.8 * PERIOD), max_size=50), st.floats(0.0, 0.002))
+def test_frames_that_overran_are_made_up_for(wanted, sending):
+    """A queue at 60 Hz, in which each other frame keeps to its limit: no pose is skipped."""
+    pace = Pace(sending, cores=2)
+    first, free = pace.limit, 0.0
+    for k, duration in enumerate(wanted):
+        waited = max(0.0, free - k * PERIOD)
+        assert pace.limit == pytest.approx(max(first - waited, LEAST))
+        if k % 2:
+            duration = min(duration, pace.limit)
+        free = max(free, k * PERIOD) + duration
+        pace.spend(duration)
+    for _ in range(20):  # whatever came before
+        last = pace.limit + sending
+        pace.spend(last)
+    assert last == pytest.approx(first + sending)

@@ -34,7 +34,7 @@ from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import find_scene, load_scene
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, TissueModel
-from us_sim.tissue.solvers.frame_budget import frame_limit, usable_cores
+from us_sim.tissue.solvers.frame_budget import Pace
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 from us_sim.volume.volume import Volume
 
@@ -453,22 +453,23 @@ class _Following:
         """Poses come at their times, and a frame begins with the newest of them.
 
         The clock is the wall's while a frame is made; waiting for a pose takes no time. A frame may
-        take as long as `frame_limit` says, as in the node, which needs 0.5 ms to send its result.
+        take as long as `Pace` says, as in the node, which needs 0.5 ms to send its result.
         """
         self._solver.reset()
         poses = self._motion.poses
         rows, latency = [], []
         now, done = 0.0, -1
+        pace = Pace(sending=0.0005)
         while True:
             newest = int(now * RATE + 1e-9)
             if newest <= done:
                 newest, now = done + 1, (done + 1) / RATE
             if newest >= len(poses):
                 break
-            waited = max(0.0, now - newest / RATE)
-            self._solver.frame_limit = frame_limit(0.0005, usable_cores(), waited)
+            self._solver.frame_limit = pace.limit
             row = self._frame(newest)
             now += 1e-3 * row[-1]
+            pace.spend(1e-3 * row[-1])
             done = newest
             if newest >= self._motion.begins:
                 rows.append(row)

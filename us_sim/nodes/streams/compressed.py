@@ -11,9 +11,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 
+from us_sim.nodes.messages import colour_pixels_from, pixels_from
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import COMPRESSED, CompressedSettings
@@ -75,10 +75,10 @@ class Compressed:
 def compressed(image: Image, settings: CompressedSettings) -> CompressedImage:
     """A ``mono8`` or ``rgb8`` image, encoded; the format says how, as the plugin says it."""
     is_colour = image.encoding == "rgb8"
-    shape = (image.height, image.width, 3) if is_colour else (image.height, image.width)
-    pixels: NDArray[np.uint8] = np.frombuffer(image.data, np.uint8).reshape(shape)
     if is_colour:
-        pixels = np.ascontiguousarray(pixels[..., ::-1])
+        pixels = np.ascontiguousarray(colour_pixels_from(image)[..., ::-1])
+    else:
+        pixels = pixels_from(image)
     target = "bgr8" if is_colour else "mono8"
     options: list[Any]
     if settings.format == "png":

@@ -1,8 +1,10 @@
 """The time and the iterations that a frame of ``fem_nonlinear`` may take.
 
->>> from us_sim.tissue.solvers.frame_budget import frame_limit
->>> f"{1e3 * frame_limit(sending=0.0005, cores=2):.1f} ms"
-'14.0 ms'
+>>> from us_sim.tissue.solvers.frame_budget import Pace
+>>> pace = Pace(sending=0.0005, cores=2)
+>>> pace.spend(0.02)
+>>> f"{1e3 * pace.limit:.1f} ms"
+'10.7 ms'
 """
 
 from __future__ import annotations
@@ -119,22 +121,41 @@ class FrameBudget:
 
 PERIOD = 1 / 60
 """s, from pose to pose."""
+LEAST = 0.002
+"""s, that every frame may take."""
 
 
-def frame_limit(sending: float, cores: int, waited: float = 0.0) -> float:
-    """s, that a frame may take, so that poses at 60 Hz are kept up with.
+class Pace:
+    """The time limit of each frame, so that poses at 60 Hz are kept up with.
+
+    What a frame takes beyond a period is subtracted from the limits of those after it.
 
     Args:
-        sending: s, that it takes to send its result.
-        cores: that the nodes of the simulation share.
-        waited: s, that its pose has, since an earlier frame took longer.
+        sending: s, that it takes to send a frame's result.
+        cores: that the nodes of the simulation share; None are those this process may run on.
     """
-    # Of a period one node may use so much; the rest is for what else its core does.
-    share = 0.87 if cores > 1 else 0.5
-    return max(share * PERIOD - sending - waited, 0.002)
+
+    def __init__(self, sending: float, cores: int | None = None) -> None:
+        # Of a period one node may use so much; the rest is for what else its core does.
+        share = 0.87 if (cores or _usable_cores()) > 1 else 0.5
+        self._undelayed = share * PERIOD - sending
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin with a pose that has not waited."""
+        self._waited = 0.0  # s, from the coming of a pose to the begin of its frame
+
+    @property
+    def limit(self) -> float:
+        """s, that the next frame may take."""
+        return max(self._undelayed - self._waited, LEAST)
+
+    def spend(self, duration: float) -> None:
+        """Count a frame that took so long (s), with sending it."""
+        self._waited = min(max(0.0, self._waited + duration - PERIOD), PERIOD)
 
 
-def usable_cores() -> int:
+def _usable_cores() -> int:
     """The cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
