@@ -13,6 +13,7 @@ NODES = [
     "nodes.openigtlink_bridge",
     "nodes.path_player",
     "nodes.probe_tracker",
+    "nodes.scorer",
     "nodes.session_player",
     "nodes.session_recorder",
     "nodes.skin_deformer",

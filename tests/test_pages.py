@@ -16,6 +16,7 @@ from us_sim.errors import SceneError
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.scene.reading import merged
 from us_sim.scene.scene import Scene
+from us_sim.scoring.exercise import Exercise
 from us_sim.settings.reading import Reader
 from us_sim.settings.tables import anchor
 from us_sim.volume.segmentation.settings import SegmentationSettings
@@ -72,6 +73,9 @@ def test_every_piece_of_a_scene_can_be_read(page):
     arm = yaml.safe_load((ROOT / "config/scenes/upper_arm.yaml").read_text(encoding="utf-8"))
     for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
         given = yaml.safe_load(block)
+        if "task" in given:
+            Reader(str(page)).read(Exercise, given)  # and no scene
+            continue
         base = arm if given.pop("based_on", None) or given.get("case") else bare
         if {"winkler", "udp"} & {str(word) for word in re.findall(r"\w+", block)}:
             continue  # what a package of others adds; see test_contributing

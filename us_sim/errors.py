@@ -104,3 +104,7 @@ class CalibrationError(UsSimError):
 
 class StiffnessError(UsSimError):
     """A recorded press is no press, or cannot determine how stiff tissue is."""
+
+
+class ScoreError(UsSimError):
+    """A recording cannot be scored as it was asked."""

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from us_sim.geometry.pose import Pose
-from us_sim.run.session_summary import LumenAreas, Session
+from us_sim.run.session_summary import Session
+from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
@@ -44,7 +45,7 @@ def measured(monkeypatch, poses, nodes):
     )
     scanner = BMode(cone(), PROBE)
     scanner.carry(BLOCK.nodes, BLOCK.tetrahedra)
-    monkeypatch.setattr(Session, "scanner_of_vessels", lambda *_: ({"vein": 1}, scanner))
+    monkeypatch.setattr(Session, "scanner_of_vessels", lambda *_: ({"vein": (1,)}, scanner))
     areas = session.lumen_areas(None, 100)
     assert isinstance(areas, LumenAreas)
     return areas

@@ -11,9 +11,10 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.hand_motion import hand_motion, shipped_hand_path
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.run.contact_sheet import _moments, _place, colour_pictures, strain_pictures
-from us_sim.run.session_summary import LumenAreas, Session
+from us_sim.run.session_summary import Session
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
+from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.flow.doppler import ColourDoppler
 
 

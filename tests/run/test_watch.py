@@ -89,12 +89,12 @@ def test_time_in_which_nobody_looked_is_no_silence(machine):
     assert told
 
 
-def test_the_first_report_has_five_minutes(machine):
+def test_the_first_report_has_a_quarter_of_an_hour(machine):
     machine.reports = 0
     fresh = Machine()
     fresh.hung()
-    assert fresh.pass_time(299.0, step=0.5) == (299.0, "")
-    assert fresh.pass_time(2.0, step=0.5)[1] == "has not reported for 300 s"
+    assert fresh.pass_time(899.0, step=0.5) == (899.0, "")
+    assert fresh.pass_time(2.0, step=0.5)[1] == "has not reported for 900 s"
 
 
 def test_another_process_of_the_node_starts_anew(machine):

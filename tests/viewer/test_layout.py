@@ -17,7 +17,7 @@ from us_sim.viewer.stream import Simulator
 
 PHONE, TURNED = (390, 844), (844, 390)
 TWICE, FOUR_TIMES = (640, 360), (320, 180)  # what a window of 1280 × 720 holds when magnified
-TABS = ("Image", "Tissue", "Cases", "Session", "Status")
+TABS = ("Image", "Tissue", "Cases", "Session", "Exercise", "Status")
 NODE = "slice_interpolator"
 PARAMETERS = (
     Parameter(NODE, "depth", Kind.NUMBER, 0.04, unit="mm", size=1e-3, limits=(0.005, 0.4)),

@@ -28,6 +28,7 @@ _COMMANDS = (
     ("render", "simulation", "one image for every pose of a path, repeatably"),
     ("play", "simulation", "play a bag's probe path into a running simulation"),
     ("bag", "bag", "look at recordings"),
+    ("score", "score", "score a recorded scan: motion, force, areas"),
     ("param", "param", "parameters of running nodes, as ros2 param lists, gets and sets them"),
     ("cases", "volumes", "list cases: what they are of, and how to scan them"),
     (

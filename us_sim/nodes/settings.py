@@ -16,6 +16,7 @@ from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.topics import TOPICS
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
+from us_sim.scoring.metrics import ScoreSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting
@@ -503,12 +504,23 @@ class OpenIGTLinkBridgeSettings(Settings):
     )
 
 
+@dataclass(frozen=True)
+class ScorerSettings(Settings):
+    """Of ``scorer``."""
+
+    exercise: str | None = setting(
+        description="file of an exercise, or name of an installed one, in place of the scene's",
+        default=None,
+    )
+
+
 NODES: dict[str, tuple[type[Settings], ...]] = {
     "probe_tracker": (SceneNodeSettings, ProbeTrackerSettings),
     "tissue_deformer": (SceneNodeSettings, TissueDeformerSettings, StructureMarkersSettings),
     "skin_deformer": (SceneNodeSettings, SkinDeformerSettings),
     "slice_interpolator": (SceneNodeSettings, PoseAgeSettings, AnnotatedImageSettings, Imaging),
     "haptic_renderer": (SceneNodeSettings,),
+    "scorer": (SceneNodeSettings, ScorerSettings, ScoreSettings),
     "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),
     "composed": (ComposedSettings,),
     "path_player": (PathPlayerSettings, AwaitedSettings),

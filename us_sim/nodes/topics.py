@@ -81,8 +81,8 @@ haptic/wrench: geometry_msgs/WrenchStamped
     haptic_renderer | what the hand shall feel, `tracker.haptic.rate` times a second
 probe/pose: geometry_msgs/PoseStamped
     probe_tracker -> viewer, tissue_deformer, skin_deformer, slice_interpolator, openigtlink_bridge,
-    volume_reconstructor | the probe in `patient`: registered, checked, filtered; once for each
-    measurement
+    volume_reconstructor, scorer | the probe in `patient`: registered, checked, filtered; once for
+    each measurement
 probe/status: diagnostic_msgs/DiagnosticStatus [latched]
     probe_tracker -> viewer | `waiting`, `tracked`, `coasting` or `lost`, each time that changes;
     then also where the probe was last
@@ -90,8 +90,8 @@ probe/marker: visualization_msgs/MarkerArray [latched]
     probe_tracker -> viewer | a transducer as the scene's probe is shaped, and the outline of its
     image, in frame `probe`
 probe/wrench: geometry_msgs/WrenchStamped
-    tissue_deformer -> viewer | the tissue's force and torque on the probe, in frame `probe`; none
-    for a pose at which the tissue's forces are not in balance
+    tissue_deformer -> viewer, scorer | the tissue's force and torque on the probe, in frame
+    `probe`; none for a pose at which the tissue's forces are not in balance
 tissue/nodes: sensor_msgs/PointCloud2
     tissue_deformer -> slice_interpolator, viewer | where the deformed mesh's nodes are, in mesh
     order
@@ -122,8 +122,8 @@ ultrasound/image_annotated: sensor_msgs/Image [on_demand]
 ultrasound/image_annotated/compressed: sensor_msgs/CompressedImage [on_demand]
     slice_interpolator | likewise
 ultrasound/labels: sensor_msgs/Image [on_demand]
-    slice_interpolator -> image_writer | `mono8`: the number of the volume's label at each pixel of
-    the image, 0 for nothing
+    slice_interpolator -> image_writer, scorer | `mono8`: the number of the volume's label at each
+    pixel of the image, 0 for nothing
 ultrasound/displacement: sensor_msgs/Image [on_demand]
     slice_interpolator -> image_writer | `32FC2`: how far each pixel's tissue has moved since rest
     along +x and +z of `probe`, m; NaN where there is no tissue
@@ -147,8 +147,11 @@ ultrasound/m_mode: sensor_msgs/Image [on_demand]
 ultrasound/image_to_probe: std_msgs/Float64MultiArray [latched]
     slice_interpolator -> openigtlink_bridge, volume_reconstructor, viewer | 4 × 4, from (column,
     row, 0, 1) of a pixel to metres in frame `probe`
+score: diagnostic_msgs/DiagnosticArray [latched]
+    scorer -> viewer | once a second: metrics so far as values of the first status; one of each step
+    of the exercise follows, OK when it is done
 session/marker: std_msgs/String
-    drivers | a text that marks a moment of the recording
+    viewer | a text that marks a moment of the recording; of a page that freezes its image `frozen`
 session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
     session_control -> viewer | scenes and cases that can be loaded: name, description, what loads
     it, and more
@@ -165,10 +168,10 @@ events/rosbag2_messages_lost: rosbag2_interfaces/MessagesLostEvent
     has not
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
-    openigtlink_bridge, composed, path_player, session_player, session_recorder, camera_driver,
-    space_mouse_driver, session_monitor, volume_reconstructor, session_control, viewer ->
-    session_monitor, viewer | once a second: state, rate, latency, what was dropped or refused; of
-    `session_monitor` which nodes ended or hung
+    scorer, openigtlink_bridge, composed, path_player, session_player, session_recorder,
+    camera_driver, space_mouse_driver, session_monitor, volume_reconstructor, session_control,
+    viewer -> session_monitor, viewer | once a second: state, rate, latency, what was dropped or
+    refused; of `session_monitor` which nodes ended or hung
 """
 
 TOPICS = tuple(_topic(entry) for entry in re.split(r"\n(?=\S)", _TABLE.strip()))

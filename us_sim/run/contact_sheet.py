@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from us_sim.errors import BagError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.run.session_summary import LumenAreas, Session
+from us_sim.run.session_summary import Session
 from us_sim.scene.building import blood_of, colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
+from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.annotation import Annotation
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.drawing.overlay import Overlay
@@ -282,9 +283,8 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
         seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
         if scanner is not None and seen:  # through air nothing is
             frame = scanner.frame(session.poses[stamp], session.nodes[stamp])
-            draw_outlines(
-                axes, frame, {numbers[name]: _colour(scene, name) for name in numbers}, extent
-            )
+            lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
+            draw_outlines(axes, frame, lumens, extent)
         where = _place(session.poses[stamp])
         axes.set_title(f"{title}: {_times([stamp], first)}, {where}", fontsize=11)
         axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)

@@ -20,8 +20,8 @@ from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagMessage
 from us_sim.run.resimulation import scene_within
-from us_sim.run.session_summary import VESSELS
 from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scoring.lumen import VESSELS
 from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.material import kind_of
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
@@ -20,44 +19,14 @@ from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.camera_video import PathVideo
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
+from us_sim.scoring.lumen import LumenAreas, LumenMeter, lumens_of
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.probe.probe import Probe
-from us_sim.tissue.elasticity.material import kind_of
 from us_sim.tracking.camera.body_pose import rotation_angle
 
-VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
 PLAYED = ("/tracker/pose", "/camera/camera_info")  # what comes in, of a path and of a camera
 STAMPED = (*PLAYED, "/probe/pose", "/tissue/nodes", "/skin/nodes", "/ultrasound/image")
 OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
-_HARDLY_CUT = 0.1
-"""Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
-_STEEPEST = 0.2
-"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 MILLISECOND = 1e6  # in nanoseconds
-
-
-@dataclass(frozen=True)
-class LumenAreas:
-    """Cross-sections of vessels in the image plane."""
-
-    time: NDArray[np.float64]  # (K,) s since the first pose
-    depth: NDArray[np.float64]  # (K,) m, how deep the probe is pressed below the skin
-    area: dict[str, NDArray[np.float64]]  # (K,) m² by vessel
-    # (K,) m² by vessel, in the same planes of the tissue at rest; NaN where it is hardly cut
-    at_rest: dict[str, NDArray[np.float64]]
-
-    @property
-    def pressed(self) -> int:
-        """The first sample within 1 % of the deepest press."""
-        return int(np.argmax(self.depth >= 0.99 * self.depth.max()))
-
-    def fraction(self, vessel: str) -> NDArray[np.float64]:
-        """(K,) area over that of the same plane at rest; NaN where there is nothing to compare."""
-        return np.asarray(self.area[vessel] / self.at_rest[vessel])
-
-    def change(self, vessel: str, sample: int) -> float:
-        """Relative change of the area from rest; -0.5 is half closed."""
-        return float(self.fraction(vessel)[sample] - 1.0)
 
 
 @dataclass(frozen=True)
@@ -111,65 +80,45 @@ class Session:
     def lumen_areas(
         self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
     ) -> LumenAreas | None:
-        """Vessel cross-sections at up to ``samples`` images; None without labels or tissue.
+        """Vessel cross-sections at up to ``samples`` images; None without labels or tissue."""
+        meter = self.measured_lumens(scene, samples, progress)
+        return meter.areas() if meter is not None else None
 
-        Where the probe slides or tilts it sees other cross-sections, so each is compared with that
-        of the same plane at rest, from the skin on. A vessel that no image cuts has none; of one
-        that reaches the image's edge, now or at rest, nobody knows how large it is.
+    def measured_lumens(
+        self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
+    ) -> LumenMeter | None:
+        """Likewise, with the poses of the images.
+
+        Raises:
+            BagError: no image has its pose and nodes.
         """
         numbers, scanner = self.scanner_of_vessels(scene)
         if scanner is None:
             return None
-        vessels = list(numbers)
         stamps = [stamp for stamp in self.images if stamp in self.nodes and stamp in self.poses]
         if not stamps:
             raise BagError(
                 "the session holds no image with its pose and nodes, so nothing can be measured: "
                 "look into nodes.log"
             )
-        picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int)
-        chosen = [stamps[i] for i in picked]
-        pixel = float(np.prod(scanner.probe.pixel_spacing))
-        edge = _edge(scanner.probe)
-        found = np.empty((2, len(vessels), len(chosen)))  # m², now and at rest
-        whole = np.ones(found.shape[1:], dtype=bool)  # in the image
-        for k, stamp in enumerate(chosen):
-            pose = self.poses[stamp]
-            seen = scanner.labels(pose, self.nodes[stamp]), scanner.labels(_lifted(pose), self.rest)
-            for i, labels in enumerate(seen):
-                found[i, :, k] = [pixel * (labels == numbers[name]).sum() for name in vessels]
-                whole[:, k] &= [not (labels[edge] == numbers[name]).any() for name in vessels]
-            if progress is not None:
-                progress((k + 1) / len(chosen))
-        now, rest = found
-        for k in [*range(1, len(chosen)), *range(len(chosen) - 2, -1, -1)]:
-            for beside in {max(k - 1, 0), min(k + 1, len(chosen) - 1)}:
-                whole[:, k] &= whole[:, beside] | (now[:, k] > 0.0)  # pushed out, maybe not closed
-        hardly = rest <= _HARDLY_CUT * rest.max(axis=1, keepdims=True)
-        rest = np.where(hardly | ~whole, np.nan, rest)
-        cut = [i for i in range(len(vessels)) if np.isfinite(rest[i]).any()]
-        if not cut:
-            return None
         first = min(self.poses)
-        return LumenAreas(
-            time=np.array([(stamp - first) * 1e-9 for stamp in chosen]),
-            depth=np.array([self.poses[stamp].position[2] for stamp in chosen]),
-            area={vessels[i]: now[i] for i in cut},
-            at_rest={vessels[i]: rest[i] for i in cut},
-        )
+        meter = LumenMeter(numbers, scanner, self.rest)
+        picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int).tolist()
+        for k, at in enumerate(picked, 1):
+            stamp = stamps[at]
+            pose = self.poses[stamp]
+            meter.add((stamp - first) * 1e-9, pose, scanner.labels(pose, self.nodes[stamp]))
+            if progress is not None:
+                progress(k / len(picked))
+        return meter
 
-    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, int], BMode | None]:
-        """Labels of vessels by their names, veins first, and the scanner that finds them.
+    def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, tuple[int, ...]], BMode | None]:
+        """Labels of vessels by their names, see `lumens_of`, and the scanner that finds them.
 
         There is no scanner without labels of vessels, or without tissue.
         """
         volume = volume_of(scene)
-        numbers = {
-            name: label
-            for kind in VESSELS
-            for label, name in volume.label_names.items()
-            if kind_of(name) == kind
-        }
+        numbers = lumens_of(volume.label_names)
         if volume.labels is None or not numbers or self.rest is None or self.tetrahedra is None:
             return {}, None
         scanner = scanner_of(scene, volume)
@@ -214,18 +163,6 @@ class Session:
             topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
             for topic, count in said.items()
         }
-
-
-def _edge(probe: Probe) -> NDArray[np.bool_]:
-    """(rows, columns) the last pixels of an image that its beams reach."""
-    reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
-    return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
-
-
-def _lifted(pose: Pose) -> Pose:
-    """Where the probe would be in the same plane if it did not press."""
-    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
-    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
 def _areas(areas: LumenAreas) -> dict[str, Any]:

@@ -52,7 +52,7 @@ STOPPED_S = 0.5  # for which a process may be stopped
 BUSY_SHARE = 0.5
 """Of the silence, in which a node that is busy has worked or waited for a processor."""
 BUSY_FACTOR = 6.0  # how many times as long a busy node may be silent: it may be compiling
-START_LIMIT_S = 300.0  # for the first report: the first run compiles
+START_LIMIT_S = 900.0  # for the first report: the first run compiles, minutes where cores are busy
 
 
 @dataclass

@@ -206,6 +206,11 @@ def check_files(scene: Scene) -> list[str]:
     if tracker.source.name == "path" and tracker.file:
         path_of(scene, Path(tracker.file))
         checked.append("tracker.file")
+    if scene.exercise:
+        from us_sim.scoring.exercise import read_exercise
+
+        read_exercise(scene.exercise)
+        checked.append("exercise")
     if scene.path:
         from us_sim.recording.path import read_path
 

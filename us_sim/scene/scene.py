@@ -238,6 +238,10 @@ class Scene(Settings):
         description="bag with a probe path, for the demo", default=None, file=True
     )
     description: str = setting(description="for a person", default="")
+    exercise: str | None = setting(
+        description="file of an exercise, or name of an installed one, which `scorer` follows",
+        default=None,
+    )
     case: str | None = setting(
         description="case, or its name, from which all is taken that the scene does not say",
         default=None,
@@ -265,6 +269,7 @@ class Scene(Settings):
             _part("skin_deformer", self.skin, "skin", "no membrane is computed"),
             Part("slice_interpolator", True, self._imaged()),
             *self._felt(),
+            *([Part("scorer", True, f"the exercise is {self.exercise}")] if self.exercise else []),
         ]
 
     @property

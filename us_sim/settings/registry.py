@@ -4,7 +4,14 @@ One line an option: its name and where its class is. A class is imported when it
 before. Packages of others add solvers and trackers under the entry point groups named here.
 """
 
-from us_sim.errors import CalibrationError, ProbeError, SolverError, TrackingError, VolumeError
+from us_sim.errors import (
+    CalibrationError,
+    ProbeError,
+    ScoreError,
+    SolverError,
+    TrackingError,
+    VolumeError,
+)
 from us_sim.settings.choice import Choice, Option
 
 SOLVERS = Choice(
@@ -28,8 +35,13 @@ SLICERS = Choice(
     per_pixel="us_sim.slicing.cutting.per_pixel:PerPixel",
 )
 
+_PHANTOMS = "us_sim.volume.phantom.phantom"
 PHANTOMS = Choice(
-    "phantom", key="phantom", error=VolumeError, upper_arm="us_sim.volume.phantom.phantom:upper_arm"
+    "phantom",
+    key="phantom",
+    error=VolumeError,
+    upper_arm=f"{_PHANTOMS}:upper_arm",
+    thrombosed_arm=f"{_PHANTOMS}:thrombosed_arm",
 )
 
 _SEGMENTATION = "us_sim.volume.segmentation"
@@ -103,6 +115,19 @@ TRACKERS = Choice(
         "us_sim.tracking.settings:OpenIGTLinkSettings",
     ),
     path=Option(f"{_INPUTS}.path_input:PathInput", _NOTHING),
+)
+
+_EXERCISES = "us_sim.scoring.exercise"
+EXERCISES = Choice(
+    "task of an exercise",
+    key="kind",
+    error=ScoreError,
+    needs=True,
+    compression=f"{_EXERCISES}:Compression",
+    keep_force=f"{_EXERCISES}:KeepForce",
+    centre=f"{_EXERCISES}:Centre",
+    follow=f"{_EXERCISES}:Follow",
+    view=f"{_EXERCISES}:View",
 )
 
 _EVALUATION = "us_sim.evaluation"

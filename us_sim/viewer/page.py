@@ -20,6 +20,7 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
+from us_sim.viewer.panels.exercise import build_exercise
 from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import build_cases, build_session
 from us_sim.viewer.parameters import Kind
@@ -279,6 +280,7 @@ PANELS = [
     ("Tissue", "layers", "Method, materials, skin and tracker", build_tissue),
     ("Cases", "collections", "Scenes and cases to load", build_cases),
     ("Session", "radio_button_checked", "Record, and replay recordings", build_session),
+    ("Exercise", "school", "A task, what is done of it, and the score", build_exercise),
     ("Status", "monitor_heart", "How every node is, and plots of the last minute", _status),
 ]
 """Name, icon of Material's, title, and the function that fills the tab."""
@@ -308,7 +310,7 @@ def build_page(simulator: Simulator) -> None:
         with _section("us-drawer", "Panels") as drawer:
             _panels(simulator)
     drawer.set_visibility(False)
-    button.props["title"] = "Panels: image, tissue, cases, session, status"
+    button.props["title"] = "Panels: image, tissue, cases, session, exercise, status"
     button.props["aria-label"] = "Panels"
     button.props["aria-expanded"] = "false"
 

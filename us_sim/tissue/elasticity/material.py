@@ -15,6 +15,7 @@ factor of two and more. Sources, by kind:
 - bone and cartilage: stiff enough to keep their shape beside the others, and no stiffer, since
   that only costs solvers time.
 - nerve: 40 kPa, of the same scene. fluid: of a cyst, a bladder: hardly resists, and is kept in.
+- thrombus: of nobody; so stiff that a vein stays open where it is.
 
 >>> from us_sim.tissue.elasticity.material import KINDS, kind_of
 >>> kind_of("Left hepatic vein"), KINDS["liver"].young_modulus
@@ -91,6 +92,7 @@ KINDS: Mapping[str, Material] = {
     "nerve": _soft(40e3),
     "artery": _soft(200e3),
     "vein": Material(5e3, 0.1, _BLOOD, _VENOUS),
+    "thrombus": _soft(50e3),
     "fluid": Material(1e3, 0.49, 1010.0),
     "cartilage": Material(500e3, 0.45, 1100.0),
     "bone": Material(10e6, 0.3, 1900.0),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,11 @@ bytes."""
 
 
 def upper_arm(
-    seed: int = 1, voxel_size: float = 0.3e-3, progress: Progress | None = None
+    seed: int = 1,
+    voxel_size: float = 0.3e-3,
+    progress: Progress | None = None,
+    *,
+    thrombosed: bool = False,
 ) -> Volume:
     """A labelled upper arm with the skin at z = 0: its echoes over 60 dB, without any loss.
 
@@ -41,6 +46,7 @@ def upper_arm(
         seed: not negative.
         voxel_size: m, 0.2 mm (1.1 GB while it is made) to 5 mm.
         progress: told the fraction done and the work in progress.
+        thrombosed: a thrombus fills a piece of the vein.
 
     Raises:
         VolumeError: the seed or the voxel size is out of range.
@@ -48,7 +54,6 @@ def upper_arm(
     # A phantom that is kept needs none of it, and a node should start quickly.
     from us_sim.volume.phantom.upper_arm import (
         UPPER_ARM_BLOCK,
-        UPPER_ARM_LABELS,
         PointSpread,
         UpperArm,
         echo_envelope,
@@ -73,7 +78,7 @@ def upper_arm(
     )
     inside = tuple(slice(m, m + n) for m, n in zip(margin, shape, strict=True))
 
-    arm = UpperArm(seed)
+    arm = UpperArm(seed, thrombosed)
     labels = np.empty((len(x), len(y), len(z)), dtype=np.uint8)
     diffuse = np.empty(labels.shape, dtype=np.float32)
     specular = np.empty(labels.shape, dtype=np.float32)
@@ -96,10 +101,13 @@ def upper_arm(
         log_compress(np.ascontiguousarray(envelope[inside])),
         placement,
         labels[inside],
-        {number: name for name, number in UPPER_ARM_LABELS.items()},
+        {number: name for name, number in arm.labels.items()},
     )
     report(1.0, "done")
     return volume
+
+
+thrombosed_arm = partial(upper_arm, thrombosed=True)
 
 
 def cached_phantom(

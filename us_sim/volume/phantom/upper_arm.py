@@ -244,6 +244,8 @@ _MARGIN = np.array([[-5e-3], [5e-3]])
 """Texture continues this far beyond the block, m: echoes at its edges come from there too."""
 
 UPPER_ARM_LABELS = {"skin": 1, "fat": 2, "muscle": 3, "bone": 4, "artery": 5, "vein": 6, "nerve": 7}
+THROMBUS = {"vein thrombus": 8}
+_THROMBUS_ENDS = (-9e-3, 9e-3)  # m along y
 
 _SIDE_LOBES = -27.0  # dB
 _BLOOD = -60.0  # dB, all but free of echoes
@@ -271,7 +273,7 @@ class ArmSection:
 
     def fill(self, label: str, where: NDArray[np.bool_], echo: NDArray[np.float64]) -> None:
         """Put a tissue with its own scatterers where another was."""
-        self.labels[where] = UPPER_ARM_LABELS[label]
+        self.labels[where] = (UPPER_ARM_LABELS | THROMBUS)[label]
         self.diffuse[where] = echo[where]
         self.specular[where] = 0.0
 
@@ -282,9 +284,14 @@ class ArmSection:
 
 
 class UpperArm:
-    """An arm from a seed: it moves structures by half a millimetre and redraws every texture."""
+    """An arm from a seed: it moves structures by half a millimetre and redraws every texture.
 
-    def __init__(self, seed: int) -> None:
+    Args:
+        thrombosed: a thrombus fills a piece of the vein.
+    """
+
+    def __init__(self, seed: int, thrombosed: bool = False) -> None:
+        self.labels = UPPER_ARM_LABELS | (THROMBUS if thrombosed else {})
         random = np.random.Generator(np.random.PCG64(seed))
 
         def tube(x: float, z: float, radius_x: float, radius_z: float, swing: float) -> Tube:
@@ -383,6 +390,9 @@ class UpperArm:
         np.maximum(section.diffuse, sheath, out=section.diffuse)
         for label, distance in zip(("artery", "vein"), walls, strict=False):
             section.fill(label, distance < 0.0, np.full(distance.shape, _echo(_BLOOD)))
+        if self.labels.keys() & THROMBUS and _THROMBUS_ENDS[0] < y < _THROMBUS_ENDS[1]:
+            clot = _echo(-39.0 + 3.0 * self._cloud.plane(x, y, z))
+            section.fill("vein thrombus", walls[1] < 0.0, clot)
         self._nerve(section, walls[2])
 
     def _nerve(self, section: ArmSection, distance: NDArray[np.float64]) -> None:

@@ -2,6 +2,7 @@
 
 import { events } from "../events.js";
 import { drawKept, hasImage, isOfOtherScene, onImage, setLive } from "../image.js";
+import { stream } from "../stream.js";
 import { Cine } from "./cine.js";
 
 const cine = new Cine();
@@ -46,6 +47,7 @@ export const freeze = {
     number = Math.max(0, cine.frames.length - 1);
     setLive(!isFrozen);
     events.tell("image-frozen", isFrozen);
+    if (isFrozen) stream.send({ frozen: true });
     tell();
   },
 

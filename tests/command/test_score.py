@@ -1,0 +1,156 @@
+"""The command `score`: sessions whose values are known, its files, and what is left out."""
+
+import csv
+
+import numpy as np
+import pytest
+from session_files import EPOCH, PERIOD, TYPES, T, cloud, image, pose, press, write
+
+from us_sim.command.main import main
+from us_sim.recording.schemas import jazzy_definitions
+from us_sim.recording.writer import BagWriter
+from us_sim.run.session_score import read_scan
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.reading import load_scene
+
+
+def table(folder):
+    with (folder / "score.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    return {(row["MetricName"], row["MetricRoles"]): row["MetricValue"] for row in rows}
+
+
+def test_a_press_of_8_newtons_for_two_seconds(tmp_path, capsys):
+    session = write(tmp_path / "s.mcap", press(120))
+    assert main(["score", str(session), "--out", str(tmp_path), "--force-limit", "4 N"]) == 0
+    found = {name: float(value) for (name, _), value in table(tmp_path).items()}
+    turn = np.pi * np.arange(120) / 120
+    seconds = 119 * PERIOD * 1e-9
+    assert found["Elapsed Time"] == pytest.approx(seconds, rel=1e-5)
+    assert found["Path Length"] == pytest.approx(8 * np.abs(np.diff(np.sin(turn))).sum(), rel=1e-5)
+    assert found["Peak Probe Force"] == pytest.approx(8.0)
+    assert found["Force Impulse"] == pytest.approx(8 * 2 * 2 / np.pi, rel=1e-3)
+    assert found["Time above 4 N"] == pytest.approx(2 * 2 / 3, abs=0.04)  # sin > 1/2
+    page = (tmp_path / "score.md").read_text()
+    assert "score.png" in page
+    assert (tmp_path / "score.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out
+    assert "left out: areas" in said
+    assert "Area" not in "".join(name for name, _ in table(tmp_path))
+
+
+def test_without_force_it_is_said_and_not_zero(tmp_path, capsys):
+    messages = [each for each in press(60) if each[0] != "/probe/wrench"]
+    session = tmp_path / "s.mcap"
+    with BagWriter(session, sidecar=False) as bag:
+        bag.add_topic("/probe/pose", TYPES["/probe/pose"])
+        for topic, data, logged, sent, number in messages:
+            if topic == "/probe/pose":
+                bag.write(topic, data, logged, sent, number)
+    assert main(["score", str(session), "--out", str(tmp_path)]) == 0
+    assert "left out: force" in capsys.readouterr().out
+    assert not [n for n, _ in table(tmp_path) if "Force" in n or "Contact" in n or " N" in n]
+
+
+def test_an_exercise_is_told_step_by_step(tmp_path, capsys):
+    session = write(tmp_path / "s.mcap", press(120))
+    file = tmp_path / "e.yaml"
+    file.write_text(
+        "name: Press\ntask: {kind: keep_force, force: 6 N, tolerance: 2.1 N, duration: 1 s}\n"
+    )
+    assert main(["score", str(session), "--exercise", str(file), "--out", str(tmp_path)]) == 0
+    assert "passed: 1 of 1 done" in capsys.readouterr().out
+    assert "passed: 1 of 1 done" in (tmp_path / "score.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--exercise", "compresion"], "compression"),
+        (["--exercise", "compression"], "without a scene"),
+        (["--topic", "/ultrasound/image"], "/ultrasound/image"),
+        (["--wrench", "force"], "force"),
+        (["--force-limit", "2 kg"], "--force-limit"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, capsys, options, said):
+    session = write(tmp_path / "s.mcap", press(20))
+    assert main(["score", str(session), *options]) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error
+
+
+def test_a_file_that_is_no_bag_and_a_score_that_is_there_are_refused(tmp_path, capsys):
+    (tmp_path / "x.mcap").write_text("no bag")
+    assert main(["score", str(tmp_path / "x.mcap")]) == 1
+    assert "x.mcap" in capsys.readouterr().err
+    session = write(tmp_path / "s.mcap", press(20))
+    (tmp_path / "score.md").write_text("mine")
+    assert main(["score", str(session), "--out", str(tmp_path)]) == 1
+    assert (tmp_path / "score.md").read_text() == "mine"
+
+
+MARKS = ("frozen", "needle in", "frozen")
+
+
+@pytest.fixture(scope="module")
+def squashed(small_scene, tmp_path_factory):
+    """A session along the vein whose tissue is pressed to half its height for a while."""
+    model = tissue_model_of(load_scene(small_scene), volume_of(load_scene(small_scene)))
+    rest, half = model.mesh.nodes, model.mesh.nodes * [1.0, 1.0, 0.5]
+    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    tetrahedra = T["std_msgs/msg/Int32MultiArray"](
+        layout=layout, data=model.mesh.tetrahedra.astype(np.int32).ravel()
+    )
+    store = jazzy_definitions()
+    mesh = store.serialize_cdr(tetrahedra, "std_msgs/msg/Int32MultiArray", little_endian=True)
+    file = tmp_path_factory.mktemp("squashed") / "s.mcap"
+    latched = {
+        "/tissue/rest": ("sensor_msgs/msg/PointCloud2", cloud(EPOCH, rest)),
+        "/tissue/tetrahedra": ("std_msgs/msg/Int32MultiArray", mesh),
+    }
+    with BagWriter(file, sidecar=False) as bag:
+        for topic, kind in {**TYPES, "/session/marker": "std_msgs/msg/String"}.items():
+            bag.add_topic(topic, kind)
+        bag.attach("scene.yaml", "text/yaml", small_scene.read_bytes(), EPOCH)
+        for topic, (kind, data) in latched.items():
+            bag.add_topic(topic, kind)
+            bag.write(topic, data, EPOCH)
+        for text in MARKS:
+            marked = T["std_msgs/msg/String"](data=text)
+            data = store.serialize_cdr(marked, "std_msgs/msg/String", little_endian=True)
+            bag.write("/session/marker", data, EPOCH)
+        for k in range(9):
+            stamp = EPOCH + k * 10**8
+            nodes = half if 3 <= k < 6 else rest
+            pixels = np.zeros((80, 96), np.uint8)
+            for topic, data in (
+                ("/probe/pose", pose(stamp, x=0.002)),
+                ("/tissue/nodes", cloud(stamp, nodes)),
+                ("/ultrasound/image", image(stamp, pixels)),
+            ):
+                bag.write(topic, data, stamp)
+    return file
+
+
+def test_areas_of_the_attached_scene_and_marks_of_frozen_images(squashed):
+    scan = read_scan(squashed)
+    assert scan.frozen == 2
+    assert scan.force is None
+    vein = scan.sections["vein"]
+    assert vein.fraction[[0, 1, 7, 8]] == pytest.approx(1.0)
+    assert vein.fraction[3:6] == pytest.approx(0.5, abs=0.06)
+    assert np.rad2deg(vein.angle) == pytest.approx(np.full(9, 85.0), abs=5.0)  # it runs along y
+    assert abs(vein.lateral).max() < 2e-3
+    assert scan.lines["vein"].lengths[-1] == pytest.approx(0.06, abs=0.004)
+
+
+def test_a_centred_vein_is_held(squashed, tmp_path, capsys):
+    file = tmp_path / "e.yaml"
+    file.write_text("name: c\ntask: {kind: centre, structure: vein, duration: 0.7 s}\n")
+    assert main(["score", str(squashed), "--exercise", str(file)]) == 0
+    assert "passed: 1 of 1" in capsys.readouterr().out
+    file.write_text("name: c\ntask: {kind: centre, structure: aorta}\n")
+    assert main(["score", str(squashed), "--exercise", str(file)]) == 1
+    assert "aorta" in capsys.readouterr().err

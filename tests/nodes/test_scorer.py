@@ -1,0 +1,93 @@
+"""The scoring node: a scan of known motion, force and area, told while it is done."""
+
+import numpy as np
+import pytest
+from bench import pose_at
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+
+from us_sim.errors import ScoreError
+from us_sim.geometry.pose import Pose
+from us_sim.nodes.messages import image_message, wrench_message
+from us_sim.nodes.scorer import Scorer
+from us_sim.scene.building import scanner_of, volume_of
+from us_sim.scene.reading import load_scene
+
+KEEP = "name: hold\ntask: {kind: keep_force, force: 5 N, tolerance: 1 N, duration: 8 s}\n"
+VEIN = 6
+
+
+@pytest.fixture
+def node(bench, small_scene, tmp_path):
+    (tmp_path / "hold.yaml").write_text(KEEP)
+    return bench.make(Scorer, scene=str(small_scene), exercise=str(tmp_path / "hold.yaml"))
+
+
+@pytest.fixture
+def scanned(bench, node, small_scene):
+    """Ten seconds at 10 mm/s and 5 N, and the vein's labels, half of them gone from 5 s on."""
+    scene = load_scene(str(small_scene))
+    labels = scanner_of(scene, volume_of(scene)).labels(Pose())
+    rows = np.flatnonzero((labels == VEIN).any(axis=1))
+    half = labels.copy()
+    half[rows[: len(rows) // 2]] = 3
+    part = (half == VEIN).sum() / (labels == VEIN).sum()
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    wrenches = bench.publisher(WrenchStamped, "probe/wrench")
+    images = bench.publisher(Image, "ultrasound/labels")
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    for second in range(11):
+        pose = pose_at(0.0, second + 1, x=0.01 * (second % 2))
+        poses.publish(pose)
+        wrench = wrench_message(np.array([0, 3.0, -4.0]), np.zeros(3), pose.header.stamp, "probe")
+        wrenches.publish(wrench)
+    bench.spin_until(lambda: bool(scores) and is_whole(scores[-1]))
+    for count, second in enumerate(range(0, 11, 2), 1):  # at the pose where they were found
+        stamp = pose_at(0.0, second + 1).header.stamp
+        images.publish(image_message(half if second > 4 else labels, stamp, "probe"))
+        bench.spin_until(lambda count=count: node.health.received == count)
+    return scores, part
+
+
+def values(score):
+    return {each.key: each.value for each in score.status[0].values}
+
+
+def test_what_the_hand_did_is_told_as_numbers_and_steps(bench, scanned):
+    scores, part = scanned
+    area = "Smallest Part of the Area at Rest of vein, %"
+    bench.spin_until(lambda: float(values(scores[-1]).get(area, "100")) < 90)
+    found = values(scores[-1])
+    assert float(found["Path Length, mm"]) == pytest.approx(100.0)
+    assert float(found["Peak Probe Force, N"]) == pytest.approx(5.0)
+    assert float(found["Time in Contact, s"]) == pytest.approx(10.0)
+    assert float(found[area]) == pytest.approx(100 * part, rel=1e-4)
+    step = scores[-1].status[1]
+    assert (step.level, step.message) == (DiagnosticStatus.OK, "10.0 s")
+
+
+def is_whole(score):
+    return values(score)["Elapsed Time, s"] == "10"
+
+
+def test_clear_begins_anew(bench, scanned):
+    scores, _ = scanned
+    client = bench.peer.create_client(Trigger, "scorer/clear")
+    bench.spin_until(client.service_is_ready)
+    future = client.call_async(Trigger.Request())
+    bench.spin_until(future.done)
+    assert future.result().success
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    for second in (20, 21):
+        poses.publish(pose_at(0.0, second))
+    bench.spin_until(lambda: values(scores[-1])["Elapsed Time, s"] == "1")
+    assert scores[-1].status[1].level == DiagnosticStatus.WARN
+
+
+def test_an_exercise_of_a_vessel_that_the_scene_lacks_is_refused(bench, small_scene, tmp_path):
+    file = tmp_path / "centre.yaml"
+    file.write_text("name: c\ntask: {kind: centre, structure: aorta}\n")
+    with pytest.raises(ScoreError, match="aorta"):
+        bench.make(Scorer, scene=str(small_scene), exercise=str(file))

@@ -1,0 +1,172 @@
+"""Exercises held against scans whose result is known, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from us_sim.errors import ScoreError
+from us_sim.scoring.centre_line import CentreLine
+from us_sim.scoring.exercise import Exercise, read_exercise
+from us_sim.scoring.metrics import Force, Scan, Section
+from us_sim.scoring.motion import Motion
+from us_sim.share import shared_roots
+
+POINTS = (0.01, 0.03, 0.05)  # m along a vein of 6 cm, of which 8 mm are left out at both ends
+LINE = CentreLine(np.linspace([0.002, -0.03, 0.013], [0.002, 0.03, 0.013], 61))
+PRESS = np.array([0.0, 0.5, 1.0, 0.5, 0.0])  # of the deepest, a second each
+
+
+def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), points=POINTS):
+    """Presses at those points down to a part of the vein's area, with so much force."""
+    count = len(points) * len(PRESS)
+    times = np.arange(float(count))
+    along = np.repeat(points, len(PRESS))
+    motion = Motion(times, LINE.points[np.rint(1e3 * along).astype(int)], [[0, 0, 0, 1]] * count)
+
+    def section(least):
+        area = 1e-5 * (1 - np.outer(1 - np.array(least), PRESS).ravel())
+        straight, middle = np.full(count, np.pi / 2), np.zeros(count)
+        return Section(times, area, np.full(count, 1e-5), along, straight, middle)
+
+    return Scan(
+        motion,
+        Force(times, np.outer(newtons, PRESS).ravel()),
+        {"vein": section(left), "artery": section(artery)},
+        {"vein": LINE, "artery": LINE},
+    )
+
+
+def steps(name, seen, **task):
+    exercise = read_exercise(name)
+    changed = replace(exercise.assigned, **task)
+    return Exercise("x", replace(exercise.task, given=changed)).steps(seen)
+
+
+def done(name, seen, **task):
+    return [step.is_done for step in steps(name, seen, **task)]
+
+
+def test_every_point_of_a_vein_that_was_closed_every_2_cm():
+    found = steps("compression", scan())
+    assert [step.is_done for step in found] == [True] * 3
+    assert np.allclose([step.target for step in found], LINE.points[[10, 30, 50]])
+    assert all("6.0 N" in step.seen for step in found)
+
+
+def test_points_have_their_spacing_and_lie_in_the_middle():
+    task = read_exercise("compression").assigned
+    assert task.points(0.06) == pytest.approx(POINTS)
+    assert task.points(0.075) == pytest.approx([0.0175, 0.0375, 0.0575])
+    assert task.points(0.01) == pytest.approx([0.005])
+
+
+def test_a_point_that_was_missed_or_not_closed_is_not_done():
+    assert done("compression", scan(points=(0.01, 0.03, 0.04))) == [True, True, False]
+    assert done("compression", scan(left=(0.0, 0.3, 0.0))) == [True, False, True]
+    hard = (6.0, 20.0, 6.0)  # and no thrombus there
+    assert done("compression", scan(left=(0.0, 0.3, 0.0), newtons=hard)) == [True, False, True]
+
+
+def test_a_thrombus_is_found_by_pressing_hard_where_it_is():
+    seen = replace(scan(left=(0.0, 0.3, 0.0), newtons=(6, 12, 6)), thrombi={"vein": (0.028, 0.034)})
+    assert done("compression", seen) == [True, True, True]
+    soft = replace(scan(left=(0.0, 0.3, 0.0)), thrombi={"vein": (0.028, 0.034)})
+    assert done("compression", soft) == [True, False, True]
+
+
+def test_the_artery_must_stay_open_when_the_vein_closes():
+    assert done("compression", scan(artery=(0.9, 0.2, 0.9))) == [True, False, True]
+    assert done("compression", scan(artery=(0.9, 0.2, 0.9)), artery=None) == [True] * 3
+
+
+def test_without_force_a_closed_vein_is_still_closed():
+    seen = replace(scan(left=(0.0, 0.3, 0.0)), force=None)
+    assert done("compression", seen) == [True, False, True]
+    assert done("keep_force", seen) == [False]
+
+
+def test_a_force_is_kept_as_long_as_it_does_not_leave_its_range():
+    times = np.linspace(0, 20, 2001)
+    newtons = np.where((times > 2) & (times < 9), 5.5, 0.0)
+    newtons[(times > 12) & (times < 16)] = 4.2
+    seen = replace(scan(), force=Force(times, newtons))
+    assert done("keep_force", seen) == [True]
+    assert done("keep_force", seen, duration=7.5) == [False]
+    assert done("keep_force", seen, tolerance=0.4) == [False]
+    assert steps("keep_force", seen)[0].seen == "7.0 s"
+
+
+def with_lateral(lateral, along):
+    section = scan().sections["vein"]
+    count = len(section.times)
+    made = replace(section, lateral=np.resize(lateral, count), along=np.resize(along, count))
+    return replace(scan(), sections={"vein": made, "artery": made})
+
+
+def test_a_vessel_is_centred_as_long_as_it_is_in_the_middle():
+    lateral = np.full(15, 0.001)
+    lateral[[4, 9]] = 0.02, np.nan  # lost for a moment
+    assert steps("centre", with_lateral(lateral, 0.0))[0].seen == "4.0 s"
+    assert done("centre", with_lateral(lateral, 0.0), duration=4.5) == [False]
+    assert done("centre", replace(scan(), sections={})) == [False]
+
+
+def test_a_vessel_is_followed_where_it_is_in_the_middle():
+    along = np.linspace(0.005, 0.055, 15)
+    assert done("follow", with_lateral(0.0, along)) == [True]
+    aside = np.where(along > 0.03, 0.02, 0.0)
+    assert steps("follow", with_lateral(aside, along))[0].seen == "50 %"
+    assert done("follow", with_lateral(aside, along)) == [False]
+    assert done("follow", with_lateral(aside, along), part=0.4) == [True]
+
+
+def test_a_view_is_found_near_its_pose_with_its_vessels():
+    seen = scan(left=(0.5, 0.5, 0.5))
+    pose = {"position": LINE.points[30].tolist()}
+    view = {"pose": type(read_exercise("view").assigned.pose)(**pose)}
+    assert done("view", seen, **view) == [True]  # 4 s long
+    assert done("view", seen, **view, duration=4.5) == [False]
+    turned = Motion(seen.motion.times, seen.motion.positions, [[0, 0, 0.2, 0.98]] * 15)
+    assert done("view", replace(seen, motion=turned), **view) == [False]
+    assert done("view", replace(seen, motion=turned), **view, angle=0.5) == [True]
+    hidden = replace(seen.sections["vein"], area=np.zeros(15))
+    unseen = replace(seen, sections={**seen.sections, "vein": hidden})
+    assert done("view", unseen, **view) == [False]
+
+
+def test_every_installed_exercise_can_be_read_and_is_of_a_scene_with_its_vessels():
+    files = [f for root in shared_roots() for f in (root / "config/exercises").glob("*.yaml")]
+    assert {file.stem for file in files} >= {"compression", "keep_force"}
+    for file in files:
+        assert read_exercise(file).steps(scan())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name: x", "task"),
+        ("name: x\ntask: {kind: compresion}", "task.kind"),
+        ("name: x\ntask: {kind: compression, spacing: 2 kg}", "task.spacing"),
+        ("name: x\ntask: {kind: keep_force, structure: vein}", "task.structure"),
+        ("name: x\ntask: {kind: view}", "task.pose"),
+        ("[1, 2]", "mapping"),
+        ("a: b: c", "YAML"),
+    ],
+)
+def test_a_file_that_is_no_exercise_is_refused_with_file_and_key(tmp_path, text, said):
+    file = tmp_path / "e.yaml"
+    file.write_text(text)
+    with pytest.raises(ScoreError) as refused:
+        read_exercise(file)
+    assert str(file) in str(refused.value)
+    assert said in str(refused.value)
+
+
+def test_a_structure_that_the_scene_lacks_and_an_unknown_exercise_are_refused():
+    with pytest.raises(ScoreError, match=r"compresion.*compression"):
+        read_exercise("compresion")
+    with pytest.raises(ScoreError, match=r"vien.*vein"):
+        steps("centre", scan(), structure="vien")
+    with pytest.raises(ScoreError, match="without a scene"):
+        steps("centre", replace(scan(), lines={}))

@@ -1,0 +1,104 @@
+"""Metrics of scans whose values can be told by hand."""
+
+import numpy as np
+import pytest
+
+from us_sim.errors import ScoreError
+from us_sim.scoring.metrics import Force, Metric, Scan, ScoreSettings, Section, metrics_of
+from us_sim.scoring.motion import Motion
+
+
+def table(scan, settings=None):
+    return {(m.name, m.roles.rpartition(" = ")[2]): m.value for m in metrics_of(scan, settings)}
+
+
+def circle(seconds=4.0, radius=0.03, count=4001):
+    """Once round, always facing inwards: v = 2πr/T, a = v²/r, jerk v³/r²."""
+    turn = np.linspace(0, 2 * np.pi, count)
+    zero = 0 * turn
+    positions = radius * np.stack([np.cos(turn), np.sin(turn), zero], axis=1)
+    orientations = np.stack([zero, zero, np.sin(turn / 2), np.cos(turn / 2)], axis=1)
+    return Motion(seconds * turn / (2 * np.pi), positions, orientations)
+
+
+def test_a_round_of_a_circle():
+    found = table(Scan(circle()))
+    speed = 2 * np.pi * 30 / 4
+    expected = {
+        "Elapsed Time": 4.0,
+        "Path Length": 2 * np.pi * 30,
+        "Rotation Total": 360.0,
+        "Average Velocity": speed,
+        "Peak Velocity": speed,
+        "Average Acceleration": speed**2 / 30,
+        "Peak Acceleration": speed**2 / 30,
+        "Motion Smoothness": 2 * speed**3 / 30**2,
+        "Dimensionless Squared Jerk": 4**6 * (speed**3 / 30**2) ** 2 / (2 * np.pi * 30) ** 2,
+        "Translational Actions": 0,  # 47 mm/s
+        "Rotational Actions": 1,  # 90 °/s
+    }
+    assert found.keys() == {(name, "Probe") for name in expected}
+    for name, value in expected.items():
+        assert found[name, "Probe"] == pytest.approx(value, rel=2e-3), name
+
+
+def test_a_press_of_a_triangle():
+    """0 for a second, up to 20 N and down again within 4 s, 0 for a second."""
+    times = np.linspace(0, 6, 6001)
+    force = Force(times, np.interp(times, [0, 1, 3, 5, 6], [0, 0, 20, 0, 0]))
+    found = table(Scan(circle(), force), ScoreSettings(force_limit="15 N", contact_force=0.001))
+    assert found["Time in Contact", "Probe"] == pytest.approx(4.0, rel=1e-3)
+    assert found["Mean Probe Force in Contact", "Probe"] == pytest.approx(10.0, rel=1e-3)
+    assert found["Peak Probe Force", "Probe"] == 20.0
+    assert found["Time above 15 N", "Probe"] == pytest.approx(1.0, rel=1e-2)
+    assert found["Force Impulse", "Probe"] == pytest.approx(40.0, rel=1e-6)
+    assert force.at(np.array([-1.0, 2.0, 7.0])) == pytest.approx([np.nan, 10, np.nan], nan_ok=True)
+
+
+def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
+    """It faces along the radius of a circle of 30 mm, 20 mm wide, and touches on half of it."""
+    force = Force(np.array([0.0, 1.999, 2.0, 4.0]), np.array([5.0, 5.0, 0.0, 0.0]))
+    found = table(Scan(circle(), force, width=0.02))
+    ring = np.pi * (40**2 - 20**2)
+    assert found["Area Scanned in Contact", "Probe"] == pytest.approx(ring / 2, rel=2e-3)
+
+
+def test_without_force_or_vessels_nothing_is_told_of_them():
+    names = {name for name, _ in table(Scan(circle()))}
+    assert not [name for name in names if "Force" in name or "Contact" in name or "Area" in name]
+
+
+def test_a_probe_that_never_touched_has_no_mean_force_in_contact():
+    found = table(Scan(circle(), Force(np.arange(3.0), np.zeros(3))))
+    assert found["Time in Contact", "Probe"] == 0.0
+    assert ("Mean Probe Force in Contact", "Probe") not in found
+
+
+def test_the_areas_of_a_vessel():
+    nan = np.nan
+    section = Section(
+        np.arange(4.0),
+        1e-6 * np.array([20.0, 5.0, 1.0, 4.0]),
+        1e-6 * np.array([20.0, 20.0, nan, 16.0]),
+        np.zeros(4),
+        np.deg2rad([90.0, 80.0, nan, 70.0]),
+        np.zeros(4),
+    )
+    found = table(Scan(circle(), sections={"vein": section}))
+    assert found["Mean Area at Rest", "vein"] == pytest.approx(56 / 3)
+    assert found["Smallest Area", "vein"] == pytest.approx(4.0)  # what cannot be compared is left
+    assert found["Smallest Part of the Area at Rest", "vein"] == pytest.approx(25.0)
+    assert found["Mean Angle to the Vessel", "vein"] == pytest.approx(80.0)
+
+
+def test_a_value_that_is_not_known_is_a_dash():
+    assert Metric("x", "mm", np.nan).text == "-"
+    assert Metric("x", "count", 3.0).text == "3"
+
+
+def test_a_force_without_its_times_is_refused():
+    with pytest.raises(ScoreError):
+        Force(np.arange(3.0), np.arange(2.0))
+    with pytest.raises(ScoreError) as refused:
+        ScoreSettings(force_limit=-1.0)
+    assert refused.value.key == "force_limit"

@@ -1,0 +1,129 @@
+"""A recording as it is scored: motion, force, and the cross-sections of vessels."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from us_sim.errors import BagError, ScoreError
+from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
+from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
+from us_sim.run.resimulation import scene_within
+from us_sim.run.session_summary import read_session
+from us_sim.scene.building import probe_of, volume_of
+from us_sim.scoring.lumen import vessels_in
+from us_sim.scoring.metrics import Force, Scan, Section
+from us_sim.scoring.motion import Motion
+
+FROZEN = "frozen"
+"""Begins the text on `session/marker` with which a page tells that its image was frozen."""
+_SAMPLES = 200  # images of which areas are measured, at least
+_RATE = 5.0  # and a second
+_POSES, _MARKS = "/probe/pose", "/session/marker"
+
+
+def read_scan(
+    file: Path,
+    topic: str | None = None,
+    wrench: str | None = None,
+    progress: Callable[[float, str], None] = lambda *_: None,
+) -> Scan:
+    """Read a session, any other bag with poses, or a tracker's recording.
+
+    Of a session the probe's poses in frame ``patient`` are taken, and areas where its scene is
+    attached. Without force, areas or marks the scan says so and has none.
+
+    Args:
+        topic: of the poses, as for `read_path`.
+        wrench: topic of the force; by default ``probe/wrench``, or the only one of its type.
+
+    Raises:
+        BagError: there are no poses, or what was named is not there.
+        ScoreError: the poses are no motion.
+    """
+    bag = None if is_tracker_recording(file) else read_bag(file)
+    if topic is None and bag is not None and _has(bag, _POSES, POSE_STAMPED):
+        topic = _POSES
+    path = read_path(file, topic, option="--topic")
+    begin = int(path.stamps.min())
+    try:
+        motion = Motion(_seconds(path.stamps, begin), path.positions, path.orientations)
+    except ScoreError as error:
+        raise ScoreError(f"{file}: {path.topic}: {error}") from error
+    missing = [path.note] if path.note else []
+    if bag is None:
+        return Scan(motion, missing=(*missing, f"force and areas: {file} holds poses alone"))
+    force = _force(bag, wrench, begin, missing)
+    frozen = None
+    if _has(bag, _MARKS, "std_msgs/msg/String"):
+        texts = [bag.deserialize(message).data for message in bag.messages([_MARKS])]
+        frozen = sum(text.startswith(FROZEN) for text in texts)
+    else:
+        missing.append(f"images that were frozen: {file} has no marks on {_MARKS}")
+    try:
+        truth = _truth(file, bag, path, progress)
+    except BagError as error:
+        truth = {}
+        missing.append(f"areas of structures: {error}")
+    return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
+
+
+def _has(bag: Bag, name: str, kind: str) -> bool:
+    return any((each.name, each.type_name) == (name, kind) for each in bag.topics)
+
+
+def _seconds(stamps: np.ndarray, begin: int) -> np.ndarray:
+    """(K,) s since the first pose; the difference first, which a float holds exactly enough."""
+    return np.asarray((stamps - begin) * 1e-9)
+
+
+def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force | None:
+    names = [each.name for each in bag.topics if each.type_name == WRENCH_STAMPED]
+    if topic is None:
+        preferred = [name for name in names if name.endswith("probe/wrench")]
+        chosen = preferred if len(preferred) == 1 else names
+        if len(chosen) != 1:
+            several = f"wrenches on {', '.join(names)}: name one with --wrench"
+            missing.append(f"force: {bag.path} holds {several if names else 'no wrench'}")
+            return None
+        topic = chosen[0]
+    record = read_wrenches(bag.path, topic)
+    newtons = np.linalg.norm(record.wrenches[:, :3], axis=1)
+    later = np.r_[True, record.stamps[1:] > np.maximum.accumulate(record.stamps)[:-1]]
+    usable = np.isfinite(newtons) & later
+    if np.count_nonzero(usable) < 2:
+        missing.append(f"force: {record.topic} holds fewer than two wrenches that can be used")
+        return None
+    return Force(_seconds(record.stamps[usable], begin), newtons[usable])
+
+
+def _truth(
+    file: Path, bag: Bag, path: ProbePath, progress: Callable[[float, str], None]
+) -> dict[str, Any]:
+    """Sections, lines and thrombi of the vessels; of five images a second, and two hundred in all.
+
+    Raises:
+        BagError: there is no scene, tissue, image or vessel.
+    """
+    attached = bag.attachments()
+    if "scene.yaml" not in attached:
+        raise BagError(f"{file} has no scene attached")
+    if path.topic != _POSES:
+        raise BagError(f"they are known for the poses on {_POSES} only, not {path.topic}")
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as place:
+        scene = scene_within(file, attached, Path(place, "attached"))
+        session = read_session(file)
+        samples = max(_SAMPLES, int(_RATE * path.duration))
+        meter = session.measured_lumens(scene, samples, lambda done: progress(done, "areas"))
+        lines, thrombi = vessels_in(volume_of(scene))
+    areas = meter.areas() if meter is not None else None
+    sections: dict[str, Section] = {}
+    width = probe_of(scene).width
+    if meter is not None and areas is not None:
+        sections = areas.sections(meter.poses, lines, width)
+    return {"sections": sections, "lines": lines, "thrombi": thrombi, "width": width}

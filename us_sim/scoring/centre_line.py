@@ -1,0 +1,97 @@
+"""A vessel's centre line, found from the labels of a volume, and where an image plane cuts it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from us_sim.geometry.pose import Pose
+from us_sim.volume.volume import Volume
+
+_PIECE = 2e-3  # m, of the vessel's length, whose voxels give one point of the line
+_SMOOTHED = 5  # points, over which the line is straightened: a surface of voxels is uneven
+
+
+def places_of(volume: Volume, labels: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(N, 3) m, the centres of a volume's marked voxels (i, j, k), in frame ``patient``."""
+    matrix = volume.index_to_patient
+    return np.asarray(np.argwhere(labels) @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+class Cut(NamedTuple):
+    """Where a plane cuts a centre line."""
+
+    along: float  # m, from the end that is first along the line's main axis
+    angle: float  # rad, between the line and the plane, 0 to a right angle
+    lateral: float  # m, along the probe's face, from its middle
+    point: NDArray[np.float64]  # (3,) m
+
+
+@dataclass(frozen=True)
+class CentreLine:
+    """A line through the middle of a vessel that does not turn back."""
+
+    points: NDArray[np.float64]  # (P, 3) m, in frame ``patient``; P at least 2
+
+    @classmethod
+    def of(cls, volume: Volume, labels: NDArray[np.bool_]) -> CentreLine | None:
+        """The line of a volume's marked voxels (i, j, k); None of a structure that is not long.
+
+        The voxels are cut across their longest axis, and each piece gives its centroid.
+        """
+        places = places_of(volume, labels)
+        if len(places) < 2:
+            return None
+        middle = places.mean(axis=0)
+        axis = np.linalg.svd(np.cov((places - middle).T))[0][:, 0]
+        axis *= np.sign(axis[np.argmax(np.abs(axis))])
+        along = (places - middle) @ axis
+        pieces = np.floor((along - along.min()) / _PIECE).astype(int)
+        counts = np.bincount(pieces)
+        sums = np.stack([np.bincount(pieces, each) for each in places.T], axis=1)
+        points = sums[counts > 0] / counts[counts > 0, None]
+        if len(points) < 2 * _SMOOTHED:
+            return None
+        kernel = np.ones(_SMOOTHED) / _SMOOTHED
+        padded = np.pad(points, ((_SMOOTHED // 2,) * 2, (0, 0)), mode="reflect", reflect_type="odd")
+        return cls(np.stack([np.convolve(each, kernel, "valid") for each in padded.T], axis=1))
+
+    @property
+    def lengths(self) -> NDArray[np.float64]:
+        """(P,) m, of the way to each point."""
+        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def along(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N,) m along the line, of its points nearest to these (N, 3) m."""
+        return np.asarray(self.lengths[cKDTree(self.points).query(points)[1]])
+
+    def at(self, along: float) -> NDArray[np.float64]:
+        """The point (3,) m of a length along the line."""
+        lengths = self.lengths
+        return np.array([np.interp(along, lengths, each) for each in self.points.T])
+
+    def cut(self, pose: Pose, width: float) -> Cut | None:
+        """Where the image plane of a probe, at most so wide (m), cuts the line below its face.
+
+        Of several places the one nearest to the face.
+        """
+        seen = pose.inverse().apply(self.points)
+        across = seen[:, 1]
+        found = None
+        for k in np.flatnonzero(across[1:] * across[:-1] <= 0).tolist():
+            step = across[k] - across[k + 1]
+            part = across[k] / step if step else 0.5
+            x, _, z = seen[k] + part * (seen[k + 1] - seen[k])
+            way = self.points[k + 1] - self.points[k]
+            if abs(x) > 0.5 * width or z < 0 or (found and z >= found[0]):
+                continue
+            length = float(np.linalg.norm(way))
+            angle = np.arcsin(min(abs(float(way @ pose.rotation[:, 1])) / length, 1.0))
+            where = float(self.lengths[k] + part * length)
+            found = (z, Cut(where, float(angle), float(x), self.points[k] + part * way))
+        return found[1] if found else None
