@@ -98,7 +98,7 @@ class HandCommand:
             goal = replace(goal, press=LIFTED)
         elif self.go == "upright":
             goal = replace(goal, rotation=0.0, fan=0.0, rock=0.0)
-        wanted = {name: n[0] for name, n in self.to.items() if name in _SINGLE}
+        wanted: dict[str, Any] = {name: n[0] for name, n in self.to.items() if name in _SINGLE}
         goal = replace(goal, **wanted)
         if "point" in self.to:
             goal = replace(goal, point=surface.closest(np.array(self.to["point"])).point)
