@@ -14,6 +14,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.path import read_path
 from us_sim.recording.reader import read_bag
 from us_sim.scene.reading import load_scene
+from us_sim.tissue.solvers.fem import FemSettings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.volume import Volume
 
@@ -27,7 +28,7 @@ def first(played_scene, tmp_path_factory):
     What is known of its images is written beside them, which changes nothing in them.
     """
     out = tmp_path_factory.mktemp("first") / "out"
-    options = ["--param", "tissue_deformer.solver=fem", "--truth", "--out", out]
+    options = ["--param", "tissue_deformer.fem.contact=sticking", "--truth", "--out", out]
     result = us_sim("render", played_scene, *options)
     assert result.returncode == 0, result.stderr
     return out
@@ -77,7 +78,8 @@ def test_messages_are_identical(first, again):
 def test_the_same_poses_make_the_same_images_without_ros(first, played_scene):
     """But for the topics' 32 bits: a node is 2e-9 m off, and few pixels round otherwise."""
     scene = load_scene(played_scene)
-    simulation = Simulation(replace(scene, tissue=replace(scene.tissue, solver="fem")))
+    settings = {"fem": FemSettings(contact="sticking")}
+    simulation = Simulation(replace(scene, tissue=replace(scene.tissue, settings=settings)))
     files = sorted((first / "images").glob("*.png"))
     path = read_path(first / "session.mcap", "/probe/pose")
     apart = []
