@@ -35,6 +35,7 @@ NO_WHEELS = (
     "python_version >= '3.14' or (sys_platform != 'darwin' and platform_machine != 'x86_64' "
     "and platform_machine != 'AMD64')"
 )
+GYMNASIUM = "gymnasium>=1.1,<2"
 ZENOH = ["eclipse-zenoh>=1.10,<2", "xxhash>=3"]
 STANDALONE = [
     f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}",
@@ -69,6 +70,7 @@ setup(
     author="us_sim developers",
     packages=find_packages(include=["us_sim", "us_sim.*"]),
     package_data={
+        "us_sim.environment": ["*.md"],
         "us_sim.evaluation": ["*/*.md"],
         "us_sim.viewer": ["assets/**/*", "panels/*.js"],
     },
@@ -101,6 +103,7 @@ setup(
             "pylibjpeg-openjpeg>=2.2",
             "python-gdcm>=3.0.20",
         ],
+        "environment": [GYMNASIUM],
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
         "rerun": ["rerun-sdk>=0.41"],
@@ -112,6 +115,7 @@ setup(
             "axe-playwright-python>=0.1.4",
             *ZENOH,
             "fast-simplification>=0.1.7",
+            GYMNASIUM,
             "hypothesis>=6.100",
             "meshio>=5.3",
             "mypy>=1.10",
@@ -141,6 +145,9 @@ setup(
         *shared_files("config"),
         *shared_files("bags"),
     ],
-    entry_points={"console_scripts": console_scripts()},
+    entry_points={
+        "console_scripts": console_scripts(),
+        "gymnasium.envs": ["us_sim = us_sim.environment:register"],
+    },
     zip_safe=False,
 )

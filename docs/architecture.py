@@ -23,7 +23,7 @@ LAYERS = (
     (
         "the domain, without ROS",
         (
-            ("scene", "scoring"),
+            ("", "scene", "environment", "scoring"),
             ("skin", "tissue", "slicing", "tracking"),
             ("", "", "volume", "recording"),
             ("geometry",),

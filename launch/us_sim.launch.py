@@ -84,6 +84,7 @@ class Supervised:
     def __init__(self, plan, settings, namespace):
         self.player = plan.player if plan.poses is not None else ""
         self.processes = {process.node: process for process in plan.processes}
+        self.parts = {each.node: [part.node for part in each.parts] for each in plan.processes}
         self.restarts, self.hang = Restarts(settings), Watch(settings.silence)
         self.actions = {}  # that run, by node
         self.why = {}  # nodes are made to end, by node
@@ -140,7 +141,8 @@ class Supervised:
                         for node, action in self.actions.items()
                         if "pid" in (action.process_details or {})
                     }
-                    for node, how in self.hang.hung(pids, self.monitor.node.heard).items():
+                    heard = self.monitor.node.heard
+                    for node, how in self.hang.hung(pids, heard, self.parts).items():
                         self.why[node] = how
                         await self.end(self.actions[node], context)
         except asyncio.CancelledError:

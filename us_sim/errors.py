@@ -102,6 +102,10 @@ class CalibrationError(UsSimError):
     """Calibration data are wrong, or cannot determine the answer."""
 
 
+class EpisodeError(UsSimError):
+    """An action cannot be done, or an environment or a data set cannot be made as asked."""
+
+
 class StiffnessError(UsSimError):
     """A recorded press is no press, or cannot determine how stiff tissue is."""
 

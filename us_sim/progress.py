@@ -6,7 +6,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 from tqdm import tqdm
 
@@ -70,12 +69,7 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.close()
 
 
@@ -101,7 +95,7 @@ def late_progress(description: str) -> Callable[[float, str], None]:
             bar.tell(text)
         if fraction >= 1.0:
             if bar is not None:
-                bar.__exit__(None, None, None)
+                bar.__exit__()
                 if bar in _late:
                     _late.remove(bar)
             begun = bar = None
@@ -112,4 +106,4 @@ def late_progress(description: str) -> Callable[[float, str], None]:
 def end_late_bars() -> None:
     """End the lines of bars whose work was broken off, so that a sentence begins on its own."""
     while _late:
-        _late.pop().__exit__(None, None, None)
+        _late.pop().__exit__()

@@ -30,6 +30,7 @@ def node():
     node.declare_parameter("numbers", [1, 2])
     node.declare_parameter("fixed", "x", ParameterDescriptor(read_only=True))
     node.declare_parameter("on", True)
+    node.declare_parameter("word", "x")
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     thread = threading.Thread(target=executor.spin, daemon=True)
@@ -41,7 +42,7 @@ def node():
     context.try_shutdown()
 
 
-NAMES = "  deep.count\n  fixed\n  names\n  numbers\n  on\n  rate\n  use_sim_time\n"
+NAMES = "  deep.count\n  fixed\n  names\n  numbers\n  on\n  rate\n  use_sim_time\n  word\n"
 DESCRIBED = """\
 Parameter name: rate
   Type: double
@@ -75,6 +76,7 @@ DUMPED = """\
     'on': true
     rate: 30.0
     use_sim_time: false
+    word: x
 
 """
 
@@ -100,7 +102,13 @@ def test_parameters_are_shown_as_ros2_param_shows_them(words, printed, capsys) -
 
 @pytest.mark.parametrize(
     ("name", "text", "value"),
-    [("rate", "12.5", 12.5), ("names", "[a, b]", ["a", "b"]), ("on", "false", False)],
+    [
+        ("rate", "12.5", 12.5),
+        ("names", "[a, b]", ["a", "b"]),
+        ("on", "false", False),
+        ("word", "", ""),
+        ("word", "null", "null"),
+    ],
 )
 def test_a_value_is_set_by_its_yaml(node, name, text, value, capsys) -> None:
     before = node.get_parameter(name)

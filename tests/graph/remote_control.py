@@ -1,4 +1,4 @@
-"""A person elsewhere on the ROS domain, who sets parameters and reads reports."""
+"""A person elsewhere on the ROS domain, with parameters to set and reports to read."""
 
 import functools
 import subprocess

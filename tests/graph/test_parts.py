@@ -50,7 +50,7 @@ def run_and_list_modules(scene: Path, tmp_path: Path) -> tuple[dict[str, set[str
 
 @pytest.fixture(scope="module")
 def said() -> set[str]:
-    """Modules that define scenes, and compute nothing: every node reads the scene."""
+    """Modules that describe scenes and compute nothing, since every node reads the scene."""
     program = "import sys, us_sim.scene.scene; print(*sys.modules)"
     names = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout
     assert not {"numba", "scipy"} & set(names.split())

@@ -1,4 +1,4 @@
-"""Load of the recorder: messages of a megabyte each at so many MB/s, for so long.
+"""Load for the recorder: messages of a megabyte each at so many MB/s, for so long.
 
     python tests/nodes/recorder_load.py 200 30 FOLDER
 

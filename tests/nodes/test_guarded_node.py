@@ -318,6 +318,18 @@ def test_latency_counts_from_arrival_where_stamps_are_of_another_clock(broken, s
     assert "95332936.7 s old, so they are of another clock" in warning
 
 
+def test_stamps_of_a_clock_that_goes_ahead_are_told(bench, broken):
+    reports = bench.collect(DiagnosticArray, "diagnostics")
+    ahead = broken.get_clock().now().nanoseconds + 2 * 10**9
+    broken.health.published("out", Time(sec=ahead // 10**9, nanosec=ahead % 10**9))
+    broken.health.report()
+    bench.spin_until(lambda: any("ahead" in each.status[0].message for each in reports))
+    status = reports[-1].status[0]
+    assert status.level == DiagnosticStatus.WARN
+    told = float(status.message.split(" ms ahead")[0].rsplit(" ", 1)[1])
+    assert 1000.0 < told <= 2000.0
+
+
 def test_spinning_survives_what_rclpy_raises(bench, broken, monkeypatch):
     bench.executor.remove_node(broken)
     original, raised = process._Executor.spin_once, []

@@ -189,6 +189,23 @@ def test_a_cut_in_the_header_of_a_chunk(tmp_path, sessions):
         assert len(list(bag.messages())) == bag.message_count > 20
 
 
+def test_bytes_of_a_message_that_could_be_a_record_do_not_hide_those_before_a_cut(tmp_path):
+    file = tmp_path / "session.mcap"
+    like_a_record = bytes.fromhex("0c 0800000000000000 00000000 00000000")  # an empty Metadata
+    with BagWriter(file, chunk_size=10_000, sidecar=False) as bag:
+        bag.add_topic("/note", "std_msgs/msg/String")
+        for second in range(6):
+            text = 50 * like_a_record
+            cdr = b"\0\1\0\0" + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
+            bag.write("/note", cdr, 10**18 + second * 10**8)
+    content = file.read_bytes()
+    file.write_bytes(content[: content.rindex(like_a_record) - 5 * len(like_a_record)])
+    bag = read_bag(file)
+    assert len(list(bag.messages())) == bag.message_count == 5
+    assert [fault.text for fault in bag.faults()] == [bag.note]
+    assert "was not ended properly" in bag.note
+
+
 @pytest.mark.parametrize("compression", ["none", "zstd"])
 def test_a_file_cut_before_its_last_chunk_loses_only_that(tmp_path, sessions, compression):
     whole = sessions[compression]

@@ -1,4 +1,4 @@
-"""Needs of a session to be simulated from itself; a sentence where it lacks one."""
+"""A session holds all that it takes to be simulated again; a sentence where it does not."""
 
 import hashlib
 

@@ -159,6 +159,15 @@ def test_a_node_that_ended_leaves_a_gap_to_the_end(tmp_path):
     assert "slice_interpolator" in text
 
 
+def test_a_topic_without_a_message_is_told(tmp_path):
+    def silence(messages):
+        messages[:] = [message for message in messages if message[0] != IMAGE]
+
+    kind, text = broken(tmp_path, silence)
+    assert kind == "gap"
+    assert text.startswith(f"{IMAGE} has no message, while 120 poses came: see in the diagnostics")
+
+
 def test_a_stamp_of_no_pose_is_told(tmp_path):
     def restamp(messages):
         message = of(messages, "/tissue/nodes")[50]
@@ -167,7 +176,7 @@ def test_a_stamp_of_no_pose_is_told(tmp_path):
 
     kind, text = broken(tmp_path, restamp)
     assert kind == "stamp"
-    assert text.startswith("1 message of /tissue/nodes have no pose's stamp on /probe/pose, first")
+    assert text.startswith("/probe/pose has no pose of the stamp of 1 message of /tissue/nodes")
 
 
 def test_messages_that_were_exchanged_are_told(tmp_path):
@@ -250,8 +259,9 @@ def test_a_damaged_chunk_is_told(tmp_path):
     content = bytearray(file.read_bytes())
     content[len(content) // 3] ^= 1
     file.write_bytes(content)
-    kinds = [kind for kind, _ in findings(file)[1]]
-    assert kinds[0] == "index"
+    ((kind, text),) = findings(file)[1]
+    assert kind == "index"
+    assert "its checksum does not match" in text
 
 
 def test_an_index_with_wrong_times_is_told(tmp_path):

@@ -63,6 +63,13 @@ def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
     assert found["Area Scanned in Contact", "Probe"] == pytest.approx(ring / 2, rel=2e-3)
 
 
+def test_pressing_scans_nothing():
+    rest = np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
+    down = Motion(np.arange(3.0), [[0, 0, 0], [0, 0, 0.01], [0, 0.005, 0.01]], rest)
+    found = table(Scan(down, Force(np.arange(3.0), np.full(3, 5.0)), width=0.04))
+    assert found["Area Scanned in Contact", "Probe"] == pytest.approx(40 * 5)
+
+
 def test_without_force_or_vessels_nothing_is_told_of_them():
     names = {name for name, _ in table(Scan(circle()))}
     assert not [name for name in names if "Force" in name or "Contact" in name or "Area" in name]

@@ -42,6 +42,7 @@ _COMMANDS = (
         "fit_stiffness",
         "Young's moduli of a scene's structures, from a recorded press with force",
     ),
+    ("dataset", "dataset", "images with every truth, of episodes drawn by a seed"),
     ("reconstruct", "volumes", "make a volume or a case of a tracked sweep"),
     (
         "segment",

@@ -97,7 +97,7 @@ def _set(asker: _Asker, args: argparse.Namespace) -> int:
     except YamlError:
         value = args.value  # a text with a colon, say
     try:
-        parameter = Parameter(args.name, value=value)
+        parameter = Parameter(args.name, value=args.value if value is None else value)
     except (TypeError, ValueError):  # a mapping, or a list of several types
         parameter = Parameter(args.name, value=args.value)
     node = asker.find(args.node)

@@ -13,6 +13,7 @@ from pathlib import Path
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.choice import Chosen
 from us_sim.settings.reading import document_of
+from us_sim.settings.spelling import aligned
 from us_sim.share import shared_roots
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, VOLUME, is_case, read_case
 from us_sim.volume.cases.provenance import Source, Step, add_step
@@ -235,15 +236,8 @@ def _write(
 def _summary(where: Path, made: Sequence[StructureSurface], remarks: Sequence[str]) -> str:
     """A line for each structure, and the remarks."""
     rows = [_HEADING, *(_cells(one) for one in made)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADING))]
-    lines = [
-        "  ".join(
-            cell.rjust(width) if column else cell.ljust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    ]
-    return "\n".join([*lines, *(f"note: {remark}" for remark in remarks), f"written to {where}"])
+    notes = (f"note: {remark}" for remark in remarks)
+    return "\n".join([*aligned(rows), *notes, f"written to {where}"])
 
 
 def _report(made: Sequence[StructureSurface], remarks: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from us_sim.errors import StiffnessError
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import aligned, counted
 from us_sim.tissue.identification.press_record import CHANNELS
 from us_sim.tissue.identification.stiffness import GROUPS, StiffnessFit
 
@@ -37,15 +37,7 @@ def table(found: StiffnessFit) -> str:
                 f"{interval.weight:.2f}",
             )
         )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
-    return "\n".join([*lines, "", _left_over(found), *found.remarks])
+    return "\n".join([*aligned(rows), "", _left_over(found), *found.remarks])
 
 
 def _unit(found: StiffnessFit, name: str) -> float:

@@ -1,6 +1,6 @@
 """A node that goes on whatever comes in, refuses bad input, and reports its health.
 
-What a node reports about itself once a second: rate, latency, drops, state.
+The report, once a second: rate, latency, drops, state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from us_sim.recording.schemas import jazzy_definitions
 
 
 def require_sequences(data: bytes, message_type: Any) -> None:
-    """Look at the sequences of a serialized message, where its type is one of Jazzy's with any.
+    """Check the sequences of a serialized message, where its type is one of Jazzy's with any.
 
     Raises:
         Exception: what rosbags raises, where the bytes are no such message.
@@ -90,13 +90,12 @@ class GuardedNode(Node):
 
     def _look_for_a_clock(self) -> None:
         """Say that simulated time does not begin."""
-        if self.get_clock().now().nanoseconds:
-            self._clockless.cancel()
-            return
-        self.get_logger().warning(
-            "use_sim_time is true, and nothing has come on /clock: this node's time stands at 0; "
-            "start what publishes it, or set use_sim_time to false"
-        )
+        self._clockless.cancel()
+        if not self.get_clock().now().nanoseconds:
+            self.get_logger().warning(
+                "use_sim_time is true, and nothing has come on /clock: this node's time stands at "
+                "0; start what publishes it, or set use_sim_time to false"
+            )
 
     def refused(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
@@ -158,7 +157,13 @@ class GuardedNode(Node):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Any:
-        """As `rclpy.node.Node.create_subscription`, guarded."""
+        """As `rclpy.node.Node.create_subscription`, guarded.
+
+        The quality of service of a relative topic may be overridden by parameters; absolute ones
+        are ROS's own, and what a recorder adopts.
+        """
+        if not topic.startswith("/"):
+            options.setdefault("qos_overriding_options", overridable())
         if not options.pop("raw", False):
             callback = decoded(msg_type, callback)
         where = self.resolve_topic_name(topic)
@@ -240,9 +245,7 @@ class Subscriptions:
         self._there = []
         if is_wanted:
             self._there = [
-                self._node.create_subscription(
-                    kind, topic, take, qos, raw=raw, qos_overriding_options=overridable()
-                )
+                self._node.create_subscription(kind, topic, take, qos, raw=raw)
                 for kind, topic, take, qos, raw in self._wanted
             ]
         return True
@@ -319,7 +322,8 @@ class Health:
 
     Latency is the age of what goes out by its stamp. It counts from the arrival of what a message
     was made from under simulated time, which goes in steps, and where stamps are of another clock,
-    as those of a recording are; the latter is said once.
+    as those of a recording are; the latter is said once. An age below zero is a clock that is
+    wrong, on this computer or another one.
 
     Args:
         node: whose clock, logger and timer are used.
@@ -416,7 +420,13 @@ class Health:
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])
             values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
-        wrong = self.fault or self._last_problem or self.warning
+        ahead = -min(self._latencies, default=0.0)
+        skew = (
+            f"stamps are up to {ahead:.1f} ms ahead of this computer's clock, so no latency is "
+            f"right: synchronise the computers' clocks, with chrony or PTP"
+        )
+        synchronous = ahead < 1.0  # ms; on a local network chrony does better
+        wrong = self.fault or self._last_problem or self.warning or ("" if synchronous else skew)
         level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
         status = DiagnosticStatus(
             level=DiagnosticStatus.ERROR if self.fault else level,

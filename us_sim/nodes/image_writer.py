@@ -17,7 +17,7 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import field_from, nanoseconds_of, pixels_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import EVERY, overridable
+from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import ImageWriterSettings
 
 REMEMBERED = 1000
@@ -38,9 +38,7 @@ class TruthFiles:
         self._early: dict[tuple[str, int], Image] = {}
         self._folders = folders
         for topic in folders:
-            node.create_subscription(
-                Image, topic, self._taking(topic), EVERY, qos_overriding_options=overridable()
-            )
+            node.create_subscription(Image, topic, self._taking(topic), EVERY)
 
     def image_came(self, number: int, stamp: int) -> None:
         """The image with that stamp (ns) has that number."""
@@ -96,9 +94,7 @@ class ImageWriter(GuardedNode):
             "ultrasound/displacement": settings.displacement,
         }
         self.count = 0
-        self.create_subscription(
-            Image, "ultrasound/image", self._write, EVERY, qos_overriding_options=overridable()
-        )
+        self.create_subscription(Image, "ultrasound/image", self._write, EVERY)
         self.truth = TruthFiles(
             self, {topic: _made(name) for topic, name in wanted.items() if name}
         )

@@ -19,7 +19,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import nanoseconds_of, pose_message, stamp_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import EVERY, STREAM, overridable
+from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited, Playback
 from us_sim.nodes.sessions.rosbag2_services import offer_player_services
 from us_sim.nodes.settings import PathPlayerSettings
@@ -58,9 +58,7 @@ class PathPlayer(GuardedNode):
         self.health = Health(self, str(path))
         self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else STREAM)
         if lockstep:
-            self.create_subscription(
-                Image, "ultrasound/image", self._imaged, EVERY, qos_overriding_options=overridable()
-            )
+            self.create_subscription(Image, "ultrasound/image", self._imaged, EVERY)
         self._awaited = Awaited(self, self._poses)
         self.health.state = "waiting"
         self._playback = Playback(

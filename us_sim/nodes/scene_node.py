@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile
 
 from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.qos import EVERY, STREAM, overridable
+from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
@@ -88,7 +88,7 @@ class SceneNode(GuardedNode):
         """
         guarded = self.guarded(self.resolve_topic_name(topic), decoded(message_type, work))
         newest = Newest(self, self.health, guarded, lockstep=self.lockstep)
-        self._subscribe(message_type, topic, newest, qos, raw=True)
+        self.listen(message_type, topic, newest, qos, raw=True)
 
     def listen(
         self,
@@ -96,17 +96,11 @@ class SceneNode(GuardedNode):
         topic: str,
         callback: Callable[[Any], None],
         qos: QoSProfile | None = None,
+        **options: Any,
     ) -> None:
         """Subscribe to every message of ``topic``."""
-        self._subscribe(message_type, topic, callback, qos)
-
-    def _subscribe(
-        self, message_type: Any, topic: str, callback: Any, qos: QoSProfile | None, **options: Any
-    ) -> None:
         qos = qos or (EVERY if self.lockstep else STREAM)
-        self.create_subscription(
-            message_type, topic, callback, qos, qos_overriding_options=overridable(), **options
-        )
+        self.create_subscription(message_type, topic, callback, qos, **options)
 
 
 LEAD_TOPIC = "tracker/pose"

@@ -25,7 +25,7 @@ from us_sim.scoring.lumen import LiveScan
 from us_sim.scoring.metrics import ScoreSettings, metrics_of
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
-_REMEMBERED = 64  # poses, for the image with the same stamp
+_REMEMBERED = 256  # poses, for the image with the same stamp
 
 
 class Scorer(SceneNode):

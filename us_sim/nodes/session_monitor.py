@@ -11,7 +11,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.qos import EVERY, overridable
+from us_sim.nodes.qos import EVERY
 from us_sim.nodes.topics import published_counts
 
 TOLD = 50  # losses that a report tells one by one, the newest
@@ -35,13 +35,7 @@ class SessionMonitor(GuardedNode):
         self._published: dict[tuple[str, int], dict[str, int]] = {}
         self.health = Health(self, run)
         self.health.state = "following"
-        self.create_subscription(
-            DiagnosticArray,
-            "diagnostics",
-            self._take,
-            EVERY,
-            qos_overriding_options=overridable(),
-        )
+        self.create_subscription(DiagnosticArray, "diagnostics", self._take, EVERY)
         self._set: dict[str, dict[str, object]] = {}
         self.create_subscription(ParameterEvent, "/parameter_events", self._note_set, EVERY)
 

@@ -24,13 +24,13 @@ from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_services
 from us_sim.nodes.settings import SessionRecorderSettings
+from us_sim.nodes.topics import MARKERS
 from us_sim.recording.topic import MARKER
 from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, losses_between
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
 _M_MMAP_THRESHOLD, _LARGE = -3, 1 << 17  # of glibc's malloc.h; bytes
-MARKERS = "session/marker"  # what is said there marks a moment
 _WITHOUT_METADATA = (
     "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
     "be read and played without"

@@ -174,6 +174,11 @@ diagnostics: diagnostic_msgs/DiagnosticArray
     refused; of `session_monitor` which nodes ended or hung
 """
 
+MARKERS = "session/marker"
+"""Topic of texts that mark a moment."""
+FROZEN = "frozen"
+"""The text of a page that freezes its image."""
+
 TOPICS = tuple(_topic(entry) for entry in re.split(r"\n(?=\S)", _TABLE.strip()))
 
 

@@ -20,7 +20,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import EVERY, LATCHED, overridable
+from us_sim.nodes.qos import EVERY, LATCHED
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.reconstruction import LiveReconstruction
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
@@ -51,7 +51,7 @@ class VolumeReconstructor(GuardedNode):
             (Image, "ultrasound/image", self._take_image, SECONDS),
             (Float64MultiArray, "ultrasound/image_to_probe", self._take_place, LATCHED),
         ):
-            self.create_subscription(kind, topic, take, qos, qos_overriding_options=overridable())
+            self.create_subscription(kind, topic, take, qos)
         self.create_service(Trigger, "~/save", self._save)
         self.create_service(Trigger, "~/clear", self._clear)
         self.health.state = "ready"

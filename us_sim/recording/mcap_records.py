@@ -158,6 +158,8 @@ def next_sound(stream: BinaryIO, offset: int, size: int) -> int | None:
             return end
         if opcode == Opcode.ATTACHMENT and min(_ends(stream, offset, opcode, length)) > size:
             return None  # it is cut, and may be an MCAP file itself
+        if cut_chunk_at(stream, offset, size) is not None:
+            return None  # among the pixels of an image are bytes that could be a record
     for begin in range(offset + 1, size, _BLOCK - _OVERLAP):
         stream.seek(begin)
         block = stream.read(_BLOCK)
@@ -169,17 +171,19 @@ def next_sound(stream: BinaryIO, offset: int, size: int) -> int | None:
 
 
 def cut_chunk_at(stream: BinaryIO, offset: int, size: int) -> Chunk | None:
-    """The chunk that begins there and within which the file ends."""
+    """The chunk that begins there and within which the file ends, as both its lengths say."""
     stream.seek(offset)
     head = stream.read(_OVERLAP)
-    if head[:1] != bytes([Opcode.CHUNK]) or len(head) < CHUNK.size:
+    if head[:1] != bytes([Opcode.CHUNK]) or len(head) < CHUNK.size + LENGTH.size:
         return None
     _, length, _, _, unpacked, _, name_length = CHUNK.unpack_from(head)
-    packed = offset + CHUNK.size + name_length + LENGTH.size
+    begin = CHUNK.size + name_length + LENGTH.size
     name = head[CHUNK.size : CHUNK.size + name_length]
-    if name not in _COMPRESSIONS or offset + HEADER.size + length <= size or packed > size:
+    if name not in _COMPRESSIONS or begin > len(head) or offset + HEADER.size + length <= size:
         return None
-    return Chunk(offset, packed, size, name.decode(), unpacked, is_whole=False)
+    if begin + LENGTH.unpack_from(head, begin - LENGTH.size)[0] != HEADER.size + length:
+        return None
+    return Chunk(offset, offset + begin, size, name.decode(), unpacked, is_whole=False)
 
 
 def records_in(stream: BinaryIO, chunk: Chunk) -> Iterator[tuple[int, memoryview]]:

@@ -30,6 +30,7 @@ from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_
 from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
 from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
+from us_sim.settings.spelling import aligned
 
 
 class Bag:
@@ -330,12 +331,7 @@ def describe(bag: Bag) -> str:
         quality = "; ".join(dict.fromkeys(topic["qos"])) or "-"
         encoding = "" if topic["encoding"] == "cdr" else f" ({topic['encoding']})"
         table.append((topic["name"], topic["type"] + encoding, str(count), rate, quality))
-    widths = [max(len(row[i]) for row in table) for i in range(4)]
-    for name, kind, count, rate, quality in table:
-        lines.append(
-            f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {count:>{widths[2]}}  "
-            f"{rate:>{widths[3]}}  {quality}"
-        )
+    lines += aligned(table, left=(0, 1, 4))
     lines += _section("lost", [f"{count} of {topic}" for topic, count in summary["lost"].items()])
     marked = [
         f"{(mark['time'] - (summary['start'] or mark['time'])) * 1e-9:.3f} s  {mark['text']}"

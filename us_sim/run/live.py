@@ -434,7 +434,7 @@ def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = N
             keep_tissue(scene, volume, late_progress("making the tissue"))
     finally:
         for shown in bar:
-            shown.__exit__(None, None, None)
+            shown.__exit__()
 
 
 def _is_kept(scene: Scene) -> bool:

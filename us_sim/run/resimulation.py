@@ -7,8 +7,10 @@ recording; those of its start are used.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +19,7 @@ from typing import Any
 from us_sim.errors import BagError
 from us_sim.nodes.sessions.attachments import checksum, parts_of
 from us_sim.recording.path import write_path
-from us_sim.recording.reader import read_bag
+from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.repair import extract, versions
 from us_sim.recording.topic import BagAttachment
 from us_sim.run.plan import Parameters, simulation_nodes
@@ -79,6 +81,20 @@ def resimulation(session: Path, folder: Path, volume: Path | None = None) -> Res
         parameters,
         [*_other_versions(session, attached)],
     )
+
+
+@contextlib.contextmanager
+def scene_of(bag: Bag) -> Iterator[Scene]:
+    """The scene that is attached to a session, as long as its files are unpacked.
+
+    Raises:
+        BagError, UsSimError: as of `resimulation`.
+    """
+    attached = bag.attachments()
+    if "scene.yaml" not in attached:
+        raise BagError(f"{bag.path} has no scene attached, so nobody knows where vessels are")
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
+        yield scene_within(bag.path, attached, Path(folder, "attached"))
 
 
 def scene_within(

@@ -21,7 +21,7 @@ from us_sim.nodes.topics import TOPICS, Topic
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import Stamp, stamp_reader
 from us_sim.recording.topic import BagTopic, Fault
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import aligned, counted
 
 POSES = "probe/pose"
 DERIVED = {
@@ -74,10 +74,6 @@ class TopicCheck:
         return next(found, None) if self.read_stamp else None
 
     @property
-    def is_latched(self) -> bool:
-        return any(profile.durability == "transient_local" for profile in self.topic.qos)
-
-    @property
     def ages(self) -> NDArray[np.float64]:
         """(K,) ms from the stamps to the sending, of messages with a stamp."""
         stamps, sent = _times(self.stamps), _times(self.sent)
@@ -92,7 +88,7 @@ class TopicCheck:
     @property
     def interval(self) -> float | None:
         """ns from message to message as is usual; None where there is no such."""
-        if len(self.sent) < _REGULAR or self.is_latched:
+        if len(self.sent) < _REGULAR or self.topic.is_latched:
             return None
         usual, long = np.percentile(np.diff(np.sort(_times(self.sent))), [50, 90])
         return float(usual) if 0 < long <= 2 * usual else None
@@ -100,7 +96,7 @@ class TopicCheck:
 
 @dataclass(frozen=True)
 class BagCheck:
-    """What was found of a bag."""
+    """The findings on a bag."""
 
     bag: Bag
     topics: list[TopicCheck]  # by name
@@ -149,6 +145,10 @@ def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) ->
         findings += _latency(each, origin)
         if poses is not None and poses.read_stamp and len(poses.stamps):
             findings += _pairing(each, poses, origin)
+    damaged = sum(fault.messages for fault in faults)
+    if damaged > 0 and sum(each.missing or 0 for each in held) <= damaged:
+        # The damaged parts held what is missing, and the poses of these stamps.
+        findings = [finding for finding in findings if finding.kind not in ("loss", "stamp")]
     return BagCheck(bag, held, findings, size, time.monotonic() - began)
 
 
@@ -200,12 +200,11 @@ def _order(each: TopicCheck, origin: int) -> Iterator[Finding]:
         )
     stamped = np.flatnonzero(_times(each.stamps))
     back = stamped[1:][np.diff(_times(each.stamps)[stamped]) < 0]
-    if len(back) and not each.is_latched:
+    if len(back) and (name.endswith(f"/{POSES}") or each.derived is not None):
         yield Finding(
             "order",
             f"the stamps of {name} go back {counted(len(back), 'time')}, first at "
             f"{_at(logged[back[0]], origin)}: let one node publish it, with one clock",
-            matters=name.endswith(f"/{POSES}") or each.derived is not None,
         )
 
 
@@ -251,6 +250,14 @@ def _losses(each: TopicCheck, said: int, origin: int, one_counter: bool) -> Iter
 
 def _gaps(each: TopicCheck, poses: TopicCheck | None, origin: int) -> Iterator[Finding]:
     sent, interval = np.sort(_times(each.sent)), each.interval
+    name = each.topic.name
+    if poses is not None and len(poses.sent) > 1 and not len(sent):
+        yield Finding(
+            "gap",
+            f"{name} has no message, while {len(poses.sent)} poses came: see in the diagnostics "
+            f"and the log of {each.derived.publishers[0] if each.derived else 'its node'} why",
+        )
+        return
     if poses is not None and len(poses.sent) and len(sent):
         # What follows from poses is missed where poses came, and at the end, too.
         came = np.sort(_times(poses.sent))
@@ -268,7 +275,7 @@ def _gaps(each: TopicCheck, poses: TopicCheck | None, origin: int) -> Iterator[F
         return
     worst = gaps[np.argmax(lengths[gaps])]
     where = f"the longest of {lengths[worst] * 1e-9:.3f} s at {_at(int(begins[worst]), origin)}"
-    name, many = each.topic.name, counted(len(gaps), "gap")
+    many = counted(len(gaps), "gap")
     if each.derived is not None and poses is not None:
         node = each.derived.publishers[0]
         yield Finding(
@@ -296,7 +303,7 @@ def _latency(each: TopicCheck, origin: int) -> Iterator[Finding]:
             f"{counted(len(early), 'message')} of {name} came up to {ahead:.1f} ms before being "
             f"sent, first at {_at(int(logged[early[0]]), origin)}: {clocks}",
         )
-    if each.is_latched or not stamps.any():
+    if each.topic.is_latched or not stamps.any():
         return
     if each.is_of_another_time:
         days = float(np.median(each.ages)) / 86_400_000
@@ -334,10 +341,10 @@ def _pairing(each: TopicCheck, poses: TopicCheck, origin: int) -> Iterator[Findi
     if len(alone):
         yield Finding(
             "stamp",
-            f"{counted(len(alone), 'message')} of {each.topic.name} have no pose's stamp on "
-            f"{poses.topic.name}, first at {_at(each.logged[alone[0]], origin)}: see whether poses "
-            f"were lost, or {each.derived.publishers[0] if each.derived else 'its node'} stamps "
-            f"by itself",
+            f"{poses.topic.name} has no pose of the stamp of "
+            f"{counted(len(alone), 'message')} of {each.topic.name}, first at "
+            f"{_at(each.logged[alone[0]], origin)}: see whether poses were lost, or "
+            f"{each.derived.publishers[0] if each.derived else 'its node'} stamps by itself",
         )
 
 
@@ -351,7 +358,7 @@ def table(found: BagCheck) -> list[tuple[str, ...]]:
     """
     rows: list[tuple[str, ...]] = [_TITLES]
     for each in found.topics:
-        ages = each.ages if not (each.is_latched or each.is_of_another_time) else np.zeros(0)
+        ages = each.ages if not (each.topic.is_latched or each.is_of_another_time) else np.zeros(0)
         told = [f"{age:.2f}" for age in np.percentile(ages, [50, 99, 100])] if len(ages) else "---"
         interval = each.interval
         rows.append(
@@ -370,18 +377,14 @@ def table(found: BagCheck) -> list[tuple[str, ...]]:
 
 def report(found: BagCheck) -> str:
     """The table, and a line for each finding, for a person."""
-    rows = table(found)
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_TITLES))]
     rate = found.bytes / 1e6 / max(found.seconds, 1e-3)
     lines = [
         f"{found.bag.path}: {sum(len(each.logged) for each in found.topics)} messages, "
         f"{found.bytes / 1e6:.1f} MB, read in {found.seconds:.2f} s ({rate:.0f} MB/s)",
         "",
+        *aligned(table(found)),
+        "",
     ]
-    for name, *numbers in rows:
-        cells = [f"{cell:>{width}}" for cell, width in zip(numbers, widths[1:], strict=True)]
-        lines.append("  ".join([f"{name:<{widths[0]}}", *cells]))
-    lines.append("")
     lines += [
         f"{finding.kind if finding.matters else 'note'}: {finding.text}"
         for finding in found.findings

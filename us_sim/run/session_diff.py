@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +18,10 @@ from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vecto
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagMessage
-from us_sim.run.resimulation import scene_within
+from us_sim.run.resimulation import scene_of
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scoring.lumen import VESSELS
-from us_sim.settings.spelling import counted
+from us_sim.settings.spelling import aligned, counted
 from us_sim.tissue.elasticity.material import kind_of
 
 AREAS = 40  # pairs of which areas are compared, evenly over the session
@@ -257,11 +256,7 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
     needed = {_NODES, _POSES, "/tissue/rest", "/tissue/tetrahedra"}
     if not needed <= names:
         return None
-    attached = one.attachments()
-    if "scene.yaml" not in attached:
-        raise BagError(f"{one.path} has no scene attached")
-    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
-        scene = scene_within(one.path, attached, Path(folder, "attached"))
+    with scene_of(one) as scene:
         volume = volume_of(scene)
         vessels = {
             label: name for label, name in volume.label_names.items() if kind_of(name) in VESSELS
@@ -319,14 +314,7 @@ def _decoded(bag: Bag, topic: str, stamps: set[int]) -> dict[int, Any]:
 def table(found: SessionDiff) -> str:
     """The numbers below each other, and what could not be compared."""
     rows = [HEAD, *found.rows]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
-    lines = [f"A {found.paths[0]}", f"B {found.paths[1]}", ""]
-    for row in rows:
-        cells = (
-            f"{cell:<{width}}" if k < 2 else f"{cell:>{width}}"
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  ".join(cells).rstrip())
+    lines = [f"A {found.paths[0]}", f"B {found.paths[1]}", "", *aligned(rows, left=(0, 1))]
     pairs = sum(len(each.stamps) for each in found.topics)
     lines += ["", *found.notes]
     if found.is_none:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import struct
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagTopic
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
-from us_sim.run.resimulation import scene_within
+from us_sim.run.resimulation import scene_of
 from us_sim.run.session_summary import read_session
 
 AREAS = 200  # images of which areas are measured, evenly over the session
@@ -137,11 +136,7 @@ def write_areas(bag: Bag, folder: Path, progress: Progress) -> Iterator[Path]:
         BagError: the session has no scene, no vessels, or other files than then; or a file exists.
         UsSimError: the scene cannot be read.
     """
-    attached = bag.attachments()
-    if "scene.yaml" not in attached:
-        raise BagError(f"{bag.path} has no scene attached, so nobody knows where vessels are")
-    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as place:
-        scene = scene_within(bag.path, attached, Path(place, "attached"))
+    with scene_of(bag) as scene:
         session = read_session(bag.path)
         areas = session.lumen_areas(scene, AREAS, lambda done: progress(done, "areas"))
     if areas is None:

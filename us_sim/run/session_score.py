@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from us_sim.errors import BagError, ScoreError
+from us_sim.errors import BagError, ScoreError, UsSimError
+from us_sim.nodes.topics import FROZEN, MARKERS
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
@@ -17,14 +18,12 @@ from us_sim.run.resimulation import scene_within
 from us_sim.run.session_summary import read_session
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scoring.lumen import vessels_in
-from us_sim.scoring.metrics import Force, Scan, Section
+from us_sim.scoring.metrics import Force, Scan
 from us_sim.scoring.motion import Motion
 
-FROZEN = "frozen"
-"""Begins the text on `session/marker` with which a page tells that its image was frozen."""
 _SAMPLES = 200  # images of which areas are measured, at least
 _RATE = 5.0  # and a second
-_POSES, _MARKS = "/probe/pose", "/session/marker"
+_POSES, _MARKS = "/probe/pose", f"/{MARKERS}"
 
 
 def read_scan(
@@ -67,9 +66,11 @@ def read_scan(
         missing.append(f"images that were frozen: {file} has no marks on {_MARKS}")
     try:
         truth = _truth(file, bag, path, progress)
-    except BagError as error:
+    except UsSimError as error:
         truth = {}
         missing.append(f"areas of structures: {error}")
+    if truth and not truth["sections"]:
+        missing.append(f"areas of structures: no image of {file} cuts a vessel of deformed tissue")
     return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 
 
@@ -83,7 +84,8 @@ def _seconds(stamps: np.ndarray, begin: int) -> np.ndarray:
 
 
 def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force | None:
-    names = [each.name for each in bag.topics if each.type_name == WRENCH_STAMPED]
+    topics = [each for each in bag.topics if each.type_name == WRENCH_STAMPED]
+    names = [each.name for each in topics if each.message_count]
     if topic is None:
         preferred = [name for name in names if name.endswith("probe/wrench")]
         chosen = preferred if len(preferred) == 1 else names
@@ -108,7 +110,7 @@ def _truth(
     """Sections, lines and thrombi of the vessels; of five images a second, and two hundred in all.
 
     Raises:
-        BagError: there is no scene, tissue, image or vessel.
+        UsSimError: there is no scene or image, or a file of the scene is missing or another.
     """
     attached = bag.attachments()
     if "scene.yaml" not in attached:
@@ -119,11 +121,11 @@ def _truth(
         scene = scene_within(file, attached, Path(place, "attached"))
         session = read_session(file)
         samples = max(_SAMPLES, int(_RATE * path.duration))
-        meter = session.measured_lumens(scene, samples, lambda done: progress(done, "areas"))
         lines, thrombi = vessels_in(volume_of(scene))
-    areas = meter.areas() if meter is not None else None
-    sections: dict[str, Section] = {}
-    width = probe_of(scene).width
-    if meter is not None and areas is not None:
-        sections = areas.sections(meter.poses, lines, width)
-    return {"sections": sections, "lines": lines, "thrombi": thrombi, "width": width}
+        meter = session.measured_lumens(scene, samples, lambda part: progress(part, "areas"), lines)
+    return {
+        "sections": meter.sections() if meter is not None else {},
+        "lines": lines,
+        "thrombi": thrombi,
+        "width": probe_of(scene).width,
+    }

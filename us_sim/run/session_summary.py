@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.camera_video import PathVideo
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
+from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.lumen import LumenAreas, LumenMeter, lumens_of
 from us_sim.slicing.b_mode import BMode
 from us_sim.tracking.camera.body_pose import rotation_angle
@@ -85,9 +86,13 @@ class Session:
         return meter.areas() if meter is not None else None
 
     def measured_lumens(
-        self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
+        self,
+        scene: Scene,
+        samples: int,
+        progress: Callable[[float], None] | None = None,
+        lines: Mapping[str, CentreLine] | None = None,
     ) -> LumenMeter | None:
-        """Likewise, with the poses of the images.
+        """Likewise, with centre lines of the vessels for their places.
 
         Raises:
             BagError: no image has its pose and nodes.
@@ -102,7 +107,7 @@ class Session:
                 "look into nodes.log"
             )
         first = min(self.poses)
-        meter = LumenMeter(numbers, scanner, self.rest)
+        meter = LumenMeter(numbers, scanner, self.rest, lines)
         picked = np.linspace(0, len(stamps) - 1, min(samples, len(stamps))).astype(int).tolist()
         for k, at in enumerate(picked, 1):
             stamp = stamps[at]

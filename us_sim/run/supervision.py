@@ -18,7 +18,7 @@ from us_sim.run.monitored import Monitored
 from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
 from us_sim.run.processes import ProcessGroup, ending
 from us_sim.run.ros_arguments import namespace
-from us_sim.run.watch import START_LIMIT_S, Restarts, SupervisionSettings, Watch
+from us_sim.run.watch import BUSY_FACTOR, START_LIMIT_S, Restarts, SupervisionSettings, Watch
 
 LIVES_S = 10.0
 """How long a node that was started again lives if what was set of it is not why it ended."""
@@ -101,8 +101,9 @@ class Supervisor:
     def failed(self) -> str:
         """Why the plan cannot run, where a node of it is given up before all were ready."""
         late = self.waiting
-        if late and time.monotonic() - self._changed > START_LIMIT_S:
-            return f"{', '.join(late)} did not start in {START_LIMIT_S:g} s"
+        limit = BUSY_FACTOR * START_LIMIT_S
+        if late and time.monotonic() - self._changed > limit:
+            return f"{', '.join(late)} did not start in {limit / 60:g} minutes"
         given_up = (loss for loss in self.losses if loss.given_up and loss.node in late)
         return str(next(given_up, ""))
 
@@ -142,7 +143,10 @@ class Supervisor:
                 self.keep(node, values)
         for node, status in ended.items():
             self._ended(node, status)
-        hung = self._watch.hung(self._running(), self._monitor.node.heard)
+        parts = {
+            node: [part.node for part in process.parts] for node, process in self._processes.items()
+        }
+        hung = self._watch.hung(self._running(), self._monitor.node.heard, parts)
         for node, how in hung.items():
             said = self._monitor.node.messages.get(node) or self._group.last_words(node)
             self._group.end(node)

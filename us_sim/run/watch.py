@@ -12,8 +12,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from us_sim.run.fork_server import ProcessState, process_state
 from us_sim.settings.quantity import Quantity
@@ -35,7 +36,7 @@ class SupervisionSettings(Settings):
     )
     silence: float = setting(
         Quantity("time", 2.0, 3600.0),
-        "without a report after which a node hangs; six times as long while it works",
+        "seconds without a report after which a node hangs; six times as long while it works",
         default=10.0,
     )
     standby: bool = setting(
@@ -46,13 +47,13 @@ class SupervisionSettings(Settings):
 
 
 STEP_S = 0.5
-"""A longer time between two looks counts as this much: the machine slept, or had no time for us,
+"""A longer time between two checks counts as this much: the machine slept, or had no time for us,
 and so perhaps none for the nodes."""
 STOPPED_S = 0.5  # for which a process may be stopped
 BUSY_SHARE = 0.5
 """Of the silence, in which a node that is busy has worked or waited for a processor."""
 BUSY_FACTOR = 6.0  # how many times as long a busy node may be silent: it may be compiling
-START_LIMIT_S = 900.0  # for the first report: the first run compiles, minutes where cores are busy
+START_LIMIT_S = 300.0  # for the first report
 
 
 @dataclass
@@ -85,25 +86,32 @@ class Watch:
         self._silences: dict[tuple[str, int], _Silence] = {}
 
     def hung(
-        self, pids: Mapping[str, int], reports: Mapping[tuple[str, int], int]
+        self,
+        pids: Mapping[str, int],
+        reports: Mapping[tuple[str, int], int],
+        parts: Mapping[str, Collection[str]] = MappingProxyType({}),
     ) -> dict[str, str]:
         """The nodes that hang, and how that shows, for a person; each is told once.
 
         Args:
             pids: the processes that run, by node.
             reports: how many have come, by node and process.
+            parts: other nodes in the process of a node; it hangs when one of them does.
         """
         now = self._clock()
         step = 0.0 if self._last is None else min(now - self._last, STEP_S)
         self._last = now
-        hung = {}
+        hung: dict[str, str] = {}
         for node, pid in pids.items():
-            silence = self._silences.setdefault((node, pid), _Silence())
-            self._add(silence, pid, step, reports.get((node, pid), 0))
-            told = self._told(silence)
-            if told:
-                silence.silent = silence.busy = silence.stopped = 0.0
-                hung[node] = told
+            for part in (node, *parts.get(node, ())):
+                silence = self._silences.setdefault((part, pid), _Silence())
+                self._add(silence, pid, step, reports.get((part, pid), 0))
+                told = self._told(silence)
+                if told:
+                    silence.silent = silence.busy = silence.stopped = 0.0
+                    hung.setdefault(
+                        node, told if part == node else f"was ended, since {part} in it {told}"
+                    )
         return hung
 
     def _add(self, silence: _Silence, pid: int, step: float, reports: int) -> None:
@@ -122,11 +130,9 @@ class Watch:
     def _told(self, silence: _Silence) -> str:
         if silence.stopped >= STOPPED_S:
             return "was stopped (SIGSTOP)"
-        limit = self._limit
+        limit = self._limit if silence.reports else max(self._limit, START_LIMIT_S)
         if silence.busy > BUSY_SHARE * silence.silent:
             limit *= BUSY_FACTOR
-        if not silence.reports:
-            limit = max(limit, START_LIMIT_S)
         if silence.silent < limit:
             return ""
         return f"has not reported for {silence.silent:.0f} s"

@@ -185,8 +185,6 @@ def tissue_model_of(
     if section is None:
         raise SceneError(f"{scene.origin}: tissue: is missing")
     if scene.structures:
-        from us_sim.scene.building import require_labels
-
         require_labels(scene, volume)
     mesh, remarks, fractions = _mesh(scene, section, volume)
     fixed, held = _fixed_nodes(scene, section, mesh, volume, fractions)
@@ -207,17 +205,26 @@ def tissue_model_of(
 
 
 def materials_of(
-    scene: Scene, materials: Mapping[str, Material], mesh: TetrahedralMesh, volume: Volume
+    scene: Scene,
+    materials: Mapping[str, Material],
+    mesh: TetrahedralMesh,
+    volume: Volume,
+    fractions: LabelFractions | None = None,
 ) -> TissueMaterials:
     """The constants of each tetrahedron, from materials by label name.
+
+    Args:
+        fractions: `label_fractions_of` mesh and volume, where they are known already.
 
     Raises:
         SceneError: a label of the volume has no material, or a material no label.
     """
-    return _materials(scene, materials, mesh, volume, _label_fractions(mesh, volume))
+    fractions = fractions or label_fractions_of(mesh, volume)
+    return _materials(scene, materials, mesh, volume, fractions)
 
 
-def _label_fractions(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
+def label_fractions_of(mesh: TetrahedralMesh, volume: Volume) -> LabelFractions | None:
+    """How much of each tetrahedron each label fills; None without labels."""
     from us_sim.tissue.elasticity.materials import label_fractions
 
     if volume.labels is None:
@@ -296,7 +303,7 @@ def _mesh(
         parts = int(mesh.parts.max()) + 1
         if parts > 1:
             remarks = (*remarks, f"it is in {parts} parts that touch nowhere")
-        return mesh, remarks, _label_fractions(mesh, volume)
+        return mesh, remarks, label_fractions_of(mesh, volume)
     if isinstance(given.nodes, int):
         from us_sim.scene.case_tissue import box_tissue, kept_tissue
 
@@ -313,7 +320,7 @@ def _mesh(
         for i, axis in enumerate("xyz")
     ]
     mesh = box_mesh(*planes)
-    return mesh, (), _label_fractions(mesh, volume)
+    return mesh, (), label_fractions_of(mesh, volume)
 
 
 def _fixed_nodes(

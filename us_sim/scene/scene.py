@@ -14,6 +14,7 @@ from typing import Any
 from us_sim.errors import SceneError
 from us_sim.geometry.pose import Placement
 from us_sim.geometry.transducer import ProbeSettings
+from us_sim.scene.episode import EpisodeSettings
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SLICERS, SOLVERS, TRACKERS
@@ -233,6 +234,10 @@ class Scene(Settings):
     m_mode: MModeSettings = setting(description="the line of M-mode", default=MModeSettings())
     tracker: TrackerSettings = setting(
         description="where poses come from", default=TrackerSettings()
+    )
+    episode: EpisodeSettings = setting(
+        description="how robots and learners move the probe, and what differs between episodes",
+        default=EpisodeSettings(),
     )
     path: str | None = setting(
         description="bag with a probe path, for the demo", default=None, file=True

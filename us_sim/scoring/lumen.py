@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, lifted
 from us_sim.scoring.centre_line import CentreLine, places_of
 from us_sim.scoring.metrics import Force, Scan, Section
 from us_sim.scoring.motion import Motion
@@ -21,8 +21,6 @@ from us_sim.volume.volume import Volume
 VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
 _HARDLY_CUT = 0.1
 """Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
-_STEEPEST = 0.2
-"""Cosine of a probe's tilt; beyond it, how far it would have to be lifted means nothing."""
 
 
 def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
@@ -83,24 +81,6 @@ class LumenAreas:
         """Relative change of the area from rest; -0.5 is half closed."""
         return float(self.fraction(vessel)[sample] - 1.0)
 
-    def sections(
-        self, poses: Sequence[Pose], lines: Mapping[str, CentreLine], width: float
-    ) -> dict[str, Section]:
-        """The same, with their places along the vessels that have a centre line.
-
-        Args:
-            poses: (K,) of the probe.
-            width: m, of the image.
-        """
-        found: dict[str, Section] = {}
-        for name in self.area.keys() & lines.keys():
-            cuts = [lines[name].cut(_lifted(pose), width) for pose in poses]
-            places = [(c.along, c.angle, c.lateral) if c else (np.nan,) * 3 for c in cuts]
-            found[name] = Section(
-                self.time, self.area[name], self.at_rest[name], *np.array(places).T
-            )
-        return {name: found[name] for name in lines if name in found}
-
 
 class LumenMeter:
     """Measures vessels image by image.
@@ -113,6 +93,7 @@ class LumenMeter:
         lumens: labels of each vessel by its name.
         scanner: that finds labels.
         rest: (N, 3) m, nodes of the mesh that the scanner carries; None where it carries none.
+        lines: centre lines by the vessels' names, for `sections`.
     """
 
     def __init__(
@@ -120,21 +101,29 @@ class LumenMeter:
         lumens: Mapping[str, tuple[int, ...]],
         scanner: BMode,
         rest: NDArray[np.float64] | None = None,
+        lines: Mapping[str, CentreLine] | None = None,
     ) -> None:
         self._lumens, self._scanner, self._rest = lumens, scanner, rest
+        self._lines = lines or {}
         self._pixel = float(np.prod(scanner.probe.pixel_spacing))
         self._edge = _edge(scanner.probe)
         self._time: list[float] = []
-        self.poses: list[Pose] = []
+        self._depth: list[float] = []
+        self._cuts: dict[str, list[tuple[float, ...]]] = {name: [] for name in self._lines}
         self._found: list[list[list[float]]] = []  # m², now and at rest, by vessel
         self._whole: list[NDArray[np.bool_]] = []  # in the image, by vessel
 
     def add(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
         """Measure an image, of the labels (rows, columns) that it shows."""
-        seen = labels, self._scanner.labels(_lifted(pose), self._rest)
+        above = lifted(pose)
+        seen = labels, self._scanner.labels(above, self._rest)
         inside = [[np.isin(each, n) for n in self._lumens.values()] for each in seen]
         self._time.append(time)
-        self.poses.append(pose)
+        self._depth.append(float(pose.position[2]))
+        for name, line in self._lines.items():
+            cut = line.cut(above, self._scanner.probe.width)
+            place = (cut.along, cut.angle, cut.lateral) if cut else (np.nan,) * 3
+            self._cuts[name].append(place)
         self._found.append([[self._pixel * float(v.sum()) for v in each] for each in inside])
         self._whole.append(~np.any([[v[self._edge].any() for v in each] for each in inside], 0))
 
@@ -154,22 +143,25 @@ class LumenMeter:
             return None
         return LumenAreas(
             time=np.array(self._time),
-            depth=np.array([pose.position[2] for pose in self.poses]),
+            depth=np.array(self._depth),
             area={name: now[i] for name, i in cut.items()},
             at_rest={name: rest[i] for name, i in cut.items()},
         )
+
+    def sections(self) -> dict[str, Section]:
+        """Likewise, with their places along the vessels; of those that have a centre line."""
+        areas = self.areas()
+        return {
+            name: Section(areas.time, areas.area[name], areas.at_rest[name], *np.array(cuts).T)
+            for name, cuts in self._cuts.items()
+            if areas is not None and name in areas.area
+        }
 
 
 def _edge(probe: Probe) -> NDArray[np.bool_]:
     """(rows, columns) the last pixels of an image that its beams reach."""
     reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
     return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
-
-
-def _lifted(pose: Pose) -> Pose:
-    """Where the probe would be in the same plane if it did not press."""
-    depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
-    return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
 
 
 class LiveScan:
@@ -190,7 +182,7 @@ class LiveScan:
         """Begin anew."""
         self._poses: list[tuple[float, Pose]] = []
         self._forces: list[tuple[float, float]] = []
-        self._meter = LumenMeter(self._lumens, self._scanner)
+        self._meter = LumenMeter(self._lumens, self._scanner, lines=self.lines)
 
     def add_pose(self, time: float, pose: Pose) -> None:
         """Take a pose of the probe at a time (s) after those before; others are passed over."""
@@ -215,7 +207,5 @@ class LiveScan:
         positions, orientations = zip(*((p.position, p.orientation) for p in poses), strict=True)
         motion = Motion(np.array(times), np.array(positions), np.array(orientations))
         force = Force(*np.array(self._forces).T) if len(self._forces) > 1 else None
-        areas = self._meter.areas()
         width = self._scanner.probe.width
-        sections = areas.sections(self._meter.poses, self.lines, width) if areas else {}
-        return Scan(motion, force, sections, self.lines, self._thrombi, width)
+        return Scan(motion, force, self._meter.sections(), self.lines, self._thrombi, width)

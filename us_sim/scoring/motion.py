@@ -133,22 +133,32 @@ class Motion:
         scale = self.elapsed_time() ** 5 / length**2 if length > 0 else np.nan
         return float(self.squared_jerk() * scale)
 
-    def swept_area(self, ends: ArrayLike, where: ArrayLike | None = None) -> float:
+    def swept_area(
+        self, ends: ArrayLike, where: ArrayLike | None = None, facing: _Array | None = None
+    ) -> float:
         """Area m² that a line sweeps which leads from each position to an end (K, 3) m.
 
         Two triangles a step, as PerkTutor's `Tissue Damage` has of a needle; only steps both of
-        whose samples are true count.
+        whose samples are true count. With unit vectors ``facing`` (K, 3), their projection across
+        them.
         """
         near, far = self.positions, np.asarray(ends, float)
         inside = np.ones(len(self), bool) if where is None else np.asarray(where, bool)
-        area = _triangles(near[1:], far[1:], near[:-1]) + _triangles(far[1:], near[:-1], far[:-1])
+        area = np.zeros(len(self) - 1)
+        for a, b, c in ((near[1:], far[1:], near[:-1]), (far[1:], near[:-1], far[:-1])):
+            normal = 0.5 * np.cross(b - a, c - a)
+            if facing is None:
+                area += np.linalg.norm(normal, axis=1)
+            else:
+                area += np.abs((normal * facing[1:]).sum(axis=1))
         return float(area[inside[1:] & inside[:-1]].sum())
 
     def face_area(self, width: float, where: ArrayLike | None = None) -> float:
-        """Area m² that a probe's face of this width (m, along x) sweeps, likewise."""
-        half = 0.5 * width * Rotation.from_quat(self.orientations).apply([1.0, 0.0, 0.0])
+        """Area m² of the skin over which a probe's face of this width (m, along x) slides."""
+        rotation = Rotation.from_quat(self.orientations)
+        half = 0.5 * width * rotation.apply([1.0, 0.0, 0.0])
         side = Motion(self.times, self.positions - half, self.orientations)
-        return side.swept_area(self.positions + half, where)
+        return side.swept_area(self.positions + half, where, rotation.apply([0.0, 0.0, 1.0]))
 
 
 def _ends(where: ArrayLike | None) -> NDArray[np.bool_] | slice:
@@ -165,7 +175,3 @@ def _actions(times: _Array, is_fast: NDArray[np.bool_]) -> int:
             acting, since = fast, time
             count += fast
     return count
-
-
-def _triangles(a: _Array, b: _Array, c: _Array) -> _Array:
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))

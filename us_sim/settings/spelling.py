@@ -1,4 +1,4 @@
-"""Names and numbers in sentences: suggestions for unknown names, singular and plural.
+"""Names and numbers for a person: suggestions for unknown names, singular and plural, columns.
 
 >>> from us_sim.settings.spelling import unknown
 >>> unknown("fem_nonlinaer", ["fem", "fem_nonlinear"])
@@ -6,13 +6,16 @@
 >>> from us_sim.settings.spelling import counted
 >>> counted(1, "place"), counted(0, "place"), counted(2, "is", "are")
 ('1 place', '0 places', '2 are')
+>>> from us_sim.settings.spelling import aligned
+>>> aligned([("topic", "count"), ("/tf", "7")])
+['topic  count', '/tf        7']
 """
 
 from __future__ import annotations
 
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 _MANY = 25
 """Names that are too many to list beside the one that was probably meant."""
@@ -23,6 +26,18 @@ _repr.maxstring = _repr.maxother = _LONGEST = 60
 def counted(count: int, one: str, several: str | None = None) -> str:
     """A number with its noun, ``1 frame`` or ``2 frames``; ``several`` where that is no mere s."""
     return f"{count} {one if count == 1 else several or f'{one}s'}"
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
+    """A line for each row, with columns below each other: those of ``left`` flush left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if k in left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
 
 
 def shown(value: object) -> str:

@@ -1,8 +1,9 @@
 """Sessions of zenoh as rmw_zenoh opens them, and a router where none runs.
 
-Sessions are peers that find each other through a router on this host (port 7447) and then speak
-directly. rmw_zenoh wants the router to be started by hand; here the first process has it, and when
-that ends another one takes over: links between peers stay meanwhile.
+Sessions are peers that find each other through a router on this host and then speak directly.
+rmw_zenoh wants the router (port 7447) to be started by hand. Sessions here use that one, whenever
+it is started, and another (port 7448) that the first process has; when that ends, another process
+takes it over: links between peers stay meanwhile.
 
 ZENOH_SESSION_CONFIG_URI, ZENOH_ROUTER_CONFIG_URI and ZENOH_CONFIG_OVERRIDE mean what they mean to
 rmw_zenoh. Of the discovery ranges, LOCALHOST keeps the router on the loopback interface, OFF keeps
@@ -11,9 +12,9 @@ sessions alone, and the others let the router be reached, and reach those of ROS
 
 from __future__ import annotations
 
-import atexit
 import json
 import os
+import re
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
@@ -23,7 +24,7 @@ import zenoh
 
 from .middleware import DiscoveryRange, MiddlewareError, loopback_fault
 
-PORT = 7447
+RMW_PORT, PORT = 7447, 7448
 _WATCH_EVERY = 0.5  # s
 
 # Where rmw_zenoh's files of configuration differ from zenoh's defaults.
@@ -40,7 +41,7 @@ _COMMON = {
 }
 _SESSION = _COMMON | {
     "mode": "peer",
-    "connect/endpoints": [f"tcp/127.0.0.1:{PORT}"],
+    "connect/endpoints": [f"tcp/127.0.0.1:{port}" for port in (RMW_PORT, PORT)],
     "connect/timeout_ms": {"router": -1, "peer": -1, "client": 0},
     "connect/exit_on_failure": {"router": False, "peer": False, "client": True},
     "connect/retry": {  # sooner than rmw_zenoh: a router that ended is soon replaced
@@ -84,8 +85,7 @@ def open_session(environment: Mapping[str, str] = os.environ) -> Any:
             f"no zenoh session can be opened ({error}); check ZENOH_SESSION_CONFIG_URI and "
             f"ZENOH_CONFIG_OVERRIDE if they are set"
         ) from None
-    if port is not None:
-        _keeper.watch(session)
+    _keeper.watch(session)
     return session
 
 
@@ -114,25 +114,24 @@ def _config(kind: str, default: Mapping[str, Any], environment: Mapping[str, str
 
 
 def _local_port(config: Any) -> int | None:
-    """The port on this host where the session looks for a router; None if it looks elsewhere."""
+    """The last port on this host where the session looks for a router; None if there is none."""
     endpoints = json.loads(config.get_json("connect/endpoints"))
-    for endpoint in endpoints if isinstance(endpoints, list) else []:
-        protocol, _, address = endpoint.partition("/")
-        host, _, port = address.rpartition(":")
-        if protocol == "tcp" and host in ("localhost", "127.0.0.1", "[::1]") and port.isdecimal():
-            return int(port)
-    return None
+    found = [
+        re.fullmatch(r"tcp/(?:localhost|127\.0\.0\.1|\[::1\]):(\d+)", each)
+        for each in (endpoints if isinstance(endpoints, list) else [])
+    ]
+    return next((int(match[1]) for match in reversed(found) if match), None)
 
 
 class _Keeper:
-    """Opens a router in this process when its sessions have none."""
+    """Opens a router in this process when its sessions have none, and closes all at its end."""
 
     def __init__(self) -> None:
         self._sessions: list[Any] = []
         self._lock = threading.Lock()
         self._router: Any = None
         self._config: Any = None
-        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
 
     def need(self, port: int, reach: DiscoveryRange, environment: Mapping[str, str]) -> None:
         """Have a router on this port from now on, this process's or another one's."""
@@ -140,32 +139,36 @@ class _Keeper:
             if self._config is not None:
                 return
             host = "127.0.0.1" if reach.name == "LOCALHOST" else "0.0.0.0"
-            peers = [f"tcp/{peer}:{PORT}" for peer in reach.static_peers]
+            peers = [f"tcp/{peer}:{p}" for peer in reach.static_peers for p in (RMW_PORT, PORT)]
             default = {"listen/endpoints": [f"tcp/{host}:{port}"], "connect/endpoints": peers}
             self._config = _config("ROUTER", _ROUTER | default, environment)
             self._open()
-            atexit.register(self._end)
-            threading.Thread(target=self._watch, name="zenoh router", daemon=True).start()
 
     def watch(self, session: Any) -> None:
         """Open a router whenever this session, and all the others here, have lost theirs."""
         with self._lock:
             self._sessions.append(session)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="zenoh sessions")
+                self._thread.start()
 
     def _open(self) -> None:
         with suppress(zenoh.ZError):  # somebody else has the port
             self._router = zenoh.open(self._config)
 
-    def _watch(self) -> None:
-        while not self._ended.wait(_WATCH_EVERY):
+    def _run(self) -> None:
+        # Python waits for the threads in which zenoh calls back, so closing from `atexit` is late.
+        program = threading.main_thread()
+        program.join(_WATCH_EVERY)
+        while program.is_alive():
             with self._lock:
                 self._sessions = sessions = [s for s in self._sessions if not s.is_closed()]
             is_lost = sessions and not any(each.info.routers_zid() for each in sessions)
-            if self._router is None and is_lost:
+            if self._config is not None and self._router is None and is_lost:
                 self._open()
-
-    def _end(self) -> None:
-        self._ended.set()
+            program.join(_WATCH_EVERY)
+        for each in self._sessions:
+            each.close()
         if self._router is not None:
             self._router.close()
 

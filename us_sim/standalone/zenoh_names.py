@@ -6,8 +6,9 @@ attachment_helpers.cpp have them; see https://github.com/ros2/rmw_zenoh.
 
 from __future__ import annotations
 
+import re
 import struct
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import xxhash
 
@@ -16,12 +17,13 @@ from .middleware import EndpointQos
 NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
 
 DEFAULT_DEPTH = 42
-"""What a depth of 0 stands for."""
+"""The depth that 0 stands for."""
 
 _SPACE = "@ros2_lv"
 _OF_NODE, _OF_ENDPOINT = 9, 13  # the parts of a token
 _DEFAULT_QOS = EndpointQos(depth=DEFAULT_DEPTH)
 _INFINITE = (9223372036, 854775807)  # rmw_time_t: s, ns
+_QOS = "{}:{}:{},{}:{},{}:{},{}:{},{},{}"
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_SIZE = 16
 
@@ -41,7 +43,7 @@ def key_of(domain: int, name: str, type_name: str, type_hash: str) -> str:
 
 
 def attachment(sequence: int, timestamp: int, gid: bytes) -> bytes:
-    """What goes with a sample: its number, when it was sent (ns since 1970), and who sent it.
+    """The bytes beside a sample: its number, its time (ns since 1970) and its sender.
 
     In zenoh's serialization: two signed numbers of 64 bits, then the bytes after their number.
     """
@@ -96,30 +98,19 @@ class Entity:
 def read_token(token: str) -> Entity | None:
     """The entity that a token tells of; None if it is none of rmw_zenoh's."""
     parts = [part.replace("%", "/") for part in token.split("/")]
-    if len(parts) not in (_OF_NODE, _OF_ENDPOINT) or parts[0] != _SPACE or not all(parts):
-        return None
-    _, domain, session, node_number, number, kind, *names = parts
+    kind = parts[5] if len(parts) >= _OF_NODE else ""
     if kind not in (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT):
         return None
+    size = _OF_NODE if kind == NODE else _OF_ENDPOINT  # Lyrical adds more, which counts for no gid
+    if len(parts) < size or parts[0] != _SPACE or not all(parts):
+        return None
+    _, domain, session, node_number, number, _, *names = parts[:size]
     try:
-        qos = read_qos(names.pop()) if kind != NODE else _DEFAULT_QOS
-        enclave, namespace, node, *topic = names
-        name, type_name, type_hash = topic or ("", "", "")
-        return Entity(
-            int(domain),
-            session,
-            int(node_number),
-            int(number),
-            kind,
-            enclave,
-            namespace,
-            node,
-            name,
-            type_name,
-            type_hash,
-            qos,
-        )
-    except (ValueError, IndexError, TypeError):
+        qos = _DEFAULT_QOS if kind == NODE else read_qos(names.pop())
+        numbers = int(node_number), int(number)
+        entity = Entity(int(domain), session, *numbers, kind, *names)  # type: ignore[arg-type]
+        return replace(entity, qos=qos)
+    except ValueError:
         return None
 
 
@@ -133,56 +124,35 @@ def qos_text(qos: EndpointQos) -> str:
     >>> qos_text(EndpointQos(depth=7, reliability=EndpointQos.BEST_EFFORT, deadline=2_000_000_001))
     '2::,7:2,1:,:,,'
     """
-
-    def text(name: str) -> str:
-        value = getattr(qos, name)
-        return "" if value == getattr(_DEFAULT_QOS, name) else str(value)
-
-    def duration(nanoseconds: int) -> str:
-        if not nanoseconds:
-            return ","
-        both = zip(divmod(nanoseconds, 10**9), _INFINITE, strict=True)
-        return ",".join("" if part == infinite else str(part) for part, infinite in both)
-
-    return (
-        f"{text('reliability')}:{text('durability')}:{text('history')},{text('depth')}:"
-        f"{duration(qos.deadline)}:{duration(qos.lifespan)}:"
-        f"{text('liveliness')},{duration(qos.liveliness_lease_duration)}"
-    )
+    pairs = zip(_numbers(qos), _DEFAULTS, strict=True)
+    return _QOS.format(*("" if number == default else number for number, default in pairs))
 
 
 def read_qos(text: str) -> EndpointQos:
-    """The policies in a token.
+    """The policies in a token; raises ValueError where the text is none of `qos_text`'s."""
+    parts = re.split("[:,]", text)
+    pairs = zip(parts, _DEFAULTS, strict=True)
+    numbers = [int(part) if part else default for part, default in pairs]
+    if _QOS.format(*parts) != text:
+        raise ValueError(text)
 
-    Raises:
-        ValueError, IndexError: it is not what `qos_text` makes.
-    """
-    reliability, durability, history, deadline, lifespan, liveliness = (
-        [int(part) if part else None for part in group.split(",")] for group in text.split(":")
-    )
+    def duration(first: int) -> int:
+        seconds, nanoseconds = both = numbers[first], numbers[first + 1]
+        return 0 if both == _INFINITE else seconds * 10**9 + nanoseconds
 
-    def duration(parts: list[int | None]) -> int:
-        if parts == [None, None]:
-            return 0
-        seconds, nanoseconds = (
-            infinite if part is None else part
-            for part, infinite in zip(parts, _INFINITE, strict=True)
-        )
-        return seconds * 10**9 + nanoseconds
+    reliability, durability, history, depth = numbers[:4]
+    times = duration(4), duration(6), numbers[8], duration(9)
+    return EndpointQos(reliability, durability, history, depth, *times)
 
-    given = {
-        "reliability": reliability[0],
-        "durability": durability[0],
-        "history": history[0],
-        "depth": history[1],
-        "liveliness": liveliness[0],
-    }
-    return EndpointQos(
-        **{
-            name: getattr(_DEFAULT_QOS, name) if value is None else value
-            for name, value in given.items()
-        },
-        deadline=duration(deadline),
-        lifespan=duration(lifespan),
-        liveliness_lease_duration=duration(liveliness[1:]),
-    )
+
+def _numbers(qos: EndpointQos) -> list[int]:
+    def duration(nanoseconds: int) -> tuple[int, int]:
+        return divmod(nanoseconds, 10**9) if nanoseconds else _INFINITE
+
+    deadline, lifespan = duration(qos.deadline), duration(qos.lifespan)
+    lease = duration(qos.liveliness_lease_duration)
+    policies = qos.reliability, qos.durability, qos.history, qos.depth
+    return [*policies, *deadline, *lifespan, qos.liveliness, *lease]
+
+
+_DEFAULTS = _numbers(_DEFAULT_QOS)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 import weakref
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
@@ -48,6 +48,7 @@ from .zenoh_names import (
 _HEARTBEAT = 0.5  # s, of latched publishers, so that a sample that was lost is noticed
 _SETTLING = 0.1  # s; tokens come by the router, sooner than the link to their session is up
 _PAUSE = 0.01  # s, between two tries
+_OPEN_REQUESTS = 100  # of one service
 _LONGEST_TRY = 10.0  # s, to reach a service that is said to be there
 
 
@@ -63,13 +64,12 @@ class Zenoh:
         self._lock = threading.RLock()
         self._closed = False
         self._alive: dict[str, Entity] = {}  # by token
-        self._since: dict[str, float] = {}  # when tokens of others came
+        self._since: dict[tuple[str, str], dict[str, float]] = {}  # by kind and key, then token
         self._announced: dict[int, GraphNode] = {}
         self._node_tokens: dict[int, Any] = {}
         self._open: weakref.WeakSet[_Endpoint] = weakref.WeakSet()
         self.session = open_session()
         self._id = str(self.session.info.zid())
-        _contexts.add(self)
         self._watch = self.session.liveliness().declare_subscriber(
             all_tokens(domain_id), self._token_changed, history=True
         )
@@ -127,27 +127,23 @@ class Zenoh:
     def declare(self, entity: Entity) -> Any:
         """Have an entity known to others for as long as the returned token is declared."""
         with self._lock:
-            self._alive[entity.token] = entity
+            self._know(entity.token, entity, since=0.0)
         return self.session.liveliness().declare_token(entity.token)
 
-    def forget(self, entity: Entity) -> None:
+    def _know(self, token: str, entity: Entity, since: float) -> None:
+        self._alive[token] = entity
+        self._since.setdefault((entity.kind, entity.key), {}).setdefault(token, since)
+
+    def forget(self, token: str, entity: Entity) -> None:
         with self._lock:
-            self._alive.pop(entity.token, None)
+            self._alive.pop(token, None)
+            self._since.get((entity.kind, entity.key), {}).pop(token, None)
 
-    def count(self, role: str, like: Entity) -> int:
-        """The number of entities in a role for the same topic or service, with the same type.
-
-        Those that are too new to be reached are left out.
-        """
+    def count(self, role: str, key: str) -> int:
+        """The number of entities in a role on a key that are old enough to be reached."""
         settled = time.monotonic() - _SETTLING
         with self._lock:
-            return sum(
-                each.kind == role
-                and each.name == like.name
-                and each.type_name == like.type_name
-                and self._since.get(token, settled) <= settled
-                for token, each in self._alive.items()
-            )
+            return sum(since <= settled for since in self._since.get((role, key), {}).values())
 
     def nodes(self) -> list[GraphNode]:
         with self._lock:
@@ -188,6 +184,7 @@ class Zenoh:
                 return
             self._closed = True
             self._alive.clear()
+            self._since.clear()
             self._announced.clear()
         for endpoint in list(self._open):
             endpoint.closed = True
@@ -200,23 +197,9 @@ class Zenoh:
             if self._closed or entity is None or entity.session == self._id:
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self._alive[token] = entity
-                self._since.setdefault(token, time.monotonic())
+                self._know(token, entity, time.monotonic())
             else:
-                self._alive.pop(token, None)
-                self._since.pop(token, None)
-
-
-_contexts: weakref.WeakSet[Zenoh] = weakref.WeakSet()
-
-
-def _close_all() -> None:
-    for context in list(_contexts):
-        context.close()
-
-
-# Zenoh calls back from threads that Python waits for before it runs what `atexit` keeps.
-threading._register_atexit(_close_all)  # type: ignore[attr-defined]
+                self.forget(token, entity)
 
 
 def _graph_node(node: Entity, readers: list[bytes], writers: list[bytes]) -> GraphNode:
@@ -231,6 +214,7 @@ class _Endpoint:
         self.closed = False
         self._middleware = middleware
         self._entity = entity
+        self._key = entity.key
         self._declared = self._declare(middleware.session, entity)
         self._token = middleware.declare(entity)
         self.gids: tuple[list[bytes], list[bytes]] = ([], [])
@@ -245,7 +229,7 @@ class _Endpoint:
         if self.closed:
             return
         self.closed = True
-        self._middleware.forget(self._entity)
+        self._middleware.forget(self._entity.token, self._entity)
         self._token.undeclare()
         self._declared.undeclare()
 
@@ -296,7 +280,7 @@ class Writer(_Endpoint):
         return True
 
     def matched_count(self) -> int:
-        return 0 if self.closed else self._middleware.count(SUBSCRIPTION, self._entity)
+        return 0 if self.closed else self._middleware.count(SUBSCRIPTION, self._key)
 
 
 class _Receiver(_Endpoint):
@@ -367,23 +351,34 @@ class Reader(_Receiver):
             self._notify()
 
     def matched_count(self) -> int:
-        return 0 if self.closed else self._middleware.count(PUBLISHER, self._entity)
+        return 0 if self.closed else self._middleware.count(PUBLISHER, self._key)
 
 
 class ServiceServer(_Receiver):
-    """Takes requests for a service and sends the responses."""
+    """Takes requests for a service and sends the responses.
+
+    Of the requests that are not answered yet the newest 100 are kept.
+    """
+
+    on_unanswered: Callable[[str], object] | None = None
 
     def _declare(self, session: Any, entity: Entity) -> Any:
-        self._queries: dict[tuple[bytes, int], Any] = {}
+        self._queries: OrderedDict[tuple[bytes, int], Any] = OrderedDict()
         return session.declare_queryable(entity.key, self._received, complete=True)
 
     def _received(self, query: Any) -> None:
         origin = self._keep(query)
         if origin is None:
             query.drop()
-        else:
-            self._queries[origin] = query
-            self._notify()
+            return
+        self._queries[origin] = query
+        if len(self._queries) > _OPEN_REQUESTS:
+            self._queries.popitem(last=False)[1].drop()
+            if self.on_unanswered is not None:
+                self.on_unanswered(
+                    f"since {_OPEN_REQUESTS} newer ones wait: answer them sooner, or ask less often"
+                )
+        self._notify()
 
     def send_response(self, data: bytes, header: RequestHeader) -> bool:
         """Answer a request; False if it was answered before."""
@@ -414,7 +409,7 @@ class ServiceClient(_Receiver):
         )
 
     def service_is_ready(self) -> bool:
-        return not self.closed and self._middleware.count(SERVICE, self._entity) > 0
+        return not self.closed and self._middleware.count(SERVICE, self._key) > 0
 
     def send_request(self, data: bytes) -> int:
         """Send a serialized request; returns its sequence number."""

@@ -39,7 +39,7 @@ from us_sim.nodes.messages import (
     vectors_from,
     wrench_from,
 )
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.slicing.settings import STRIPS
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.stream import Feed, Packet, Posted
@@ -132,13 +132,7 @@ def image_feeds(
     def place(message: Float64MultiArray) -> None:
         places[:] = [affine_from(message)]
 
-    node.create_subscription(
-        Float64MultiArray,
-        "ultrasound/image_to_probe",
-        place,
-        LATCHED,
-        qos_overriding_options=overridable(),
-    )
+    node.create_subscription(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
 
     def telling(make: Callable[[Image, int, bool], Packet]) -> Make:
         def tell(message: Image, sequence: int) -> Packet:

@@ -28,7 +28,7 @@ from us_sim.errors import MessageError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.nodes.settings import PLAYERS
 from us_sim.settings.spelling import shown
@@ -294,9 +294,7 @@ class ViewerSurface:
         self._skin: RestSurface | None = None
         self._tissue: RestSurface | None = None
         self._plane = RestSurface.plane(0.1)  # m around the origin
-        self._heard = node.create_subscription(
-            Mesh, "skin/mesh", self._take_skin, LATCHED, qos_overriding_options=overridable()
-        )
+        self._heard = node.create_subscription(Mesh, "skin/mesh", self._take_skin, LATCHED)
         rest.watch(self._make_tissue)
         node.guarded(node.resolve_topic_name("tissue/rest"), self._make_tissue)()
 

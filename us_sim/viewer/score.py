@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.topics import FROZEN, MARKERS
 
 if TYPE_CHECKING:
     from us_sim.viewer.stream import Simulator
@@ -80,7 +81,7 @@ class ScoreListener(ScoreBoard):
         self._heard = Subscriptions(node, (DiagnosticArray, "score", self._hear, LATCHED, False))
         self._scorer = node.create_client(Trigger, "scorer/clear")
         self._marks = node.create_publisher(
-            String, "session/marker", STREAM, qos_overriding_options=overridable()
+            String, MARKERS, STREAM, qos_overriding_options=overridable()
         )
 
     def take_commands(self, simulator: Simulator) -> None:
@@ -89,7 +90,7 @@ class ScoreListener(ScoreBoard):
 
     def _mark(self, is_frozen: Any, _: int) -> str | None:
         if is_frozen is True:
-            self._post(lambda: self._marks.publish(String(data="frozen")))
+            self._post(lambda: self._marks.publish(String(data=FROZEN)))
         return None
 
     def _listen(self) -> None:

@@ -299,8 +299,8 @@ def _refuse_security() -> None:
         return
     raise RCLError(
         "failed to initialize rcl: ROS_SECURITY_ENABLE is true, but without ROS 2 there is no DDS "
-        "security; install ROS 2, or unset it, or set ROS_SECURITY_STRATEGY=Permissive, to send "
-        "everything in the clear"
+        "security: install ROS 2; or, to send everything in the clear, unset ROS_SECURITY_ENABLE "
+        "or set ROS_SECURITY_STRATEGY=Permissive"
     )
 
 

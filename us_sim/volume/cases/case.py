@@ -25,7 +25,7 @@ from us_sim.errors import CaseError, UsSimError, VolumeError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
-from us_sim.settings.spelling import nearest, unknown
+from us_sim.settings.spelling import aligned, nearest, unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
@@ -300,11 +300,7 @@ def table(cases: Sequence[ListedCase]) -> str:
     titles = ("case", "region", "probe", "size", "structures")
     rows = [titles, *((c.name, c.region, c.probe, c.size, c.structures) for c in good)]
     cut = [[text if len(text) <= 60 else f"{text[:60]}..." for text in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cut, strict=True)]
-    lines = [
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in (cut if good else [])
-    ]
+    lines = aligned(cut, left=range(len(titles))) if good else []
     return "\n".join(
         [*lines, *(f"cannot be used: {case.problem}" for case in cases if case.problem)]
     )

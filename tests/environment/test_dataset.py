@@ -1,0 +1,151 @@
+"""A data set is the same for any number of workers, and goes on where it stopped."""
+
+import hashlib
+import io
+import json
+import resource
+import tarfile
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from us_sim.command.main import main
+from us_sim.environment import dataset
+from us_sim.environment.agents import Wander
+from us_sim.environment.environment import ScanEnvironment
+
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def scene(small_scene, tmp_path_factory):
+    file = tmp_path_factory.mktemp("scene") / "short.yaml"
+    given = {"based_on": str(small_scene), "name": "short", "skin": None}
+    given["episode"] = {"steps": STEPS, "draws": {"height": [0.0, 0.0]}}
+    file.write_text(yaml.safe_dump(given))
+    return str(file)
+
+
+def make(scene, out, *options):
+    return main(["dataset", scene, "--episodes", "3", "--out", str(out), *options])
+
+
+@pytest.fixture(scope="module")
+def made(scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("data") / "set"
+    assert make(scene, out, "--task", "FindVein") == 0
+    return out
+
+
+def digests(folder):
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in sorted(folder.iterdir())}
+
+
+def steps_of(shard):
+    """The members of each step, as any reader of a WebDataset groups them."""
+    steps: dict[str, dict[str, bytes]] = {}
+    with tarfile.open(shard) as tar:
+        for member in tar:
+            key, _, ending = member.name.partition(".")
+            steps.setdefault(key, {})[ending] = tar.extractfile(member).read()
+    return list(steps.values())
+
+
+def test_workers_change_no_byte(scene, made, tmp_path):
+    assert make(scene, tmp_path / "set", "--task", "FindVein", "--workers", "2") == 0
+    assert digests(tmp_path / "set") == digests(made)
+
+
+def test_a_shard_holds_what_the_environment_gives(scene, made):
+    facts = json.loads((made / "00-short-000001.json").read_text())
+    steps = steps_of(made / "00-short-000001.tar")
+    assert len(steps) == facts["images"] == STEPS
+    environment = ScanEnvironment("FindVein", scene)
+    environment.reset(seed=facts["seed"])
+    for step in steps:
+        state, told = environment.state, json.loads(step["json"])
+        for name, truth in (("image.png", state.image), ("labels.png", state.labels)):
+            coded = np.frombuffer(step[name], np.uint8)
+            assert np.array_equal(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), truth)
+        moved = np.load(io.BytesIO(step["displacement.npy"]))
+        assert np.abs(moved - state.displacement).max() <= 2**-11 * np.abs(moved).max()
+        assert told["wrench"] == state.wrench.tolist()
+        vein = (state.labels == 6).sum() * environment.simulation.pixel_area
+        assert told["areas"]["vein"] == pytest.approx(vein)
+        _, reward, *_ = environment.step(told["action"])
+        assert told["reward"] == pytest.approx(reward, abs=1e-5)  # actions have six digits
+
+
+def test_the_same_command_makes_only_what_is_missing(scene, made, monkeypatch, capsys):
+    before = digests(made)
+    (made / "00-short-000002.tar").unlink()
+    seen = []
+    record = dataset._record
+    monkeypatch.setattr(dataset, "_record", lambda *args: seen.append(args) or record(*args))
+    assert make(scene, made, "--task", "FindVein") == 0
+    assert [order.name for order, _ in seen] == ["00-short-000002"]
+    assert digests(made) == before
+    assert "18 images in 3 episodes" in capsys.readouterr().out
+
+
+def test_another_data_set_or_folder_is_refused(scene, made, tmp_path, capsys):
+    assert make(scene, made, "--task", "FindVein", "--seed", "1") == 1
+    assert "holds a data set of other seed; choose another folder" in capsys.readouterr().err
+    (tmp_path / "mine.txt").write_text("mine")
+    assert make(scene, tmp_path) == 1
+    assert "is not empty; choose another folder" in capsys.readouterr().err
+
+
+def test_an_episode_that_fails_is_told_and_the_others_go_on(scene, tmp_path, monkeypatch, capsys):
+    class Stumbles(Wander):
+        def __init__(self, seed):
+            super().__init__(seed)
+            if seed == json.loads((tmp_path / "seed").read_text()):
+                raise FloatingPointError("stumbled")
+
+    out = tmp_path / "set"
+    (tmp_path / "seed").write_text(str(np.random.SeedSequence([0, 0, 1]).generate_state(1)[0]))
+    monkeypatch.setattr(dataset, "Wander", Stumbles)
+    assert make(scene, out) == 1
+    told = json.loads((out / "manifest.json").read_text())["episodes"]
+    assert [("error" in each, each.get("images")) for each in told.values()] == [
+        (False, STEPS),
+        (True, None),
+        (False, STEPS),
+    ]
+    assert "stumbled" in told["00-short-000001"]["error"]
+    assert "00-short-000001 failed: FloatingPointError('stumbled')" in capsys.readouterr().out
+    assert not (out / "00-short-000001.tar").exists()
+
+
+def test_a_full_disk_is_one_sentence_and_the_command_goes_on_later(scene, tmp_path, capsys):
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limit[1]))  # of a file, as a disk's end
+    try:
+        assert make(scene, tmp_path / "set") == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    said = capsys.readouterr().err
+    assert "cannot be written: File too large; make room and give the same command again" in said
+    assert not list((tmp_path / "set").glob("*.tar"))
+    assert make(scene, tmp_path / "set") == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--task", "FindVien"], "--task: 'FindVien' is not one of"),
+        (["--episodes", "0"], "--episodes: 0 is outside 1 to"),
+        (["--workers", "many"], "--workers: 'many' is not a number"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(scene, tmp_path, capsys, options, said):
+    try:
+        status = main(["dataset", scene, "--out", str(tmp_path / "set"), *options])
+    except SystemExit as ended:
+        status = ended.code
+    assert status
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()

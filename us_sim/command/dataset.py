@@ -1,0 +1,35 @@
+"""The command `us-sim dataset`: episodes of scenes with images and every truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from us_sim.command.options import add_setting_options, read_settings
+from us_sim.errors import EpisodeError
+
+
+def dataset_options(parser: argparse.ArgumentParser) -> None:
+    try:
+        from us_sim.environment.dataset import DatasetSettings
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "gymnasium":
+            raise
+        raise EpisodeError(
+            "data sets need the package gymnasium: pip install 'us_sim[environment]'"
+        ) from error
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help="file, name, or case:NAME")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        help="folder; one with part of the same data set is gone on with",
+    )
+    add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed"))
+    parser.set_defaults(command=_dataset)
+
+
+def _dataset(args: argparse.Namespace) -> int:
+    from us_sim.environment.dataset import DatasetSettings, make_dataset
+
+    return make_dataset(args.scenes, read_settings(args, DatasetSettings))

@@ -1,0 +1,327 @@
+"""Data sets: episodes with images and every truth, the same bytes for any number of processes.
+
+Each episode is one shard of a WebDataset (https://github.com/webdataset/webdataset): a tar file
+whose members of one step have one name. Beside it lies a JSON file of what was drawn. What is there
+whole is not made again, so an interrupted command is repeated and goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import multiprocessing
+import tarfile
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim import __version__
+from us_sim.environment.agents import VisualServo, Wander
+from us_sim.environment.environment import ScanEnvironment, scene_of
+from us_sim.environment.tasks import TASKS
+from us_sim.errors import EpisodeError, UsSimError
+from us_sim.progress import Progress
+from us_sim.recording.repair import versions
+from us_sim.scene.scene import Scene
+from us_sim.settings.quantity import Quantity
+from us_sim.settings.reading import document_of
+from us_sim.settings.setting import Settings, setting
+from us_sim.settings.spelling import counted
+from us_sim.volume.partial_file import partial_file
+
+_COMPUTING = ("python", "us_sim_code", "numpy", "scipy", "numba", "opencv-python-headless")
+_CARD = Path(__file__).with_name("data_card.md")
+_WITHOUT_TASK = "HoldContact"
+"""The task whose environment moves the probe where none is asked for; it judges nothing then."""
+
+
+@dataclass(frozen=True)
+class DatasetSettings(Settings):
+    """A data set."""
+
+    error = EpisodeError
+
+    out: Path = setting(description="folder")
+    episodes: int = setting(
+        Quantity("number", 1, 10_000_000), "number of episodes of each scene", default=10
+    )
+    task: str | None = setting(
+        description="record its rewards too, and have an agent do it that sees the image alone "
+        "where there is one (FindVein, CompressVein); else the probe wanders over the skin",
+        choices=tuple(TASKS),
+        default=None,
+    )
+    workers: int = setting(Quantity("number", 1, 1024), "number of processes", default=1)
+    seed: int = setting(Quantity("number", 0, 2**31), "decides every byte", default=0)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """An episode to be made."""
+
+    scene: str
+    task: str | None
+    seed: int
+    name: str  # of the shard, without its ending
+    out: Path
+
+    @property
+    def shard(self) -> Path:
+        return self.out / f"{self.name}.tar"
+
+    @property
+    def facts(self) -> Path:
+        return self.out / f"{self.name}.json"
+
+    def done(self) -> dict[str, Any] | None:
+        """The facts of an episode that is there whole."""
+        with contextlib.suppress(OSError, ValueError):
+            facts: dict[str, Any] = json.loads(self.facts.read_text(encoding="utf-8"))
+            if self.shard.is_file():
+                return facts
+        return None
+
+
+def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
+    """Make what is not there yet of a data set; 1 if an episode failed, 0 else.
+
+    Raises:
+        UsSimError: a scene cannot be used, the folder holds another data set, a file cannot be
+            written, or a process was ended.
+    """
+    out = settings.out
+    loaded = [scene_of(scene) for scene in scenes]
+    head = _head(scenes, loaded, settings)
+    _require_same(out, head)
+    orders = list(_orders(scenes, loaded, settings))
+    found = {order.name: order.done() for order in orders}
+    left = [order for order in orders if found[order.name] is None]
+    # In this process first, where kernels are compiled and a volume is made with progress.
+    for scene in dict.fromkeys(order.scene for order in left):
+        _environment(scene, settings.task)
+    with Progress("making", len(orders), "episodes") as bar:
+        bar.update(len(orders) - len(left))
+        for order, facts in _made(left, settings.workers):
+            found[order.name] = facts
+            bar.update(sum(each is not None for each in found.values()))
+    made = {name: facts for name, facts in found.items() if facts is not None}
+    _write(out / "manifest.json", _json({**head, "episodes": made}))
+    images = sum(int(facts.get("images", 0)) for facts in made.values())
+    failed = {name: facts["error"] for name, facts in made.items() if "error" in facts}
+    _write(out / "README.md", _card(head, images, len(made) - len(failed)))
+    print(f"{counted(images, 'image')} in {counted(len(made) - len(failed), 'episode')} in {out}")
+    for name, error in failed.items():
+        print(f"{name} failed: {error}")
+    return int(bool(failed))
+
+
+def _orders(
+    names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings
+) -> Iterator[_Order]:
+    for k, (name, scene) in enumerate(zip(names, scenes, strict=True)):
+        for n in range(settings.episodes):
+            words = np.random.SeedSequence([settings.seed, k, n]).generate_state(1)
+            shard = f"{k:02d}-{scene.name.replace('/', '_')}-{n:06d}"
+            yield _Order(name, settings.task, int(words[0]), shard, settings.out)
+
+
+def _made(orders: Sequence[_Order], workers: int) -> Iterator[tuple[_Order, dict[str, Any]]]:
+    """Each episode with its facts, as they are finished."""
+    if workers == 1 or len(orders) <= 1:
+        yield from ((order, _episode(order)) for order in orders)
+        return
+    context = multiprocessing.get_context("spawn")  # numba and threads are here already
+    with ProcessPoolExecutor(min(workers, len(orders)), mp_context=context) as pool:
+        waiting: dict[Future[dict[str, Any]], _Order] = {
+            pool.submit(_episode, order): order for order in orders
+        }
+        try:
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        except BrokenProcessPool as error:
+            raise EpisodeError(
+                "a process that makes episodes was ended, as for want of memory: give the same "
+                "command again with fewer --workers; the episodes made so far are kept"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+_environments: dict[tuple[str, str | None], ScanEnvironment] = {}
+
+
+def _environment(scene: str, task: str | None) -> ScanEnvironment:
+    """The environment of this process for a scene and a task."""
+    key = scene, task
+    if key not in _environments:
+        cv2.setNumThreads(1)
+        made = ScanEnvironment(task or _WITHOUT_TASK, scene)
+        _environments.clear()  # one at a time: its volume and its tissue are large
+        _environments[key] = made
+    return _environments[key]
+
+
+def _episode(order: _Order) -> dict[str, Any]:
+    """Make an episode and its files; where it fails, the facts say why, and there is no shard.
+
+    Raises:
+        EpisodeError: a file cannot be written.
+    """
+    facts: dict[str, Any] = {"seed": order.seed}
+    try:
+        with partial_file(order.shard, error_type=_FullError) as path:
+            facts |= _record(order, path)
+    except _FullError as error:
+        raise EpisodeError(
+            f"{error}; make room and give the same command again, the episodes made so far are kept"
+        ) from error
+    except Exception as error:  # a solver's own, say: the other episodes go on
+        problem = str(error) if isinstance(error, UsSimError) else repr(error)
+        facts["error"] = problem
+    _write(order.facts, _json(facts))
+    return facts
+
+
+class _FullError(UsSimError):
+    """A shard cannot be written."""
+
+
+def _record(order: _Order, path: Path) -> dict[str, Any]:
+    environment = _environment(order.scene, order.task)
+    observation, info = environment.reset(seed=order.seed)
+    draw, images, is_success = info["draw"], 0, False
+    agent: Any = Wander(order.seed)
+    if order.task in ("FindVein", "CompressVein"):
+        agent = VisualServo(press=order.task == "CompressVein")
+    labels = environment.simulation.volume.label_names
+    with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
+        while True:
+            action = agent.act(observation)
+            members = _members(environment, observation, labels)
+            observation, reward, done, truncated, info = environment.step(action)
+            step = members.pop("json") | {"action": np.round(action, 6).tolist()}
+            if order.task:
+                step |= {"reward": reward, "is_success": done, **environment.task.facts()}
+                is_success = is_success or done
+            members["json"] = _json(step)
+            for ending, content in members.items():
+                entry = tarfile.TarInfo(f"{order.name}_{images:05d}.{ending}")
+                entry.size = len(content)
+                shard.addfile(entry, io.BytesIO(content))
+            images += 1
+            if done or truncated:
+                break
+    facts = {"scene": order.scene, "images": images, "draw": draw, "labels": labels}
+    return facts | ({"is_success": is_success} if order.task else {})
+
+
+def _members(
+    environment: ScanEnvironment, observation: Mapping[str, NDArray[Any]], labels: Mapping[int, str]
+) -> dict[str, Any]:
+    """The files of a step by their endings; ``json`` is still a mapping."""
+    state, area = environment.state, environment.simulation.pixel_area
+    members: dict[str, Any] = {"image.png": _png(state.image)}
+    step: dict[str, Any] = {
+        "pose": [*state.pose.position.tolist(), *state.pose.orientation.tolist()],
+        "wrench": state.wrench.tolist(),
+        "is_balanced": state.is_balanced,
+        "contact": state.contact,
+        "observed": {
+            name: value.tolist() for name, value in observation.items() if value.ndim == 1
+        },
+    }
+    if labels:
+        members["labels.png"] = _png(state.labels)
+        counts = np.bincount(state.labels.ravel(), minlength=256)
+        step["areas"] = {name: float(area * counts[n]) for n, name in labels.items()}
+    if environment.scene.tissue is not None:
+        members["displacement.npy"] = _npy(state.displacement)
+        if "strain" in environment.scene.episode.observe:
+            members["strain.npy"] = _npy(state.strain)
+    return members | {"json": step}
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    _, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return content.tobytes()
+
+
+def _npy(array: NDArray[np.float32]) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array.astype(np.float16))  # 11 bits: 8 µm of 12 mm
+    return stream.getvalue()
+
+
+def _head(
+    names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings
+) -> dict[str, Any]:
+    """All that decides the bytes, as JSON gives it back."""
+    lines = (line.rpartition(" ") for line in versions().splitlines())
+    found = {name: version for name, _, version in lines if name in _COMPUTING}
+    head = {
+        "seed": settings.seed,
+        "task": settings.task,
+        "episodes_of_each_scene": settings.episodes,
+        "scenes": {name: document_of(scene) for name, scene in zip(names, scenes, strict=True)},
+        "versions": {"us_sim": __version__, **found},
+    }
+    same: dict[str, Any] = json.loads(_json(head))
+    return same
+
+
+def _require_same(out: Path, head: Mapping[str, Any]) -> None:
+    """Begin a data set in a folder, or make sure that it holds the same one.
+
+    Raises:
+        EpisodeError: it holds another, or something else.
+    """
+    manifest = out / "manifest.json"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not manifest.exists():
+            if any(out.iterdir()):
+                raise EpisodeError(f"--out {out}: is not empty; choose another folder")
+            _write(manifest, _json({**head, "episodes": {}}))
+            return
+        there = json.loads(manifest.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise EpisodeError(f"--out {out}: cannot be used: {error.strerror}") from error
+    except ValueError:
+        there = {}
+    other = [key for key in head if not isinstance(there, dict) or there.get(key) != head[key]]
+    if other:
+        raise EpisodeError(
+            f"--out {out}: holds a data set of other {', '.join(other)}; choose another folder"
+        )
+
+
+def _card(head: Mapping[str, Any], images: int, episodes: int) -> bytes:
+    return (
+        _CARD.read_text(encoding="utf-8")
+        .format(
+            images=images,
+            episodes=episodes,
+            scenes=", ".join(head["scenes"]),
+            task=head["task"] or "none: the probe wanders over the skin",
+            seed=head["seed"],
+            version=head["versions"]["us_sim"],
+        )
+        .encode()
+    )
+
+
+def _json(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
+
+
+def _write(path: Path, content: bytes) -> None:
+    with partial_file(path, error_type=EpisodeError) as partial:
+        partial.write_bytes(content)

@@ -1,0 +1,298 @@
+"""A scene as one object without ROS: a pose of the probe in, image, forces and every truth out.
+
+It makes the same objects as the nodes do in lockstep, and calls them in the same order. Frames are
+counted in iterations and on one thread, so that the same poses give the same bytes.
+
+>>> from us_sim.environment.simulation import Simulation
+>>> from us_sim.geometry.pose import Pose
+>>> from us_sim.scene.reading import load_scene
+>>> simulation = Simulation(load_scene("tests/small_scene.yaml"))
+>>> state = simulation.step(Pose([0.0, 0.0, 0.006]))
+>>> state.image.shape, bool(state.force > 1.0)  # N
+((80, 96), True)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+from us_sim.errors import SceneError
+from us_sim.geometry.pose import Pose, lifted
+from us_sim.geometry.se3 import rotation_exp
+from us_sim.progress import late_progress
+from us_sim.scene.building import (
+    label_fractions_of,
+    materials_of,
+    membrane_of,
+    scanner_of,
+    tissue_model_of,
+    volume_of,
+)
+from us_sim.scene.episode import Draws
+from us_sim.scene.scene import Scene
+from us_sim.settings.registry import SOLVERS
+from us_sim.slicing.b_mode import BMode
+from us_sim.slicing.frame import Frame
+from us_sim.slicing.strain import AxialStrain, displacement
+from us_sim.tissue.elasticity.material import kind_of
+from us_sim.tissue.elasticity.materials import LabelFractions
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
+from us_sim.tissue.model import Deformation, TissueModel
+from us_sim.tissue.solvers.solver import TissueSolver
+from us_sim.tissue.solvers.switching import compiled_solver
+from us_sim.volume.volume import Volume
+
+_VOLUMES = 4
+"""Phantoms of other speckle that are kept, with the labels in the tissue's mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """An episode's values, drawn from `Draws`; as they are here, the scene is as it says."""
+
+    stiffness: Mapping[str, float] = field(default_factory=dict)  # factor by label; else 1
+    lumen_pressure: float = 1.0  # factor
+    thickness: float = 1.0  # factor
+    start: Pose = field(default_factory=Pose)  # in ``patient``
+    gain: float = 0.0  # dB, added to the scene's
+    speckle: int | None = None  # seed of the phantom; None for the scene's
+    position_noise: float = 0.0  # m
+    orientation_noise: float = 0.0  # rad
+    delay: int = 0  # steps
+
+    @classmethod
+    def of(cls, draws: Draws, scene: Scene, random: np.random.Generator) -> Draw:
+        """The next values; a fixed number of them is taken, whatever the ranges are."""
+
+        def linear(name: str, count: int | None = None) -> Any:
+            low, high = getattr(draws, name)
+            return random.uniform(low, high, count)
+
+        def factor(name: str, count: int | None = None) -> Any:
+            low, high = np.log(getattr(draws, name))
+            return np.exp(random.uniform(low, high, count))
+
+        labels = sorted(scene.tissue.materials) if scene.tissue else []
+        stiffness = dict(zip(labels, factor("stiffness", len(labels)).tolist(), strict=True))
+        lumen_pressure, thickness = float(factor("lumen_pressure")), float(linear("thickness"))
+        place = [linear("lateral"), linear("elevational"), -linear("height")]
+        turn = np.array([*linear("tilt", 2), linear("rotation")])
+        gain = float(linear("gain"))
+        speckle = int(random.integers(*draws.speckle, endpoint=True))
+        noise = float(linear("position_noise")), float(linear("orientation_noise"))
+        delay = int(random.integers(*draws.delay, endpoint=True))
+        start = Pose(np.array(place), rotation_exp(turn))
+        is_phantom = scene.volume.phantom is not None
+        seed = speckle if is_phantom else None
+        return cls(stiffness, lumen_pressure, thickness, start, gain, seed, *noise, delay)
+
+    def document(self) -> dict[str, Any]:
+        """The values as JSON, in SI units."""
+        start = [*self.start.position.tolist(), *self.start.orientation.tolist()]
+        return {**vars(self), "stiffness": dict(self.stiffness), "start": start}
+
+
+@dataclass(eq=False)
+class State:
+    """A pose of the probe, and what follows from it; images are made when they are asked for."""
+
+    pose: Pose  # of the probe, true
+    frame: Frame
+    wrench: NDArray[np.float64]  # (6,) N, N m, of the tissue on the probe, frame ``probe``
+    is_balanced: bool  # else the wrench is an earlier state's
+    strains: AxialStrain | None = None
+
+    @property
+    def force(self) -> float:
+        """N, by which the tissue pushes the probe back along its axis."""
+        return -float(self.wrench[2])
+
+    @cached_property
+    def contact(self) -> float:
+        """Part of the face that touches, 0 to 1; without air in the scene, whether a force acts."""
+        contact = self.frame.contact
+        return float(self.wrench.any()) if contact is None else float(contact[0].mean())
+
+    @property
+    def image(self) -> NDArray[np.uint8]:
+        """(rows, columns) B-mode."""
+        return self.frame.pixels
+
+    @property
+    def labels(self) -> NDArray[np.uint8]:
+        """(rows, columns) label of each pixel, 0 for none."""
+        return self.frame.labels
+
+    @cached_property
+    def displacement(self) -> NDArray[np.float32]:
+        """(rows, columns, 2) m, lateral and axial way from rest; 0 where no tissue is."""
+        return np.nan_to_num(displacement(self.frame))
+
+    @cached_property
+    def strain(self) -> NDArray[np.float32]:
+        """(rows, columns) axial strain against rest; 0 where no tissue is."""
+        assert self.strains is not None
+        return np.nan_to_num(self.strains.image(self.frame))
+
+
+class Simulation:
+    """The tissue, the skin and the scanner of a scene, as a draw changes them.
+
+    Raises:
+        UsSimError: something of the scene cannot be made.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._blas = ThreadpoolController()
+        self._volumes: dict[int | None, tuple[Volume, TissueModel | None, Any]] = {}
+        self._shape: tuple[Any, ...] | None = None
+        self._materials: tuple[Any, ...] | None = None
+        self._solver: TissueSolver | None = None
+        self._membrane = membrane_of(scene) if scene.skin and scene.imaging.contact else None
+        self._strains: AxialStrain | None = None
+        self._mesh: TetrahedralMesh
+        self.scanner: BMode
+        self.volume: Volume
+        self.reset()
+
+    @property
+    def pixel_area(self) -> float:
+        """m² of a pixel."""
+        return float(np.prod(self.scanner.probe.pixel_spacing))
+
+    def label(self, name: str | None) -> int:
+        """The number of the label of that name; of the first vein where it is None.
+
+        Raises:
+            SceneError: the volume has no such label.
+        """
+        names = self.volume.label_names if self.volume.labels is not None else {}
+        for number, each in names.items():
+            if each == name or (name is None and kind_of(each) == "vein"):
+                return number
+        what = f"label `{name}`" if name else "vein"
+        has = ", ".join(names.values()) or "no labels"
+        raise SceneError(
+            f"{self.scene.origin}: episode.target: the volume has no {what}; it has {has}: name "
+            f"another scene or label"
+        )
+
+    def reset(self, draw: Draw | None = None) -> None:
+        """Bring the tissue to rest with no probe near, and make what a draw changes.
+
+        Raises:
+            UsSimError: something cannot be made.
+        """
+        draw = draw or Draw()
+        with self._blas.limit(limits=1, user_api="blas"):
+            shape = draw.speckle, draw.thickness
+            materials = *shape, draw.lumen_pressure, dict(draw.stiffness)
+            if shape != self._shape:
+                self._make_scanner(draw)
+            if materials != self._materials:
+                self._make_tissue(draw)
+            elif self._solver is not None:
+                self._solver.reset()
+            self._shape, self._materials = shape, materials
+        if self._membrane is not None:
+            self._membrane.reset()
+        imaging = self.scene.imaging
+        gain = imaging.gain + draw.gain
+        self.scanner.use(
+            self.scanner.probe, dataclasses.replace(imaging, gain=gain), imaging.acoustics
+        )
+        self._number = 0
+        self._wrench = np.zeros(6)
+
+    def step(self, pose: Pose) -> State:
+        """Move the probe to a pose in frame ``patient``, and let tissue and skin follow.
+
+        Raises:
+            PoseError, ProbeError: the pose is nowhere near.
+        """
+        with self._blas.limit(limits=1, user_api="blas"):
+            deformation: Deformation | None = None
+            if self._solver is not None:
+                deformation = self._solver.deform(pose)
+                if deformation.is_balanced:
+                    self._wrench = np.concatenate([deformation.force, deformation.torque])
+            skin = self._membrane.deform(pose).vertices if self._membrane is not None else None
+        nodes = deformation.nodes if deformation is not None else None
+        time = self._number * self.scene.episode.period
+        frame = self.scanner.frame(pose, nodes, skin=skin, number=self._number, time=time)
+        self._number += 1
+        is_balanced = deformation is None or deformation.is_balanced
+        return State(pose, frame, self._wrench, is_balanced, self._strains)
+
+    def labels_at_rest(self, pose: Pose) -> NDArray[np.uint8]:
+        """(rows, columns) labels in the plane of a pose if the probe did not press."""
+        nodes = self._solver.model.mesh.nodes if self._solver is not None else None
+        return self.scanner.labels(lifted(pose), nodes)
+
+    def _make_scanner(self, draw: Draw) -> None:
+        base, model, _ = self._drawn_from(draw.speckle)
+        deeper = np.diag([1.0, 1.0, draw.thickness, 1.0])
+        self.volume = dataclasses.replace(base, index_to_patient=deeper @ base.index_to_patient)
+        self.scanner = scanner_of(self.scene, self.volume)
+        if self._membrane is not None:
+            surface = self._membrane.surface
+            self.scanner.touch(surface.vertices, surface.triangles)
+        if model is not None:
+            self._mesh = mesh = _deeper(model.mesh, draw.thickness)
+            self.scanner.carry(mesh.nodes, mesh.tetrahedra)
+            self._strains = AxialStrain(mesh.nodes, mesh.tetrahedra)
+
+    def _make_tissue(self, draw: Draw) -> None:
+        scene, (_, model, fractions) = self.scene, self._drawn_from(draw.speckle)
+        if model is None or scene.tissue is None:
+            return
+        materials = {
+            name: dataclasses.replace(
+                given,
+                young_modulus=given.young_modulus * draw.stiffness.get(name, 1.0),
+                lumen_pressure=given.lumen_pressure and given.lumen_pressure * draw.lumen_pressure,
+            )
+            for name, given in scene.tissue.materials.items()
+        }
+        constants = materials_of(scene, materials, self._mesh, self.volume, fractions)
+        model = dataclasses.replace(model, mesh=self._mesh, materials=constants)
+        method = SOLVERS.load(scene.tissue.solver)
+        settings = scene.solver_settings(scene.tissue.solver) or method.Settings()
+        if self._solver is None:
+            show = late_progress("preparing the tissue")
+            self._solver = compiled_solver(method, model, settings, show)
+        else:
+            self._solver = method(model, settings)
+
+    def _drawn_from(
+        self, speckle: int | None
+    ) -> tuple[Volume, TissueModel | None, LabelFractions | None]:
+        """The scene's volume, its tissue, and the labels in that; they are kept for some seeds."""
+        if speckle not in self._volumes:
+            given, scene = self.scene.volume, self.scene
+            if speckle is not None:
+                scene = dataclasses.replace(scene, volume=dataclasses.replace(given, seed=speckle))
+            volume = volume_of(scene, late_progress("making the volume"))
+            model = tissue_model_of(scene, volume) if scene.tissue else None
+            fractions = label_fractions_of(model.mesh, volume) if model else None
+            while len(self._volumes) >= _VOLUMES:
+                del self._volumes[next(iter(self._volumes))]
+            self._volumes[speckle] = volume, model, fractions
+        return self._volumes[speckle]
+
+
+def _deeper(mesh: TetrahedralMesh, factor: float) -> TetrahedralMesh:
+    """The mesh with all depths multiplied."""
+    if mesh.planes is not None:
+        x, y, z = mesh.planes
+        return box_mesh(x, y, np.asarray(z) * factor)
+    return TetrahedralMesh(mesh.nodes * [1.0, 1.0, factor], mesh.tetrahedra)

@@ -1,0 +1,186 @@
+"""Tasks of `us_sim.environment`: reward and success, from the truth that a simulator knows.
+
+The rewards of an episode's steps sum to between -1 and 0; success adds 1.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.environment.simulation import Simulation, State
+from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import rotation_exp
+
+CLOSED = 0.27
+"""Part of a vein's cross-section at rest at which opposite walls touch (Flaherty, Keller and
+Rubinow, Circulation Research 30, 1972), as `structures.NAME.flow.closed_at`."""
+
+_OPEN = 0.5
+"""Part of it from which a vein counts as open."""
+_HARDLY_CUT = 0.1
+"""Part of its largest cross-section at rest in the episode below which a vessel is not in view."""
+_TOUCHING = 0.9
+"""Part of the face that touches."""
+
+
+class Task(ABC):
+    """A task of one episode."""
+
+    in_short: ClassVar[str]
+    """The task, for a person."""
+    has_goal: ClassVar[bool] = False
+    """Whether observations have an entry `goal`, a pose."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._held = 0  # steps in a row
+
+    def begin(self, start: Pose) -> None:  # noqa: B027 - most tasks begin alike
+        """Begin with the probe at ``start``."""
+
+    @abstractmethod
+    def judge(self, state: State) -> tuple[float, bool]:
+        """The reward of a step, -1 to 0, and whether the task is done."""
+
+    def goal(self, step: int) -> Pose:  # noqa: ARG002
+        """The pose to be at, where the task has one."""
+        return Pose()
+
+    def facts(self) -> dict[str, float]:
+        """Truths of the last step, for a person or a data set."""
+        return {}
+
+    def _hold(self, is_right: bool, steps: int) -> bool:
+        """Whether this and the last steps were right."""
+        self._held = self._held + 1 if is_right else 0
+        return self._held >= steps
+
+
+class _VesselTask(Task):
+    """A task about the target vessel, whose cross-section is compared with the plane's at rest."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        super().__init__(simulation)
+        self._label = simulation.label(simulation.scene.episode.target)
+        self._largest = 0.0  # m²
+        self.fraction = 1.0  # of the area at rest
+        self.offset: float | None = None  # m, of the vessel from the image's middle; None unseen
+
+    def _look(self, state: State) -> None:
+        area = self._simulation.pixel_area
+        rest = self._simulation.labels_at_rest(state.pose) == self._label
+        now = state.labels == self._label
+        at_rest = float(rest.sum()) * area
+        self._largest = max(self._largest, at_rest)
+        is_cut_off = bool(rest[:, [0, -1]].any())
+        if at_rest <= _HARDLY_CUT * self._largest or is_cut_off:
+            self.fraction, self.offset = 1.0, None
+            return
+        self.fraction = float(now.sum()) * area / at_rest
+        columns = np.nonzero(now if now.any() else rest)[1]
+        probe = self._simulation.scanner.probe
+        middle = (probe.columns - 1) / 2
+        self.offset = float((columns.mean() - middle) * probe.pixel_spacing[0])
+
+    def facts(self) -> dict[str, float]:
+        """Area over that at rest, and the offset (m) of what is in view."""
+        seen = {} if self.offset is None else {"target_offset": self.offset}
+        return {"target_area_fraction": self.fraction, **seen}
+
+
+class FindVein(_VesselTask):
+    """Bring the vein to the image's middle, in contact and not pressed flat."""
+
+    in_short = "the vein within 2 mm of the image's middle, open, the face in contact, for 10 steps"
+
+    def judge(self, state: State) -> tuple[float, bool]:
+        """The nearer and the better in contact, the more."""
+        self._look(state)
+        half = self._simulation.scanner.probe.width / 2
+        distance = half if self.offset is None else min(abs(self.offset), half)
+        touches = state.contact >= _TOUCHING
+        is_right = distance <= 2e-3 and touches and self.fraction >= _OPEN
+        return -0.5 * distance / half - 0.5 * (not touches), self._hold(is_right, 10)
+
+
+class CompressVein(_VesselTask):
+    """Compress the vein to closure, and let go."""
+
+    in_short = "the vein at 27 % of its area at rest for 5 steps, then open with less than 1 N"
+
+    def __init__(self, simulation: Simulation) -> None:
+        super().__init__(simulation)
+        self.is_closed = False  # at some time in the episode
+
+    def judge(self, state: State) -> tuple[float, bool]:
+        """The less of the vein is open, and once it was closed, the less force."""
+        self._look(state)
+        if not self.is_closed:
+            shut = self.offset is not None and self.fraction <= CLOSED
+            self.is_closed = self._hold(shut, 5)
+            return -min(self.fraction, 1.0), False
+        let_go = state.force < 1.0 and self.fraction >= _OPEN
+        return -min(state.force / 20.0, 1.0), let_go
+
+    def facts(self) -> dict[str, float]:
+        """Also whether the vein was closed."""
+        return super().facts() | {"closed": float(self.is_closed)}
+
+
+class HoldContact(Task):
+    """Hold a force on the skin."""
+
+    in_short = "4 N along the probe's axis, within 20 %, the face in contact, for 60 steps"
+
+    def judge(self, state: State) -> tuple[float, bool]:
+        """The nearer to the force, the more."""
+        error = abs(state.force - 4.0) / 4.0
+        return -min(error, 1.0), self._hold(error <= 0.2 and state.contact >= _TOUCHING, 60)
+
+
+class FollowPlane(Task):
+    """Follow an image plane that slides along the arm and turns."""
+
+    in_short = (
+        "the image's corners within 2 mm of those of a plane that slides by 10 mm and turns by "
+        "10 deg in 200 steps, for 60 steps in a row"
+    )
+    has_goal = True
+
+    def __init__(self, simulation: Simulation) -> None:
+        super().__init__(simulation)
+        probe = simulation.scanner.probe
+        x, z = probe.width / 2, probe.depth
+        self._corners = np.array([[-x, 0.0, 0.0], [x, 0.0, 0.0], [-x, 0.0, z], [x, 0.0, z]])
+        self._start, self._step, self._error = Pose(), 0, 0.0
+
+    def begin(self, start: Pose) -> None:
+        """The plane begins under the start, pressed by 2 mm and upright."""
+        self._start = Pose(np.array([start.position[0], start.position[1], 2e-3]))
+
+    def goal(self, step: int) -> Pose:
+        """The plane's pose at a step."""
+        part = min(step / 200, 1.0)
+        turn = np.array([0.0, 0.0, np.deg2rad(10.0) * part])
+        return self._start @ Pose(np.array([0.0, 10e-3 * part, 0.0]), rotation_exp(turn))
+
+    def judge(self, state: State) -> tuple[float, bool]:
+        """The nearer to the plane, the more."""
+        self._step += 1
+        apart: NDArray[np.float64] = self.goal(self._step).apply(self._corners)
+        apart = apart - state.pose.apply(self._corners)
+        self._error = float(np.linalg.norm(apart, axis=1).max())
+        return -min(self._error / 0.02, 1.0), self._hold(self._error <= 2e-3, 60)
+
+    def facts(self) -> dict[str, float]:
+        """The largest distance (m) of a corner from where it should be."""
+        return {"plane_error": self._error}
+
+
+TASKS: dict[str, type[Task]] = {
+    task.__name__: task for task in (FindVein, CompressVein, HoldContact, FollowPlane)
+}
