@@ -73,7 +73,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _group(nodeid: str) -> str:
-    """What one process runs in a row: a file, or files that share kernels or a machine's time."""
+    """The group of a test: its file, or files that share kernels or a machine's time."""
     file = _file(nodeid)
     if file.startswith(_TISSUE):
         return "tissue"

@@ -1,13 +1,12 @@
 """The layers hold, nothing is imported in circles, and docs/architecture.md is of this code."""
 
 import ast
-import importlib.util
 import re
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
+import architecture as structure
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -15,20 +14,11 @@ DOMAIN_MAY_NOT = ("rclpy", "_msgs", "_interfaces")
 STANDALONE_MAY = {"cyclonedds", "numpy", "rosbags", "yaml", "xxhash", "zenoh"}
 
 
-@pytest.fixture(scope="module")
-def structure():
-    """docs/architecture.py, which reads rooms and imports from the code."""
-    spec = importlib.util.spec_from_file_location("structure", ROOT / "docs" / "architecture.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_every_room_has_its_place_in_a_layer(structure):
+def test_every_room_has_its_place_in_a_layer():
     assert set(structure.places()) == set(structure.rooms())
 
 
-def test_no_arrow_leads_to_a_layer_above(structure):
+def test_no_arrow_leads_to_a_layer_above():
     layer = {
         room: number
         for number, (_, rows) in enumerate(structure.LAYERS)
@@ -39,18 +29,18 @@ def test_no_arrow_leads_to_a_layer_above(structure):
     assert not {(start, end) for start, end in pairs if layer[start] > layer[end]}
 
 
-def test_rooms_are_not_in_circles(structure):
+def test_rooms_are_not_in_circles():
     pairs = structure.arrows()
     assert not [room for room in structure.rooms() if room in structure.reached(room, pairs)]
 
 
-def test_modules_are_not_in_circles(structure):
+def test_modules_are_not_in_circles():
     names = structure.FILES.keys()
     graph = {name: (structure.imports(name, lazy=False) & names) - {name} for name in names}
     TopologicalSorter(graph).prepare()  # raises CycleError
 
 
-def test_only_what_provides_rclpy_knows_that_it_may_not_be_there(structure):
+def test_only_what_provides_rclpy_knows_that_it_may_not_be_there():
     room = f"us_sim.{structure.BESIDE}"
     inside = {name for name in structure.FILES if f"{name}.".startswith(f"{room}.")}
     knows = {name for name in structure.FILES if structure.imports(name) & inside} - inside
@@ -60,7 +50,7 @@ def test_only_what_provides_rclpy_knows_that_it_may_not_be_there(structure):
     assert {name.partition(".")[0] for name in known} <= STANDALONE_MAY | sys.stdlib_module_names
 
 
-def test_the_domain_knows_nothing_of_ros(structure):
+def test_the_domain_knows_nothing_of_ros():
     domain = {room for row in structure.LAYERS[-1][1] for room in row}
     for name in structure.FILES:
         if structure.room_of(name) in domain:
@@ -68,7 +58,7 @@ def test_the_domain_knows_nothing_of_ros(structure):
             assert not [root for root in roots if root.endswith(DOMAIN_MAY_NOT)], name
 
 
-def test_settings_import_no_other_room_and_no_numerical_library(structure):
+def test_settings_import_no_other_room_and_no_numerical_library():
     assert not [end for start, end in structure.arrows() if start == "settings"]
     for name in structure.FILES:
         if structure.room_of(name) == "settings":
@@ -76,13 +66,13 @@ def test_settings_import_no_other_room_and_no_numerical_library(structure):
             assert not roots & {"numpy", "scipy", "numba"}, name
 
 
-def test_a_module_is_no_longer_than_700_lines_and_few_are_at_the_top(structure):
+def test_a_module_is_no_longer_than_700_lines_and_few_are_at_the_top():
     texts = {name: file.read_text(encoding="utf-8") for name, file in structure.FILES.items()}
     assert {name for name, text in texts.items() if len(text.splitlines()) > 700} == set()
     assert len(list(structure.PACKAGE.glob("*.py"))) <= 7
 
 
-def test_the_page_has_each_rooms_own_sentence(structure):
+def test_the_page_has_each_rooms_own_sentence():
     told = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", PAGE, re.MULTILINE))
     said = {room: text.partition("\n")[0] for room, text in structure.rooms().items()}
     assert {room: told.get(room) for room in said} == said

@@ -81,7 +81,7 @@ def bench():
 
 
 def names_of(code):
-    """What a code block defines."""
+    """The names that a code block defines."""
     names: dict = {}
     exec(code, names)
     return names

@@ -27,7 +27,7 @@ APT = {"opencv": "opencv-python-headless", "skimage": "scikit-image", "yaml": "p
 
 @functools.cache
 def named(dotted):
-    """What a dotted name stands for, or None."""
+    """The object that a dotted name stands for, or None."""
     name, *rest = dotted.split(".")
     found = importlib.import_module(name)
     for part in rest:
@@ -94,7 +94,7 @@ def test_the_installed_versions_have_all_that_is_used(folder):
 
 @pytest.fixture
 def set_up(monkeypatch):
-    """What setup.py says when it is called with a command."""
+    """The arguments of setup.py's `setup` when it is called with a command."""
     given = {}
     monkeypatch.setattr(pytest.importorskip("setuptools"), "setup", given.update)
     monkeypatch.chdir(ROOT)

@@ -1,33 +1,23 @@
 """The security policy is what the table of topics says, with an enclave for every process."""
 
-import importlib.util
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import pytest
+import security
 
 from us_sim.run.plan import NodeProcess, enclave_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture(scope="module")
-def security():
-    """docs/security.py, which writes the policy."""
-    spec = importlib.util.spec_from_file_location("security", ROOT / "docs" / "security.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_policy_is_what_the_code_says(security):
+def test_the_policy_is_what_the_code_says():
     assert security.FILE.read_text(encoding="utf-8") == security.policy(), (
         "config/policy.xml is not what the code says: run `python docs/security.py`"
     )
 
 
-def test_every_executable_has_an_enclave_of_its_own(security):
+def test_every_executable_has_an_enclave_of_its_own():
     setup = (ROOT / "setup.py").read_text(encoding="utf-8")
     executables = re.findall(r'^    "(?:nodes|viewer)\.(\w+)",$', setup, re.MULTILINE)
     root = ET.fromstring(security.policy())
@@ -41,7 +31,7 @@ def test_every_executable_has_an_enclave_of_its_own(security):
     assert NodeProcess("viewer").arguments()[:3] == ["--ros-args", "--enclave", "/us_sim/viewer"]
 
 
-def test_a_node_may_do_what_it_does_and_no_more(security):
+def test_a_node_may_do_what_it_does_and_no_more():
     root = ET.fromstring(security.policy())
     profile = next(each for each in root.iter("profile") if each.get("node") == "skin_deformer")
     allowed = {

@@ -8,11 +8,12 @@ import pytest
 import yaml
 from known_press import KnownPress, arm
 from PIL import Image
+from wrench_files import write_wrenches
 
 from us_sim.command.main import main
 from us_sim.recording.path import ProbePath, write_poses
 from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.recording.wrench import WrenchRecord, write_wrenches
+from us_sim.recording.wrench import WrenchRecord
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.reading import load_scene
 from us_sim.settings.reading import Reader

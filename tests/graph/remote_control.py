@@ -1,4 +1,4 @@
-"""What a person elsewhere on the ROS domain has: parameters to set, and reports to read."""
+"""A person elsewhere on the ROS domain, with parameters to set and reports to read."""
 
 import functools
 import subprocess
@@ -71,7 +71,7 @@ class RemoteControl:
             self._executor.spin_once(timeout_sec=0.05)
 
     def report(self, node="session_control"):
-        """What a node said last, by key."""
+        """The last report of a node, by key."""
         return self.reports.get(node, {})
 
     @property

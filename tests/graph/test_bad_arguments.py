@@ -12,7 +12,7 @@ from rclpy.signals import uninstall_signal_handlers
 
 @pytest.fixture
 def _own_signals() -> Iterator[None]:
-    """What a node does at its end about signals is undone."""
+    """Undo the changes that a node makes to signals at its end."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     kept = [signal.getsignal(number) for number in numbers]
     yield

@@ -15,7 +15,7 @@ from us_sim.volume.cases.case import read_case
 
 
 def run(folder, *words):
-    """What a command prints."""
+    """The output of a command."""
     command = [sys.executable, "-m", "us_sim", *map(str, words)]
     made = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=os.environ)
     assert made.returncode == 0, made.stderr[-2000:]

@@ -1,4 +1,4 @@
-"""What a scene does not name costs nothing: no process, no module, no topic."""
+"""A part that a scene does not name costs nothing: no process, no module, no topic."""
 
 import json
 import os
@@ -49,7 +49,7 @@ def run_and_list_modules(scene: Path, tmp_path: Path) -> tuple[dict[str, set[str
 
 @pytest.fixture(scope="module")
 def said() -> set[str]:
-    """What says which scenes there can be, and computes nothing: every node reads the scene."""
+    """Modules that describe scenes and compute nothing, since every node reads the scene."""
     program = "import sys, us_sim.scene.scene; print(*sys.modules)"
     names = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout
     assert not {"numba", "scipy"} & set(names.split())

@@ -1,4 +1,4 @@
-"""What the recorder takes: messages of a megabyte each at so many MB/s, for so long.
+"""Load for the recorder: messages of a megabyte each at so many MB/s, for so long.
 
     python tests/nodes/recorder_load.py 200 30 FOLDER
 

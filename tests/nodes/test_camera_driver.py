@@ -101,7 +101,7 @@ def test_a_video_that_began_earlier_goes_on_where_it_would_be(bench, video):
 
 
 class PaperCamera:
-    """What `cv2.VideoCapture` is of a camera that gives ``left`` grey images, then none."""
+    """A stand-in for `cv2.VideoCapture` of a camera that gives ``left`` grey images, then none."""
 
     left = 0
     opened = 0

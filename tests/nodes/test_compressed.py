@@ -1,6 +1,6 @@
 """Compressed companions of images: what is decoded again, and the names of image_transport."""
 
-import time
+import threading
 
 import cv2
 import numpy as np
@@ -78,14 +78,13 @@ def test_a_png_is_the_image_itself_and_a_jpeg_is_near(bench, imager) -> None:
 
 
 def test_live_an_image_does_not_wait_for_its_companion(bench, imager, monkeypatch) -> None:
-    """Encoding is made to take half a second: the images come meanwhile, the newest is encoded."""
+    """Encoding is held up: the images come meanwhile, and then the newest is encoded."""
     from us_sim.nodes.streams import compressed as module
 
-    def slow(image, settings):
-        time.sleep(0.5)
-        return compressed(image, settings)
-
-    monkeypatch.setattr(module, "compressed", slow)
+    may_encode = threading.Event()
+    monkeypatch.setattr(
+        module, "compressed", lambda *given: may_encode.wait(30) and compressed(*given)
+    )
     node, poses = imager()
     images = bench.collect(Image, IMAGE)
     companions = bench.collect(CompressedImage, f"{IMAGE}/compressed")
@@ -94,6 +93,7 @@ def test_live_an_image_does_not_wait_for_its_companion(bench, imager, monkeypatc
         poses.publish(pose_at(0.0, second))
         bench.spin_until(lambda n=second: len(images) == n)
     assert not companions
+    may_encode.set()
     bench.spin_until(lambda: companions and companions[-1].header == images[-1].header)
     assert len(companions) < len(images)
     assert np.array_equal(decoded(companions[-1]).shape, pixels_from(images[-1]).shape)

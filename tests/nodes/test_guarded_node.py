@@ -48,7 +48,7 @@ def broken(bench):
 
 @pytest.fixture
 def said(broken, monkeypatch):
-    """What the node logs: level and sentence."""
+    """The node's log: level and sentence."""
     lines = []
     log = broken.get_logger()
     for level in ("error", "warning", "debug"):

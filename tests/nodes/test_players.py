@@ -332,7 +332,7 @@ def test_a_recording_is_paused_gone_along_and_ends_when_it_may(bench, tmp_path):
 
 
 def ask(bench, player, service, **fields):
-    """What one of a player's services answers."""
+    """The answer of one of a player's services."""
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", service).lower()
     kind = getattr(pytest.importorskip("rosbag2_interfaces.srv"), service)
     client = bench.peer.create_client(kind, f"/{player.get_name()}/{name}")
@@ -505,7 +505,7 @@ def test_the_clock_is_that_of_the_recording(bench, numbers):
     player = make(clock=100.0, rate=0.5, start_offset=0.02, stay=True)
     bench.spin_until(lambda: player.health.state == "finished")
     end = stamp_message(EPOCH + 9 * STEP)
-    bench.spin_until(lambda: ticks[-1].clock == end)
+    bench.spin_until(lambda: ticks and ticks[-1].clock == end)
     times = np.array([Time.from_msg(tick.clock).nanoseconds for tick in ticks]) - EPOCH
     assert len(times) >= 20  # 160 ms at half the pace are 32 ticks of 10 ms
     assert STEP <= times[0] < 2 * STEP

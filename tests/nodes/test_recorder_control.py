@@ -45,7 +45,7 @@ newer_than_jazzy = pytest.mark.skipif(
 
 
 def call(bench, service, name, **fields):
-    """What one of the recorder's services answers."""
+    """The answer of one of the recorder's services."""
     client = bench.peer.create_client(service, f"/session_recorder/{name}")
     bench.spin_until(client.service_is_ready)
     answer = client.call_async(service.Request(**fields))
@@ -261,15 +261,21 @@ def test_of_a_large_attachment_there_is_the_checksum(bench, tmp_path):
     assert large.name not in made
 
 
-@newer_than_jazzy
-def test_losses_are_told(bench, quiet, monkeypatch):
-    from rosbag2_interfaces.msg import MessagesLostEvent
-
-    may_write = threading.Event()
+@pytest.fixture
+def may_write(monkeypatch):
+    """An event before which nothing is written."""
+    allowed = threading.Event()
     write = BagWriter.write
     monkeypatch.setattr(
-        BagWriter, "write", lambda *arguments: (may_write.wait(30), write(*arguments))
+        BagWriter, "write", lambda *arguments: (allowed.wait(30), write(*arguments))
     )
+    return allowed
+
+
+@newer_than_jazzy
+def test_losses_are_told(bench, quiet, may_write):
+    from rosbag2_interfaces.msg import MessagesLostEvent
+
     recorder, note, _, file = quiet(max_cache_size=1000)
     events = bench.collect(MessagesLostEvent, "events/rosbag2_messages_lost")
     bench.spin_until(lambda: bench.peer.count_publishers("events/rosbag2_messages_lost") > 0)
@@ -290,12 +296,7 @@ def test_losses_are_told(bench, quiet, monkeypatch):
 
 
 @newer_than_jazzy
-def test_losses_are_recorded_under_the_name_that_rosbag2_uses(bench, quiet, monkeypatch):
-    may_write = threading.Event()
-    write = BagWriter.write
-    monkeypatch.setattr(
-        BagWriter, "write", lambda *arguments: (may_write.wait(30), write(*arguments))
-    )
+def test_losses_are_recorded_under_the_name_that_rosbag2_uses(bench, quiet, may_write):
     lost = "/events/rosbag2_messages_lost"
     recorder, note, _, file = quiet(max_cache_size=1000, also=[lost])
     bench.spin_until(lambda: bench.peer.count_subscribers(lost) > 0)

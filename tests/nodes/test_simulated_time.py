@@ -51,7 +51,7 @@ class Graph:
         self.bench.spin_until(lambda: self.tracker._steady.now().nanoseconds > until)
 
     def reports(self, seconds: float) -> dict[str, list[dict[str, object]]]:
-        """What each node reports in so many real seconds."""
+        """The reports of each node in so many real seconds."""
         self._reports.clear()
         self.spin_for(seconds)
         told: dict[str, list[dict[str, object]]] = {name: [] for name in NODES}

@@ -61,7 +61,7 @@ def slicer(bench, small_scene):
 
 
 def test_the_images_topic_is_there_once_all_is_prepared(bench, small_scene, monkeypatch):
-    """What plays poses waits for it, so that no pose is lost to what is still being loaded."""
+    """The player of poses waits for it, so that none is lost while a volume is being loaded."""
     made = []
     stream = SceneNode.stream
     monkeypatch.setattr(

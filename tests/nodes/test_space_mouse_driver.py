@@ -58,7 +58,7 @@ def test_as_many_buttons_as_have_been_pressed():
 
 
 class PaperDevice:
-    """What `hid` is with one device, which sends ``reports`` and can be pulled out."""
+    """A stand-in for `hid` with one device, which sends ``reports`` and can be pulled out."""
 
     def __init__(self):
         self.reports, self.is_there, self.may_open, self.opened = [], True, True, []

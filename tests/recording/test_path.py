@@ -7,13 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from wrench_files import write_wrenches
 
 from us_sim.errors import BagError
 from us_sim.recording.path import POSE_STAMPED, ProbePath, bodies_in, read_path, write_path
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import jazzy_definitions
-from us_sim.recording.wrench import WrenchRecord, read_wrenches, write_wrenches
+from us_sim.recording.wrench import WrenchRecord, read_wrenches
 from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000

@@ -1,4 +1,4 @@
-"""What a run lost, in a sentence and in the summary."""
+"""The losses of a run, in a sentence and in the summary."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What a session must hold to be simulated from itself; a sentence where it does not."""
+"""A session holds all that it takes to be simulated again; a sentence where it does not."""
 
 import hashlib
 
@@ -32,7 +32,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def attached(scene):
-    """What the recorder attaches to a session of it, with a parameter that a person gave."""
+    """The attachments of a session of it, with a parameter that a person gave."""
     nodes = simulation_nodes(load_scene(scene), {"slice_interpolator": {"stale_after": "0.7"}})
     settings = SessionRecorderSettings(scene=str(scene), parameters=parameters_file(nodes))
     return {name: data for name, (_, data) in session_attachments(settings).items()}

@@ -1,4 +1,4 @@
-"""What a running simulation does as its control is set, without any process."""
+"""A running simulation follows its control, here without any process."""
 
 import shutil
 from dataclasses import replace

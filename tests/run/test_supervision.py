@@ -1,4 +1,4 @@
-"""What the supervisor does with nodes that end, without any process."""
+"""The supervisor restarts nodes that end, here without any process."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -58,7 +58,7 @@ class Group:
 
 
 class Monitor:
-    """What nodes report, on paper: each at once."""
+    """A monitor whose nodes report at once, without any process."""
 
     def __init__(self, group):
         self.group = group

@@ -133,7 +133,7 @@ def test_the_state_of_a_real_process():
 
 
 def refusals(times, **settings):
-    """What is said at these times, s."""
+    """The sentences at these times, s."""
     now = [0.0]
     restarts = Restarts(SupervisionSettings(**settings), clock=lambda: now[0])
     told = []

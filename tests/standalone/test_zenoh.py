@@ -146,6 +146,27 @@ def test_a_request_of_rmw_zenoh_is_answered_with_its_own_number(ours, raw):
     assert abs(sent - time.time_ns()) < 60e9
 
 
+def test_a_hundred_requests_may_wait_for_their_answers(ours, raw):
+    server = ours.create_service(PROBE, *GO, EndpointQos(depth=500))
+    told: list[str] = []
+    server.on_unanswered = told.append
+    querier = raw.declare_querier(TRIGGER_KEY, target=zenoh.QueryTarget.ALL_COMPLETE)
+
+    def ask(number):
+        return querier.get(payload=b"", attachment=attachment(number, 1, bytes(16)))
+
+    number = iter(range(500))
+    open_requests = [until(lambda: ask(next(number)) and server.take())[1]]
+    replies = [ask(1000 + each) for each in range(120)]
+    while open_requests[-1].sequence != 1119:
+        open_requests.append(until(server.take)[1])
+    given_up = len(open_requests) - 100
+    until(lambda: len(told) == given_up)
+    answered = [server.send_response(b"done", each) for each in open_requests]
+    assert answered == [False] * given_up + [True] * 100
+    assert [len(list(each)) for each in replies[-100:]] == [1] * 100
+
+
 def test_a_service_of_rmw_zenoh_is_found_and_called(ours, raw):
     client = ours.create_client(PROBE, *GO, QOS)
     assert not client.service_is_ready()
@@ -332,10 +353,17 @@ for line in sys.stdin:
 """
 
 
-class Member:
-    """A process with a node in the domain, and a router if it is the first one."""
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
-    def __init__(self, name: str, port: int) -> None:
+
+class Member:
+    """A process with a node in the domain, and a router on the last port if it is the first one."""
+
+    def __init__(self, name: str, *ports: int) -> None:
+        routers = json.dumps([f"tcp/127.0.0.1:{port}" for port in ports])
         self.process = subprocess.Popen(
             [sys.executable, "-c", MEMBER, str(DOMAIN), name],
             stdin=subprocess.PIPE,
@@ -345,7 +373,7 @@ class Member:
             | {
                 "RMW_IMPLEMENTATION": ZENOH,
                 "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                "ZENOH_CONFIG_OVERRIDE": f'connect/endpoints=["tcp/127.0.0.1:{port}"]',
+                "ZENOH_CONFIG_OVERRIDE": f"connect/endpoints={routers}",
             },
         )
         assert self.process.stdout.readline() == "up\n"
@@ -358,9 +386,7 @@ class Member:
 
 @pytest.mark.parametrize("way", [signal.SIGTERM, signal.SIGKILL])
 def test_another_process_takes_the_router_over_when_its_process_ends(way):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     members = [Member(name, port) for name in ("first", "second", "third")]
     try:
         until(lambda: all(m.sees() == ["first", "second", "third"] for m in members))
@@ -376,6 +402,18 @@ def test_another_process_takes_the_router_over_when_its_process_ends(way):
         for member in members:
             member.process.kill()
             member.process.communicate()
+
+
+def test_the_router_of_rmw_zenoh_may_start_later():
+    theirs = free_port()
+    member = Member("first", theirs, free_port())
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{theirs}"]')
+    router = zenoh.open(config)
+    until(lambda: list(router.info.peers_zid()))
+    router.close()
+    member.process.communicate(timeout=20)
 
 
 def test_a_session_with_range_off_meets_nobody(ours, monkeypatch):

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from wrench_files import write_wrenches
 
 from us_sim.geometry.collider import Sphere
 from us_sim.recording.path import ProbePath, write_poses
 from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.recording.wrench import WrenchRecord, write_wrenches
+from us_sim.recording.wrench import WrenchRecord
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.building import materials_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene

@@ -1,6 +1,6 @@
 """A node that goes on whatever comes in, refuses bad input, and reports its health.
 
-What a node reports about itself once a second: rate, latency, drops, state.
+The report, once a second: rate, latency, drops, state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from us_sim.recording.schemas import jazzy_definitions
 
 
 def require_sequences(data: bytes, message_type: Any) -> None:
-    """Look at the sequences of a serialized message, where its type is one of Jazzy's with any.
+    """Check the sequences of a serialized message, where its type is one of Jazzy's with any.
 
     Raises:
         Exception: what rosbags raises, where the bytes are no such message.

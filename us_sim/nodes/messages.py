@@ -85,7 +85,7 @@ def stamp_message(nanoseconds: int) -> Time:
 
 
 def require_stamp(message: Any) -> None:
-    """Look at the stamp that a message has in its header, or as a clock.
+    """Check the stamp that a message has in its header, or as a clock.
 
     Raises:
         StampError: there is one, and it is no time.
@@ -97,7 +97,7 @@ def require_stamp(message: Any) -> None:
 
 
 def require_frame(header: Header, frame: str | None) -> None:
-    """Look at the frame of a message; None is any.
+    """Check the frame of a message; None is any.
 
     Raises:
         MessageError: it is another one.
@@ -107,7 +107,7 @@ def require_frame(header: Header, frame: str | None) -> None:
 
 
 _FARTHEST_POSE = 1e7
-"""m: from the middle of the Earth everything is nearer, but for what is no place."""
+"""m, beyond which a position is in another unit, or nonsense."""
 
 
 def pose_from(message: PoseStamped, frame: str | None = None) -> Pose:
@@ -428,7 +428,7 @@ def pixels_from(message: Image) -> NDArray[np.uint8]:
     """
     if message.encoding not in ("mono8", "8UC1"):
         raise VolumeError(f"the image is {message.encoding}; it must be mono8")
-    return _lines(message, 1)
+    return rows_from(message, 1)
 
 
 def colour_pixels_from(message: Image) -> NDArray[np.uint8]:
@@ -439,7 +439,7 @@ def colour_pixels_from(message: Image) -> NDArray[np.uint8]:
     """
     if message.encoding != "rgb8":
         raise VolumeError(f"the image is {message.encoding}; it must be rgb8")
-    return _lines(message, 3).reshape(int(message.height), int(message.width), 3)
+    return rows_from(message, 3).reshape(int(message.height), int(message.width), 3)
 
 
 def field_from(message: Image) -> NDArray[np.float32]:
@@ -454,17 +454,20 @@ def field_from(message: Image) -> NDArray[np.float32]:
         what = f"big-endian {message.encoding}" if message.is_bigendian else message.encoding
         raise VolumeError(f"the image is {what}; it must be 32FC1 to 32FC4, little-endian")
     count = int(form[1])
-    values = np.ascontiguousarray(_lines(message, 4 * count)).view("<f4")
+    values = np.ascontiguousarray(rows_from(message, 4 * count)).view("<f4")
     rows, columns = int(message.height), int(message.width)
     return values.reshape((rows, columns) if count == 1 else (rows, columns, count))
 
 
-def _lines(message: Image, size: int) -> NDArray[np.uint8]:
+def rows_from(message: Image, size: int) -> NDArray[np.uint8]:
     """The bytes of an image, row by row, without padding.
 
     Args:
         message: the image.
         size: bytes of a pixel.
+
+    Raises:
+        VolumeError: no pixels, or fewer bytes than the stated size.
     """
     rows, columns = int(message.height), int(message.width)
     step = int(message.step) or size * columns

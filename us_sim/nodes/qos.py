@@ -1,46 +1,21 @@
 """The quality of service of each kind of topic in the graph."""
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-STREAM = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=10,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+STREAM = QoSProfile(depth=10)  # reliable, volatile, keep last, as rclpy's is where nothing is said
 """Poses, nodes and images inside the graph."""
 
-EVERY = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+EVERY = QoSProfile(depth=1000)
 """A lockstep consumer, which must not lose one."""
 
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Topics published once, for later subscribers too."""
 
-CATALOGUE = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=200,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+CATALOGUE = QoSProfile(depth=200, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Likewise, where each message is about another thing."""
 
-FOREIGN = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-)
+FOREIGN = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Input from drivers, many of which publish best effort."""
 
 

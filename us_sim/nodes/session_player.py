@@ -10,7 +10,7 @@ from typing import Any
 
 from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 
 from us_sim.errors import BagError
@@ -95,17 +95,12 @@ class SessionPlayer(GuardedNode):
             kind = message_type(topic.type_name)
         except BagError as error:
             return f"{topic.name} ({error})"
-        latched = _is_latched(topic)
+        latched = topic.is_latched
         if latched:
             self._latched.add(topic.name)
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST,
-            depth=DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=durability,
-        )
         try:
+            qos = QoSProfile(depth=DEPTH, durability=durability)
             self._topics[topic.name] = self.stream(kind, topic.name, qos)
         except (NameValidationException, ValueError):
             return f"{topic.name!r} (no topic of ROS 2 is called so)"
@@ -212,10 +207,6 @@ def _joined(sentences: list[str]) -> str:
     more = len(sentences) - _MOST_SAID
     shown = "; ".join(sentences[:_MOST_SAID]) or "no topic of it has a message"
     return f"{shown}; and {more} more" if more > 0 else shown
-
-
-def _is_latched(topic: BagTopic) -> bool:
-    return bool(topic.qos) and all(q.durability == "transient_local" for q in topic.qos)
 
 
 main = partial(run_node, SessionPlayer)

@@ -176,6 +176,11 @@ class BagTopic:
     encoding: str = "cdr"
     schema: str | None = None  # ros2msg text; None where the bag carries none
 
+    @property
+    def is_latched(self) -> bool:
+        """Whether all its publishers kept messages for those who come later."""
+        return bool(self.qos) and all(q.durability == "transient_local" for q in self.qos)
+
     def joined(self, other: BagTopic, bag: str) -> BagTopic:
         """This topic with the messages of another channel or file of the same name.
 

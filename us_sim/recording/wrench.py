@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.recording.schemas import jazzy_definitions, stamped
-from us_sim.recording.topic import QosProfile
-from us_sim.recording.writer import BagWriter
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 
@@ -85,23 +82,3 @@ def read_wrenches(path: str | Path, topic: str = "probe/wrench") -> WrenchRecord
     except OverflowError:
         raise BagError(f"{bag.path} holds a stamp on {chosen.name} that is no time") from None
     return WrenchRecord(chosen.name, next(iter(frames)), times, np.array(wrenches))
-
-
-def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:
-    """Writes them as a bag of their one topic, or beside other topics into one that is open.
-
-    Raises:
-        BagError: the file exists or cannot be written.
-    """
-    if not isinstance(file, BagWriter):
-        with BagWriter(file, compression="zstd") as writer:
-            write_wrenches(writer, record)
-        return
-    file.add_topic(record.topic, WRENCH_STAMPED, [QosProfile()])
-    types = jazzy_definitions().types
-    vector = types["geometry_msgs/msg/Vector3"]
-    for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):
-        force, torque = vector(*wrench[:3]), vector(*wrench[3:])
-        measured = types["geometry_msgs/msg/Wrench"](force=force, torque=torque)
-        message = stamped(WRENCH_STAMPED, stamp, record.frame_id, wrench=measured)
-        file.write(record.topic, message, stamp, stamp)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import NamedTuple
 
 from us_sim.errors import BagError, FileTakenError
-from us_sim.recording.schemas import definitions, schema_text
+from us_sim.recording.schemas import schema_text, type_hash
 from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
 
@@ -63,7 +63,7 @@ def losses_between(now: Mapping[str, Loss], before: Mapping[str, Loss]) -> dict[
 
 
 _FLUSH = 0.5  # s, after which messages are handed to the operating system
-_RETRY = 1.0  # s, between looks at a disk that was full
+_RETRY = 1.0  # s, between checks of a disk that was full
 _BATCH = 512 * 1024  # bytes of messages for which it is worth to wake the thread
 
 
@@ -119,8 +119,8 @@ class WriteBehind:
             BagError: the type is unknown.
         """
         schema = schema_text(type_name)
-        type_hash = definitions(type_name, schema).hash_rihs01(type_name)
-        self._do(partial(self._bag.add_topic, topic, type_name, qos, type_hash, schema=schema))
+        digest = type_hash(type_name)
+        self._do(partial(self._bag.add_topic, topic, type_name, qos, digest, schema=schema))
 
     def put(self, topic: str, data: bytes, log_time: int, publish_time: int | None = None) -> bool:
         """A serialized message; False if the queue is full, and it is lost.

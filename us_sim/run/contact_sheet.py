@@ -92,9 +92,9 @@ def draw_outlines(
     """Draw the outlines of labels over a frame's image whose extent is in mm."""
     left, right, bottom, top = extent
     scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
-    settle = partial(onto_border, frame)
+    refine = partial(onto_border, frame)
     for label, colour in colours.items():
-        for outline in label_outlines(frame.labels, label, settle=settle):
+        for outline in label_outlines(frame.labels, label, refine=refine):
             x, y = ((outline + 0.5) * scale + (left, top)).T
             axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
     axes.set(xlim=(left, right), ylim=(bottom, top))
@@ -190,7 +190,7 @@ def colour_pictures(
         for name in scene.flows
     }
     annotation = Annotation(scanner.probe, outlined)
-    aim = settings.depth or 0.5 * scanner.probe.depth
+    depth = settings.depth or 0.5 * scanner.probe.depth
     seen = stamps
     if areas is not None:
         named = {scene.structures[name].label or name for name in scene.flows} & {*areas.area}
@@ -200,14 +200,14 @@ def colour_pictures(
     titles = {stamp: title for title, stamp in _flow_moments(session, seen, blood).items()}
     pictures = {}
     for stamp in stamps:  # all of them, as a closed vein fills up
-        pose = _tilted(session.poses[stamp], aim)
+        pose = _tilted(session.poses[stamp], depth)
         frame = scanner.frame(pose, session.nodes[stamp], time=1e-9 * stamp)
         blood.at(frame)
         if stamp in titles:
             velocity = colour.estimate(blood, frame)
             overlay = Overlay(velocity, colour.scale, 0.9, outline=colour.outline)
             pixels = annotation.draw(
-                frame.pixels, frame.labels, overlay=overlay, settle=partial(onto_border, frame)
+                frame.pixels, frame.labels, overlay=overlay, refine=partial(onto_border, frame)
             )
             pictures[titles[stamp]] = Picture((stamp,), pixels)
     return pictures
@@ -247,12 +247,12 @@ def _flow_moments(session: Session, stamps: list[int], blood: Blood) -> Mapping[
     return found
 
 
-def _tilted(pose: Pose, aim: float) -> Pose:
-    """A probe tilted about its array, aimed at the point ``aim`` m under this one."""
+def _tilted(pose: Pose, depth: float) -> Pose:
+    """A probe tilted about its array and about the point ``depth`` m under this one."""
     half = math.radians(0.5 * TILT)
     turned = pose @ Pose(np.zeros(3), np.array([math.sin(half), 0.0, 0.0, math.cos(half)]))
-    there = pose.position + aim * pose.rotation[:, 2]
-    return Pose(there - aim * turned.rotation[:, 2], turned.orientation)
+    there = pose.position + depth * pose.rotation[:, 2]
+    return Pose(there - depth * turned.rotation[:, 2], turned.orientation)
 
 
 def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file: Path) -> None:

@@ -265,9 +265,9 @@ class ProcessGroup:
             standby.kill()
         running = self._running.pop(node, None)
         if running is not None:
-            patience = RECORDER_STOP_S if node == RECORDER else STOP_S
+            limit = RECORDER_STOP_S if node == RECORDER else STOP_S
             running.tell_to_end()
-            self._leaving.append((node, running, time.monotonic() + patience))
+            self._leaving.append((node, running, time.monotonic() + limit))
 
     def leaving(self) -> dict[str, bool]:
         """Nodes that were dismissed and are not gone, or were killed since this was asked last.

@@ -1,4 +1,4 @@
-"""What follows ``--ros-args`` on the command line of `us-sim`, for all nodes that it starts.
+"""The arguments after ``--ros-args`` of the command line of `us-sim`, for all nodes that it starts.
 
 >>> from us_sim.run.ros_arguments import keeping_ros_arguments, namespace, ros_arguments
 >>> with keeping_ros_arguments(["run", "arm", "--ros-args", "-r", "__ns:=/a", "--", "-x"]) as rest:

@@ -75,10 +75,6 @@ class TopicCheck:
         return next(found, None) if self.read_stamp else None
 
     @property
-    def is_latched(self) -> bool:
-        return any(profile.durability == "transient_local" for profile in self.topic.qos)
-
-    @property
     def ages(self) -> NDArray[np.float64]:
         """(K,) ms from the stamps to the sending, of messages with a stamp."""
         stamps, sent = _times(self.stamps), _times(self.sent)
@@ -92,12 +88,12 @@ class TopicCheck:
 
     @property
     def tells_latency(self) -> bool:
-        return not (self.is_latched or self.is_of_another_time or self.by_another_clock)
+        return not (self.topic.is_latched or self.is_of_another_time or self.by_another_clock)
 
     @property
     def interval(self) -> float | None:
         """ns from message to message as is usual; None where there is no such."""
-        if len(self.sent) < _REGULAR or self.is_latched:
+        if len(self.sent) < _REGULAR or self.topic.is_latched:
             return None
         usual, long = np.percentile(np.diff(np.sort(_times(self.sent))), [50, 90])
         return float(usual) if 0 < long <= 2 * usual else None
@@ -105,7 +101,7 @@ class TopicCheck:
 
 @dataclass(frozen=True)
 class BagCheck:
-    """What was found of a bag."""
+    """The findings on a bag."""
 
     bag: Bag
     topics: list[TopicCheck]  # by name
@@ -323,7 +319,7 @@ def _latency(each: TopicCheck, origin: int) -> Iterator[Finding]:
             f"{counted(len(early), 'message')} of {name} came up to {ahead:.1f} ms before being "
             f"sent, first at {_at(int(logged[early[0]]), origin)}: {clocks}",
         )
-    if each.is_latched or each.by_another_clock or not stamps.any():
+    if each.topic.is_latched or each.by_another_clock or not stamps.any():
         return
     if each.is_of_another_time:
         days = float(np.median(each.ages)) / 86_400_000

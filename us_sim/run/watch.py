@@ -47,7 +47,7 @@ class SupervisionSettings(Settings):
 
 
 STEP_S = 0.5
-"""A longer time between two looks counts as this much: the machine slept, or had no time for us,
+"""A longer time between two checks counts as this much: the machine slept, or had no time for us,
 and so perhaps none for the nodes."""
 STOPPED_S = 0.5  # for which a process may be stopped
 BUSY_SHARE = 0.5

@@ -22,7 +22,7 @@ _ROS = Path("/opt/ros")
 
 
 class DdsError(MiddlewareError):
-    """Cyclone DDS refuses a request, or is not to be had."""
+    """Cyclone DDS refuses a request, or cannot be found."""
 
 
 def load(needed: Iterable[str], environment: Mapping[str, str] = os.environ) -> Any:
@@ -40,7 +40,7 @@ def load(needed: Iterable[str], environment: Mapping[str, str] = os.environ) -> 
             return library
     hint = "set US_SIM_DDSC to libddsc.so of Cyclone DDS 0.10 or 11, or run pip install cyclonedds"
     raise DdsError(
-        f"the C library of Cyclone DDS is not to be had: "
+        f"the C library of Cyclone DDS cannot be found: "
         f"{'; '.join(refused) or 'there is none on this machine'}; {hint}"
     )
 

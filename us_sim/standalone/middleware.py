@@ -176,27 +176,16 @@ class GraphNode:
     number: int = 0  # its owner's, in the process that it is of
 
 
-class Endpoint(Protocol):
-    """A publisher, subscription, client or service.
-
-    ``gids`` are those of its readers and of its writers.
-    """
-
-    gids: tuple[list[bytes], list[bytes]]
-
-    def close(self) -> None: ...
-
-
 class Middleware(Protocol):
     """One context's place in the graph of a domain.
 
     The arguments of the four ``create_`` methods are the node that the endpoint is of, the absolute
     ROS name, the ROS type (``sensor_msgs/msg/Image``), and rclpy's QoSProfile. They return
-    endpoints: publishers ``write`` (False if the sample was dropped); the others ``take`` (bytes
-    and their origin, or None) and call back after ``set_on_data``, from another thread; publishers
-    and subscriptions tell their ``matched_count``; clients ``send_request`` and say
-    ``service_is_ready``; services ``send_response``, and
-    call ``on_foreign`` for a request that they cannot read.
+    endpoints, all with ``close`` and ``gids`` (of readers and of writers): publishers ``write``
+    (False if the sample was dropped); the others ``take`` (bytes and their origin, or None) and
+    call back after ``set_on_data``, from another thread; publishers and subscriptions tell their
+    ``matched_count``; clients ``send_request`` and say ``service_is_ready``; services
+    ``send_response``, and say ``on_unanswered`` why a request will not be answered.
 
     Raises:
         MiddlewareError: a name or a quality of service is refused.

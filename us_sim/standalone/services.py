@@ -86,7 +86,7 @@ class ServiceServer(_ServiceEndpoint):
     """Takes requests for a service and sends the responses."""
 
     _key = "serviceid"
-    on_foreign: Callable[[], object] | None = None  # called for each request that is not understood
+    on_unanswered: Callable[[str], object] | None = None  # told why, for each such request
 
     def _understands(self, info: SampleInfo) -> bool:
         """Whether a client of Cyclone's sent it, each of which has had an id since ROS 2 Foxy.
@@ -97,8 +97,11 @@ class ServiceServer(_ServiceEndpoint):
         client = self._reader.user_data_of(info.publication_handle)
         if client is None or "clientid" in client:
             return True
-        if self.on_foreign is not None:
-            self.on_foreign()
+        if self.on_unanswered is not None:
+            self.on_unanswered(
+                "since its client does not run on Cyclone DDS: set "
+                "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp there, or rmw_zenoh_cpp on both sides"
+            )
         return False
 
     def send_response(self, data: bytes, header: RequestHeader) -> bool:

@@ -17,7 +17,7 @@ from .middleware import EndpointQos
 NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
 
 DEFAULT_DEPTH = 42
-"""What a depth of 0 stands for."""
+"""The depth that 0 stands for."""
 
 _SPACE = "@ros2_lv"
 _OF_NODE, _OF_ENDPOINT = 9, 13  # the parts of a token
@@ -43,7 +43,7 @@ def key_of(domain: int, name: str, type_name: str, type_hash: str) -> str:
 
 
 def attachment(sequence: int, timestamp: int, gid: bytes) -> bytes:
-    """What goes with a sample: its number, when it was sent (ns since 1970), and who sent it.
+    """The bytes beside a sample: its number, its time (ns since 1970) and its sender.
 
     In zenoh's serialization: two signed numbers of 64 bits, then the bytes after their number.
     """

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 import weakref
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
@@ -48,6 +48,7 @@ from .zenoh_names import (
 _HEARTBEAT = 0.5  # s, of latched publishers, so that a sample that was lost is noticed
 _SETTLING = 0.1  # s; tokens come by the router, sooner than the link to their session is up
 _PAUSE = 0.01  # s, between two tries
+_OPEN_REQUESTS = 100  # of one service
 _LONGEST_TRY = 10.0  # s, to reach a service that is said to be there
 
 
@@ -354,19 +355,30 @@ class Reader(_Receiver):
 
 
 class ServiceServer(_Receiver):
-    """Takes requests for a service and sends the responses."""
+    """Takes requests for a service and sends the responses.
+
+    Of the requests that are not answered yet the newest 100 are kept.
+    """
+
+    on_unanswered: Callable[[str], object] | None = None
 
     def _declare(self, session: Any, entity: Entity) -> Any:
-        self._queries: dict[tuple[bytes, int], Any] = {}
+        self._queries: OrderedDict[tuple[bytes, int], Any] = OrderedDict()
         return session.declare_queryable(entity.key, self._received, complete=True)
 
     def _received(self, query: Any) -> None:
         origin = self._keep(query)
         if origin is None:
             query.drop()
-        else:
-            self._queries[origin] = query
-            self._notify()
+            return
+        self._queries[origin] = query
+        if len(self._queries) > _OPEN_REQUESTS:
+            self._queries.popitem(last=False)[1].drop()
+            if self.on_unanswered is not None:
+                self.on_unanswered(
+                    f"since {_OPEN_REQUESTS} newer ones wait: answer them sooner, or ask less often"
+                )
+        self._notify()
 
     def send_response(self, data: bytes, header: RequestHeader) -> bool:
         """Answer a request; False if it was answered before."""

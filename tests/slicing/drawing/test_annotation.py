@@ -348,9 +348,9 @@ def test_an_outline_has_no_steps_and_its_area_whatever_the_press(volume, flat):
     scanner.carry(MESH.nodes, MESH.tetrahedra)
     pressed = MESH.nodes * [1.0, 1.0, flat]
     frame = scanner.frame(Pose([0.015, 0.0014, 0.0]), pressed)
-    settle = partial(onto_border, frame)
+    refine = partial(onto_border, frame)
     (plain,) = label_outlines(frame.labels, 1, smoothing=5.0)
-    (outline,) = label_outlines(frame.labels, 1, smoothing=5.0, settle=settle)
+    (outline,) = label_outlines(frame.labels, 1, smoothing=5.0, refine=refine)
 
     def off(points):
         """mm, root mean square from the ellipse that the circle has become."""
@@ -374,7 +374,7 @@ def test_an_outline_has_no_steps_and_its_area_whatever_the_press(volume, flat):
 
 def test_what_the_image_cuts_off_ends_at_its_side(volume):
     frame = BMode(volume, BORDER_PROBE).frame(Pose([0.0152, 0.0014, 0.0113]))
-    settle = partial(onto_border, frame)
-    (outline,) = label_outlines(frame.labels, 1, smoothing=2.0, settle=settle)
+    refine = partial(onto_border, frame)
+    (outline,) = label_outlines(frame.labels, 1, smoothing=2.0, refine=refine)
     assert -0.6 < outline[:, 1].min() < 0.6
     assert np.isfinite(outline).all()

@@ -203,10 +203,6 @@ def _own(point: Point) -> NDArray[np.float64]:
     return point.frames.own
 
 
-def _slipped(point: Point) -> NDArray[np.float64]:
-    return point.frames.slipped
-
-
 def _together(points: Sequence[Point], values: Callable[[Point], NDArray]) -> NDArray:
     return np.concatenate([values(p) for p in points]) if points else np.empty(0)
 

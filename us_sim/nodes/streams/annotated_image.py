@@ -248,8 +248,8 @@ class AnnotatedImage:
                 self._probe, self._structures, is_flipped=not self._annotation.is_flipped
             )
         lines = [line for each in self._streams if each.is_wanted for line in each.lines]
-        settle = None if frame is None else partial(onto_border, frame)
-        picture = self._annotation.draw(image, self._labels, badge, overlay, lines, settle)
+        refine = None if frame is None else partial(onto_border, frame)
+        picture = self._annotation.draw(image, self._labels, badge, overlay, lines, refine)
         if shown.beside:
             plain = image[:, ::-1] if shown.flip else image
             picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])

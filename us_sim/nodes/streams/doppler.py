@@ -24,7 +24,7 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import ColourSettings, DopplerSettings, SpectrumSettings
 from us_sim.volume.volume import Volume
 
-EVERY_S = 0.2  # between two looks at where the vessel is; of the frames' time
+EVERY_S = 0.2  # between two searches for the vessel; of the frames' time
 
 
 class Following:

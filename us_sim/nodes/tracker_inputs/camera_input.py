@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from us_sim.errors import TrackingError
+from us_sim.errors import TrackingError, VolumeError
+from us_sim.nodes.messages import rows_from
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import camera_body_of
 from us_sim.tracking.camera.model import CameraModel
@@ -81,20 +82,10 @@ def grey_from(message: Image) -> NDArray[np.uint8]:
             f"the image's encoding is '{message.encoding}'; known are {', '.join(_ENCODINGS)}"
         )
     size, conversion = _ENCODINGS[message.encoding]
-    row = message.width * size
-    step = message.step or row
-    if not message.width or not message.height or step < row:
-        raise TrackingError(
-            f"the image says it has {message.height} rows of {message.width} pixels in {step} "
-            f"bytes each, which cannot be"
-        )
-    if len(message.data) < message.height * step:
-        raise TrackingError(
-            f"the image holds {len(message.data)} bytes, but says it has {message.height} rows "
-            f"of {step}"
-        )
-    flat = np.frombuffer(message.data, dtype=np.uint8, count=message.height * step)
-    rows = flat.reshape(message.height, step)[:, :row]
+    try:
+        rows = rows_from(message, size)
+    except VolumeError as error:
+        raise TrackingError(str(error)) from None
     if message.encoding in ("mono16", "16UC1"):
         high = 0 if message.is_bigendian else 1  # the more significant byte is enough
         return np.ascontiguousarray(rows[:, high::2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseStamped, Twist
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
@@ -124,20 +124,10 @@ class SixDofMouseInput(TrackerInput):
             self._device.refuse("axes", f"{topic}: {self._mouse.last_problem}")
 
 
-MOVING = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=100,
-    reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-)
+MOVING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Many nodes share `tf`, this one too: the newest message alone would often be another's."""
 
-STATIC = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class TfInput(TrackerInput):

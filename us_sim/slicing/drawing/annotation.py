@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.slicing.drawing.label_outlines import Settle, label_outlines
+from us_sim.slicing.drawing.label_outlines import Refine, label_outlines
 from us_sim.slicing.drawing.overlay import Colour, ColourBar, Label, lettering, mirrored
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class Annotation:
         badge: Badge | None = None,
         overlay: Overlay | None = None,
         lines: Sequence[NDArray[np.floating]] = (),
-        settle: Settle | None = None,
+        refine: Refine | None = None,
     ) -> NDArray[np.uint8]:
         """A new (rows, columns, 3) picture of red, green and blue.
 
@@ -95,7 +95,7 @@ class Annotation:
             labels: (rows, columns), where outlines are wanted.
             overlay: colours over the grey, below all else, and their bar.
             lines: (N, 2) column and row, such as a gate's.
-            settle: of the labels' outlines, as for `label_outlines`.
+            refine: of the labels' outlines, as for `label_outlines`.
 
         All as in an image that is not flipped.
         """
@@ -115,7 +115,7 @@ class Annotation:
         cv2.polylines(picture, drawn, False, _SHADOW, self._line + 2, cv2.LINE_AA, _FINE)
         cv2.polylines(picture, drawn, False, _FOCUS, self._line, cv2.LINE_AA, _FINE)
         if labels is not None:
-            self._outline(picture, labels, [bar.box] if bar else [], settle)
+            self._outline(picture, labels, [bar.box] if bar else [], refine)
         if bar is not None:
             bar.draw(picture)
         cv2.polylines(picture, self._ticks, False, _SHADOW, self._line + 2)
@@ -189,13 +189,13 @@ class Annotation:
         picture: NDArray[np.uint8],
         labels: NDArray[np.uint8],
         drawn: list[Box],
-        settle: Settle | None,
+        refine: Refine | None,
     ) -> None:
         """Thin outlines of the structures, and the name of each once, at its longest outline."""
         named: list[tuple[Label, Box]] = []
         for number, (name, colour) in self._structures.items():
             smoothing = self._text / 2.5
-            outlines = label_outlines(labels, number, smoothing=smoothing, settle=settle)
+            outlines = label_outlines(labels, number, smoothing=smoothing, refine=refine)
             if not outlines:
                 continue
             if self.is_flipped:

@@ -18,7 +18,7 @@ from us_sim.kernels import njit
 from us_sim.slicing.frame import Frame
 from us_sim.volume.volume import Volume
 
-Settle = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+Refine = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Moves points (P, 2) of a label's outline to where it runs between voxels."""
 
 _MOST = 64  # most outlines of one label; the longest are taken
@@ -30,14 +30,14 @@ def label_outlines(
     label: int,
     *,
     smoothing: float = 1.0,
-    settle: Settle | None = None,
+    refine: Refine | None = None,
 ) -> list[NDArray[np.float64]]:
     """Closed outlines of the areas and holes of one label, the longest first.
 
     Args:
         labels: (rows, columns).
         smoothing: pixels, about the length of the steps between pixels that are smoothed away.
-        settle: moves points of a label's outline to where it runs between voxels.
+        refine: moves points of a label's outline to where it runs between voxels.
 
     Returns:
         (P, 2) column and row of each outline, in pixels, between pixels with the label and those
@@ -54,7 +54,7 @@ def label_outlines(
     ]
     enclosing.sort(key=len, reverse=True)
     outlines = [_smooth(chain, smoothing) for chain in enclosing[:_MOST]]
-    return outlines if settle is None else [settle(label, outline) for outline in outlines]
+    return outlines if refine is None else [refine(label, outline) for outline in outlines]
 
 
 def _smooth(chain: NDArray[Any], smoothing: float) -> NDArray[np.float64]:

@@ -500,7 +500,7 @@ class Subscription(Receiver):
 
 
 _logger = get_logger("rclpy")
-_PAUSE = 0.01  # s, between two looks at whether a service is there
+_PAUSE = 0.01  # s, between two checks whether a service is there
 
 
 class Client(Receiver):
@@ -613,10 +613,9 @@ class Service(Receiver):
         self.srv_type = srv_type
         self.srv_name = srv_name
         self.callback = callback
-        endpoint.on_foreign = lambda: _logger.warning(
-            f"a request for {full_name} is not answered, since its client does not run on Cyclone "
-            f"DDS: set RMW_IMPLEMENTATION=rmw_cyclonedds_cpp there, or rmw_zenoh_cpp on both "
-            f"sides; further requests of this kind are ignored silently",
+        endpoint.on_unanswered = lambda why: _logger.warning(
+            f"a request for {full_name} is not answered, {why}; further requests of this kind are "
+            f"ignored silently",
             once=True,
         )
 

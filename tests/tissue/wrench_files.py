@@ -1,0 +1,28 @@
+"""Bags of wrenches."""
+
+from pathlib import Path
+
+from us_sim.recording.schemas import jazzy_definitions, stamped
+from us_sim.recording.topic import QosProfile
+from us_sim.recording.wrench import WRENCH_STAMPED, WrenchRecord
+from us_sim.recording.writer import BagWriter
+
+
+def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:
+    """Writes them as a bag of their one topic, or beside other topics into one that is open.
+
+    Raises:
+        BagError: the file exists or cannot be written.
+    """
+    if not isinstance(file, BagWriter):
+        with BagWriter(file, compression="zstd") as writer:
+            write_wrenches(writer, record)
+        return
+    file.add_topic(record.topic, WRENCH_STAMPED, [QosProfile()])
+    types = jazzy_definitions().types
+    vector = types["geometry_msgs/msg/Vector3"]
+    for stamp, wrench in zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True):
+        force, torque = vector(*wrench[:3]), vector(*wrench[3:])
+        measured = types["geometry_msgs/msg/Wrench"](force=force, torque=torque)
+        message = stamped(WRENCH_STAMPED, stamp, record.frame_id, wrench=measured)
+        file.write(record.topic, message, stamp, stamp)
