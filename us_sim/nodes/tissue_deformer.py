@@ -296,6 +296,8 @@ class StructureMarkers:
         triangles = self._settings.values["markers"].structure_triangles
         try:
             self._structures = list(structures_of(scene, volume_of(scene), self._mesh, triangles))
+            for made in self._structures:
+                made.surface.carry(self._mesh.nodes)  # or a frame would compile its kernel
         except UsSimError as error:
             self.state = str(error)
             self._node.health.problem("structures", f"{error}; no structure is shown")
@@ -362,19 +364,21 @@ class TissueDeformer(SceneNode):
         self._unbalanced = 0  # frames
         self._came = 0  # poses since `_go_on` was last called
         self.newest(PoseStamped, "probe/pose", self._deform)
-        self.health.measure = self._estimate
+        self._estimated: dict[str, str] = {}  # of a frame since the last report
+        self._is_estimate_due = True
+        self.health.measure = self._take_estimate
         self.health.state = f"ready with {self._live.tissue.name}"
         self.get_logger().info(self.health.state)
 
     def _deform(self, message: PoseStamped) -> None:
         self._came += 1
         self._last = message
-        if self.lockstep:
-            self._frame(message)
-            return
-        self._live.tissue.limit_frames(self._pace.limit)
+        if not self.lockstep:
+            self._live.tissue.limit_frames(self._pace.limit)
         self._frame(message)
-        self._pace.spend(1e-9 * (time.monotonic_ns() - self.arrived))
+        self._estimate()  # now that the nodes are sent; it counts as a part of the frame
+        if not self.lockstep:
+            self._pace.spend(1e-9 * (time.monotonic_ns() - self.arrived))
 
     def _go_on(self) -> None:
         """Finish the last frame while no pose comes."""
@@ -385,6 +389,7 @@ class TissueDeformer(SceneNode):
         if self._last is not None and not self._live.tissue.is_settled:
             self._live.tissue.limit_frames(self._pace.limit)
             self._frame(self._last, again=True)
+        self._estimate()
 
     def _frame(self, message: PoseStamped, again: bool = False) -> None:
         """Deform the tissue and send topics with subscribers; ``again`` only if visible."""
@@ -450,9 +455,17 @@ class TissueDeformer(SceneNode):
             "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
         }
 
-    def _estimate(self) -> dict[str, str]:
-        error = self._live.tissue.discretisation_error()
-        return {} if error is None else {"discretisation_error_percent": f"{100 * error:.2g}"}
+    def _estimate(self) -> None:
+        """Estimate the error of the first frame after a report."""
+        if self._is_estimate_due:
+            self._is_estimate_due = False
+            error = self._live.tissue.discretisation_error()
+            found = {} if error is None else {"discretisation_error_percent": f"{100 * error:.2g}"}
+            self._estimated = found
+
+    def _take_estimate(self) -> dict[str, str]:
+        self._is_estimate_due = True
+        return self._estimated
 
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
         x, y, z = nodes.T

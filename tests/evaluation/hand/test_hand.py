@@ -1,4 +1,4 @@
-"""What is said of a method in a hand is true of solvers of which it is known beforehand."""
+"""Errors and faults of a method in a hand, of solvers of which they are known beforehand."""
 
 import csv
 from dataclasses import replace
@@ -81,8 +81,9 @@ class Oracle:
         return Deformation(nodes, np.zeros(1, np.int32), np.zeros(3), np.zeros(3), residual)
 
 
-def test_what_knows_the_answer_has_no_error_and_skips_nothing():
-    point = measure(Oracle(answer()), MOTION, answer())
+def test_what_knows_the_answer_has_no_error_and_skips_nothing(monkeypatch):
+    live_by_its_own_clock(monkeypatch, solver := Oracle(answer()))
+    point = measure(solver, MOTION, answer())
     assert len(point.frames.number) == len(MOTION.poses) - BEGINS == 30
     assert point.frames.error.max() == point.frames.rms.max() == 0.0
     assert point.speed == pytest.approx(HASTES["brisk"].speed)
@@ -160,6 +161,20 @@ def test_live_the_newest_pose_wins(monkeypatch):
     waits = [1e3 * (0.040 * (k + 1) - expected[k] / 60) for k in range(25)]
     assert point.live.latency == pytest.approx(waits[-len(counted) :])
     assert set(point.live.frames.error) == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("errors", "poses"),
+    [
+        ([0.9, 0.9, 0.9, 0.9], 0),
+        ([9.0, 0.9, 9.0, 0.9], 1),
+        ([9.0, 9.0, 0.9, 9.0], 3),  # the second is shown for two poses, of which one was skipped
+        ([9.0, np.nan, 0.9, 9.0], 1),
+    ],
+)
+def test_tissue_is_away_until_a_frame_that_is_near(errors, poses):
+    frames = Frames(number=np.array([4, 5, 7, 8]), error=np.array(errors))
+    assert Live(5, frames).away == pytest.approx(1e3 * poses / 60)
 
 
 def test_live_nothing_is_seen_before_it_came(monkeypatch):

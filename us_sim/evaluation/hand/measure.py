@@ -45,6 +45,7 @@ CONVERGED = 1e-5  # residual at which a pose is left for the next
 TRUSTED = 1e-3  # residual of the answer above which nothing is compared with it
 HELD = 1e-6  # m that a fixed node may move before nothing is compared with it either
 ENOUGH = 0.9  # fraction of the frames that must be compared before their errors are reported
+AWAY = 1.0  # mm to the converged answer, beyond which tissue is elsewhere
 HOLD = 60  # frames in which the probe stays at its last pose
 OWN_EVERY = 5  # frames, of which one is converged by itself
 
@@ -300,6 +301,16 @@ class Live:
         """Fraction of the poses without a frame."""
         return 1.0 - len(self.frames.number) / self.poses if self.poses else math.nan
 
+    @property
+    def away(self) -> float:
+        """The longest time (ms) that a node is shown farther than `AWAY` from where it belongs."""
+        longest, lasted = 0, 0  # poses
+        until = np.append(self.frames.number, self.frames.number[-1:] + 1)[1:]  # it is shown
+        for poses, error in zip(until - self.frames.number, self.frames.error, strict=True):
+            lasted = lasted + poses if error > AWAY else 0
+            longest = max(longest, lasted)
+        return 1e3 * longest / RATE
+
 
 @dataclass(frozen=True, eq=False)
 class Held:
@@ -356,7 +367,8 @@ class Point(Row):
             **_percentiles("cpu_ms", frames.cpu, (50, 99, 100)),
             **_percentiles("wall_ms", frames.wall, (50, 99, 100)),
             "live_skipped": live.skipped,
-            **_percentiles("live_error_mm", live.frames.error, (50, 99, 100)),
+            **_percentiles("live_error_mm", live.frames.error, (50, 100)),
+            "live_away_ms": live.away,
             **_percentiles("live_latency_ms", live.latency, (50, 99, 100)),
             "live_frames_inverted": int((live.frames.inverted > 0).sum()),
             "hold_frames_to_1e-2": held.frames_to(1e-2),

@@ -102,7 +102,7 @@ class PenaltyContact:
         corners: NDArray[np.integer] | None = None,
         weights: NDArray[np.float64] | None = None,
     ) -> None:
-        self._probe = probe
+        self.probe = probe
         self.stiffness = stiffness  # (P,) N/m, with which springs begin
         self._greatest_force = greatest_force
         self._stiffening = stiffening
@@ -133,7 +133,7 @@ class PenaltyContact:
 
     def depth(self, pose: Pose, positions: NDArray[np.float64]) -> float:
         """How deep (m) a probe would be in points (P, 3) m, at least 0."""
-        gap, _ = self._probe.distance(pose, positions)
+        gap, _ = self.probe.distance(pose, positions)
         return max(0.0, -float(gap.min(initial=np.inf)))
 
     def set_pose(self, pose: Pose, positions: NDArray[np.float64]) -> None:
@@ -144,14 +144,14 @@ class PenaltyContact:
         `drop_planes`, ends that.
         """
         last, self._pose = self._pose, pose
-        gap, self.normal = self._probe.distance(pose, positions)
-        self.near = np.flatnonzero(gap < self._probe.reach)
-        self._planar = np.flatnonzero(gap < -self._probe.deep)
+        gap, self.normal = self.probe.distance(pose, positions)
+        self.near = np.flatnonzero(gap < self.probe.reach)
+        self._planar = np.flatnonzero(gap < -self.probe.deep)
         if len(self._planar):
             if last is not None and math.dist(last.position, pose.position) > _LEAP:
                 last = None
             inside = positions[self._planar]
-            gap[self._planar], normal = self._probe.entered(last, pose, inside)
+            gap[self._planar], normal = self.probe.entered(last, pose, inside)
             self.normal[self._planar] = normal
             self._height = np.einsum("ij,ij->i", inside, normal) - gap[self._planar]
         self._measure(gap)
@@ -167,9 +167,9 @@ class PenaltyContact:
         if self._pose is None:
             return False
         planar, before = len(self._planar), self.normal_force
-        gap, _ = self._probe.distance(self._pose, positions)
+        gap, _ = self.probe.distance(self._pose, positions)
         self._planar = self._planar[:0]
-        self.near = np.flatnonzero(gap < self._probe.reach)
+        self.near = np.flatnonzero(gap < self.probe.reach)
         self.update_gaps(positions)
         self.update_relief()
         return planar > 0 or not np.array_equal(self.normal_force, before)
@@ -206,7 +206,7 @@ class PenaltyContact:
         """Update gaps, normals and forces at other positions (P, 3) m."""
         if self._pose is None:
             return
-        gap, normal = self._probe.distance(self._pose, positions, self.near)
+        gap, normal = self.probe.distance(self._pose, positions, self.near)
         if len(planar := self._planar):
             normal[planar] = self.normal[planar]
             gap[planar] = np.einsum("ij,ij->i", positions[planar], normal[planar]) - self._height
@@ -240,7 +240,7 @@ class PenaltyContact:
         """(K, 3, 3) 1/m, how the push would turn as points (K, 3) m move; zero without a probe."""
         if self._pose is None:
             return np.zeros((len(positions), 3, 3))
-        return self._probe.curvature(self._pose, positions)
+        return self.probe.curvature(self._pose, positions)
 
     @property
     def force(self) -> NDArray[np.float64]:

@@ -68,8 +68,8 @@ class FemNonlinearSettings(SolverSettings):
     frame_budget: float | None = setting(
         Quantity("time", 0.0005, 10.0),
         "time after which a frame ends with what it has, and the next goes on. Not given, 0 as a "
-        "parameter: live, what the rate leaves, and up to a quarter more until the forces are "
-        "balanced; in lockstep no limit, lest results depend on the machine",
+        "parameter: live, what the rate leaves, and up to a quarter more until residual and error "
+        "are at most 0.01; in lockstep no limit, lest results depend on the machine",
         default=None,
     )
     most_iterations: int = setting(
@@ -132,8 +132,9 @@ class FemNonlinear(TissueSolver):
     )
     must_be_held: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
-    # Of the residual and of the estimated error: then the displacement of 2,000 and 8,192 nodes is
-    # within 7 % in 95 of 100 frames that ended too early, and within 11 % in all.
+    # Of the residual and of the estimated error. Of 102 generated presses of 2,000 nodes by four
+    # probes, the first Newton step that came so far was within 7 % of the balance that followed in
+    # 72 and within 35 % in 98: neither number knows of tissue that is about to snap.
     most_unbalanced: ClassVar[float] = 0.1
 
     Settings = FemNonlinearSettings
@@ -292,7 +293,7 @@ class FemNonlinear(TissueSolver):
             budget.end_step(newton.iterations)
             start = None
             stagnated = not taken and newton.has_stagnated
-            is_over = budget.is_over(balanced=not self._exceeds(self.most_unbalanced))
+            is_over = budget.is_over(balanced=not self._exceeds(TUNING.overtime_tolerance))
             if is_over and budget.is_shorter_than_a_step:
                 actions.append(
                     f"frame_budget is {1e3 * (budget.time_limit or 0.0):.3g} ms, but one step "
