@@ -18,7 +18,7 @@ _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 _WORKER = "PYTEST_XDIST_WORKER"
 
-_TISSUE = ("tissue", *(f"evaluation/{name}" for name in ("hand", "image", "stability", "tissue")))
+_TISSUE = ("tissue", *(f"evaluation/{n}" for n in ("hand", "measured", "stability", "tissue")))
 """Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
 the other one what is beside them."""
 

@@ -71,7 +71,7 @@ def main() -> int:
 
 
 def _all_said(task: dict[str, Any], until: float | None) -> Iterator[dict[str, Any]]:
-    """What workers say; where one dies of a case, that is said, and another one goes on."""
+    """The lines of workers; where one dies of a case, that is said, and another one goes on."""
     while True:
         case = None
         command = [sys.executable, "-m", "tests.fuzz.worker", json.dumps(task)]

@@ -299,7 +299,7 @@ class Attack:
             raise RuntimeError("tissue/nodes is not finite")
 
     def write_down(self, file: Path) -> None:
-        """What was sent in the last round."""
+        """Write the messages of the last round."""
         lines = [f"{topic} {data.hex()}" for topic, data in self._sent]
         file.write_text("\n".join(lines), encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""What a good driver would send for a scene's tracker, so that images come of it."""
+"""Messages of a good driver for a scene's tracker, so that images come of them."""
 
 from __future__ import annotations
 

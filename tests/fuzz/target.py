@@ -1,4 +1,4 @@
-"""What is fuzzed: by its name, files that are whole, and the function that reads a changed one."""
+"""Fuzzed readers: by name, files that are whole, and the function that reads a changed one."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def main(task: dict[str, Any]) -> None:
 
 
 def _check_seeds(target: Target, seeds: list[bytes], folder: Path) -> None:
-    """What is refused as it is would not be read far when it is changed."""
+    """Read them whole: a refused one would not be read far when it is changed."""
     for number, seed in enumerate(seeds):
         file = folder / f"seed{number}{target.suffix}"
         file.write_bytes(seed)

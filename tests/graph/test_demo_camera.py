@@ -6,6 +6,7 @@ import pytest
 from command import us_sim
 from mcap.reader import make_reader
 
+from us_sim.command.main import main
 from us_sim.share import shared_path
 
 IMAGES = 45  # of 90 poses, 60 a second: 1.48 s at 30 images a second
@@ -64,20 +65,19 @@ def test_the_recording_has_the_camera_but_not_its_images(demo):
     assert not {"/camera/image_raw", "/tracker/pose"} & names
 
 
-def test_a_scene_without_a_camera_is_refused(played_scene, tmp_path):
-    result = us_sim("demo", played_scene, "--source", "camera", "--out", tmp_path / "out")
-    assert result.returncode == 1
-    assert "the tracker of" in result.stderr
-    assert "name a scene whose tracker is a camera" in result.stderr
-    assert "Traceback" not in result.stderr
+def test_a_scene_without_a_camera_is_refused(played_scene, tmp_path, capsys):
+    out = str(tmp_path / "out")
+    assert main(["demo", str(played_scene), "--source", "camera", "--out", out]) == 1
+    said = capsys.readouterr().err
+    assert "the tracker of" in said
+    assert "name a scene whose tracker is a camera" in said
 
 
-def test_a_camera_that_looks_elsewhere_is_refused(camera_scene, tmp_path):
+def test_a_camera_that_looks_elsewhere_is_refused(camera_scene, tmp_path, capsys):
     away = tmp_path / "away.yaml"
     away.write_text(
         f"name: away\nbased_on: {camera_scene}\n"
         "tracker: {registration: {position: [0, 0, 1], orientation: [0, 0, 0, 1]}}\n"
     )
-    result = us_sim("demo", away, "--source", "camera", "--out", tmp_path / "out")
-    assert result.returncode == 1
-    assert "the camera does not see the markers on the path" in result.stderr
+    assert main(["demo", str(away), "--source", "camera", "--out", str(tmp_path / "out")]) == 1
+    assert "the camera does not see the markers on the path" in capsys.readouterr().err

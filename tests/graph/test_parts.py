@@ -10,6 +10,7 @@ import pytest
 import yaml
 from command import us_sim
 
+from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
 
 AT_EXIT = """
@@ -81,14 +82,13 @@ def test_what_a_scene_leaves_out_is_not_started_imported_or_published(
     assert not any(topic.startswith(f"/{left_out}/") for topic in topics)
 
 
-def test_the_dry_run_says_what_is_left_out_and_why(played_scene, tmp_path):
+def test_the_dry_run_says_what_is_left_out_and_why(played_scene, tmp_path, capsys):
     document = yaml.safe_load(played_scene.read_text())
     del document["skin"]
     scene = tmp_path / "scene.yaml"
     scene.write_text(yaml.safe_dump(document))
-    result = us_sim("run", scene, "--dry-run")
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
+    assert main(["run", str(scene), "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
     assert any(
         line.split()[:3] == ["left", "out", "skin_deformer"]
         and line.endswith("the scene has no `skin`: no membrane is computed")

@@ -361,6 +361,20 @@ def test_a_chunk_is_unpacked_up_to_what_it_says_and_a_limit(tmp_path):
         assert "is damaged (bytes 25 to" in bag.note
 
 
+def test_messages_recorded_while_simulated_time_stood_are_read_one_by_one(tmp_path):
+    with BagWriter(tmp_path / "a.mcap", sidecar=False) as writer:
+        writer.add_topic("/note", STRING)
+        for number in range(60):
+            writer.write("/note", bytes(200_000), 10**18, sequence=number)
+    bag = read_bag(tmp_path / "a.mcap")
+    tracemalloc.start()
+    try:
+        assert [message.sequence for message in bag.messages()] == list(range(60))
+        assert tracemalloc.get_traced_memory()[1] < 6 << 20
+    finally:
+        tracemalloc.stop()
+
+
 def test_a_packed_file_is_unpacked_only_where_there_is_room(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(unpacking, "LARGEST_FILE", 10_000_000)

@@ -234,6 +234,16 @@ def test_poses_played_with_old_stamps_tell_no_latency(tmp_path):
     assert table(found)[1][4] == "-"
 
 
+def test_a_recording_under_simulated_time_is_whole_and_tells_no_latency(tmp_path):
+    messages = press()
+    for message in messages:
+        message[3] += 86_400 * 10**9  # sent by the clock on the wall
+    found = check(read_bag(write(tmp_path / "s.mcap", messages)))
+    assert found.is_whole
+    assert "of the sending of 480 messages, as under simulated time" in report(found)
+    assert table(found)[1][2:5] == ("60.0", "0.02", "-")
+
+
 def test_a_message_too_short_for_its_type_is_told(tmp_path):
     def cut(messages):
         of(messages, "/probe/pose")[20][1] = b"\0\1\0\0\1"

@@ -223,11 +223,11 @@ def unknown_keys(place: Place) -> Iterator[Mistake]:
 
 
 Wrong = Iterator[tuple[str, object, str, tuple[str, ...]]]
-"""What is wrong, a wrong value, the keys in it to what is wrong, and facts of the sentence."""
+"""A fault, a wrong value, the keys in it to the fault, and facts of the sentence."""
 
 
 def wrong_values(kind: Any, rule: Rule, others: Collection[Any] = ()) -> Wrong:
-    """What will not do for a type; ``others`` will do too."""
+    """Values that will not do for a type; ``others`` will do too."""
     if kind is bool:
         for value in (1, "yes", None, [True]):
             yield "not a truth", value, "", ("true", "false")
@@ -259,7 +259,7 @@ def wrong_values(kind: Any, rule: Rule, others: Collection[Any] = ()) -> Wrong:
 
 
 def wrong_numbers(kind: type, quantity: Quantity) -> Wrong:
-    """What will not do for a number of a quantity."""
+    """Values that will not do for a number of a quantity."""
     low, high, unit = quantity.minimum, quantity.maximum, quantity.unit
     named = f" {quantity.dimension}"
     foreign = "1 mm" if quantity.dimension != "length" else "1 kPa"
@@ -280,7 +280,7 @@ def wrong_numbers(kind: type, quantity: Quantity) -> Wrong:
 
 
 def wrong_texts(rule: Rule) -> Wrong:
-    """What will not do for a text."""
+    """Values that will not do for a text."""
     names = rule.choice.names if rule.choice else rule.choices
     for value in (5, True, ["text"], {"a": 1}):
         yield "not a text", value, "", ("text",)
@@ -295,7 +295,7 @@ def wrong_texts(rule: Rule) -> Wrong:
 
 
 def wrong_choice(choice: Choice) -> Wrong:
-    """What will not do for a mapping that says what is chosen."""
+    """Values that will not do for a mapping that says what is chosen."""
     name = max(choice.names, key=len)
     wrong = name[1:]
     key = choice.key
@@ -308,7 +308,7 @@ def wrong_choice(choice: Choice) -> Wrong:
 
 
 def not_here(place: Place) -> Iterator[Mistake]:
-    """What only other options have, and what goes with other values of another setting."""
+    """Keys that only other options have, or that go with other values of another setting."""
     if place.choice is not None and place.option not in place.path:
         own = rules_of(place.settings)
         for other in place.choice.names:
@@ -341,7 +341,7 @@ def not_here(place: Place) -> Iterator[Mistake]:
 
 
 def complaint(mistake: Mistake) -> str:
-    """What is wrong with what is said of a mistake, '' if nothing."""
+    """The fault of the sentence about a mistake, '' if there is none."""
     what = f"{mistake.what} at {mistake.key}"
     try:
         parse_scene(mistake.document, origin="my.yaml")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.metrics import Force, Metric, Scan, ScoreSettings, Section, metrics_of
+from us_sim.scoring.metrics import Force, Metric, Scan, Section, metrics_of
 from us_sim.scoring.motion import Motion
+from us_sim.scoring.settings import ScoreSettings
 
 
 def table(scan, settings=None):

@@ -97,7 +97,7 @@ KINDS = sorted(
 
 
 def written(made: Settings) -> dict[str, Any]:
-    """What a file would say of settings made of plain values."""
+    """A file's content for settings made of plain values."""
     values = {name: getattr(made, name) for name in rules_of(type(made))}
     return {
         name: list(value) if isinstance(value, tuple) else value

@@ -1,4 +1,4 @@
-"""What a covariance must be.
+"""Demands on a covariance.
 
 The state by a table: what comes when, and what it is then.
 """

@@ -327,7 +327,7 @@ def test_a_port_in_use_says_so():
 
 
 def test_closing_waits_for_a_thread_that_has_ended_already(monkeypatch):
-    """What wakes the thread is sent once more when the thread has ended."""
+    """The message that wakes the thread is sent once more when the thread has ended."""
 
     class Late(socket.socket):
         def send(self, data):

@@ -1,4 +1,4 @@
-"""What the gate refuses: by known speeds, by chi-square's own shares, and never for good."""
+"""Refusals of the gate: by known speeds, by chi-square's own shares, and never for good."""
 
 import math
 import re

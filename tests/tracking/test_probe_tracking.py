@@ -308,7 +308,7 @@ def test_outliers_of_a_real_tracker_are_refused_and_counted(recorded, method, na
 
 
 def test_a_matrix_of_zeros_is_no_pose(recorded):
-    """What PLUS writes where a transform could not be computed, in a real stream of poses."""
+    """A matrix of PLUS where a transform could not be computed, in a real stream of poses."""
     times, matrices = recorded
     tracked = tracking("one_euro", GateSettings())
     for k in range(8, 108):

@@ -35,7 +35,7 @@ def served() -> Iterator[Any]:
 
 @pytest.fixture
 def simulator(served: Any) -> Simulator:
-    """What the page of :func:`page` shows: nothing yet."""
+    """The simulator of :func:`page`, which shows nothing yet."""
     _, simulator = served
     empty = Simulator()
     for name, value in vars(empty).items():

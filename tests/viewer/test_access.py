@@ -23,7 +23,7 @@ def asked(
     path: str = "/",
     app: Any = None,
 ) -> Any:
-    """What is answered: "passed", or the messages of the refusal."""
+    """The answer: "passed", or the messages of the refusal."""
     headers = [(b"host", host.encode())]
     if origin:
         headers.append((b"origin", origin.encode()))

@@ -1,4 +1,4 @@
-"""What a page saves, read back by the programs that people have for it."""
+"""Files that a page saves, read back by the programs that people have for them."""
 
 import io
 import json
@@ -22,7 +22,7 @@ StudyTime StudyID AccessionNumber ReferringPhysicianName Modality SeriesInstance
 Manufacturer InstanceNumber PatientOrientation ImageType SamplesPerPixel PhotometricInterpretation
 Rows Columns BitsAllocated BitsStored HighBit PixelRepresentation PixelData SOPClassUID
 SOPInstanceUID RegionSpatialFormat"""
-"""What must be there, by PS3.3 A.6.4, in the data set or in the region's."""
+"""Attributes that must be there, by PS3.3 A.6.4, in the data set or in the region's."""
 NOON = 1_790_000_000 * 10**9
 
 

@@ -1,4 +1,4 @@
-"""What streams to pages: subscribed to while watched, decoded when taken, or refused.
+"""Topics that stream to pages: subscribed to while watched, decoded when taken, or refused.
 
 What the 3D scene of a page gets of a graph: rest once, then what moves; and what is refused.
 """
@@ -254,7 +254,7 @@ def cloud(points: np.ndarray, second: int = 0) -> PointCloud2:
 
 
 def unused() -> None:
-    """What a page does when it is told of something new: it takes it when it is ready."""
+    """Do nothing: a page that is told of something new takes it when it is ready."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What keys, drags, wheel, fingers and sliders of a real browser ask of the hand."""
+"""Wishes of keys, drags, wheel, fingers and sliders of a real browser to the hand."""
 
 import math
 from typing import Any

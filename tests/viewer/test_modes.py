@@ -27,7 +27,7 @@ def known(value: str, is_flipped: bool = False) -> NodeParameters:
 
 @pytest.fixture
 def asked(simulator: Simulator) -> list[str]:
-    """What the node was asked to show; it refuses velocity."""
+    """The modes that the node was asked to show; it refuses velocity."""
     values: list[str] = []
 
     def send(_: Parameter, raw: Any) -> "Future[str]":

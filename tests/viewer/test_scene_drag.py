@@ -1,4 +1,4 @@
-"""What drags in the 3D scene of a real browser ask of the hand, by where they are in space."""
+"""Wishes of drags in the 3D scene of a real browser to the hand, by where they are in space."""
 
 import json
 import math

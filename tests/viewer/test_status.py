@@ -1,4 +1,4 @@
-"""What pages know of nodes: newest status, problems, silence, and bounded histories.
+"""The state of nodes for pages: newest status, problems, silence, and bounded histories.
 
 The status board fed by real messages, only while somebody looks.
 """

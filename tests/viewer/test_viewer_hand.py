@@ -123,7 +123,7 @@ class Holder(GuardedNode):
 
 
 class Page:
-    """What a page does with the hand."""
+    """A page, which asks the hand."""
 
     def __init__(self, bench, holder):
         self._bench, self._holder = bench, holder

@@ -15,7 +15,8 @@ from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
 from us_sim.scoring.exercise import Exercise, Step, read_exercise
-from us_sim.scoring.metrics import Metric, Scan, ScoreSettings, metrics_of
+from us_sim.scoring.metrics import Metric, Scan, metrics_of
+from us_sim.scoring.settings import ScoreSettings
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:

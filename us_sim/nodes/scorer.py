@@ -22,7 +22,8 @@ from us_sim.nodes.settings import ScorerSettings
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.lumen import LiveScan
-from us_sim.scoring.metrics import ScoreSettings, metrics_of
+from us_sim.scoring.metrics import metrics_of
+from us_sim.scoring.settings import ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
 _REMEMBERED = 256  # poses, for the image with the same stamp

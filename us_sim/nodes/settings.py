@@ -16,7 +16,7 @@ from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.topics import TOPICS
 from us_sim.scene.building import probe_of
 from us_sim.scene.scene import Scene
-from us_sim.scoring.metrics import ScoreSettings
+from us_sim.scoring.settings import ScoreSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import FILTERS, SOLVERS, TRACKERS
 from us_sim.settings.setting import Refusal, Settings, convert, kinds_of, rules_of, setting

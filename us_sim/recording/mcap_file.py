@@ -148,7 +148,7 @@ class McapFile:
         held = 0
         with self._path.open("rb") as stream:
             for run in self._runs.since(since):
-                while pending and pending[0][0] < run.start:
+                while pending and pending[0][:2] < (run.start, run.offset):
                     message = heapq.heappop(pending)[-1]
                     held -= len(message.data)
                     yield message

@@ -63,6 +63,7 @@ class TopicCheck:
     stamps: array[int] = field(default_factory=lambda: array("q"))  # ns; 0 where there is none
     numbers: array[int] = field(default_factory=lambda: array("Q"))
     too_short: int = 0  # messages, for their type
+    by_another_clock: int = 0  # messages whose log time is of another clock than their sending
     missing: int | None = None  # messages, by their numbers; None without numbers
     longest_gap: float = 0.0  # s
     unpaired: int | None = None  # messages; None where no pose is followed
@@ -81,9 +82,13 @@ class TopicCheck:
 
     @property
     def is_of_another_time(self) -> bool:
-        """Whether the stamps are from long before the recording, or after it."""
+        """Whether the stamps are from long before the sending, or after it."""
         ages = self.ages
         return bool(len(ages)) and abs(float(np.median(ages))) > _OTHER_TIME / 1e6
+
+    @property
+    def tells_latency(self) -> bool:
+        return not (self.topic.is_latched or self.is_of_another_time or self.by_another_clock)
 
     @property
     def interval(self) -> float | None:
@@ -123,8 +128,10 @@ def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) ->
     read, total, size = 0, max(bag.message_count, 1), 0
     for message in bag.all_messages(faults):
         into = topics[message.topic]
+        is_apart = abs(message.log_time - message.publish_time) > _OTHER_TIME
+        into.by_another_clock += is_apart
         into.logged.append(message.log_time)
-        into.sent.append(message.publish_time)
+        into.sent.append(message.log_time if is_apart else message.publish_time)
         into.numbers.append(message.sequence)
         into.stamps.append(_stamp(into, message.data))
         size += len(message.data)
@@ -134,6 +141,15 @@ def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) ->
     progress(1.0, "")
     held = sorted(topics.values(), key=lambda each: each.topic.name)
     findings = [*_index(bag, faults, read)]
+    if apart := sum(each.by_another_clock for each in held):
+        findings.append(
+            Finding(
+                "latency",
+                f"{bag.path} was recorded by another clock than that of the sending of "
+                f"{counted(apart, 'message')}, as under simulated time: no latency is told of them",
+                matters=False,
+            )
+        )
     one_counter = _count_together(held)
     for each in held:
         origin = bag.start or 0
@@ -303,7 +319,7 @@ def _latency(each: TopicCheck, origin: int) -> Iterator[Finding]:
             f"{counted(len(early), 'message')} of {name} came up to {ahead:.1f} ms before being "
             f"sent, first at {_at(int(logged[early[0]]), origin)}: {clocks}",
         )
-    if each.topic.is_latched or not stamps.any():
+    if each.topic.is_latched or each.by_another_clock or not stamps.any():
         return
     if each.is_of_another_time:
         days = float(np.median(each.ages)) / 86_400_000
@@ -358,7 +374,7 @@ def table(found: BagCheck) -> list[tuple[str, ...]]:
     """
     rows: list[tuple[str, ...]] = [_TITLES]
     for each in found.topics:
-        ages = each.ages if not (each.topic.is_latched or each.is_of_another_time) else np.zeros(0)
+        ages = each.ages if each.tells_latency else np.zeros(0)
         told = [f"{age:.2f}" for age in np.percentile(ages, [50, 99, 100])] if len(ages) else "---"
         interval = each.interval
         rows.append(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from us_sim.nodes.topics import FROZEN, MARKERS
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
-from us_sim.run.resimulation import scene_within
+from us_sim.run.resimulation import scene_of
 from us_sim.run.session_summary import read_session
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scoring.lumen import vessels_in
@@ -112,13 +111,9 @@ def _truth(
     Raises:
         UsSimError: there is no scene or image, or a file of the scene is missing or another.
     """
-    attached = bag.attachments()
-    if "scene.yaml" not in attached:
-        raise BagError(f"{file} has no scene attached")
     if path.topic != _POSES:
         raise BagError(f"they are known for the poses on {_POSES} only, not {path.topic}")
-    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as place:
-        scene = scene_within(file, attached, Path(place, "attached"))
+    with scene_of(bag) as scene:
         session = read_session(file)
         samples = max(_SAMPLES, int(_RATE * path.duration))
         lines, thrombi = vessels_in(volume_of(scene))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +15,10 @@ from numpy.typing import NDArray
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.motion import Motion
-from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import Settings, setting
+from us_sim.scoring.settings import ScoreSettings
 
 _Array = NDArray[np.float64]
 _MM, _MM2, _DEGREES = 1e3, 1e6, float(np.rad2deg(1.0))
-
-
-@dataclass(frozen=True)
-class ScoreSettings(Settings):
-    """Limits that metrics of force are about."""
-
-    error: ClassVar = ScoreError
-
-    force_limit: float = setting(
-        Quantity("force", 0.01, 1000.0), "of which the time above it is told", default=10.0
-    )
-    contact_force: float = setting(
-        Quantity("force", 1e-6, 100.0),
-        "from which the probe is in contact; a sensor's noise is below it",
-        default=0.1,
-    )
 
 
 @dataclass(frozen=True)

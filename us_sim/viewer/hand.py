@@ -98,7 +98,8 @@ class HandCommand:
             goal = replace(goal, press=LIFTED)
         elif self.go == "upright":
             goal = replace(goal, rotation=0.0, fan=0.0, rock=0.0)
-        goal = _with(goal, {name: n[0] for name, n in self.to.items() if name in _SINGLE})
+        wanted: dict[str, Any] = {name: n[0] for name, n in self.to.items() if name in _SINGLE}
+        goal = replace(goal, **wanted)
         if "point" in self.to:
             goal = replace(goal, point=surface.closest(np.array(self.to["point"])).point)
         if "x" in self.to or "y" in self.to:
@@ -107,16 +108,12 @@ class HandCommand:
         if "slide" in self.by:
             goal = goal.slid(surface, *self.by["slide"])
         changed = {n: getattr(goal, n) + self.by[n][0] for n in _SINGLE if n in self.by}
-        return _with(goal, changed).within_reach()
+        return replace(goal, **changed).within_reach()
 
 
 def is_source(value: Any) -> TypeGuard[str]:
     """Whether it can be the name that a page has given itself."""
     return isinstance(value, str) and 0 < len(value) <= _LONGEST_SOURCE
-
-
-def _with(stance: Stance, numbers: dict[str, Any]) -> Stance:
-    return replace(stance, **numbers)
 
 
 def _numbers(
@@ -178,16 +175,8 @@ def hand_state(
 
 
 def _stance_numbers(stance: Stance) -> dict[str, float]:
-    x, y, z = stance.point.tolist()
-    return {
-        "x": x,
-        "y": y,
-        "z": z,
-        "press": stance.press,
-        "rotation": stance.rotation,
-        "fan": stance.fan,
-        "rock": stance.rock,
-    }
+    place = dict(zip("xyz", stance.point.tolist(), strict=True))
+    return place | {name: getattr(stance, name) for name in _SINGLE}
 
 
 _KEPT = 512  # poses, until their images are made

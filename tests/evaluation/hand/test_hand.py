@@ -1,4 +1,4 @@
-"""What is said of a method in a hand is true of solvers of which it is known beforehand."""
+"""Errors and faults of a method in a hand, of solvers of which they are known beforehand."""
 
 import csv
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is said of a running graph is true of arrivals and processes that are known beforehand."""
+"""Latency and usage of arrivals and processes that are known beforehand, and of a real graph."""
 
 import csv
 import os

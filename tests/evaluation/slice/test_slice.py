@@ -1,4 +1,4 @@
-"""What `us-sim evaluate slice` measures and writes, and what it says when it cannot."""
+"""`us-sim evaluate slice` in small: its measures, its files, and its sentences when it cannot."""
 
 import csv
 import importlib.util

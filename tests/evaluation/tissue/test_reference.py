@@ -72,9 +72,9 @@ def test_a_cubic_displacement_without_change_of_volume_costs_only_shear_energy()
 def test_a_shallow_press_has_hertz_force():
     depth = 0.0004
     planes = (
-        graded_planes(-0.05, 0.05, -0.004, 0.004, 0.002, 1.5),
-        graded_planes(0.0, 0.05, 0.0, 0.004, 0.002, 1.5),
-        graded_planes(0.0, 0.07, 0.0, 0.002, 0.002, 1.5),
+        graded_planes(-0.05, 0.05, -0.004, 0.004, 0.002, 2.0),
+        graded_planes(0.0, 0.05, 0.0, 0.004, 0.002, 2.0),
+        graded_planes(0.0, 0.07, 0.0, 0.002, 0.002, 2.0),
     )
     solution = solve_contact(planes, SOFT, Sphere(0.03), [Pose([0.0, 0.0, depth])])
     expected = 4 / 3 * 10e3 / (1 - 0.45**2) * np.sqrt(0.03) * depth**1.5

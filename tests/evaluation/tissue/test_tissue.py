@@ -1,4 +1,4 @@
-"""What `us-sim evaluate tissue` measures and writes, and what it says when it cannot."""
+"""`us-sim evaluate tissue` in small: its measures, its files, and its sentences when it cannot."""
 
 import csv
 import re

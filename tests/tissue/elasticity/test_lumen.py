@@ -61,7 +61,7 @@ def test_a_block_of_lumen_under_a_pressure_has_the_area_of_the_law(outside):
     tissue = NeoHookean(mesh, uniform_material(mesh, VEIN), np.float64)
 
     def excess(area):
-        """What the sides of the block, narrowed alike, are pressed with beyond ``outside``."""
+        """The pressure on the sides of the block, narrowed alike, beyond ``outside``."""
         narrow = np.sqrt(area) - 1
         forces = tissue.forces(np.ascontiguousarray(mesh.nodes.T * [[0.0], [narrow], [narrow]]))
         top = mesh.nodes[:, 2] > 0.1 - 1e-9

@@ -80,7 +80,7 @@ def with_springs(nodes, normals, stiffness):
 
 
 def add_springs(nodes, normals, stiffness):
-    """What adds the forces of such springs."""
+    """A function that adds the forces of such springs."""
 
     def add(field, image):
         for node, normal, k in zip(nodes, normals, stiffness, strict=True):

@@ -1,4 +1,4 @@
-"""What holds for every tissue solver, and how one goes on from where another is."""
+"""Laws of every tissue solver, and of one that goes on from where another is."""
 
 import contextlib
 import subprocess

@@ -222,7 +222,7 @@ def slow(tmp_path, monkeypatch):
 
 
 def prepared(slow):
-    """What is said while it is compiled beside; then how often from the cache and how often not."""
+    """The states while it is compiled beside; then how often from the cache and how often not."""
     said = []
     model = block((3, 3, 3))
     compiled_solver(
@@ -278,7 +278,7 @@ def preparation(tissue):
 
 
 def outcome_of(preparation):
-    """What comes of it in the end."""
+    """The outcome in the end."""
     deadline = time.monotonic() + 20
     while (outcome := preparation.take()) is None:
         assert time.monotonic() < deadline

@@ -21,9 +21,6 @@ from us_sim.volume.volume import Volume
 STEPS = np.array([0.5e-3, 0.5e-3, 1e-3])
 SHAPE = (60, 60, 30)
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, -1]])  # about z, and mirrored
-RADII = np.linalg.norm(
-    (np.indices(SHAPE).transpose(1, 2, 3, 0) - (30, 30, 15)) * STEPS * 1e3, axis=-1
-)
 
 
 def grid():

@@ -240,7 +240,7 @@ def _unbalanced(residual: float, goal: float) -> SolverError:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of the beads in a box of one height, all of them in order of ``beads``."""
+    """Predictions of the beads in a box of one height, all of them in order of ``beads``."""
 
     top: float  # m
     beads: Beads  # inside, which gave no face its displacement

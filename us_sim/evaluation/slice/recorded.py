@@ -20,15 +20,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.evaluation.report import Row, filled, markdown_table, write_rows
+from us_sim.evaluation.report import Row, filled, markdown_table, picture, write_rows
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
@@ -258,46 +258,35 @@ def _draw_recorded(
     rows: Sequence[RecordedFrame], pairs: Sequence[RecordedPair], probe: Probe, file: Path
 ) -> None:
     """A column a pair: recorded, simulated, their difference; below, all frames' correlation."""
-    figure = Figure(figsize=(2.9 * len(pairs) + 0.8, 9.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(4, len(pairs), height_ratios=(1, 1, 1, 0.7))
     white = float(np.percentile([pair.recorded for pair in pairs], 99.2))  # few pixels are bright
     corner = 1e3 * (probe.image_to_probe @ [-0.5, -0.5, 0, 1])
     end = 1e3 * (probe.image_to_probe @ [probe.columns - 0.5, probe.rows - 0.5, 0, 1])
-    extent = (corner[0], end[0], end[2], corner[2])
+    look: Any = {"extent": (corner[0], end[0], end[2], corner[2])}
+    grey: Any = {"cmap": "gray", "vmin": 0.0, "vmax": white}
     by_frame = {row.frame: row for row in rows}
-    for column, pair in enumerate(pairs):
-        difference = pair.simulated.astype(np.float32) - pair.recorded
-        difference[~pair.compared] = np.nan
-        row = by_frame[pair.frame]
-        for line, (name, image, colours, (low, high)) in enumerate(
-            (
-                ("recorded", pair.recorded, "gray", (0.0, white)),
-                ("simulated", pair.simulated, "gray", (0.0, white)),
-                ("simulated − recorded", difference, "RdBu_r", (-40.0, 40.0)),
-            )
-        ):
-            axes = figure.add_subplot(grid[line, column])
-            shown = axes.imshow(image, cmap=colours, vmin=low, vmax=high, extent=extent)
-            axes.tick_params(labelsize=7, labelbottom=line == 2, labelleft=column == 0)
-            if line == 0:
-                axes.set_title(f"frame {pair.frame}, t = {row.time:.2f} s", fontsize=10)
-            if line == 2:
-                axes.set_xlabel(f"NCC {row.ncc_raw:.3f}; smoothed {row.ncc_smoothed:.3f}")
-                if column == len(pairs) - 1:
-                    figure.colorbar(shown, ax=axes, shrink=0.8, label="grey levels")
-            if column == 0:
-                axes.set_ylabel(f"{name}\ndepth, mm")
-    _plot_correlation(figure.add_subplot(grid[3, :]), rows)
-    figure.suptitle(
-        f"Real frames of a freehand sweep, and the volume made from it cut at their poses.  "
-        f"{_ATTRIBUTION}",
-        fontsize=13,
-    )
-    figure.savefig(file, dpi=80)
+    title = "Real frames of a freehand sweep, and the volume made from it cut at their poses"
+    with picture(file, 2.9 * len(pairs) + 0.8, 9.6, f"{title}.  {_ATTRIBUTION}") as figure:
+        grid = figure.add_gridspec(4, len(pairs), height_ratios=(1, 1, 1, 0.7))
+        for column, pair in enumerate(pairs):
+            difference = pair.simulated.astype(np.float32) - pair.recorded
+            difference[~pair.compared] = np.nan
+            row = by_frame[pair.frame]
+            top, middle, bottom = (figure.add_subplot(grid[line, column]) for line in range(3))
+            top.imshow(pair.recorded, **grey, **look)
+            middle.imshow(pair.simulated, **grey, **look)
+            shown = bottom.imshow(difference, cmap="RdBu_r", vmin=-40.0, vmax=40.0, **look)
+            top.set_title(f"frame {pair.frame}, t = {row.time:.2f} s", fontsize=10)
+            bottom.set_xlabel(f"NCC {row.ncc_raw:.3f}; smoothed {row.ncc_smoothed:.3f}")
+            names = ("recorded", "simulated", "simulated − recorded")
+            for axes, name in zip((top, middle, bottom), names, strict=True):
+                axes.tick_params(labelsize=7, labelbottom=axes is bottom, labelleft=column == 0)
+                if column == 0:
+                    axes.set_ylabel(f"{name}\ndepth, mm")
+        figure.colorbar(shown, ax=bottom, shrink=0.8, label="grey levels")
+        _plot_correlation(figure.add_subplot(grid[3, :]), rows)
 
 
-def _plot_correlation(axes, rows: Sequence[RecordedFrame]) -> None:  # type: ignore[no-untyped-def]
+def _plot_correlation(axes: Axes, rows: Sequence[RecordedFrame]) -> None:
     frames = [row.frame for row in rows]
     for name, words, colour, mark in (
         ("ncc_smoothed", "smoothed to the volume's resolution", "#0072B2", "s"),
