@@ -270,13 +270,12 @@ def test_a_hold_up_is_skipped_and_not_made_up_for():
     thread = PeriodicThread(1 / period, work)
     run(thread, done)
     assert thread.skipped >= 19
-    count, ways = len(ticks), [b - a for a, b in itertools.pairwise(ticks)]
+    ways = [b - a for a, b in itertools.pairwise(ticks)]
     # On the whole as many periods passed as there were ticks and skipped ones: nothing drifts.
     assert abs((ticks[59] - ticks[0]) * 1e-9 / period - (59 + thread.skipped)) < 3
     assert sum(way < 0.2e9 * period for way in ways) <= 3
     assert 0.0 < thread.jitter < 25 * period
-    time.sleep(4 * period)
-    assert len(ticks) == count
+    assert "periodic" not in {each.name for each in threading.enumerate()}
 
 
 def test_it_ends_even_if_it_never_began():
