@@ -12,6 +12,7 @@ import pytest
 import rclpy
 
 import us_sim.standalone
+from us_sim.standalone.libddsc import DdsError
 
 pytestmark = pytest.mark.skipif(
     rclpy.__name__ == "rclpy", reason="the real rclpy is here, so nothing is installed"
@@ -123,5 +124,8 @@ def test_nodes_may_call_their_attributes_what_they_like(bench) -> None:
     "name", [file.stem for file in sorted(FOLDER.glob("*.py")) if ">>> " in file.read_text()]
 )
 def test_examples(name: str) -> None:
-    module = importlib.import_module(f"us_sim.standalone.{name}".removesuffix(".__init__"))
+    try:
+        module = importlib.import_module(f"us_sim.standalone.{name}".removesuffix(".__init__"))
+    except DdsError as error:  # zenoh takes its place there
+        pytest.skip(str(error))
     assert doctest.testmod(module).failed == 0

@@ -10,6 +10,7 @@ from us_sim.viewer.stream import Simulator
 
 EVERY_S = 0.5
 """How often the panel is brought up to date."""
+TITLE = "Exercise"
 NOTHING = (
     "No exercise is followed: load a scene that has one, such as upper arm thrombosis, or start "
     "the node scorer."
@@ -27,7 +28,7 @@ def build_exercise(simulator: Simulator) -> None:
         if told == drawn:
             return
         drawn = told
-        name.set_text(told.name)
+        name.set_text(told.name or TITLE)
         about.set_text(told.description if told.name else NOTHING)
         done = sum(step.is_done for step in told.steps)
         passed = "passed: " if done == len(told.steps) else ""
@@ -38,17 +39,15 @@ def build_exercise(simulator: Simulator) -> None:
         with steps:
             for step in told.steps:
                 with ui.row(wrap=False).classes("us-step"):
-                    icon = ui.icon("check_circle" if step.is_done else "radio_button_unchecked")
-                    icon.props["role"] = "img"
-                    icon.props["aria-label"] = "done" if step.is_done else "not done"
-                    ui.label(f"{step.what}: {step.seen}")
+                    ui.icon("check_circle" if step.is_done else "radio_button_unchecked")
+                    ui.label(f"{'Done' if step.is_done else 'To do'}: {step.what}, {step.seen}")
         with metrics:
             for label, value in told.metrics.items():
                 ui.label(label).classes("us-quiet")
                 ui.label(value)
 
     with WhileShown(board.watch, lambda: board.watch(-1), EVERY_S, refresh):
-        name = ui.label().classes("us-heading").props('role="heading" aria-level="2"')
+        name = ui.label(TITLE).classes("us-heading").props('role="heading" aria-level="2"')
         about = ui.label().classes("us-note")
         result = ui.label().classes("us-session-state").props('role="status"')
         steps = ui.column().classes("us-steps")
