@@ -23,7 +23,7 @@ LAYERS = (
     (
         "the domain, without ROS",
         (
-            ("", "scene", "environment", "scoring"),
+            ("", "environment", "scene", "scoring"),
             ("skin", "tissue", "slicing", "tracking"),
             ("", "", "volume", "recording"),
             ("geometry",),

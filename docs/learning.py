@@ -21,7 +21,7 @@ from us_sim.environment.environment import ScanEnvironment
 from us_sim.progress import Progress
 
 FOLDER = Path(__file__).parent
-GENERATIONS, POPULATION, EACH, TESTS, STEPS = 20, 8, 1, 24, 100
+GENERATIONS, POPULATION, EACH, TESTS, STEPS = 16, 8, 1, 24, 100
 SAME = {"thickness": 1.0, "speckle": 1, "stiffness": 1.0, "lumen_pressure": 1.0}
 SETTINGS = {
     "tissue": {"solver": "fem"},

@@ -83,6 +83,8 @@ def test_a_seed_decides_every_byte_here_and_in_another_process(scene):
 
 def test_other_processes_step_as_this_one_does_though_numba_and_threads_are_there(scene):
     def make():
+        import us_sim.environment  # noqa: F401 - as in a process of its own
+
         return gymnasium.make("us_sim/FindVein-v0", scene=scene, settings={"skin": None})
 
     def run(vector):

@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import multiprocessing
+import signal
 import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -139,7 +140,9 @@ def _made(orders: Sequence[_Order], workers: int) -> Iterator[tuple[_Order, dict
         yield from ((order, _episode(order)) for order in orders)
         return
     context = multiprocessing.get_context("spawn")  # numba and threads are here already
-    with ProcessPoolExecutor(min(workers, len(orders)), mp_context=context) as pool:
+    # Ctrl-C is for this process, which lets the others finish their episodes.
+    ignore = signal.SIGINT, signal.SIG_IGN
+    with ProcessPoolExecutor(min(workers, len(orders)), context, signal.signal, ignore) as pool:
         waiting: dict[Future[dict[str, Any]], _Order] = {
             pool.submit(_episode, order): order for order in orders
         }
@@ -207,7 +210,7 @@ def _record(order: _Order, path: Path) -> dict[str, Any]:
             action = agent.act(observation)
             members = _members(environment, observation, labels)
             observation, reward, done, truncated, info = environment.step(action)
-            step = members.pop("json") | {"action": np.round(action, 6).tolist()}
+            step = members.pop("json") | {"action": action.tolist()}
             if order.task:
                 step |= {"reward": reward, "is_success": done, **environment.task.facts()}
                 is_success = is_success or done
@@ -243,9 +246,9 @@ def _members(
         counts = np.bincount(state.labels.ravel(), minlength=256)
         step["areas"] = {name: float(area * counts[n]) for n, name in labels.items()}
     if environment.scene.tissue is not None:
-        members["displacement.npy"] = _npy(state.displacement)
+        members["displacement.npy"] = _npy(state.displacement, 1e-6)
         if "strain" in environment.scene.episode.observe:
-            members["strain.npy"] = _npy(state.strain)
+            members["strain.npy"] = _npy(state.strain, 1e-4)
     return members | {"json": step}
 
 
@@ -254,9 +257,10 @@ def _png(image: NDArray[np.uint8]) -> bytes:
     return content.tobytes()
 
 
-def _npy(array: NDArray[np.float32]) -> bytes:
+def _npy(array: NDArray[np.float32], unit: float) -> bytes:
+    """An int16 array in a unit, as a file; a quarter of the bytes of float64, and no subnormals."""
     stream = io.BytesIO()
-    np.save(stream, array.astype(np.float16))  # 11 bits: 8 µm of 12 mm
+    np.save(stream, np.rint(array / unit).clip(-32768, 32767).astype(np.int16))
     return stream.getvalue()
 
 

@@ -39,6 +39,7 @@ from us_sim.scene.building import (
 from us_sim.scene.episode import Draws
 from us_sim.scene.scene import Scene
 from us_sim.settings.registry import SOLVERS
+from us_sim.slicing.acoustics.surface_echo import surface_normals_of
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.strain import AxialStrain, displacement
@@ -154,6 +155,7 @@ class Simulation:
         self.scene = scene
         self._blas = ThreadpoolController()
         self._volumes: dict[int | None, tuple[Volume, TissueModel | None, Any]] = {}
+        self._normals: dict[int | None, Any] = {}  # kept for thicker and thinner layers
         self._shape: tuple[Any, ...] | None = None
         self._materials: tuple[Any, ...] | None = None
         self._solver: TissueSolver | None = None
@@ -196,9 +198,11 @@ class Simulation:
         with self._blas.limit(limits=1, user_api="blas"):
             shape = draw.speckle, draw.thickness
             materials = *shape, draw.lumen_pressure, dict(draw.stiffness)
-            if shape != self._shape:
+            last = self._shape, self._materials
+            self._shape = self._materials = None  # where something cannot be made
+            if shape != last[0]:
                 self._make_scanner(draw)
-            if materials != self._materials:
+            if materials != last[1]:
                 self._make_tissue(draw)
             elif self._solver is not None:
                 self._solver.reset()
@@ -284,8 +288,11 @@ class Simulation:
             volume = volume_of(scene, late_progress("making the volume"))
             model = tissue_model_of(scene, volume) if scene.tissue else None
             fractions = label_fractions_of(model.mesh, volume) if model else None
+            is_live = scene.imaging.acoustics.is_live and volume.labels is not None
+            self._normals[speckle] = surface_normals_of(volume) if is_live else None
             while len(self._volumes) >= _VOLUMES:
-                del self._volumes[next(iter(self._volumes))]
+                oldest = next(iter(self._volumes))
+                del self._volumes[oldest], self._normals[oldest]
             self._volumes[speckle] = volume, model, fractions
         return self._volumes[speckle]
 

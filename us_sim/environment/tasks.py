@@ -98,13 +98,14 @@ class FindVein(_VesselTask):
     in_short = "the vein within 2 mm of the image's middle, open, the face in contact, for 10 steps"
 
     def judge(self, state: State) -> tuple[float, bool]:
-        """The nearer and the better in contact, the more."""
+        """The nearer the more; half of it is for contact that leaves the vein open."""
         self._look(state)
         half = self._simulation.scanner.probe.width / 2
         distance = half if self.offset is None else min(abs(self.offset), half)
-        touches = state.contact >= _TOUCHING
-        is_right = distance <= 2e-3 and touches and self.fraction >= _OPEN
-        return -0.5 * distance / half - 0.5 * (not touches), self._hold(is_right, 10)
+        is_open = self.fraction >= _OPEN
+        is_right = distance <= 2e-3 and is_open and state.contact >= _TOUCHING
+        reward = -0.5 * distance / half - 0.5 * (1.0 - state.contact * is_open)
+        return reward, self._hold(is_right, 10)
 
 
 class CompressVein(_VesselTask):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -28,7 +29,13 @@ from us_sim.slicing.acoustics.path_loss import (
     sharpen_edges,
 )
 from us_sim.slicing.acoustics.settings import Acoustics
-from us_sim.slicing.acoustics.surface_echo import ANGLES, GRAIN, draw_surfaces, surface_normals_of
+from us_sim.slicing.acoustics.surface_echo import (
+    ANGLES,
+    GRAIN,
+    SurfaceNormals,
+    draw_surfaces,
+    surface_normals_of,
+)
 from us_sim.slicing.cutting.resampling import Located, full_runs, label_voxels, pixel_to_index
 from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.frame import Frame
@@ -185,8 +192,12 @@ class BeamAcoustics:
         maps = np.ascontiguousarray(pixel_to_index(self._volume, plane)[None])
         return Located(elements, maps, np.empty(0, dtype=np.intp)), np.empty((0, 3))
 
+    @cached_property
+    def _normals(self) -> SurfaceNormals:
+        return surface_normals_of(self._volume)
+
     def _draw(self, frame: Frame, out: NDArray[np.uint8]) -> None:
-        normals = surface_normals_of(self._volume)
+        normals = self._normals
         grid, plane = self.grid, frame.plane
         located, nodes = self._at
         lateral, axial = self._probe.pixel_spacing

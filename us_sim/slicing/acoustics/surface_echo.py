@@ -13,7 +13,7 @@ indices, which a tetrahedron's map carries into the patient. They are kept in bl
 from __future__ import annotations
 
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,6 +240,7 @@ class SurfaceNormals:
     """Normals of the borders between a volume's labels (i, j, k)."""
 
     def __init__(self, labels: NDArray[np.uint8]) -> None:
+        self._labels = labels  # whose memory is no other volume's as long as these are kept
         shape = np.array(labels.shape, dtype=np.int64)
         self.blocks = np.full(tuple(-(-shape // BLOCK)), -1, dtype=np.int32)
         offset = np.arange(-_REACH, _REACH + 1)
@@ -278,15 +279,20 @@ def _distances() -> NDArray[np.int8]:
 
 
 _DISTANCES = _distances()
-_found: WeakKeyDictionary[Volume, SurfaceNormals] = WeakKeyDictionary()
+_found: WeakValueDictionary[tuple[int, tuple[int, ...]], SurfaceNormals] = WeakValueDictionary()
 
 
 def surface_normals_of(volume: Volume) -> SurfaceNormals:
-    """The normals of a volume's labels, found when they are first asked for (about a second)."""
+    """The normals of a volume's labels, found when they are first asked for (about a second).
+
+    They are kept while somebody uses them, also for a volume of the same labels in another place.
+    """
     assert volume.labels is not None
-    if volume not in _found:
-        _found[volume] = SurfaceNormals(volume.labels)
-    return _found[volume]
+    key = volume.labels.ctypes.data, volume.labels.shape
+    found = _found.get(key)
+    if found is None:
+        found = _found[key] = SurfaceNormals(volume.labels)
+    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
