@@ -19,10 +19,10 @@ from us_sim.standalone.cdr import deserialize, serialize
 from us_sim.standalone.libddsc import DdsError
 from us_sim.standalone.messages import message_class
 from us_sim.standalone.middleware import EndpointQos, GraphNode, MiddlewareError, qos_of_profile
-from us_sim.standalone.services import ServiceServer
 
 try:
     from us_sim.standalone.graph import Graph
+    from us_sim.standalone.services import ServiceServer
     from us_sim.standalone.transport import DiscoveryRange, Participant
 except DdsError as error:  # zenoh takes its place there
     pytest.skip(str(error), allow_module_level=True)
