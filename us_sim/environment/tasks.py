@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 from us_sim.environment.simulation import Simulation, State
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
-
-CLOSED = 0.27
-"""Part of a vein's cross-section at rest at which opposite walls touch (Flaherty, Keller and
-Rubinow, Circulation Research 30, 1972), as `structures.NAME.flow.closed_at`."""
+from us_sim.slicing.settings import WALLS_TOUCH
 
 _OPEN = 0.5
 """Part of it from which a vein counts as open."""
@@ -121,7 +118,7 @@ class CompressVein(_VesselTask):
         """The less of the vein is open, and once it was closed, the less force."""
         self._look(state)
         if not self.is_closed:
-            shut = self.offset is not None and self.fraction <= CLOSED
+            shut = self.offset is not None and self.fraction <= WALLS_TOUCH
             self.is_closed = self._hold(shut, 5)
             return -min(self.fraction, 1.0), False
         let_go = state.force < 1.0 and self.fraction >= _OPEN

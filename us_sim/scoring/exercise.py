@@ -31,6 +31,7 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.share import shared_roots
+from us_sim.slicing.settings import WALLS_TOUCH
 
 _LENGTH, _TIME, _FORCE = Quantity("length", 1e-4, 1.0), Quantity("time", 0.1, 3600.0), "force"
 _PART = Quantity("number", 0.0, 1.0)
@@ -76,8 +77,9 @@ class Compression(Task):
     spacing: float = setting(_LENGTH, "between points along the vein", default=0.02)
     margin: float = setting(Quantity("length", 0.0, 1.0), "left out at both ends", default=0.008)
     tolerance: float = setting(_LENGTH, "from a point, within which it counts", default=0.005)
-    # Below a fifth, the mesh holds a vein open: see `us_sim.evaluation.measured.vein`.
-    closed: float = setting(_PART, "part of its area that a closed vein may keep", default=0.2)
+    closed: float = setting(
+        _PART, "part of its area that a closed vein may keep", default=WALLS_TOUCH
+    )
     open: float = setting(_PART, "part of its area that the artery must keep", default=0.5)
     enough: float = setting(
         Quantity(_FORCE, 0.1, 200.0),

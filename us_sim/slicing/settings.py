@@ -50,6 +50,10 @@ STRIPS = {
 }
 """Pictures that run over time, by the prefix of their parameters."""
 
+WALLS_TOUCH = 0.27
+"""Part of a vessel's area at rest at which opposite walls touch, so that it is closed: Flaherty,
+Keller and Rubinow, Post buckling behavior of elastic tubes, SIAM J. Appl. Math. 23 (1972)."""
+
 TISSUE_PARAMETERS = "acoustics.tissues."  # prefix of the parameters of a label's acoustics
 ECHO_RANGE = 60.0
 """dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
@@ -266,7 +270,7 @@ class FlowSettings(Settings):
     closed_at: float = setting(
         Quantity("number", 0.0, 0.9),
         "fraction of its area at rest at which opposite walls touch and the vessel is closed",
-        default=0.27,
+        default=WALLS_TOUCH,
     )
 
     def check(self) -> None:
