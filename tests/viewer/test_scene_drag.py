@@ -18,6 +18,7 @@ CAMERA = f"() => {SCENE}.then(m => m.stage.camera.position.toArray())"
 def hand(page: Any, simulator: Simulator) -> FakeHand:
     hand = FakeHand(simulator)
     show_patient(simulator)
+    page.emulate_media(reduced_motion="reduce")  # the view turns at once
     page.goto(page.address)
     page.evaluate(f"async () => {{ window.scene = await {SCENE}; }}")
     page.wait_for_function("window.scene.probePose() !== null && window.scene.stage.pace.drawn > 1")
@@ -30,6 +31,7 @@ def await_view(page: Any) -> None:
     """Until the view has turned to what there is to see."""
     seen: list[list[float]] = []
     while len(seen) < 2 or seen[-1] != seen[-2]:
+        page.wait_for_function("window.scene.stage.pace.isAtRest")
         seen.append(page.evaluate(CAMERA))
         page.wait_for_timeout(400)
         assert len(seen) < 50

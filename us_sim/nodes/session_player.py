@@ -122,9 +122,13 @@ class SessionPlayer(GuardedNode):
             if self._playback.loops:
                 self._playback.restart()
             return
-        elapsed = max(self._playhead.position(self._playback.now), self._shown)
-        while self._age() <= elapsed and self._step():
-            pass
+        if self._settings.paused:  # as rosbag2's, which sends nothing by itself
+            while self._age() < self._shown and self._step():
+                pass
+        else:
+            elapsed = max(self._playhead.position(self._playback.now), self._shown)
+            while self._age() <= elapsed and self._step():
+                pass
         self._say_progress()
         if self._age() <= self._playback.until or self._settings.paused:
             return
