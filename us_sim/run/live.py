@@ -504,12 +504,14 @@ def _report(
         contact_sheet(session, scene, areas, out / "contact_sheet.png")
         bar.update(100)
     write_summary(summary, out / "summary.json")
-    latency = summary["latency_ms"]["end_to_end"]
+    latency = summary["latency_ms"]
+    image, recorder = latency["/ultrasound/image"], latency["end_to_end"]
     print(
         f"{summary['poses_in']} {'poses' if video is None else 'camera images'} in, "
         f"{summary['images_out']} images out, "
         f"{summary['dropped']} dropped, {summary['images_per_second']:.1f} images/s, "
-        f"latency to the recorder p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+        f"pose to image p50 {image['p50']:.1f} ms, p99 {image['p99']:.1f} ms; "
+        f"to the recorder {recorder['p50']:.1f} ms, {recorder['p99']:.1f} ms"
     )
     if tracked is not None:
         print(tracked)
