@@ -87,7 +87,7 @@ class Score:
         return markdown_table(("metric", "value", "unit", "roles"), rows)
 
     def exercise_table(self) -> str:
-        """What was to be done, whether it is, and what was seen; then the result."""
+        """Steps of the exercise, whether each is done, what was seen of it; then the result."""
         from us_sim.evaluation.report import markdown_table
 
         assert self.exercise is not None

@@ -6,7 +6,6 @@ import sys
 from functools import partial
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import Image
@@ -69,7 +68,7 @@ class Scorer(SceneNode):
     def _take_wrench(self, message: WrenchStamped) -> None:
         if self._begin:
             time = self._seconds(nanoseconds_of(message.header.stamp))
-            self._live.add_force(time, float(np.linalg.norm(wrench_from(message)[:3])))
+            self._live.add_force(time, wrench_from(message)[:3])
 
     def _take_labels(self, message: Image) -> None:
         stamp = nanoseconds_of(message.header.stamp)

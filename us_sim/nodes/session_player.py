@@ -69,7 +69,7 @@ class SessionPlayer(GuardedNode):
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._first = self._bag.start or 0
-        self._shown = 0  # of the recording, ns: until when it is shown while it is paused
+        self._shown = -1  # of the recording, ns: until when it is shown while it is paused
         self._playback = Playback(
             self,
             lambda: self._settings,
@@ -122,13 +122,11 @@ class SessionPlayer(GuardedNode):
             if self._playback.loops:
                 self._playback.restart()
             return
-        if self._settings.paused:  # as rosbag2's, which sends nothing by itself
-            while self._age() < self._shown and self._step():
-                pass
-        else:
-            elapsed = max(self._playhead.position(self._playback.now), self._shown)
-            while self._age() <= elapsed and self._step():
-                pass
+        elapsed = self._shown
+        if not self._settings.paused:  # then nothing is sent by itself, as rosbag2's
+            elapsed = max(elapsed, self._playhead.position(self._playback.now))
+        while self._age() <= elapsed and self._step():
+            pass
         self._say_progress()
         if self._age() <= self._playback.until or self._settings.paused:
             return
@@ -191,7 +189,7 @@ class SessionPlayer(GuardedNode):
         self._sent = 0 if since is None else self._count  # what is passed over counts as played
         self._messages = iter(self._bag.messages(list(self._topics), self._damage, since))
         self._waiting = self._next()
-        self._shown = position + _SHOWN if position and at is None else 0
+        self._shown = position + _SHOWN if position and at is None else -1
         self._playhead.go_to(position, self._playback.now if at is None else at)
 
     def _next(self) -> BagMessage | None:

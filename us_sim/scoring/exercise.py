@@ -284,7 +284,7 @@ class Exercise(Settings):
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
 
     def steps(self, scan: Scan) -> list[Step]:
-        """What is to be done, and what was seen of it.
+        """Steps to be done, with what was seen of each.
 
         Raises:
             ScoreError: as `require`.

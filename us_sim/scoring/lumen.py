@@ -189,10 +189,10 @@ class LiveScan:
         if not self._poses or time > self._poses[-1][0]:
             self._poses.append((time, pose))
 
-    def add_force(self, time: float, newtons: float) -> None:
-        """Take the magnitude of the force on the probe, likewise."""
+    def add_force(self, time: float, force: NDArray[np.float64]) -> None:
+        """Take the force (3,) N on the probe, likewise."""
         if not self._forces or time > self._forces[-1][0]:
-            self._forces.append((time, newtons))
+            self._forces.append((time, float(np.linalg.norm(force))))
 
     def add_labels(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
         """Take the labels (rows, columns) of an image."""

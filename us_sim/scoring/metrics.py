@@ -28,13 +28,17 @@ class Metric:
     name: str
     unit: str
     value: float
-    roles: str = "Any = Probe"  # what it is of, as PerkTutor writes it
+    structure: str = ""  # that it is of, beside the probe
+
+    @property
+    def roles(self) -> str:
+        """The objects that it is of, as PerkTutor writes them."""
+        return f"Any = Probe, Structure = {self.structure}" if self.structure else "Any = Probe"
 
     @property
     def label(self) -> str:
         """Name, the structure that it is of, and unit."""
-        structure = self.roles.partition("Structure = ")[2]
-        return f"{self.name}{structure and f' of {structure}'}, {self.unit}"
+        return f"{self.name}{self.structure and f' of {self.structure}'}, {self.unit}"
 
     @property
     def text(self) -> str:
@@ -149,15 +153,13 @@ def _of_force(force: Force, settings: ScoreSettings) -> Iterator[Metric]:
 
 
 def _of_section(name: str, section: Section) -> Iterator[Metric]:
-    roles, fraction = f"Any = Probe, Structure = {name}", section.fraction
+    fraction = section.fraction
     known = np.isfinite(fraction)
     if not known.any():
         return
-    yield Metric("Mean Area at Rest", "mm^2", _MM2 * float(section.at_rest[known].mean()), roles)
-    yield Metric("Smallest Area", "mm^2", _MM2 * float(section.area[known].min()), roles)
-    yield Metric(
-        "Smallest Part of the Area at Rest", "%", 100 * float(fraction[known].min()), roles
-    )
+    yield Metric("Mean Area at Rest", "mm^2", _MM2 * float(section.at_rest[known].mean()), name)
+    yield Metric("Smallest Area", "mm^2", _MM2 * float(section.area[known].min()), name)
+    yield Metric("Smallest Part of the Area at Rest", "%", 100 * float(fraction[known].min()), name)
     angles = section.angle[np.isfinite(section.angle)]
     if len(angles):
-        yield Metric("Mean Angle to the Vessel", "deg", _DEGREES * float(angles.mean()), roles)
+        yield Metric("Mean Angle to the Vessel", "deg", _DEGREES * float(angles.mean()), name)

@@ -29,7 +29,7 @@ class ToldStep(NamedTuple):
 
 @dataclass(frozen=True)
 class ToldScore:
-    """What `scorer` last said."""
+    """The last message of `scorer`."""
 
     name: str = ""  # of the exercise, or of the scene; empty before anything was said
     description: str = ""
