@@ -103,17 +103,22 @@ class Motion:
 
     def translational_actions(self) -> int:
         """Times that the position moved faster than 50 mm/s."""
-        return _actions(self.times, self.speeds > ACTION_SPEED)
+        return Actions().add(self.times[1:], self.speeds > ACTION_SPEED, self.times[0]).count
 
     def rotational_actions(self) -> int:
         """Times that it turned faster than 50 °/s."""
-        return _actions(self.times, self.angular_speeds > ACTION_TURN)
+        return Actions().add(self.times[1:], self.angular_speeds > ACTION_TURN, self.times[0]).count
 
-    def squared_jerk(self) -> float:
-        """Integral of the squared jerk, m²/s⁵, by backward differences; 0 of under four samples."""
+    @cached_property
+    def squared_jerks(self) -> _Array:
+        """(K-3,) m²/s⁵, of each step, by backward differences."""
         steps = self.steps[2:]
         jerk = np.diff(self.accelerations, axis=0) / steps[:, None]
-        return float((jerk**2).sum(axis=1) @ steps)
+        return np.asarray((jerk**2).sum(axis=1) * steps)
+
+    def squared_jerk(self) -> float:
+        """Integral of the squared jerk, m²/s⁵; 0 of under four samples."""
+        return float(self.squared_jerks.sum())
 
     def motion_smoothness(self) -> float:
         """PerkTutor's `Motion Smoothness`: the root of the squared jerk's integral, m/s^2.5.
@@ -165,13 +170,25 @@ def _ends(where: ArrayLike | None) -> NDArray[np.bool_] | slice:
     return slice(None) if where is None else np.asarray(where, bool)[1:]
 
 
-def _actions(times: _Array, is_fast: NDArray[np.bool_]) -> int:
-    """Number of actions: a change counts once it has lasted longer than the pause."""
-    count, acting, since = 0, False, times[0]
-    for time, fast in zip(times[1:].tolist(), is_fast.tolist(), strict=True):
-        if fast == acting:
-            since = time
-        elif time - since > ACTION_PAUSE:
-            acting, since = fast, time
-            count += fast
-    return count
+class Actions:
+    """Number of actions of a motion that comes in pieces.
+
+    A change counts once it has lasted longer than the pause.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._is_acting = False
+        self._since: float | None = None  # s
+
+    def add(self, times: _Array, is_fast: NDArray[np.bool_], begin: float) -> Actions:
+        """Take the ends (K,) s of steps, and whether each was fast; the first begins at ``begin``."""
+        since = begin if self._since is None else self._since
+        for time, fast in zip(times.tolist(), is_fast.tolist(), strict=True):
+            if fast == self._is_acting:
+                since = time
+            elif time - since > ACTION_PAUSE:
+                self._is_acting, since = fast, time
+                self.count += fast
+        self._since = since
+        return self
