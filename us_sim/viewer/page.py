@@ -78,8 +78,8 @@ class _Modes:
         board, status = simulator.nodes, simulator.status
         board.watch(NODE)
         ui.context.client.on_delete(lambda: board.unwatch(NODE))
-        status.watch(pages=1)
-        ui.context.client.on_delete(lambda: status.watch(pages=-1))
+        status.watch()
+        ui.context.client.on_delete(status.unwatch)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
@@ -259,9 +259,9 @@ def build_headline(simulator: Simulator) -> None:
         problem.set_text(board.state.problem)
 
     board.watch()
-    nodes.watch(pages=1)
+    nodes.watch()
     ui.context.client.on_delete(board.unwatch)
-    ui.context.client.on_delete(lambda: nodes.watch(pages=-1))
+    ui.context.client.on_delete(nodes.unwatch)
     ui.timer(0.5, refresh)
 
 
