@@ -82,7 +82,8 @@ def ask(bench, name):
     return future.result().success
 
 
-def test_the_picture_is_drawn_once_passed_and_when_asked_for_and_cleared(bench, node, scanned):
+@pytest.mark.usefixtures("scanned")
+def test_the_picture_is_drawn_once_passed_and_when_asked_for_and_cleared(bench):
     pictures = bench.collect(CompressedImage, "score/picture", latched=True)
     bench.spin_until(lambda: len(pictures) == 1)  # the last step is done
     assert bytes(pictures[0].data[:4]) == b"\x89PNG"

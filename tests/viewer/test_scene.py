@@ -243,8 +243,7 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     scene.becomes(stands(-0.02), lambda c: c[0] > c[2] + 80 and c[0] > c[1] + 80)  # red
     scene.becomes(stands(0.0), lambda c: c.min() > 200)  # white
     scene.becomes(stands(0.02), lambda c: c[0] > c[2] + 100 and c[1] > c[2] + 50)  # orange
-    pressed = SKIN.vertices + [0.0, 0.0, 0.01]
-    scene.patient.dent(pressed)
+    scene.patient.dent(np.add(SKIN.vertices, [0.0, 0.0, 0.01]))
     scene.ask("scene.view('front')")
     scene.becomes(stands(-0.04, 0.0095), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)
     scene.ask("scene.setVisible('targets', false)")

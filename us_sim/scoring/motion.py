@@ -182,7 +182,7 @@ class Actions:
         self._since: float | None = None  # s
 
     def add(self, times: _Array, is_fast: NDArray[np.bool_], begin: float) -> Actions:
-        """Take the ends (K,) s of steps, and whether each was fast; the first begins at ``begin``."""
+        """Take the ends (K,) s of steps, the begin of the first, and whether each was fast."""
         since = begin if self._since is None else self._since
         for time, fast in zip(times.tolist(), is_fast.tolist(), strict=True):
             if fast == self._is_acting:

@@ -76,7 +76,7 @@ def _numbers(text: str) -> list[Any]:
         listed = np.array(json.loads(text), np.float64)
     except (ValueError, TypeError, ArithmeticError, RecursionError):
         return []
-    is_usable = listed.shape == (7,) or listed.ndim == 2 and listed.shape[1] == 3
+    is_usable = listed.shape == (7,) or (listed.ndim == 2 and listed.shape[1] == 3)
     return listed.tolist() if is_usable and np.isfinite(listed).all() else []
 
 
