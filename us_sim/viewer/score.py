@@ -20,6 +20,7 @@ from us_sim.viewer.stream import Packet, Posted, Simulator
 SCORE, PICTURE = "score", "score_picture"
 """Streams: of an exercise's steps and the metrics, and of their picture as PNG."""
 _STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
+_SHAPES = {"target": (-1, 3), "pose": (7,)}  # of the numbers that a step may have
 
 
 def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
@@ -66,18 +67,17 @@ def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
 def _step(status: DiagnosticStatus) -> dict[str, Any]:
     step = {"what": shown(status.name), "seen": shown(status.message)}
     step["state"] = _STATES.get(status.level, "to do")
-    places = {each.key: _numbers(each.value) for each in status.values}
-    return step | {key: places[key] for key in ("target", "pose") if places.get(key)}
+    places = {e.key: _numbers(e.value, _SHAPES[e.key]) for e in status.values if e.key in _SHAPES}
+    return step | {key: numbers for key, numbers in places.items() if numbers}
 
 
-def _numbers(text: str) -> list[Any]:
-    """The numbers, or lists of three of them, of a JSON list; none where it is no such list."""
+def _numbers(text: str, shape: tuple[int, ...]) -> list[Any]:
+    """The finite numbers of a JSON list; none where it is no such list."""
     try:
-        listed = np.array(json.loads(text), np.float64)
+        numbers = np.array(json.loads(text), np.float64).reshape(shape)
     except (ValueError, TypeError, ArithmeticError, RecursionError):
         return []
-    is_usable = listed.shape == (7,) or (listed.ndim == 2 and listed.shape[1] == 3)
-    return listed.tolist() if is_usable and np.isfinite(listed).all() else []
+    return numbers.tolist() if np.isfinite(numbers).all() else []
 
 
 def _picture(message: CompressedImage, sequence: int) -> Packet:
