@@ -197,8 +197,10 @@ class Tally:
             yield Metric("Average Acceleration", "mm/s^2", _MM * mean)
             yield Metric("Peak Acceleration", "mm/s^2", _MM * self._extremes["acceleration"])
         if total["jerks"]:
-            # PerkTutor's table says mm/s^3: the unit of jerk and not of this integral's root.
+            # PerkTutor's table says mm/s^3: the unit of jerk and not of this integral's root. It is
+            # larger the less smooth the motion, and of a noisy or fast tracker mostly noise.
             yield Metric("Motion Smoothness", "mm/s^2.5", _MM * float(np.sqrt(total["jerk"])))
+            # 720 for a straight movement of minimum jerk, whatever its length and time.
             scale = total["time"] ** 5 / total["path"] ** 2 if total["path"] > 0 else np.nan
             yield Metric("Dimensionless Squared Jerk", "1", total["jerk"] * scale)
 

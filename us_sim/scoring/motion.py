@@ -101,42 +101,12 @@ class Motion:
         """Metres, likewise."""
         return float((self.speeds * self.steps)[_ends(where)].sum())
 
-    def translational_actions(self) -> int:
-        """Times that the position moved faster than 50 mm/s."""
-        return Actions().add(self.times[1:], self.speeds > ACTION_SPEED, self.times[0]).count
-
-    def rotational_actions(self) -> int:
-        """Times that it turned faster than 50 °/s."""
-        return Actions().add(self.times[1:], self.angular_speeds > ACTION_TURN, self.times[0]).count
-
     @cached_property
     def squared_jerks(self) -> _Array:
-        """(K-3,) m²/s⁵, of each step, by backward differences."""
+        """(K-3,) m²/s⁵, squared jerk of each step times its length, by backward differences."""
         steps = self.steps[2:]
         jerk = np.diff(self.accelerations, axis=0) / steps[:, None]
         return np.asarray((jerk**2).sum(axis=1) * steps)
-
-    def squared_jerk(self) -> float:
-        """Integral of the squared jerk, m²/s⁵; 0 of under four samples."""
-        return float(self.squared_jerks.sum())
-
-    def motion_smoothness(self) -> float:
-        """PerkTutor's `Motion Smoothness`: the root of the squared jerk's integral, m/s^2.5.
-
-        It is larger the less smooth the motion is, and of a noisy or fast tracker mostly noise:
-        compare recordings of the same tracker.
-        """
-        return float(np.sqrt(self.squared_jerk()))
-
-    def dimensionless_jerk(self) -> float:
-        """Integral of the squared jerk times duration⁵ over path length² (Hogan and Sternad).
-
-        It is 720 for a straight movement of minimum jerk, whatever its length and time; NaN of a
-        probe that stood still.
-        """
-        length = self.path_length()
-        scale = self.elapsed_time() ** 5 / length**2 if length > 0 else np.nan
-        return float(self.squared_jerk() * scale)
 
     def swept_area(
         self, ends: ArrayLike, where: ArrayLike | None = None, facing: _Array | None = None
