@@ -29,9 +29,12 @@ from us_sim.scene.building import (
 from us_sim.scene.case_tissue import keep_tissue, kept_tissue
 from us_sim.scene.conforming_tissue import conforming_tissue
 from us_sim.scene.reading import load_scene, parse_scene
+from us_sim.scoring.exercise import read_exercise
+from us_sim.scoring.live import LiveScan
 from us_sim.settings.reading import Reader
 from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+from us_sim.tissue.solvers.solver import create_solver
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.tissue import read_tissue
 from us_sim.volume.cases.writing import new_case, write_case_settings
@@ -98,6 +101,46 @@ def test_a_case_alone_is_a_whole_scene(cases):
     assert scene.tissue.fixed == ("bottom", "rib")
     assert scene.tissue.materials["vein"].lumen_pressure == 1e3
     assert colour_of(scene, "vein") == (0.25, 0.4, 0.85)
+
+
+def test_a_vein_closes_unless_a_thrombus_is_in_it_and_an_exercise_knows_where(tmp_path):
+    """A structure of a case that is called after its vein is a thrombus, with no word more."""
+    held = block()
+    held.labels[8:11, 18:22, 10:20] = 8
+    structures = {name: CaseStructure(n) for n, name in ((6, "vein"), (8, "vein thrombus"))}
+    for name, volume in (("clot", held), ("free", block())):
+        probe = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
+        settings = CaseSettings(
+            name,
+            probe=probe,
+            start=CaseStart((0.0, 0.0, 0.0), TURN),
+            structures={k: v for k, v in structures.items() if (volume.labels == v.label).any()},
+            nodes=600,
+        )
+        with new_case(tmp_path / name) as folder:
+            write_volume(folder / "volume.nrrd", volume)
+            write_labels(folder / "labels.nrrd", volume)
+            write_case_settings(folder, settings)
+    (tmp_path / "e.yaml").write_text("name: e\ntask: {kind: compression, margin: 20 mm}\n")
+    exercise = read_exercise(tmp_path / "e.yaml")
+    seen = {}
+    for name in ("clot", "free"):
+        scene = load_scene(f"case:{tmp_path / name}")
+        volume = volume_of(scene)
+        model = tissue_model_of(scene, volume)
+        solver = create_solver("fem", model)
+        scanner = scanner_of(scene, volume)
+        scanner.carry(model.mesh.nodes, model.mesh.tetrahedra)
+        live = LiveScan(volume, scanner_of(scene, volume), exercise)
+        for k, depth in enumerate((0.0, 0.004, 0.008, 0.012)):
+            pose = Pose([0.0, 0.0, depth])
+            nodes = solver.deform(pose).nodes
+            live.add_pose(float(k), pose)
+            live.add_force(float(k), np.array([0.0, 0.0, -1e3 * depth]))
+            live.add_labels(float(k), pose, scanner.labels(pose, nodes))
+        _, (step,) = live.score()
+        seen[name] = step.seen
+    assert seen == {"clot": "", "free": ""}
 
 
 def test_its_image_is_of_the_volume_below_the_start():

@@ -163,16 +163,15 @@ class Tally:
 
     def _add_motion(self, scan: Scan) -> None:
         motion = scan.motion
-        times, steps, speeds, turns, jerks = scan.new(
+        times, steps, speeds, turns, jerks, accelerations = scan.new(
             motion.times,
             motion.times[1:],
             motion.steps,
             motion.speeds,
             motion.angular_speeds,
-            motion.squared_jerks if len(motion) > 3 else np.zeros(0),
+            motion.squared_jerks,
+            np.linalg.norm(motion.accelerations, axis=1),
         )
-        accelerations = np.linalg.norm(motion.accelerations, axis=1)
-        (accelerations,) = scan.new(motion.times, accelerations)
         self._sum(steps=len(steps), time=steps.sum(), path=speeds @ steps, turn=turns @ steps)
         self._sum(speed=speeds.sum(), jerks=len(jerks), jerk=jerks.sum())
         self._sum(accelerations=len(accelerations), acceleration=accelerations.sum())
