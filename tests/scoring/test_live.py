@@ -49,12 +49,16 @@ def messages(seed, seconds):
     places = np.cumsum(random.normal(0, 0.5, (len(times) // RATE + 2, 2)), axis=0) * [3, 12]
     depth = np.clip(np.sin(times * random.uniform(0.5, 2.0)) * 1.5, 0.0, 1.0)
     depth[(times > 0.4 * seconds) & (times < 0.6 * seconds)] = 1.0  # held closed
+    holds = (times > 0.6 * seconds) & (times < 0.9 * seconds)  # 4.8 N, the artery in the middle
+    depth[holds] = 0.4
     sent = []
     for k, time in enumerate(times.tolist()):
         x, y = MM * np.array(
             [np.interp(time, np.arange(len(places)), places[:, axis]) for axis in (0, 1)]
         )
         turn = 0.2 * np.sin(time)
+        if holds[k]:
+            x, y, turn = -3.5 * MM, 0.0, 0.0
         pose = Pose([x, y, 0.012 * depth[k]], [0, 0, np.sin(turn / 2), np.cos(turn / 2)])
         sent.append((time + random.uniform(0, 0.01), "add_pose", (time, pose)))
         if random.random() < 0.6:
@@ -93,7 +97,7 @@ def test_the_score_so_far_is_that_of_all_samples_so_far(name, seed):
         for step, known in zip(steps, exercise.steps(whole), strict=True):
             assert step[:3] == known[:3]
             told.add(step.seen)
-    assert len(told) > 3  # something went on
+    assert len(told) >= 3  # something went on
 
 
 def test_the_cost_of_a_second_does_not_grow(monkeypatch):
