@@ -64,8 +64,10 @@ def test_points_have_their_spacing_and_lie_in_the_middle():
 
 def test_a_point_that_was_missed_or_not_closed_is_not_done():
     found = steps("compression", scan(points=(0.01, 0.03, 0.04)))
-    assert [(step.is_done, step.is_tried) for step in found] == [(True, True)] * 2 + [(False,) * 2]
-    assert done("compression", scan(left=(0.0, 0.3, 0.0))) == [True, False, True]
+    assert [step.is_done for step in found] == [True, True, False]
+    found = steps("compression", scan(left=(0.0, 0.3, 0.3)))
+    assert [step.is_done for step in found] == [True, False, False]
+    assert [step.is_missed for step in found] == [False, True, False]  # the probe is at the last
     hard = (6.0, 20.0, 6.0)  # and no thrombus there
     assert done("compression", scan(left=(0.0, 0.3, 0.0), newtons=hard)) == [True, False, True]
 

@@ -36,7 +36,7 @@ class Scorer(SceneNode):
     """``probe/pose``, ``probe/wrench`` and ``ultrasound/labels`` in, ``score`` once a second.
 
     The first status has the metrics as values; one of each step follows, with what was seen of it
-    and where it is to be done. It is OK when it is done, and an ERROR when it was tried in vain.
+    and where it is to be done. It is OK when it is done, and an ERROR when it was missed.
     The service ``~/clear`` begins anew; ``~/draw`` has a picture made, on ``score/picture``, which
     is also made once the last step is done.
     """
@@ -142,7 +142,7 @@ class Scorer(SceneNode):
 
 
 def _status_of(step: Step) -> DiagnosticStatus:
-    level = DiagnosticStatus.ERROR if step.is_tried else DiagnosticStatus.WARN
+    level = DiagnosticStatus.ERROR if step.is_missed else DiagnosticStatus.WARN
     values = []
     if step.target is not None:
         values.append(KeyValue(key="target", value=json.dumps(step.target.round(4).tolist())))

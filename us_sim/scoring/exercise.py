@@ -34,6 +34,7 @@ from us_sim.slicing.settings import WALLS_TOUCH
 
 _LENGTH, _TIME, _FORCE = Quantity("length", 1e-4, 1.0), Quantity("time", 0.1, 3600.0), "force"
 _PART = Quantity("number", 0.0, 1.0)
+_PRESSED = 0.9  # part of a vein's area below which it was pressed, and not only passed
 _MM = 1e3
 
 
@@ -46,7 +47,7 @@ class Step(NamedTuple):
     # (P, 3) m in frame ``patient``, where it is to be done: one point, or those of a line
     target: NDArray[np.float64] | None = None
     pose: Pose | None = None  # of the probe, that is to be found
-    is_tried: bool = False  # whether the probe was there
+    is_missed: bool = False  # whether it was tried in vain, and the probe has moved on
 
 
 class Attempt(ABC):
@@ -161,7 +162,7 @@ class _Point:
         self._closed: tuple[float, float] | None = None  # N, and the part of the artery left open
         self._least, self._force = np.inf, np.nan  # part that was open at least, and N then
         self._most = 0.0  # N, of all images
-        self._is_thrombus = False
+        self._is_thrombus = self._is_here = False
 
     def add(self, scan: Scan) -> None:
         task = self._task
@@ -172,6 +173,7 @@ class _Point:
             return
         new = section.times > scan.since
         is_near = np.abs(section.along - self._at) <= task.tolerance
+        self._is_here = bool(is_near[new][-1]) if new.any() else self._is_here
         near = np.flatnonzero(new & is_near & np.isfinite(section.fraction))
         if not len(near):
             return
@@ -190,21 +192,24 @@ class _Point:
 
     def step(self) -> Step:
         task = self._task
+        is_done, seen = self._seen()
+        is_missed = not is_done and not self._is_here and self._least < _PRESSED
         what = f"{task.structure} at {_MM * self._at:.0f} mm"
-        target = self._place[None]
+        return Step(what, is_done, seen, self._place[None], is_missed=is_missed)
+
+    def _seen(self) -> tuple[bool, str]:
+        task = self._task
         if self._closed is not None:
             force, artery = self._closed
-            seen = f"closed{_newtons(force)}"
-            if artery < task.open:
-                seen += f", and of the {task.artery} {100 * artery:.0f} % were left"
-            return Step(what, artery >= task.open, seen, target, is_tried=True)
+            is_open = artery >= task.open
+            also = "" if is_open else f", and of the {task.artery} {100 * artery:.0f} % were left"
+            return is_open, f"closed{_newtons(force)}{also}"
         if self._least == np.inf:
-            return Step(what, False, "not reached", target)
+            return False, "not reached"
         seen = f"{100 * self._least:.0f} % open{_newtons(self._force)}"
         if self._most < task.enough:
-            return Step(what, False, f"{seen}: press harder", target, is_tried=True)
-        seen += f": {'a thrombus' if self._is_thrombus else 'not closed'}"
-        return Step(what, self._is_thrombus, seen, target, is_tried=True)
+            return False, f"{seen}: press harder"
+        return self._is_thrombus, f"{seen}: {'a thrombus' if self._is_thrombus else 'not closed'}"
 
 
 @dataclass(frozen=True)

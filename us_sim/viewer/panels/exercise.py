@@ -27,7 +27,7 @@ NOTHING = (
 )
 _LOOKS = {
     "done": ("Done", "check_circle"),
-    "missed": ("Not done", "cancel"),
+    "missed": ("Missed", "cancel"),
     "to do": ("To do", "radio_button_unchecked"),
 }
 """Words and icons of Material's, by states of steps."""
@@ -72,20 +72,13 @@ class _Panel:
     def _changed(self) -> None:
         """Nothing: the panel looks twice a second."""
 
-    def _newest(self) -> Mapping[str, Any]:
-        """The score of the scene that runs; empty where there is none."""
-        feed, state = self._simulator.feeds.get(SCORE), self._simulator.session.state
-        packet = feed.newest() if feed is not None else None
-        is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
-        return {} if packet is None or is_other else packet.header
-
     def _drawn(self) -> bytes:
         feed = self._simulator.feeds.get(PICTURE)
         packet = feed.newest() if feed is not None else None
         return packet.payload if packet is not None else b""
 
     def _refresh(self) -> None:
-        told = self._newest()
+        told = told_score(self._simulator)
         if told != self._told:
             self._told = told
             self._show(told)
@@ -99,7 +92,9 @@ class _Panel:
         name, steps = told.get("name", ""), told.get("steps", [])
         self._name.set_text(name or TITLE)
         self._about.set_text(told["description"] if name else NOTHING)
-        self._result.set_text(result_of(_done(steps)) if steps else "")
+        done = _done(steps)
+        passed = "passed: " if all(done) else ""
+        self._result.set_text(f"{passed}{sum(done)} of {len(done)} done" if done else "")
         self._buttons.set_visibility(bool(name))
         self._steps.clear()
         self._metrics.clear()
@@ -132,13 +127,21 @@ class _Panel:
     async def _save(self) -> None:
         if await self._draw():
             now = datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
-            page = result_page(self._newest(), self._drawn(), now)
+            page = result_page(told_score(self._simulator), self._drawn(), now)
             ui.download.content(page, f"us_sim-{now}.html", "text/html")
 
 
 def build_exercise(simulator: Simulator) -> None:
     """Make the panel; every page shows the same, so that a teacher sees what a learner does."""
     _Panel(simulator)
+
+
+def told_score(simulator: Simulator) -> Mapping[str, Any]:
+    """The newest score of the scene that runs; empty where there is none."""
+    feed, state = simulator.feeds.get(SCORE), simulator.session.state
+    packet = feed.newest() if feed is not None else None
+    is_other = packet is not None and state.is_there and packet.header["scene"] != state.scene
+    return {} if packet is None or is_other else packet.header
 
 
 def result_page(told: Mapping[str, Any], picture: bytes, when: str) -> str:

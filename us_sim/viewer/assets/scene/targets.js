@@ -24,11 +24,11 @@ const group = new THREE.Group();
 group.name = "targets";
 const dots = new THREE.InstancedMesh(
   new THREE.SphereGeometry(1, 16, 12),
-  new THREE.MeshBasicMaterial(),
+  new THREE.MeshBasicMaterial({ depthTest: false, transparent: true }), // over the probe
   MOST,
 );
 dots.frustumCulled = false;
-dots.renderOrder = 6;
+dots.renderOrder = 8;
 const plane = new THREE.Mesh(
   new THREE.BufferGeometry(),
   new THREE.MeshBasicMaterial({
