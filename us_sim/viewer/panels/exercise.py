@@ -101,7 +101,8 @@ class _Panel:
         with self._steps:
             for step in steps:
                 word, icon = _LOOKS[step["state"]]
-                with ui.row(wrap=False).classes("us-step").props(f'data-state="{step["state"]}"'):
+                with ui.row(wrap=False).classes("us-step") as row:
+                    row.props["data-state"] = step["state"]
                     ui.icon(icon)
                     ui.label(f"{word}: {step['what']}, {step['seen']}")
         with self._metrics:
