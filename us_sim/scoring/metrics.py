@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +154,7 @@ class Tally:
         for name, tally in self._of_vessels.items():
             yield from tally._of_section(name)
 
-    def _sum(self, **values: float) -> None:
+    def _sum(self, **values: Any) -> None:
         for name, value in values.items():
             self._sums[name] += float(value)
 
