@@ -25,7 +25,7 @@ def dataset_options(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="folder; one with part of the same data set is gone on with",
     )
-    add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed"))
+    add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed", "format"))
     parser.set_defaults(command=_dataset)
 
 
