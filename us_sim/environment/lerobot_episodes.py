@@ -68,8 +68,7 @@ def write_lerobot(
         Progress("writing for LeRobot", len(episodes), "episodes") as bar,
     ):
         for done, (name, facts) in enumerate(sorted(episodes.items()), 1):
-            steps = list(_steps(shards / f"{name}.tar"))
-            names, frames = _names(steps[0], facts), _frames(steps, facts)
+            frames, names = read_episode(shards / f"{name}.tar", facts)
             writer.write_episode(frames, names, str(about), f"{name} of {facts['scene']}")
             bar.update(done)
 
@@ -87,6 +86,19 @@ def frames_a_second(period: float) -> int:
             f"a whole number: set it to {1000 / rate:.9g} ms"
         )
     return rate
+
+
+def read_episode(
+    shard: Path, facts: Mapping[str, Any]
+) -> tuple[Iterator[Frame], Mapping[str, Sequence[str]]]:
+    """The frames of an episode by LeRobot's names of features, and the names of their numbers.
+
+    Args:
+        shard: the episode's tar file.
+        facts: of the episode.
+    """
+    steps = list(_steps(shard))
+    return _frames(steps, facts), _names(steps[0], facts)
 
 
 def _steps(shard: Path) -> Iterator[_Step]:
@@ -118,7 +130,6 @@ def _names(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[str]]:
 
 
 def _frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]:
-    """Each step by LeRobot's names of features."""
     late: deque[NDArray[np.uint8]] = deque(maxlen=facts["draw"]["delay"] + 1)
     for step in steps:
         told = step["json"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from us_sim.errors import EpisodeError
 
 Frame = Mapping[str, NDArray[Any]]
-"""Values by feature: uint8 of two or three dimensions is an image, grey or red, green and blue."""
+"""Arrays by feature; ``observation.images.…`` are of uint8, grey or red, green and blue."""
 
 IMAGES = "observation.images."
 STATE = "observation.state"
@@ -75,12 +76,13 @@ class LeRobotWriter:
             if self._dataset is not None and error is None:
                 with self._telling():
                     self._dataset.finalize()
+                    shutil.rmtree(self._partial / "images", ignore_errors=True)  # empty folders
                     self._partial.rename(self._folder)
 
     def write_episode(
         self, frames: Iterable[Frame], names: Mapping[str, Sequence[str]], task: str, origin: str
-    ) -> int:
-        """Write an episode of at least one frame, and return how many they are.
+    ) -> None:
+        """Write an episode of at least one frame.
 
         Args:
             frames: of the same features as those of the first episode.
@@ -88,11 +90,8 @@ class LeRobotWriter:
             task: in words, for policies that read.
             origin: of the frames, for an error.
         """
-        count = 0
-        for count, frame in enumerate(frames, 1):
-            kinds = {
-                name: (value.shape, list(names.get(name, ()))) for name, value in frame.items()
-            }
+        for frame in frames:
+            kinds = {name: (v.shape, list(names.get(name, ()))) for name, v in frame.items()}
             if self._first is None:
                 self._first = kinds
                 self._dataset = self._create(frame, names)
@@ -103,12 +102,11 @@ class LeRobotWriter:
                         f"{origin}: {name} is {now}, and {first} in the first frame of all: a "
                         f"LeRobot data set has the same features everywhere; make one of each kind"
                     )
-            given = {name: _rgb(v) if _is_image(v) else v for name, v in frame.items()}
+            given = {n: _rgb(v) if n.startswith(IMAGES) else v for n, v in frame.items()}
             with self._telling():
                 self._dataset.add_frame({**given, "task": task})
         with self._telling():
             self._dataset.save_episode()
-        return count
 
     def _create(self, frame: Frame, names: Mapping[str, Sequence[str]]) -> Any:
         try:
@@ -121,8 +119,8 @@ class LeRobotWriter:
         features: dict[str, dict[str, Any]] = {}
         for name, value in frame.items():
             kind, shape, parts = value.dtype.name, value.shape, list(names.get(name, [name]))
-            if _is_image(value):
-                kind = "video" if self._is_video and name.startswith(IMAGES) else "image"
+            if name.startswith(IMAGES):
+                kind = "video" if self._is_video else "image"
                 shape, parts = (*shape[:2], 3), ["height", "width", "channels"]
             features[name] = {"dtype": kind, "shape": shape, "names": parts}
         with self._telling():
@@ -141,10 +139,6 @@ class LeRobotWriter:
             yield
         except Exception as error:  # lerobot's own are of many kinds
             raise EpisodeError(f"{self._folder}: cannot be written: {error}") from error
-
-
-def _is_image(value: NDArray[Any]) -> bool:
-    return value.dtype == np.uint8 and value.ndim > 1
 
 
 def _rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
