@@ -1,11 +1,13 @@
 """The scoring node: a scan of known motion, force and area, told while it is done."""
 
+import json
+
 import numpy as np
 import pytest
 from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
 from us_sim.errors import ScoreError
@@ -72,13 +74,30 @@ def is_whole(score):
     return values(score)["Elapsed Time, s"] == "10"
 
 
-def test_clear_begins_anew(bench, scanned):
-    scores, _ = scanned
-    client = bench.peer.create_client(Trigger, "scorer/clear")
+def ask(bench, name):
+    client = bench.peer.create_client(Trigger, f"scorer/{name}")
     bench.spin_until(client.service_is_ready)
     future = client.call_async(Trigger.Request())
     bench.spin_until(future.done)
-    assert future.result().success
+    return future.result().success
+
+
+@pytest.mark.usefixtures("scanned")
+def test_the_picture_is_drawn_once_passed_and_when_asked_for_and_cleared(bench):
+    pictures = bench.collect(CompressedImage, "score/picture", latched=True)
+    bench.spin_until(lambda: len(pictures) == 1)  # the last step is done
+    assert bytes(pictures[0].data[:4]) == b"\x89PNG"
+    assert ask(bench, "draw")
+    bench.spin_until(lambda: len(pictures) == 2)
+    assert ask(bench, "clear")
+    bench.spin_until(lambda: len(pictures) == 3)
+    assert not len(pictures[2].data)
+    assert not ask(bench, "draw")  # of nothing
+
+
+def test_clear_begins_anew(bench, scanned):
+    scores, _ = scanned
+    assert ask(bench, "clear")
     poses = bench.publisher(PoseStamped, "probe/pose")
     for second in (20, 21):
         poses.publish(pose_at(0.0, second))
@@ -91,3 +110,17 @@ def test_an_exercise_of_a_vessel_that_the_scene_lacks_is_refused(bench, small_sc
     file.write_text("name: c\ntask: {kind: centre, structure: aorta}\n")
     with pytest.raises(ScoreError, match="aorta"):
         bench.make(Scorer, scene=str(small_scene), exercise=str(file))
+
+
+def test_a_step_says_where_it_is_to_be_done(bench, small_scene):
+    bench.make(Scorer, scene=str(small_scene), exercise="view")
+    poses = bench.publisher(PoseStamped, "probe/pose")
+    scores = bench.collect(DiagnosticArray, "score", latched=True)
+    for second in (1, 2):
+        poses.publish(pose_at(0.0, second))
+    bench.spin_until(lambda: bool(scores))
+    step = scores[-1].status[1]
+    assert step.level == DiagnosticStatus.WARN
+    assert {each.key: json.loads(each.value) for each in step.values} == {
+        "pose": [0, 0, 0, 0, 0, 0, 1]
+    }

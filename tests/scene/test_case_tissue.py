@@ -29,9 +29,12 @@ from us_sim.scene.building import (
 from us_sim.scene.case_tissue import keep_tissue, kept_tissue
 from us_sim.scene.conforming_tissue import conforming_tissue
 from us_sim.scene.reading import load_scene, parse_scene
+from us_sim.scoring.exercise import read_exercise
+from us_sim.scoring.live import LiveScan
 from us_sim.settings.reading import Reader
 from us_sim.tissue.mesh.tetrahedral_mesh import MeshSettings
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+from us_sim.tissue.solvers.solver import create_solver
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.tissue import read_tissue
 from us_sim.volume.cases.writing import new_case, write_case_settings
@@ -42,13 +45,18 @@ TURN = (0.5, 0.5, 0.5, 0.5)
 """The probe's x, y and z along the volume's y, z and x."""
 
 
-def block() -> Volume:
-    """50 mm deep along x, 80 mm along y, 60 mm along z; a vein along z under the middle."""
+def block(clot: int = 6) -> Volume:
+    """50 mm deep along x, 80 mm along y, 60 mm along z; a vein along z under the middle.
+
+    Args:
+        clot: the label of the vein's middle.
+    """
     grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     grid[:3, 3] = [1e-3, -39e-3, -29e-3]
     grey = np.random.default_rng(1).integers(60, 120, (25, 40, 30), dtype=np.uint8)
     labels = np.zeros_like(grey)
     labels[8:11, 18:22, :] = 6
+    labels[8:11, 18:22, 10:20] = clot
     labels[22:, :, :] = 2
     grey[labels == 6] = 10
     return Volume(grey, grid, labels)
@@ -98,6 +106,46 @@ def test_a_case_alone_is_a_whole_scene(cases):
     assert scene.tissue.fixed == ("bottom", "rib")
     assert scene.tissue.materials["vein"].lumen_pressure == 1e3
     assert colour_of(scene, "vein") == (0.25, 0.4, 0.85)
+
+
+def test_a_thrombus_in_a_cases_vein_keeps_it_open_and_an_exercise_knows_of_it(tmp_path):
+    """A structure of a case that is called after its vein is a thrombus, with no word more."""
+    numbers = {"vein": 6, "vein thrombus": 8, "rib": 2}
+    for name, volume in (("clot", block(8)), ("free", block())):
+        probe = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
+        settings = CaseSettings(
+            name,
+            probe=probe,
+            start=CaseStart((0.0, 0.0, 0.0), TURN),
+            structures={k: CaseStructure(n) for k, n in numbers.items() if n in volume.labels},
+            nodes=600,
+        )
+        with new_case(tmp_path / name) as folder:
+            write_volume(folder / "volume.nrrd", volume)
+            write_labels(folder / "labels.nrrd", volume)
+            write_case_settings(folder, settings)
+    (tmp_path / "e.yaml").write_text("name: e\ntask: {kind: compression, margin: 20 mm}\n")
+    exercise = read_exercise(tmp_path / "e.yaml")
+    seen = {}
+    for name in ("clot", "free"):
+        scene = load_scene(f"case:{tmp_path / name}")
+        volume = volume_of(scene)
+        model = tissue_model_of(scene, volume)
+        solver = create_solver("fem", model)
+        scanner = scanner_of(scene, volume)
+        scanner.carry(model.mesh.nodes, model.mesh.tetrahedra)
+        live = LiveScan(volume, scanner_of(scene, volume), exercise)
+        for k, depth in enumerate((0.0, 0.006, 0.012, 0.018)):
+            pose = Pose([0.0, 0.0, depth])
+            nodes = solver.deform(pose).nodes
+            live.add_pose(float(k), pose)
+            live.add_force(float(k), np.array([0.0, 0.0, -1e3 * depth]))
+            live.add_labels(float(k), pose, scanner.labels(pose, nodes))
+        metrics, (step,) = live.score()
+        least = {each.name: each.value for each in metrics}["Smallest Part of the Area at Rest"]
+        seen[name] = least, step.is_done
+    assert seen["clot"][0] > 80 > 60 > seen["free"][0]  # %, of linear tissue with few nodes
+    assert (seen["clot"][1], seen["free"][1]) == (True, False)  # pressed by 18 N
 
 
 def test_its_image_is_of_the_volume_below_the_start():

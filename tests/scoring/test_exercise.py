@@ -19,6 +19,7 @@ PRESS = np.array([0.0, 0.5, 1.0, 0.5, 0.0])  # of the deepest, a second each
 
 def scan(left=(0.0, 0.0, 0.0), artery=(0.9, 0.9, 0.9), newtons=(6.0, 6.0, 6.0), points=POINTS):
     """Presses at those points down to a part of the vein's area, with so much force."""
+    newtons = np.resize(newtons, len(points))
     count = len(points) * len(PRESS)
     times = np.arange(float(count))
     along = np.repeat(points, len(PRESS))
@@ -50,7 +51,7 @@ def done(name, seen, **task):
 def test_every_point_of_a_vein_that_was_closed_every_2_cm():
     found = steps("compression", scan())
     assert [step.is_done for step in found] == [True] * 3
-    assert np.allclose([step.target for step in found], LINE.points[[10, 30, 50]])
+    assert np.allclose([step.target[0] for step in found], LINE.points[[10, 30, 50]])
     assert all("6.0 N" in step.seen for step in found)
 
 
@@ -62,8 +63,11 @@ def test_points_have_their_spacing_and_lie_in_the_middle():
 
 
 def test_a_point_that_was_missed_or_not_closed_is_not_done():
-    assert done("compression", scan(points=(0.01, 0.03, 0.04))) == [True, True, False]
-    assert done("compression", scan(left=(0.0, 0.3, 0.0))) == [True, False, True]
+    found = steps("compression", scan(points=(0.01, 0.03, 0.04)))
+    assert [step.is_done for step in found] == [True, True, False]
+    found = steps("compression", scan(left=(0.0, 0.3, 0.3)))
+    assert [step.is_done for step in found] == [True, False, False]
+    assert [step.is_missed for step in found] == [False, True, False]  # the probe is at the last
     hard = (6.0, 20.0, 6.0)  # and no thrombus there
     assert done("compression", scan(left=(0.0, 0.3, 0.0), newtons=hard)) == [True, False, True]
 
@@ -78,6 +82,8 @@ def test_a_thrombus_is_found_by_pressing_hard_where_it_is():
 def test_the_artery_must_stay_open_when_the_vein_closes():
     assert done("compression", scan(artery=(0.9, 0.2, 0.9))) == [True, False, True]
     assert done("compression", scan(artery=(0.9, 0.2, 0.9)), artery=None) == [True] * 3
+    again = scan(points=(*POINTS, POINTS[1]), left=(0,) * 4, artery=(0.9, 0.2, 0.9, 0.9))
+    assert done("compression", again) == [True] * 3
 
 
 def test_without_force_a_closed_vein_is_still_closed():

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
+from us_sim.scoring.metrics import Scan, metrics_of
 from us_sim.scoring.motion import Motion
 from us_sim.volume.sequences.slicer_transforms import read_slicer_sequences
 
@@ -20,6 +21,10 @@ MM, MM2 = 1e3, 1e6
 def motion(times, matrices):
     """Of the positions; ITK's matrices of images are no rotations."""
     return Motion(times, matrices[:, :3, 3], np.tile([0, 0, 0, 1], (len(times), 1)))
+
+
+def table(moved):
+    return {metric.name: metric.value for metric in metrics_of(Scan(moved))}
 
 
 def shown(times, time, tolerance=1e-3):
@@ -135,8 +140,10 @@ def minimum_jerk(length, seconds, count=2001):
 @given(st.floats(0.01, 1.0), st.floats(0.2, 20.0))
 def test_the_dimensionless_jerk_of_a_minimum_jerk_movement_is_720(length, seconds):
     moved = minimum_jerk(length, seconds)
-    assert moved.dimensionless_jerk() == pytest.approx(720, rel=0.01)
-    assert moved.motion_smoothness() ** 2 == pytest.approx(720 * length**2 / seconds**5, rel=0.01)
+    found = table(moved)
+    assert found["Dimensionless Squared Jerk"] == pytest.approx(720, rel=0.01)
+    squared_jerk = (1e-3 * found["Motion Smoothness"]) ** 2
+    assert squared_jerk == pytest.approx(720 * length**2 / seconds**5, rel=0.01)
     assert moved.speeds.max() == pytest.approx(1.875 * length / seconds, rel=1e-4)
     peak = np.linalg.norm(moved.accelerations, axis=1).max()
     assert peak == pytest.approx(10 / 3**0.5 * length / seconds**2, rel=1e-3)
@@ -156,8 +163,8 @@ def test_an_action_is_faster_than_50_mm_s_and_ends_after_a_fifth_of_a_second():
     orientations = np.stack([zero, np.sin(half), zero, np.cos(half)], axis=1)
     orientations[::2] *= -1  # the same rotations
     moved = Motion(dt * np.arange(501), positions, orientations)
-    assert moved.translational_actions() == 2
-    assert moved.rotational_actions() == 2
+    found = table(moved)
+    assert found["Translational Actions"] == found["Rotational Actions"] == 2
     assert np.rad2deg(moved.angular_speeds[60]) == pytest.approx(60)
 
 

@@ -1,68 +1,131 @@
 """The panel of an exercise: what a page shows of the score, and what it asks for."""
 
+import base64
+import json
+from pathlib import Path
+
 import pytest
 from awaiting import until
 from bench import Bench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fake_hand import FakeHand
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import LATCHED
-from us_sim.viewer.score import ScoreBoard, ScoreListener, ToldScore, ToldStep
-from us_sim.viewer.stream import Simulator
+from us_sim.viewer.score import PICTURE, SCORE, add_score
+from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
 
 STEPS = (
-    ToldStep("vein at 9 mm", True, "closed at 6.0 N"),
-    ToldStep("vein at 29 mm", False, "missed"),
+    {"what": "vein at 9 mm", "state": "done", "seen": "closed at 6.0 N"},
+    {"what": "vein at <b>29 mm", "state": "to do", "seen": "not reached"},
+)
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
 )
 
 
-def test_task_steps_and_score_are_shown_and_begun_anew(page, simulator):
-    asked = []
-    simulator.score = ScoreBoard(clear=lambda: asked.append(True))
+class Scorer:
+    """The streams of a score, and what pages ask of it: it draws at once."""
+
+    def __init__(self, simulator):
+        self.score, self.picture = Feed(SCORE, rate=None), Feed(PICTURE, rate=None)
+        simulator.add(self.score, self.picture)
+        simulator.ask_scorer = self._take
+        self.asked = []
+
+    def _take(self, what):
+        self.asked.append(what)
+        if what == "draw":
+            self.picture.offer(lambda n: Packet(PICTURE, n, {}, PNG))
+
+    def say(self, steps):
+        header = {"name": "Compression", "description": "Compress the vein.", "scene": "arm"}
+        header |= {"metrics": {"Path Length, mm": "60"}, "steps": list(steps)}
+        self.score.offer(lambda n: Packet(SCORE, n, header, b""))
+
+
+def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
+    scorer = Scorer(simulator)
     page.goto(page.address)
     page.locator("#us-panels").click()
     page.get_by_role("tab", name="Exercise").click()
     page.get_by_text("No exercise is followed").wait_for()
-    until(lambda: simulator.score.is_watched, "the panel is seen")
-    metrics = {"Path Length, mm": "60"}
-    simulator.score.score = ToldScore("Compression", "Compress the vein.", metrics, STEPS)
-    page.get_by_text("To do: vein at 29 mm, missed").wait_for()
+    until(lambda: scorer.picture.is_watched, "the panel is seen")
+    scorer.say(STEPS)
+    page.get_by_text("To do: vein at <b>29 mm, not reached").wait_for()
     page.get_by_text("Done: vein at 9 mm, closed at 6.0 N").wait_for()
     page.get_by_text("1 of 2 done", exact=True).wait_for()
     page.get_by_text("Score so far").click()
     page.get_by_text("Path Length, mm").wait_for()
     page.get_by_role("button", name="Begin anew").click()
-    until(lambda: asked == [True], "it is asked for")
-    done = tuple(step._replace(is_done=True) for step in STEPS)
-    simulator.score.score = ToldScore("Compression", "Compress the vein.", metrics, done)
-    page.get_by_text("passed: 2 of 2 done").wait_for()
+    until(lambda: scorer.asked == ["clear"], "it is asked for")
+    scorer.say({**step, "state": "done"} for step in STEPS)
+    page.get_by_text("passed: 2 of 2 done", exact=True).wait_for()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save the result").click()
+    kept = Path(download.value.path()).read_text()
+    assert base64.b64encode(PNG).decode() in kept
+    assert "<td>vein at &lt;b&gt;29 mm</td>" in kept
+    assert "<td>Path Length, mm</td><td>60</td>" in kept
+    page.get_by_role("img", name="The probe's way over the skin").wait_for()
     page.get_by_role("tab", name="Image").click()
-    until(lambda: not simulator.score.is_watched, "another tab is chosen")
+    until(lambda: not scorer.picture.is_watched, "another tab is chosen")
+
+
+def test_a_teacher_sees_the_learners_exercise_and_result_and_who_holds_the_probe(
+    page, profile, simulator
+):
+    hand, scorer = FakeHand(simulator), Scorer(simulator)
+    hand.say(holder="learner", is_moving=True)
+    page.goto(page.address)
+    teacher = profile.new_page()
+    teacher.goto(page.address)
+    scorer.say(STEPS)
+    teacher.get_by_text("Another page moves the probe").wait_for()
+    teacher.get_by_text("1 of 2 done", exact=True).wait_for()
+    page.get_by_role("button", name="Show the result").click()
+    teacher.get_by_role("img", name="The probe's way over the skin").wait_for()
+    teacher.close()
+    assert not hand.asked  # a page that only looks moves nothing
 
 
 @pytest.fixture
 def heard(bench: Bench):
-    """A listener on its node, and the simulator that it obeys."""
+    """The simulator that a node fills."""
     node = bench.add(GuardedNode("viewer", context=bench.context))
-    simulator = Simulator(score=ScoreListener(node, lambda work: work()))
-    simulator.score.take_commands(simulator)
+    simulator = Simulator()
+    add_score(node, Posted(node), simulator)
     return simulator
 
 
 def test_what_the_scorer_says_is_heard_while_a_page_shows_it(bench, heard):
     publisher = bench.peer.create_publisher(DiagnosticArray, "score", LATCHED)
+    pictures = bench.peer.create_publisher(CompressedImage, "score/picture", LATCHED)
     first = DiagnosticStatus(name="Press", message="Press.", values=[KeyValue(key="a", value="1")])
-    step = DiagnosticStatus(name="5 N", level=DiagnosticStatus.WARN, message="2.0 s")
-    publisher.publish(DiagnosticArray(status=[first, step]))
+    target = KeyValue(key="target", value=json.dumps([[0.0, 0.01, 0.02]]))
+    wrong = [KeyValue(key="target", value=text) for text in ("[[1, 2]]", "{", '["a"]', "[1e999]")]
+    steps = [
+        DiagnosticStatus(name="5 N", level=DiagnosticStatus.ERROR, message="2 s", values=[target]),
+        *(DiagnosticStatus(level=DiagnosticStatus.WARN, values=[each]) for each in wrong),
+    ]
+    publisher.publish(DiagnosticArray(status=[first, *steps]))
+    pictures.publish(CompressedImage(format="png", data=PNG))
     bench.spin_for(5)
-    assert heard.score.score == ToldScore()
-    heard.score.watch()
-    bench.spin_until(lambda: heard.score.score.name == "Press")
-    expected = ToldScore("Press", "Press.", {"a": "1"}, (ToldStep("5 N", False, "2.0 s"),))
-    assert heard.score.score == expected
+    score, picture = heard.feeds[SCORE], heard.feeds[PICTURE]
+    assert not score.sequence
+    for feed in (score, picture):
+        feed.watch(lambda: None)
+    bench.spin_until(lambda: score.sequence and picture.sequence)
+    assert picture.newest().payload == PNG
+    told = score.newest().header
+    assert (told["name"], told["description"], told["metrics"]) == ("Press", "Press.", {"a": "1"})
+    missed = {"what": "5 N", "state": "missed", "seen": "2 s", "target": [[0.0, 0.01, 0.02]]}
+    assert told["steps"] == [missed, *[{"what": "", "state": "to do", "seen": ""}] * len(wrong)]
     publisher.publish(DiagnosticArray())
-    bench.spin_until(lambda: heard.score.score == ToldScore())
+    bench.spin_until(lambda: score.sequence == 2)
+    assert score.newest().header["name"] == ""
 
 
 def test_a_frozen_image_is_marked_in_the_recording(bench, heard):

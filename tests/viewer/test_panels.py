@@ -250,7 +250,7 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     values = {"state": "fem", "rate_hz": "59.9", "latency_p50_ms": "7.04", "latency_p99_ms": "120"}
     values |= {"received": "300", "dropped": "3", "residual": "1e-3"}
     opened(page, "Status")
-    until(lambda: board.is_watched and board.is_force_watched, "status and plots are seen")
+    until(lambda: board.is_watched and board.force.is_watched, "status and plots are seen")
 
     def tell() -> None:
         now = time.monotonic()
@@ -292,7 +292,7 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     page.keyboard.press("Escape")
     until(lambda: "tissue_deformer" not in node.board.watched, "the dialog is closed")
     page.get_by_role("tab", name="Image").click()
-    until(lambda: not board.is_force_watched, "nobody looks at the plots any more")
+    until(lambda: not board.force.is_watched, "nobody looks at the plots any more")
     assert board.is_watched  # the image says what its node says of it
     page.goto("about:blank")
     until(lambda: not board.is_watched, "nobody looks any more")

@@ -65,12 +65,12 @@ def test_a_silent_node_is_gone_and_later_forgotten():
 
 def test_nobody_is_silent_who_was_not_listened_to():
     board = StatusBoard()
-    board.watch(pages=1)
+    board.watch()
     begun = time.monotonic()
     board.tell(said("a"), now=begun - 2 * GONE_S)
     assert [s.level for s in board.nodes(begun + 0.5)] == [Level.WELL]
     assert [s.level for s in board.nodes(begun + GONE_S + 0.5)] == [Level.GONE]
-    board.watch(pages=1)  # another page, which changes nothing
+    board.watch()  # another page, which changes nothing
     assert [s.level for s in board.nodes(begun + GONE_S + 0.5)] == [Level.GONE]
 
 
@@ -100,9 +100,13 @@ def test_of_the_forces_within_a_tenth_of_a_second_the_largest_is_kept():
 
 def test_only_the_first_who_looks_and_the_last_who_goes_are_told():
     told: list[tuple[bool, bool]] = []
-    board = StatusBoard(lambda: told.append((board.is_watched, board.is_force_watched)))
-    for pages, plots in [(1, 0), (1, 0), (0, 1), (-1, 0), (0, -1), (-1, 0)]:
-        board.watch(pages, plots)
+    board = StatusBoard(lambda: told.append((board.is_watched, board.force.is_watched)))
+    board.watch()
+    board.watch()
+    board.force.watch()
+    board.unwatch()
+    board.force.unwatch()
+    board.unwatch()
     assert told == [(True, False), (True, True), (True, False), (False, False)]
 
 
@@ -122,7 +126,7 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     wrenches = bench.peer.create_publisher(WrenchStamped, "probe/wrench", 10)
     bench.spin_for(5)
     assert bench.peer.count_subscribers("diagnostics") == 0
-    board.watch(pages=1)
+    board.watch()
     bench.spin_until(lambda: bench.peer.count_subscribers("diagnostics") == 1)
     node.health.state = "fem"
 
@@ -141,7 +145,7 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     bench.spin_until(warned)
     assert bench.peer.count_subscribers("probe/wrench") == 0
 
-    board.watch(plots=1)
+    board.force.watch()
     bench.spin_until(lambda: wrenches.get_subscription_count() == 1)
     message = WrenchStamped()
     message.wrench.force.x, message.wrench.force.z = 3.0, -4.0
@@ -157,6 +161,7 @@ def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):
     bench.spin_until(lambda: board.node("camera: lens", now()) is not None)
     assert board.node("camera: lens", now()).level is Level.ERROR
 
-    board.watch(pages=-1, plots=-1)
+    board.unwatch()
+    board.force.unwatch()
     bench.spin_until(lambda: bench.peer.count_subscribers("diagnostics") == 0)
     assert wrenches.get_subscription_count() == 0

@@ -7,25 +7,19 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
-from us_sim.scoring.exercise import Exercise, Step, read_exercise
+from us_sim.scoring.exercise import Exercise, Step, read_exercise, result_of
 from us_sim.scoring.metrics import Metric, Scan, metrics_of
+from us_sim.scoring.picture import draw_score
 from us_sim.scoring.settings import ScoreSettings
 from us_sim.share import find_bag
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _HEAD = ("MetricName", "MetricRoles", "MetricUnit", "MetricValue")
 """Columns of PerkTutor's tables."""
 _FILES = ("score.csv", "score.png", "score.md")
-_MM = 1e3
 
 
 def score_options(parser: argparse.ArgumentParser) -> None:
@@ -92,17 +86,15 @@ class Score:
 
         assert self.exercise is not None
         rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in self.steps]
-        done = sum(each.is_done for each in self.steps)
-        result = "passed" if done == len(self.steps) else "not passed"
         table = markdown_table((self.exercise.name, "done", "seen"), rows)
-        return f"{table}\n\n{result}: {done} of {len(rows)} done"
+        return f"{table}\n\n{result_of([each.is_done for each in self.steps])}"
 
     def write(self, folder: Path) -> None:
         """Write table, picture and page into a folder."""
         with (folder / "score.csv").open("w", encoding="utf-8", newline="") as stream:
             rows = [(each.name, each.roles, each.unit, each.text) for each in self.metrics]
             csv.writer(stream, lineterminator="\n").writerows([_HEAD, *rows])
-        self._draw(folder / "score.png")
+        draw_score(folder / "score.png", self.title, self.scan, self.steps)
         missing = [f"- Left out: {sentence}." for sentence in self.scan.missing]
         parts = [
             f"# Score of {self.title}",
@@ -115,69 +107,3 @@ class Score:
         ]
         text = "\n\n".join(filter(None, parts)) + "\n"
         (folder / "score.md").write_text(text, encoding="utf-8")
-
-    def _draw(self, file: Path) -> None:
-        """The way over the skin at the left; force and areas over time at the right."""
-        from us_sim.evaluation.report import picture, plain
-
-        force, sections = self.scan.force, self.scan.sections
-        over_time = [self._draw_force] * (force is not None) + [self._draw_areas] * bool(sections)
-        over_time = over_time or [self._draw_speed]
-        with picture(file, 11, 5.2, self.title) as figure:
-            grid = figure.add_gridspec(len(over_time), 2, width_ratios=(1, 1.4))
-            self._draw_way(figure.add_subplot(grid[:, 0]))
-            first: Axes | None = None
-            for row, draw in enumerate(over_time):
-                axes = figure.add_subplot(grid[row, 1], sharex=first)
-                first = first or axes
-                draw(axes)
-                plain(axes)
-            axes.set_xlabel("s since the first pose")
-
-    def _draw_way(self, axes: Axes) -> None:
-        from us_sim.evaluation.report import plain
-
-        motion, force = self.scan.motion, self.scan.force
-        x, y = _MM * motion.positions[:, :2].T
-        axes.plot(x, y, color="0.8", lw=1, zorder=1)
-        if force is None:
-            axes.plot(x, y, color="C0", lw=1.2, zorder=2)
-        else:
-            newtons = force.at(motion.times)
-            upwards = np.argsort(newtons)  # the strongest on top
-            shown = axes.scatter(x[upwards], y[upwards], 9, newtons[upwards], cmap="viridis")
-            axes.figure.colorbar(shown, ax=axes, label="force, N", shrink=0.7)
-        for name, line in self.scan.lines.items():
-            way = _MM * line.points[:, :2].T
-            axes.plot(*way, color=_colour(name), lw=3, alpha=0.5, label=name, zorder=0)
-        for step in self.steps:
-            if step.target is not None:
-                x, y = _MM * step.target[:2]
-                axes.scatter(x, y, 150, "none", lw=2, edgecolors="C2" if step.is_done else "C3")
-        if self.scan.lines:
-            axes.legend(fontsize=8, frameon=False)
-        axes.set(xlabel="x, mm", ylabel="y, mm", title="Way of the probe's face over the skin")
-        axes.set_aspect("equal", adjustable="datalim")
-        plain(axes)
-
-    def _draw_force(self, axes: Axes) -> None:
-        assert self.scan.force is not None
-        axes.plot(self.scan.force.times, self.scan.force.newtons, lw=1)
-        axes.set_ylabel("force, N")
-
-    def _draw_areas(self, axes: Axes) -> None:
-        for name, section in self.scan.sections.items():
-            label = f"{name}, % of its area at rest"
-            axes.plot(section.times, 100 * section.fraction, color=_colour(name), label=label)
-        axes.set_ylim(bottom=0)
-        axes.legend(fontsize=8, frameon=False)
-
-    def _draw_speed(self, axes: Axes) -> None:
-        axes.plot(self.scan.motion.times[1:], _MM * self.scan.motion.speeds, lw=1)
-        axes.set_ylabel("speed, mm/s")
-
-
-def _colour(name: str) -> tuple[float, float, float]:
-    from us_sim.volume.structure_names import anatomical_colour
-
-    return anatomical_colour(name)

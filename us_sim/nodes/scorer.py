@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from array import array
+from collections.abc import Sequence
 from functools import partial
+from io import BytesIO
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
 from us_sim.geometry.pose import Pose
@@ -19,9 +23,9 @@ from us_sim.nodes.qos import EVERY, LATCHED, overridable
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
 from us_sim.scene.building import scanner_of, volume_of
-from us_sim.scoring.exercise import read_exercise
-from us_sim.scoring.lumen import LiveScan
-from us_sim.scoring.metrics import metrics_of
+from us_sim.scoring.exercise import Step, read_exercise
+from us_sim.scoring.live import LiveScan
+from us_sim.scoring.picture import draw_score
 from us_sim.scoring.settings import ScoreSettings
 
 _PERIOD = 200_000_000  # ns of the probe's poses, after which areas are measured again
@@ -31,29 +35,36 @@ _REMEMBERED = 256  # poses, for the image with the same stamp
 class Scorer(SceneNode):
     """``probe/pose``, ``probe/wrench`` and ``ultrasound/labels`` in, ``score`` once a second.
 
-    The first status has the metrics as values; one of each step follows, OK when it is done, with
-    what was seen of it. The service ``~/clear`` begins anew.
+    The first status has the metrics as values; one of each step follows, with what was seen of it
+    and where it is to be done. It is OK when it is done, and an ERROR when it was missed.
+    The service ``~/clear`` begins anew; ``~/draw`` has a picture made, on ``score/picture``, which
+    is also made once the last step is done.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("scorer", **kwargs)
         name = declared(self, ScorerSettings()).exercise or self.scene.exercise
         self._exercise = read_exercise(name) if name else None
-        self._limits = declared(self, ScoreSettings())
+        limits = declared(self, ScoreSettings())
         volume = volume_of(self.scene)
-        self._live = LiveScan(volume, scanner_of(self.scene, volume, threads=self.threads))
-        if self._exercise is not None:
-            self._exercise.require(self._live.lines)
+        scanner = scanner_of(self.scene, volume, threads=self.threads)
+        self._live = LiveScan(volume, scanner, self._exercise, limits)
+        self._title = self._exercise.name if self._exercise is not None else self.scene.name
+        self._is_drawn = False  # since the last step was done
         self._poses: dict[int, Pose] = {}
         self._begin = self._measured = 0  # ns
         self._score = self.create_publisher(
             DiagnosticArray, "score", LATCHED, qos_overriding_options=overridable()
+        )
+        self._picture = self.create_publisher(
+            CompressedImage, "score/picture", LATCHED, qos_overriding_options=overridable()
         )
         self.listen(PoseStamped, "probe/pose", self._take_pose, EVERY)
         self.listen(WrenchStamped, "probe/wrench", self._take_wrench, EVERY)
         if self._live.lines:
             self.newest(Image, "ultrasound/labels", self._take_labels)
         self.create_service(Trigger, "~/clear", self._clear)
+        self.create_service(Trigger, "~/draw", self._draw)
         self.create_timer(1.0, self._tell)
         self.health.state = "following"
 
@@ -81,35 +92,69 @@ class Scorer(SceneNode):
         return 1e-9 * (stamp - self._begin)
 
     def _tell(self) -> None:
-        scan = self._live.scan()
-        if scan is None or not self._score.get_subscription_count():
+        if not self._score.get_subscription_count():
             return
-        exercise = self._exercise
-        steps = exercise.steps(scan) if exercise is not None else []
-        metrics = metrics_of(scan, self._limits)
+        score = self._live.score()
+        if score is None:
+            return
+        metrics, steps = score
         told = DiagnosticStatus(
             level=DiagnosticStatus.OK,
-            name=exercise.name if exercise is not None else self.scene.name,
-            message=exercise.description if exercise is not None else "",
+            name=self._title,
+            message=self._exercise.description if self._exercise is not None else "",
+            hardware_id=self.scene.name,
             values=[KeyValue(key=each.label, value=each.text) for each in metrics],
         )
-        message = DiagnosticArray(status=[told])
+        message = DiagnosticArray(status=[told, *map(_status_of, steps)])
         message.header.stamp = self.get_clock().now().to_msg()
-        for step in steps:
-            level = DiagnosticStatus.OK if step.is_done else DiagnosticStatus.WARN
-            where = step.target if step.target is not None else ()
-            values = [KeyValue(key=k, value=f"{v:.4f}") for k, v in zip("xyz", where, strict=False)]
-            message.status.append(
-                DiagnosticStatus(level=level, name=step.what, message=step.seen, values=values)
-            )
         self._score.publish(message)
         self.health.published("score")
+        is_passed = bool(steps) and all(step.is_done for step in steps)
+        if is_passed and not self._is_drawn and self._picture.get_subscription_count():
+            self._is_drawn = self._publish_picture(steps)
+
+    def _publish_picture(self, steps: Sequence[Step]) -> bool:
+        """Publish a picture of the scan; whether there is one."""
+        scan = self._live.scan()
+        if scan is None:
+            return False
+        drawn = BytesIO()
+        draw_score(drawn, self._title, scan, steps)
+        message = CompressedImage(format="png", data=array("B", drawn.getvalue()))
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._picture.publish(message)
+        self.health.published("score/picture")
+        return True
+
+    def _draw(self, _: Any, response: Any) -> Any:
+        score = self._live.score()
+        response.success = score is not None and self._publish_picture(score[1])
+        response.message = "it is on score/picture" if response.success else "nothing was done yet"
+        return response
 
     def _clear(self, _: Any, response: Any) -> Any:
         self._live.clear()
         self._poses, self._begin, self._measured = {}, 0, 0
+        self._is_drawn = False
+        self._picture.publish(CompressedImage())  # what was drawn is of before
         response.success, response.message = True, "the score begins anew"
         return response
+
+
+def _status_of(step: Step) -> DiagnosticStatus:
+    level = DiagnosticStatus.ERROR if step.is_missed else DiagnosticStatus.WARN
+    values = []
+    if step.target is not None:
+        values.append(KeyValue(key="target", value=json.dumps(step.target.round(4).tolist())))
+    if step.pose is not None:
+        pose = [*step.pose.position.tolist(), *step.pose.orientation.tolist()]
+        values.append(KeyValue(key="pose", value=json.dumps(pose)))
+    return DiagnosticStatus(
+        level=DiagnosticStatus.OK if step.is_done else level,
+        name=step.what,
+        message=step.seen,
+        values=values,
+    )
 
 
 main = partial(run_node, Scorer)

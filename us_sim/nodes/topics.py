@@ -149,7 +149,11 @@ ultrasound/image_to_probe: std_msgs/Float64MultiArray [latched]
     row, 0, 1) of a pixel to metres in frame `probe`
 score: diagnostic_msgs/DiagnosticArray [latched]
     scorer -> viewer | once a second: metrics so far as values of the first status; one of each step
-    of the exercise follows, OK when it is done
+    of the exercise follows, OK when it is done, with the points (`target`) or the probe's pose
+    (`pose`) where it is to be done as JSON lists
+score/picture: sensor_msgs/CompressedImage [latched] [on_demand]
+    scorer -> viewer | PNG of the way over the skin, force and areas so far, when `scorer/draw` asks
+    for it and once the last step is done; empty after `scorer/clear`
 session/marker: std_msgs/String
     viewer | a text that marks a moment of the recording; of a page that freezes its image `frozen`
 session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on_demand]

@@ -68,7 +68,8 @@ def read_scan(
     except UsSimError as error:
         truth = {}
         missing.append(f"areas of structures: {error}")
-    if truth and not truth["sections"]:
+    sections = truth.get("sections", {})
+    if truth and not any(np.isfinite(each.fraction).any() for each in sections.values()):
         missing.append(f"areas of structures: no image of {file} cuts a vessel of deformed tissue")
     return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 

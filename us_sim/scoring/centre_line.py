@@ -36,6 +36,7 @@ class CentreLine:
     """A line through the middle of a vessel that does not turn back."""
 
     points: NDArray[np.float64]  # (P, 3) m, in frame ``patient``; P at least 2
+    area: float = 0.0  # m², mean cross-section of the vessel
 
     @classmethod
     def of(cls, volume: Volume, labels: NDArray[np.bool_]) -> CentreLine | None:
@@ -58,7 +59,9 @@ class CentreLine:
             return None
         kernel = np.ones(_SMOOTHED) / _SMOOTHED
         padded = np.pad(points, ((_SMOOTHED // 2,) * 2, (0, 0)), mode="reflect", reflect_type="odd")
-        return cls(np.stack([np.convolve(each, kernel, "valid") for each in padded.T], axis=1))
+        line = cls(np.stack([np.convolve(each, kernel, "valid") for each in padded.T], axis=1))
+        size = len(places) * abs(float(np.linalg.det(volume.index_to_patient[:3, :3])))
+        return cls(line.points, size / float(line.lengths[-1]))
 
     @property
     def lengths(self) -> NDArray[np.float64]:

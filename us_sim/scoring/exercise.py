@@ -9,18 +9,17 @@
 from __future__ import annotations
 
 import os
-from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
-from us_sim.geometry.pose import Placement
-from us_sim.geometry.se3 import rotation_between
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.scoring.centre_line import CentreLine
 from us_sim.scoring.metrics import Scan, Section
 from us_sim.settings.choice import Chosen
@@ -35,6 +34,7 @@ from us_sim.slicing.settings import WALLS_TOUCH
 
 _LENGTH, _TIME, _FORCE = Quantity("length", 1e-4, 1.0), Quantity("time", 0.1, 3600.0), "force"
 _PART = Quantity("number", 0.0, 1.0)
+_PRESSED = 0.9  # part of a vein's area below which it was pressed, and not only passed
 _MM = 1e3
 
 
@@ -44,7 +44,22 @@ class Step(NamedTuple):
     what: str
     is_done: bool
     seen: str
-    target: NDArray[np.float64] | None = None  # (3,) m in frame ``patient``, where it is to be done
+    # (P, 3) m in frame ``patient``, where it is to be done: one point, or those of a line
+    target: NDArray[np.float64] | None = None
+    pose: Pose | None = None  # of the probe, that is to be found
+    is_missed: bool = False  # whether it was tried in vain, and the probe has moved on
+
+
+class Attempt(ABC):
+    """What was done of a task so far: a scan is added whole, or in pieces one after another."""
+
+    @abstractmethod
+    def add(self, scan: Scan) -> None:
+        """Take the samples that are new."""
+
+    @abstractmethod
+    def steps(self) -> list[Step]:
+        """Every thing that is to be done."""
 
 
 class Task(Settings):
@@ -59,8 +74,22 @@ class Task(Settings):
         return ()
 
     @abstractmethod
-    def steps(self, scan: Scan) -> Iterator[Step]:
-        """Every thing that is to be done, for a scan that has the structures."""
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+        """An attempt at it, in a scene with these vessels."""
+
+
+class _Hold:
+    """The longest time (s) for which something was held without a break."""
+
+    def __init__(self) -> None:
+        self.longest = self._held = 0.0
+        self._last, self._was = 0.0, False
+
+    def add(self, times: NDArray[np.float64], within: NDArray[np.bool_]) -> None:
+        for time, now in zip(times.tolist(), within.tolist(), strict=True):
+            self._held = self._held + time - self._last if now and self._was else 0.0
+            self.longest = max(self.longest, self._held)
+            self._last, self._was = time, now
 
 
 @dataclass(frozen=True)
@@ -100,47 +129,87 @@ class Compression(Task):
             0.5 * length + self.spacing * (np.arange(count) - 0.5 * (count - 1)), np.float64
         )
 
-    def steps(self, scan: Scan) -> Iterator[Step]:
-        """A step for each point."""
-        line = scan.lines[self.structure]
-        for point in self.points(float(line.lengths[-1])).tolist():
-            what = f"{self.structure} at {_MM * point:.0f} mm"
-            yield Step(what, *self._seen(scan, point), line.at(point))
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+        """An attempt with a step for each point."""
+        line = lines[self.structure]
+        points = self.points(float(line.lengths[-1])).tolist()
+        return _Points([_Point(self, at, line.at(at)) for at in points])
 
-    def _seen(self, scan: Scan, point: float) -> tuple[bool, str]:
-        section = scan.sections.get(self.structure)
+
+class _Points(Attempt):
+    def __init__(self, points: list[_Point]) -> None:
+        self._points = points
+
+    def add(self, scan: Scan) -> None:
+        for point in self._points:
+            point.add(scan)
+
+    def steps(self) -> list[Step]:
+        return [point.step() for point in self._points]
+
+
+class _Point:
+    """What was seen of a vein around one point of it.
+
+    Args:
+        task: with the limits.
+        at: m along the vein.
+        place: (3,) m, the same in frame ``patient``.
+    """
+
+    def __init__(self, task: Compression, at: float, place: NDArray[np.float64]) -> None:
+        self._task, self._at, self._place = task, at, place
+        self._closed: tuple[float, float] | None = None  # N, and the part of the artery left open
+        self._least, self._force = np.inf, np.nan  # part that was open at least, and N then
+        self._most = 0.0  # N, of all images
+        self._is_thrombus = self._is_here = False
+
+    def add(self, scan: Scan) -> None:
+        task = self._task
+        begin, end = scan.thrombi.get(task.structure, (np.inf, -np.inf))
+        self._is_thrombus = begin - task.tolerance <= self._at <= end + task.tolerance
+        section = scan.sections.get(task.structure)
         if section is None:
-            return False, "missed"
-        near = np.flatnonzero(
-            (np.abs(section.along - point) <= self.tolerance) & np.isfinite(section.fraction)
-        )
+            return
+        new = section.times > scan.since
+        is_near = np.abs(section.along - self._at) <= task.tolerance
+        self._is_here = bool(is_near[new][-1]) if new.any() else self._is_here
+        near = np.flatnonzero(new & is_near & np.isfinite(section.fraction))
         if not len(near):
-            return False, "missed"
+            return
         left = section.fraction[near]
         force = scan.force.at(section.times[near]) if scan.force else np.full(len(near), np.nan)
-        if (left <= self.closed).any():
-            first = int(np.argmax(left <= self.closed))
-            artery = self._artery(scan, float(section.times[near[first]]))
-            seen = f"closed{_newtons(force[first])}"
-            if artery < self.open:
-                return False, f"{seen}, and of the {self.artery} {100 * artery:.0f} % were left"
-            return True, seen
         least = int(np.argmin(left))
-        most = float(np.nanmax(force)) if np.isfinite(force).any() else 0.0
-        seen = f"{100 * left[least]:.0f} % open{_newtons(force[least])}"
-        begin, end = scan.thrombi.get(self.structure, (np.inf, -np.inf))
-        if most < self.enough:
-            return False, f"{seen}: press harder"
-        is_there = begin - self.tolerance <= point <= end + self.tolerance
-        return is_there, f"{seen}: {'a thrombus' if is_there else 'not closed'}"
+        if left[least] < self._least:
+            self._least, self._force = float(left[least]), float(force[least])
+        self._most = max(self._most, float(np.nan_to_num(force).max()))
+        artery = scan.sections.get(task.artery or "")
+        for k in np.flatnonzero(left <= task.closed).tolist():
+            part = float(artery.fraction[near[k]]) if artery is not None else 1.0
+            part = part if np.isfinite(part) else 1.0  # nobody knows
+            if self._closed is None or (self._closed[1] < task.open <= part):
+                self._closed = float(force[k]), part
 
-    def _artery(self, scan: Scan, time: float) -> float:
-        """The part of its area that the artery had; all where nobody knows."""
-        section = scan.sections.get(self.artery or "")
-        if section is None:
-            return 1.0
-        part = float(section.fraction[np.argmin(np.abs(section.times - time))])
-        return part if np.isfinite(part) else 1.0
+    def step(self) -> Step:
+        task = self._task
+        is_done, seen = self._seen()
+        is_missed = not is_done and not self._is_here and self._least < _PRESSED
+        what = f"{task.structure} at {_MM * self._at:.0f} mm"
+        return Step(what, is_done, seen, self._place[None], is_missed=is_missed)
+
+    def _seen(self) -> tuple[bool, str]:
+        task = self._task
+        if self._closed is not None:
+            force, artery = self._closed
+            is_open = artery >= task.open
+            also = "" if is_open else f", and of the {task.artery} {100 * artery:.0f} % were left"
+            return is_open, f"closed{_newtons(force)}{also}"
+        if self._least == np.inf:
+            return False, "not reached"
+        seen = f"{100 * self._least:.0f} % open{_newtons(self._force)}"
+        if self._most < task.enough:
+            return False, f"{seen}: press harder"
+        return self._is_thrombus, f"{seen}: {'a thrombus' if self._is_thrombus else 'not closed'}"
 
 
 @dataclass(frozen=True)
@@ -151,14 +220,28 @@ class KeepForce(Task):
     tolerance: float = setting(Quantity(_FORCE, 0.01, 200.0), "above and below", default=1.0)
     duration: float = setting(_TIME, "without leaving it", default=5.0)
 
-    def steps(self, scan: Scan) -> Iterator[Step]:
-        """One step."""
-        what = f"{self.force:g} ± {self.tolerance:g} N for {self.duration:g} s"
-        if scan.force is None:
-            yield Step(what, False, "the recording has no force")
-            return
-        within = np.abs(scan.force.newtons - self.force) <= self.tolerance
-        yield _held(what, scan.force.times, within, self.duration)
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
+        """An attempt with one step."""
+        return _KeptForce(self)
+
+
+class _KeptForce(Attempt):
+    def __init__(self, task: KeepForce) -> None:
+        self._task, self._hold, self._is_known = task, _Hold(), False
+
+    def add(self, scan: Scan) -> None:
+        if scan.force is not None:
+            self._is_known = True
+            new = scan.force.times > scan.since
+            within = np.abs(scan.force.newtons - self._task.force) <= self._task.tolerance
+            self._hold.add(scan.force.times[new], within[new])
+
+    def steps(self) -> list[Step]:
+        task = self._task
+        what = f"{task.force:g} ± {task.tolerance:g} N for {task.duration:g} s"
+        if not self._is_known:
+            return [Step(what, False, "the recording has no force")]
+        return [_held(what, self._hold, task.duration)]
 
 
 @dataclass(frozen=True)
@@ -174,14 +257,29 @@ class Centre(Task):
         """The vessel."""
         return (self.structure,)
 
-    def steps(self, scan: Scan) -> Iterator[Step]:
-        """One step."""
-        what = f"{self.structure} within {_MM * self.offset:g} mm for {self.duration:g} s"
-        section = scan.sections.get(self.structure)
-        if section is None:
-            yield Step(what, False, "never in the image")
-            return
-        yield _held(what, section.times, _is_centred(section, self.offset), self.duration)
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+        """An attempt with one step."""
+        return _Centred(self, lines[self.structure])
+
+
+class _Centred(Attempt):
+    def __init__(self, task: Centre, line: CentreLine) -> None:
+        self._task, self._line, self._hold, self._is_seen = task, line, _Hold(), False
+
+    def add(self, scan: Scan) -> None:
+        section = scan.sections.get(self._task.structure)
+        if section is not None:
+            new = section.times > scan.since
+            self._is_seen |= bool(np.isfinite(section.fraction[new]).any())
+            within = _is_centred(section, self._task.offset)
+            self._hold.add(section.times[new], within[new])
+
+    def steps(self) -> list[Step]:
+        task, points = self._task, self._line.points
+        what = f"{task.structure} within {_MM * task.offset:g} mm for {task.duration:g} s"
+        if not self._is_seen:
+            return [Step(what, False, "never in the image", points)]
+        return [_held(what, self._hold, task.duration)._replace(target=points)]
 
 
 @dataclass(frozen=True)
@@ -198,21 +296,37 @@ class Follow(Task):
         """The vessel."""
         return (self.structure,)
 
-    def steps(self, scan: Scan) -> Iterator[Step]:
-        """One step: pieces of 2 mm that were passed between two images, or seen in one."""
-        line = scan.lines[self.structure]
-        pieces = np.arange(self.margin, line.lengths[-1] - self.margin, 0.002)
-        seen = np.zeros(len(pieces), bool)
-        section = scan.sections.get(self.structure)
-        if section is not None:
-            centred = _is_centred(section, self.offset)
-            for k in np.flatnonzero(centred).tolist():
-                last = k - 1 if k and centred[k - 1] else k
-                low, high = sorted((section.along[last], section.along[k]))
-                seen |= (pieces > low - 0.002) & (pieces < high + 0.002)
-        part = float(seen.mean()) if len(seen) else 0.0
-        what = f"{100 * self.part:.0f} % of the {self.structure} in the image's middle"
-        yield Step(what, part >= self.part, f"{100 * part:.0f} %")
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+        """An attempt with one step."""
+        return _Followed(self, lines[self.structure])
+
+
+class _Followed(Attempt):
+    """Pieces of 2 mm that were passed between two images, or seen in one."""
+
+    def __init__(self, task: Follow, line: CentreLine) -> None:
+        self._task, self._line = task, line
+        self._pieces = np.arange(task.margin, line.lengths[-1] - task.margin, 0.002)
+        self._seen = np.zeros(len(self._pieces), bool)
+        self._last: float | None = None  # m along the vessel, where it was centred just before
+
+    def add(self, scan: Scan) -> None:
+        section = scan.sections.get(self._task.structure)
+        if section is None:
+            return
+        new = section.times > scan.since
+        centred = _is_centred(section, self._task.offset)[new]
+        for along, now in zip(section.along[new].tolist(), centred.tolist(), strict=True):
+            if now:
+                last = self._last if self._last is not None else along
+                low, high = sorted((last, along))
+                self._seen |= (self._pieces > low - 0.002) & (self._pieces < high + 0.002)
+            self._last = along if now else None
+
+    def steps(self) -> list[Step]:
+        part = float(self._seen.mean()) if len(self._seen) else 0.0
+        what = f"{100 * self._task.part:.0f} % of the {self._task.structure} in the image's middle"
+        return [Step(what, part >= self._task.part, f"{100 * part:.0f} %", self._line.points)]
 
 
 @dataclass(frozen=True)
@@ -230,29 +344,47 @@ class View(Task):
         """The vessels that must be seen."""
         return self.visible
 
-    def steps(self, scan: Scan) -> Iterator[Step]:
-        """One step."""
-        wanted, motion = self.pose.pose, scan.motion
-        apart = np.linalg.norm(motion.positions - wanted.position, axis=1)
-        turned = np.array(
-            [
-                np.linalg.norm(rotation_between(each, wanted.orientation))
-                for each in motion.orientations
-            ]
-        )
-        within = (apart <= self.distance) & (turned <= self.angle)
-        for name in self.visible:
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:  # noqa: ARG002
+        """An attempt with one step."""
+        return _Found(self)
+
+
+class _Found(Attempt):
+    def __init__(self, task: View) -> None:
+        self._task, self._hold = task, _Hold()
+        self._nearest = np.inf, np.inf, np.inf  # how far in all, m, rad
+
+    def add(self, scan: Scan) -> None:
+        task, wanted = self._task, self._task.pose.pose
+        new = scan.motion.times > scan.since
+        times = scan.motion.times[new]
+        if not len(times):
+            return
+        apart = np.linalg.norm(scan.motion.positions[new] - wanted.position, axis=1)
+        shared = np.abs(scan.motion.orientations[new] @ wanted.orientation)
+        turned = 2.0 * np.arccos(np.minimum(shared, 1.0))
+        within = (apart <= task.distance) & (turned <= task.angle)
+        for name in task.visible:
             section = scan.sections.get(name)
             if section is None:
                 within[:] = False
                 continue
-            nearest = np.abs(section.times[:, None] - motion.times).argmin(axis=0)
-            within &= np.nan_to_num(section.area)[nearest] > 0
-        what = f"the view within {_MM * self.distance:g} mm and {np.rad2deg(self.angle):.0f}°"
-        held = _held(f"{what} for {self.duration:g} s", motion.times, within, self.duration)
-        best = int(np.argmin(apart / self.distance + turned / self.angle))
-        near = f"nearest {_MM * apart[best]:.1f} mm and {np.rad2deg(turned[best]):.0f}°"
-        yield held._replace(seen=f"{held.seen}; {near}", target=wanted.position)
+            last = np.searchsorted(section.times, times, side="right") - 1  # image
+            within &= (last >= 0) & (section.area[last] > 0)
+        self._hold.add(times, within)
+        best = int(np.argmin(apart / task.distance + turned / task.angle))
+        far = apart[best] / task.distance + turned[best] / task.angle
+        self._nearest = min(self._nearest, (far, apart[best], turned[best]))
+
+    def steps(self) -> list[Step]:
+        task = self._task
+        what = f"the view within {_MM * task.distance:g} mm and {np.rad2deg(task.angle):.0f}°"
+        held = _held(f"{what} for {task.duration:g} s", self._hold, task.duration)
+        _, apart, turned = self._nearest
+        if np.isfinite(apart):
+            near = f"nearest {_MM * apart:.1f} mm and {np.rad2deg(turned):.0f}°"
+            held = held._replace(seen=f"{held.seen}; {near}")
+        return [held._replace(pose=task.pose.pose)]
 
 
 @dataclass(frozen=True)
@@ -271,26 +403,29 @@ class Exercise(Settings):
         """The task with its settings."""
         return self.task.settings(EXERCISES)
 
-    def require(self, lines: Mapping[str, CentreLine]) -> None:
-        """Refuse vessels of which some that the task needs are missing.
+    def begin(self, lines: Mapping[str, CentreLine]) -> Attempt:
+        """An attempt at it, in a scene with these vessels.
 
         Raises:
-            ScoreError: one sentence with the structure.
+            ScoreError: some that the task needs are missing; one sentence with the structure.
         """
         for name in self.assigned.structures:
             if name not in lines:
                 known = unknown(name, lines) if lines else f"{name!r} is not known"
                 of = "the vessels of the scene" if lines else "a scan without a scene"
                 raise ScoreError(f"exercise {self.name}: in {of} the structure {known}")
+        attempt: Attempt = self.assigned.begin(lines)
+        return attempt
 
     def steps(self, scan: Scan) -> list[Step]:
-        """Steps to be done, with what was seen of each.
+        """Steps to be done, with what was seen of each in a whole scan.
 
         Raises:
-            ScoreError: as `require`.
+            ScoreError: as `begin`.
         """
-        self.require(scan.lines)
-        return list(self.assigned.steps(scan))
+        attempt = self.begin(scan.lines)
+        attempt.add(scan)
+        return attempt.steps()
 
 
 def read_exercise(name: str | Path) -> Exercise:
@@ -308,6 +443,15 @@ def read_exercise(name: str | Path) -> Exercise:
     return Reader(str(path), None, ScoreError).read(Exercise, read_yaml(path, ScoreError))
 
 
+def result_of(done: Sequence[bool]) -> str:
+    """The result of steps in words.
+
+    >>> result_of([True, False])
+    'not passed: 1 of 2 done'
+    """
+    return f"{'passed' if all(done) else 'not passed'}: {sum(done)} of {len(done)} done"
+
+
 def _newtons(force: float) -> str:
     return f" at {force:.1f} N" if np.isfinite(force) else ""
 
@@ -317,11 +461,5 @@ def _is_centred(section: Section, offset: float) -> NDArray[np.bool_]:
         return np.asarray(np.abs(section.lateral) <= offset)
 
 
-def _held(what: str, times: NDArray[np.float64], within: ArrayLike, duration: float) -> Step:
-    """A step of holding something for so long without a break."""
-    longest = held = 0.0
-    inside = np.asarray(within, bool)
-    for step, was, now in zip(np.diff(times).tolist(), inside[:-1], inside[1:], strict=True):
-        held = held + step if was and now else 0.0
-        longest = max(longest, held)
-    return Step(what, longest >= duration, f"{longest:.1f} s")
+def _held(what: str, hold: _Hold, duration: float) -> Step:
+    return Step(what, hold.longest >= duration, f"{hold.longest:.1f} s")

@@ -11,8 +11,7 @@ from scipy.ndimage import binary_erosion
 
 from us_sim.geometry.pose import Pose, lifted
 from us_sim.scoring.centre_line import CentreLine, places_of
-from us_sim.scoring.metrics import Force, Scan, Section
-from us_sim.scoring.motion import Motion
+from us_sim.scoring.metrics import Section
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.probe.probe import Probe
 from us_sim.tissue.elasticity.material import kind_of
@@ -20,7 +19,8 @@ from us_sim.volume.volume import Volume
 
 VESSELS = ("vein", "artery")  # kinds of tissue whose cross-sections are measured
 _HARDLY_CUT = 0.1
-"""Of a vessel's largest cross-section at rest: less of it is its edge, or cut off by the image."""
+"""Of a vessel's mean cross-section, or else of its largest in an image at rest: less of it is its
+edge, or cut off by the image."""
 
 
 def lumens_of(label_names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
@@ -87,7 +87,8 @@ class LumenMeter:
 
     Where the probe slides or tilts it sees other cross-sections, so each is compared with that of
     the same plane at rest, from the skin on. A vessel that no image cuts has none; of one that
-    reaches the image's edge, now or at rest, nobody knows how large it is.
+    reaches the image's edge, now or at rest, nobody knows how large it is, nor of one that vanishes
+    from the image just before or after.
 
     Args:
         lumens: labels of each vessel by its name.
@@ -105,6 +106,8 @@ class LumenMeter:
     ) -> None:
         self._lumens, self._scanner, self._rest = lumens, scanner, rest
         self._lines = lines or {}
+        typical = [self._lines[name].area if name in self._lines else 0.0 for name in lumens]
+        self._typical = np.array(typical).reshape(-1, 1)  # m²
         self._pixel = float(np.prod(scanner.probe.pixel_spacing))
         self._edge = _edge(scanner.probe)
         self._time: list[float] = []
@@ -131,13 +134,7 @@ class LumenMeter:
         """All that were measured; None where no vessel was cut that can be compared."""
         if not self._time:
             return None
-        now, rest = np.array(self._found).transpose(1, 2, 0)
-        whole, count = np.array(self._whole).T.copy(), len(self._time)
-        for k in [*range(1, count), *range(count - 2, -1, -1)]:
-            for beside in {max(k - 1, 0), min(k + 1, count - 1)}:
-                whole[:, k] &= whole[:, beside] | (now[:, k] > 0.0)  # pushed out, maybe not closed
-        hardly = rest <= _HARDLY_CUT * rest.max(axis=1, keepdims=True)
-        rest = np.where(hardly | ~whole, np.nan, rest)
+        now, rest = self._compared()
         cut = {n: i for i, n in enumerate(self._lumens) if np.isfinite(rest[i]).any()}
         if not cut:
             return None
@@ -148,13 +145,38 @@ class LumenMeter:
             at_rest={name: rest[i] for name, i in cut.items()},
         )
 
-    def sections(self) -> dict[str, Section]:
-        """Likewise, with their places along the vessels; of those that have a centre line."""
-        areas = self.areas()
+    def _compared(
+        self, begin: int = 0, end: int | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Areas (V, K) m² of these samples, and those at rest, NaN where nobody knows them."""
+        now, rest = np.array(self._found[begin:end]).transpose(1, 2, 0)
+        whole, count = np.array(self._whole[begin:end]).T.copy(), now.shape[1]
+        is_gone = (now == 0.0) & (rest > 0.0)  # pushed out, maybe not closed
+        for k in [*range(1, count), *range(count - 2, -1, -1)]:
+            for beside in {max(k - 1, 0), min(k + 1, count - 1)}:
+                whole[:, k] &= whole[:, beside] | ~is_gone[:, k]
+        typical = np.where(self._typical > 0, self._typical, rest.max(axis=1, keepdims=True))
+        return now, np.where((rest <= _HARDLY_CUT * typical) | ~whole, np.nan, rest)
+
+    @property
+    def times(self) -> list[float]:
+        """Of all samples, s."""
+        return self._time
+
+    def is_settled(self, sample: int) -> bool:
+        """Whether later samples change nothing of this one and those before."""
+        now, rest = self._found[sample]
+        return not any(n == 0.0 and r > 0.0 for n, r in zip(now, rest, strict=True))
+
+    def sections(self, begin: int = 0, end: int | None = None) -> dict[str, Section]:
+        """Areas and places of the vessels that have a centre line, of these samples."""
+        times = np.array(self._time[begin:end])
+        if not len(times):
+            return {}
+        areas = dict(zip(self._lumens, zip(*self._compared(begin, end), strict=True), strict=True))
         return {
-            name: Section(areas.time, areas.area[name], areas.at_rest[name], *np.array(cuts).T)
+            name: Section(times, *areas[name], *np.array(cuts[begin:end]).T)
             for name, cuts in self._cuts.items()
-            if areas is not None and name in areas.area
         }
 
 
@@ -162,50 +184,3 @@ def _edge(probe: Probe) -> NDArray[np.bool_]:
     """(rows, columns) the last pixels of an image that its beams reach."""
     reached = np.pad(np.isfinite(probe.pixel_beams[0]), 1)
     return np.asarray((reached & ~binary_erosion(reached))[1:-1, 1:-1])
-
-
-class LiveScan:
-    """A scan that grows while it is done.
-
-    Args:
-        volume: whose vessels are measured, where it has labels.
-        scanner: of that volume at rest, with the probe that scans.
-    """
-
-    def __init__(self, volume: Volume, scanner: BMode) -> None:
-        self.lines, self._thrombi = vessels_in(volume)
-        self._lumens = lumens_of(volume.label_names) if self.lines else {}
-        self._scanner = scanner
-        self.clear()
-
-    def clear(self) -> None:
-        """Begin anew."""
-        self._poses: list[tuple[float, Pose]] = []
-        self._forces: list[tuple[float, float]] = []
-        self._meter = LumenMeter(self._lumens, self._scanner, lines=self.lines)
-
-    def add_pose(self, time: float, pose: Pose) -> None:
-        """Take a pose of the probe at a time (s) after those before; others are passed over."""
-        if not self._poses or time > self._poses[-1][0]:
-            self._poses.append((time, pose))
-
-    def add_force(self, time: float, force: NDArray[np.float64]) -> None:
-        """Take the force (3,) N on the probe, likewise."""
-        if not self._forces or time > self._forces[-1][0]:
-            self._forces.append((time, float(np.linalg.norm(force))))
-
-    def add_labels(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
-        """Take the labels (rows, columns) of an image."""
-        if self._lumens:
-            self._meter.add(time, pose, labels)
-
-    def scan(self) -> Scan | None:
-        """All so far; None before there is a motion."""
-        if len(self._poses) < 2:
-            return None
-        times, poses = zip(*self._poses, strict=True)
-        positions, orientations = zip(*((p.position, p.orientation) for p in poses), strict=True)
-        motion = Motion(np.array(times), np.array(positions), np.array(orientations))
-        force = Force(*np.array(self._forces).T) if len(self._forces) > 1 else None
-        width = self._scanner.probe.width
-        return Scan(motion, force, self._meter.sections(), self.lines, self._thrombi, width)

@@ -6,15 +6,17 @@ integrals over time, stated below.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import ScoreError
 from us_sim.scoring.centre_line import CentreLine
-from us_sim.scoring.motion import Motion
+from us_sim.scoring.motion import ACTION_SPEED, ACTION_TURN, Actions, Motion
 from us_sim.scoring.settings import ScoreSettings
 
 _Array = NDArray[np.float64]
@@ -88,7 +90,11 @@ class Section:
 
 @dataclass(frozen=True)
 class Scan:
-    """Everything of a recording that is scored; times are seconds since its first pose."""
+    """Everything of a recording that is scored, or a piece of it; times are s since its first pose.
+
+    A piece that follows another begins with samples of it, whose times are not after ``since``:
+    three poses, a force and a section, as far as there are any.
+    """
 
     motion: Motion  # of the probe in frame ``patient``
     force: Force | None = None
@@ -99,67 +105,154 @@ class Scan:
     width: float | None = None  # m, of the image, so of the probe's face
     frozen: int | None = None  # images that were frozen
     missing: tuple[str, ...] = ()  # metrics that cannot be told, and why, in sentences
+    since: float = -np.inf  # s
+
+    def new(self, times: _Array, *values: _Array) -> list[_Array]:
+        """The last of each values, for as many samples as are new by their times."""
+        count = int(np.count_nonzero(times > self.since))
+        return [each[max(len(each) - count, 0) :] for each in values]
 
 
 def metrics_of(scan: Scan, settings: ScoreSettings | None = None) -> Iterator[Metric]:
     """All metrics that the scan has data for, in the order of a report."""
-    settings = settings or ScoreSettings()
-    yield from _of_motion(scan.motion)
-    if scan.force is not None:
-        yield from _of_force(scan.force, settings)
+    return Tally(settings).add(scan).metrics()
+
+
+class Tally:
+    """Metrics of a scan that is added whole, or in pieces one after another."""
+
+    def __init__(self, settings: ScoreSettings | None = None) -> None:
+        self._settings = settings or ScoreSettings()
+        self._sums: defaultdict[str, float] = defaultdict(float)
+        self._extremes: defaultdict[str, float] = defaultdict(float)
+        self._translation, self._rotation = Actions(), Actions()
+        self._of_vessels: dict[str, Tally] = {}
+        self._is_touching = False  # at the last pose
+        self._frozen: int | None = None
+
+    def add(self, scan: Scan) -> Tally:
+        """Take the samples that are new."""
+        self._add_motion(scan)
+        if scan.force is not None:
+            self._add_force(scan, scan.force)
+        else:
+            self._is_touching = False
+        for name, section in scan.sections.items():
+            self._of_vessels.setdefault(name, Tally())._add_section(scan, section)
+        self._frozen = scan.frozen
+        return self
+
+    def metrics(self) -> Iterator[Metric]:
+        """All that there are data for, in the order of a report."""
+        yield from self._of_motion()
+        if "impulse" in self._sums:
+            yield from self._of_force()
+        if "area" in self._sums:
+            yield Metric("Area Scanned in Contact", "mm^2", _MM2 * self._sums["area"])
+        if self._frozen is not None:
+            yield Metric("Images Frozen", "count", self._frozen)
+        for name, tally in self._of_vessels.items():
+            yield from tally._of_section(name)
+
+    def _sum(self, **values: Any) -> None:
+        for name, value in values.items():
+            self._sums[name] += float(value)
+
+    def _peak(self, name: str, values: _Array) -> None:
+        """Keep the largest; none is below 0."""
+        self._extremes[name] = max(self._extremes[name], float(values.max(initial=0.0)))
+
+    def _add_motion(self, scan: Scan) -> None:
+        motion = scan.motion
+        times, steps, speeds, turns, jerks, accelerations = scan.new(
+            motion.times,
+            motion.times[1:],
+            motion.steps,
+            motion.speeds,
+            motion.angular_speeds,
+            motion.squared_jerks,
+            np.linalg.norm(motion.accelerations, axis=1),
+        )
+        self._sum(steps=len(steps), time=steps.sum(), path=speeds @ steps, turn=turns @ steps)
+        self._sum(speed=speeds.sum(), jerks=len(jerks), jerk=jerks.sum())
+        self._sum(accelerations=len(accelerations), acceleration=accelerations.sum())
+        self._peak("speed", speeds)
+        self._peak("acceleration", accelerations)
+        if len(steps):
+            begin = float(times[0] - steps[0])
+            self._translation.add(times, speeds > ACTION_SPEED, begin)
+            self._rotation.add(times, turns > ACTION_TURN, begin)
+
+    def _of_motion(self) -> Iterator[Metric]:
+        total = self._sums
+        yield Metric("Elapsed Time", "s", total["time"])
+        yield Metric("Path Length", "mm", _MM * total["path"])
+        yield Metric("Rotation Total", "deg", _DEGREES * total["turn"])
+        yield Metric("Translational Actions", "count", self._translation.count)
+        yield Metric("Rotational Actions", "count", self._rotation.count)
+        yield Metric("Average Velocity", "mm/s", _MM * total["speed"] / total["steps"])
+        yield Metric("Peak Velocity", "mm/s", _MM * self._extremes["speed"])
+        if total["accelerations"]:
+            mean = total["acceleration"] / total["accelerations"]
+            yield Metric("Average Acceleration", "mm/s^2", _MM * mean)
+            yield Metric("Peak Acceleration", "mm/s^2", _MM * self._extremes["acceleration"])
+        if total["jerks"]:
+            # PerkTutor's table says mm/s^3: the unit of jerk and not of this integral's root. It is
+            # larger the less smooth the motion, and of a noisy or fast tracker mostly noise.
+            yield Metric("Motion Smoothness", "mm/s^2.5", _MM * float(np.sqrt(total["jerk"])))
+            # 720 for a straight movement of minimum jerk, whatever its length and time.
+            scale = total["time"] ** 5 / total["path"] ** 2 if total["path"] > 0 else np.nan
+            yield Metric("Dimensionless Squared Jerk", "1", total["jerk"] * scale)
+
+    def _add_force(self, scan: Scan, force: Force) -> None:
+        """Means over time, the force linear between two samples, which count as the later one."""
+        steps, during, ends = scan.new(
+            force.times,
+            np.diff(force.times),
+            0.5 * (force.newtons[1:] + force.newtons[:-1]),
+            force.newtons[1:],
+        )
+        touching = ends >= self._settings.contact_force
+        self._sum(contact=steps[touching].sum(), pressed=during[touching] @ steps[touching])
+        self._sum(above=steps[ends > self._settings.force_limit].sum(), impulse=during @ steps)
+        self._peak("force", force.newtons)
         if scan.width is not None:
-            touching = scan.force.at(scan.motion.times) >= settings.contact_force
-            area = _MM2 * scan.motion.face_area(scan.width, touching)
-            yield Metric("Area Scanned in Contact", "mm^2", area)
-    if scan.frozen is not None:
-        yield Metric("Images Frozen", "count", scan.frozen)
-    for name, section in scan.sections.items():
-        yield from _of_section(name, section)
+            motion = scan.motion
+            at_poses = force.at(motion.times) >= self._settings.contact_force
+            old = len(motion) - np.count_nonzero(motion.times > scan.since)
+            at_poses[:old] = False
+            if old:
+                at_poses[old - 1] = self._is_touching
+            self._is_touching = bool(at_poses[-1])
+            self._sum(area=motion.face_area(scan.width, at_poses))
 
+    def _of_force(self) -> Iterator[Metric]:
+        total = self._sums
+        yield Metric("Time in Contact", "s", total["contact"])
+        if total["contact"] > 0:
+            mean = total["pressed"] / total["contact"]
+            yield Metric("Mean Probe Force in Contact", "N", mean)
+        yield Metric("Peak Probe Force", "N", self._extremes["force"])
+        yield Metric(f"Time above {self._settings.force_limit:g} N", "s", total["above"])
+        yield Metric("Force Impulse", "N s", total["impulse"])
 
-def _of_motion(motion: Motion) -> Iterator[Metric]:
-    speeds, turns = _MM * motion.speeds, _DEGREES * motion.angular_speeds
-    yield Metric("Elapsed Time", "s", motion.elapsed_time())
-    yield Metric("Path Length", "mm", _MM * motion.path_length())
-    yield Metric("Rotation Total", "deg", float(turns @ motion.steps))
-    yield Metric("Translational Actions", "count", motion.translational_actions())
-    yield Metric("Rotational Actions", "count", motion.rotational_actions())
-    yield Metric("Average Velocity", "mm/s", float(speeds.mean()))
-    yield Metric("Peak Velocity", "mm/s", float(speeds.max()))
-    if len(motion) > 2:
-        accelerations = _MM * np.linalg.norm(motion.accelerations, axis=1)
-        yield Metric("Average Acceleration", "mm/s^2", float(accelerations.mean()))
-        yield Metric("Peak Acceleration", "mm/s^2", float(accelerations.max()))
-    if len(motion) > 3:
-        # PerkTutor's table says mm/s^3, which is the unit of jerk and not of this integral's root.
-        yield Metric("Motion Smoothness", "mm/s^2.5", _MM * motion.motion_smoothness())
-        yield Metric("Dimensionless Squared Jerk", "1", motion.dimensionless_jerk())
+    def _add_section(self, scan: Scan, section: Section) -> None:
+        area, rest, angle = scan.new(section.times, section.area, section.at_rest, section.angle)
+        known = np.isfinite(area / rest)
+        angles = angle[np.isfinite(angle)]
+        self._sum(known=known.sum(), rest=rest[known].sum())
+        self._sum(angles=len(angles), angle=angles.sum())
+        for name, values in (("area", area[known]), ("part", (area / rest)[known])):
+            self._extremes[name] = min(self._extremes.get(name, np.inf), values.min(initial=np.inf))
 
-
-def _of_force(force: Force, settings: ScoreSettings) -> Iterator[Metric]:
-    """Means over time, the force linear between two samples, which count as the later one."""
-    steps = np.diff(force.times)
-    during = 0.5 * (force.newtons[1:] + force.newtons[:-1])
-    touching = force.newtons[1:] >= settings.contact_force
-    contact = float(steps[touching].sum())
-    yield Metric("Time in Contact", "s", contact)
-    if contact > 0:
-        mean = float(during[touching] @ steps[touching]) / contact
-        yield Metric("Mean Probe Force in Contact", "N", mean)
-    yield Metric("Peak Probe Force", "N", float(force.newtons.max()))
-    above = float(steps[force.newtons[1:] > settings.force_limit].sum())
-    yield Metric(f"Time above {settings.force_limit:g} N", "s", above)
-    yield Metric("Force Impulse", "N s", float(during @ steps))
-
-
-def _of_section(name: str, section: Section) -> Iterator[Metric]:
-    fraction = section.fraction
-    known = np.isfinite(fraction)
-    if not known.any():
-        return
-    yield Metric("Mean Area at Rest", "mm^2", _MM2 * float(section.at_rest[known].mean()), name)
-    yield Metric("Smallest Area", "mm^2", _MM2 * float(section.area[known].min()), name)
-    yield Metric("Smallest Part of the Area at Rest", "%", 100 * float(fraction[known].min()), name)
-    angles = section.angle[np.isfinite(section.angle)]
-    if len(angles):
-        yield Metric("Mean Angle to the Vessel", "deg", _DEGREES * float(angles.mean()), name)
+    def _of_section(self, name: str) -> Iterator[Metric]:
+        total = self._sums
+        if not total["known"]:
+            return
+        mean = total["rest"] / total["known"]
+        yield Metric("Mean Area at Rest", "mm^2", _MM2 * mean, name)
+        yield Metric("Smallest Area", "mm^2", _MM2 * self._extremes["area"], name)
+        yield Metric("Smallest Part of the Area at Rest", "%", 100 * self._extremes["part"], name)
+        if total["angles"]:
+            mean = total["angle"] / total["angles"]
+            yield Metric("Mean Angle to the Vessel", "deg", _DEGREES * mean, name)

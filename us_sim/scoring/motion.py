@@ -101,37 +101,12 @@ class Motion:
         """Metres, likewise."""
         return float((self.speeds * self.steps)[_ends(where)].sum())
 
-    def translational_actions(self) -> int:
-        """Times that the position moved faster than 50 mm/s."""
-        return _actions(self.times, self.speeds > ACTION_SPEED)
-
-    def rotational_actions(self) -> int:
-        """Times that it turned faster than 50 °/s."""
-        return _actions(self.times, self.angular_speeds > ACTION_TURN)
-
-    def squared_jerk(self) -> float:
-        """Integral of the squared jerk, m²/s⁵, by backward differences; 0 of under four samples."""
+    @cached_property
+    def squared_jerks(self) -> _Array:
+        """(K-3,) m²/s⁵, squared jerk of each step times its length, by backward differences."""
         steps = self.steps[2:]
         jerk = np.diff(self.accelerations, axis=0) / steps[:, None]
-        return float((jerk**2).sum(axis=1) @ steps)
-
-    def motion_smoothness(self) -> float:
-        """PerkTutor's `Motion Smoothness`: the root of the squared jerk's integral, m/s^2.5.
-
-        It is larger the less smooth the motion is, and of a noisy or fast tracker mostly noise:
-        compare recordings of the same tracker.
-        """
-        return float(np.sqrt(self.squared_jerk()))
-
-    def dimensionless_jerk(self) -> float:
-        """Integral of the squared jerk times duration⁵ over path length² (Hogan and Sternad).
-
-        It is 720 for a straight movement of minimum jerk, whatever its length and time; NaN of a
-        probe that stood still.
-        """
-        length = self.path_length()
-        scale = self.elapsed_time() ** 5 / length**2 if length > 0 else np.nan
-        return float(self.squared_jerk() * scale)
+        return np.asarray((jerk**2).sum(axis=1) * steps)
 
     def swept_area(
         self, ends: ArrayLike, where: ArrayLike | None = None, facing: _Array | None = None
@@ -165,13 +140,25 @@ def _ends(where: ArrayLike | None) -> NDArray[np.bool_] | slice:
     return slice(None) if where is None else np.asarray(where, bool)[1:]
 
 
-def _actions(times: _Array, is_fast: NDArray[np.bool_]) -> int:
-    """Number of actions: a change counts once it has lasted longer than the pause."""
-    count, acting, since = 0, False, times[0]
-    for time, fast in zip(times[1:].tolist(), is_fast.tolist(), strict=True):
-        if fast == acting:
-            since = time
-        elif time - since > ACTION_PAUSE:
-            acting, since = fast, time
-            count += fast
-    return count
+class Actions:
+    """Number of actions of a motion that comes in pieces.
+
+    A change counts once it has lasted longer than the pause.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._is_acting = False
+        self._since: float | None = None  # s
+
+    def add(self, times: _Array, is_fast: NDArray[np.bool_], begin: float) -> Actions:
+        """Take the ends (K,) s of steps, the begin of the first, and whether each was fast."""
+        since = begin if self._since is None else self._since
+        for time, fast in zip(times.tolist(), is_fast.tolist(), strict=True):
+            if fast == self._is_acting:
+                since = time
+            elif time - since > ACTION_PAUSE:
+                self._is_acting, since = fast, time
+                self.count += fast
+        self._since = since
+        return self

@@ -20,7 +20,7 @@ from nicegui import ui
 from us_sim.errors import UsSimError
 from us_sim.slicing.settings import OVERLAYS, STRIPS
 from us_sim.viewer.export import LARGEST, exported, frames_of
-from us_sim.viewer.panels.exercise import build_exercise
+from us_sim.viewer.panels.exercise import build_exercise, told_score
 from us_sim.viewer.panels.nodes import build_image, build_plots, build_status, build_tissue
 from us_sim.viewer.panels.session import build_cases, build_session
 from us_sim.viewer.parameters import Kind
@@ -78,8 +78,8 @@ class _Modes:
         board, status = simulator.nodes, simulator.status
         board.watch(NODE)
         ui.context.client.on_delete(lambda: board.unwatch(NODE))
-        status.watch(pages=1)
-        ui.context.client.on_delete(lambda: status.watch(pages=-1))
+        status.watch()
+        ui.context.client.on_delete(status.unwatch)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
@@ -259,9 +259,9 @@ def build_headline(simulator: Simulator) -> None:
         problem.set_text(board.state.problem)
 
     board.watch()
-    nodes.watch(pages=1)
+    nodes.watch()
     ui.context.client.on_delete(board.unwatch)
-    ui.context.client.on_delete(lambda: nodes.watch(pages=-1))
+    ui.context.client.on_delete(nodes.unwatch)
     ui.timer(0.5, refresh)
 
 
@@ -308,7 +308,7 @@ def build_page(simulator: Simulator) -> None:
             _block("strips")
             _block("image-tools")
         with _section("us-drawer", "Panels") as drawer:
-            _panels(simulator)
+            tabs = _panels(simulator)
     drawer.set_visibility(False)
     button.props["title"] = "Panels: image, tissue, cases, session, exercise, status"
     button.props["aria-label"] = "Panels"
@@ -318,7 +318,16 @@ def build_page(simulator: Simulator) -> None:
         drawer.set_visibility(not drawer.visible)
         button.props["aria-expanded"] = str(drawer.visible).lower()
 
+    def show_exercise() -> None:
+        """Open its panel, once, when there is one."""
+        if told_score(simulator).get("steps"):
+            asking.deactivate()
+            tabs.set_value("Exercise")
+            if not drawer.visible:
+                toggle()
+
     button.on_click(toggle)
+    asking = ui.timer(0.5, show_exercise)
 
 
 def _block(name: str) -> None:
@@ -333,7 +342,7 @@ def _section(name: str, label: str) -> ui.element:
     return section
 
 
-def _panels(simulator: Simulator) -> None:
+def _panels(simulator: Simulator) -> ui.tabs:
     with ui.tabs().props("dense no-caps").classes("us-tabs") as tabs:
         for name, icon, title, _ in PANELS:
             ui.tab(name, icon=icon).props["title"] = title
@@ -341,6 +350,7 @@ def _panels(simulator: Simulator) -> None:
         for name, _, _, build in PANELS:
             with ui.tab_panel(name):
                 build(simulator)
+    return tabs
 
 
 ASSETS = Path(__file__).parent / "assets"

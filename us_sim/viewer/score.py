@@ -1,115 +1,84 @@
-"""The score as pages see it: an exercise's steps and the metrics, as `scorer` says them."""
+"""The score as pages see it: streams of what `scorer` says, and what pages ask of it."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+import json
+from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
+from us_sim.nodes.guarded_node import GuardedNode, shown
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.nodes.topics import FROZEN, MARKERS
+from us_sim.viewer.feeds import topic_feed
+from us_sim.viewer.stream import Packet, Posted, Simulator
 
-if TYPE_CHECKING:
-    from us_sim.viewer.stream import Simulator
-
-
-class ToldStep(NamedTuple):
-    """A step of an exercise."""
-
-    what: str
-    is_done: bool
-    seen: str
+SCORE, PICTURE = "score", "score_picture"
+"""Streams: of an exercise's steps and the metrics, and of their picture as PNG."""
+_STATES = {DiagnosticStatus.OK: "done", DiagnosticStatus.ERROR: "missed"}
+_SHAPES = {"target": (-1, 3), "pose": (7,)}  # of the numbers that a step may have
 
 
-@dataclass(frozen=True)
-class ToldScore:
-    """The last message of `scorer`."""
-
-    name: str = ""  # of the exercise, or of the scene; empty before anything was said
-    description: str = ""
-    metrics: Mapping[str, str] = field(default_factory=dict)
-    steps: tuple[ToldStep, ...] = ()
-
-
-class ScoreBoard:
-    """The newest score, and how many pages show it; for any thread.
-
-    Args:
-        on_watch: called when pages begin to show it, or no longer do.
-        clear: has the score begin anew.
-    """
-
-    def __init__(
-        self, on_watch: Callable[[], None] = lambda: None, clear: Callable[[], None] = lambda: None
-    ) -> None:
-        self._on_watch, self.clear = on_watch, clear
-        self._lock = threading.Lock()
-        self._pages = 0
-        self.score = ToldScore()
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether a page shows it."""
-        return self._pages > 0
-
-    def watch(self, pages: int = 1) -> None:
-        """Count so many pages more that show it; fewer where negative."""
-        with self._lock:
-            before = self.is_watched
-            self._pages += pages
-        if before != self.is_watched:
-            self._on_watch()
-
-
-class ScoreListener(ScoreBoard):
-    """A board that hears ``score`` while a page shows it, and marks when an image is frozen.
+def add_score(node: GuardedNode, post: Posted, simulator: Simulator) -> None:
+    """Give pages the score, have them ask `scorer`, and mark when they freeze an image.
 
     Args:
         node: that listens.
         post: has work done in the thread that spins ``node``.
+        simulator: what pages see.
     """
+    marks = node.create_publisher(String, MARKERS, STREAM, qos_overriding_options=overridable())
+    services = {name: node.create_client(Trigger, f"scorer/{name}") for name in ("clear", "draw")}
 
-    def __init__(self, node: GuardedNode, post: Callable[[Callable[[], Any]], Any]) -> None:
-        super().__init__(lambda: post(self._listen), lambda: post(self._begin_anew))
-        self._post = post
-        self._heard = Subscriptions(node, (DiagnosticArray, "score", self._hear, LATCHED, False))
-        self._scorer = node.create_client(Trigger, "scorer/clear")
-        self._marks = node.create_publisher(
-            String, MARKERS, STREAM, qos_overriding_options=overridable()
-        )
+    def ask(what: str) -> None:
+        if services[what].service_is_ready():
+            services[what].call_async(Trigger.Request())
 
-    def take_commands(self, simulator: Simulator) -> None:
-        """Obey pages that say that they have frozen the image."""
-        simulator.commands["frozen"] = self._mark
-
-    def _mark(self, is_frozen: Any, _: int) -> str | None:
+    def mark(is_frozen: Any, _: int) -> str | None:
         if is_frozen is True:
-            self._post(lambda: self._marks.publish(String(data=FROZEN)))
+            post(lambda: marks.publish(String(data=FROZEN)))
         return None
 
-    def _listen(self) -> None:
-        self._heard.keep(self.is_watched)
-        if not self.is_watched:
-            self.score = ToldScore()
+    simulator.commands["frozen"] = mark
+    simulator.ask_scorer = lambda what: post(lambda: ask(what))
+    simulator.add(
+        topic_feed(node, post, DiagnosticArray, "score", score_packet, SCORE, None, LATCHED),
+        topic_feed(node, post, CompressedImage, "score/picture", _picture, PICTURE, None, LATCHED),
+    )
 
-    def _begin_anew(self) -> None:
-        if self._scorer.service_is_ready():
-            self._scorer.call_async(Trigger.Request())
 
-    def _hear(self, message: DiagnosticArray) -> None:
-        first, *steps = message.status or [DiagnosticStatus()]
-        self.score = ToldScore(
-            shown(first.name),
-            shown(first.message),
-            {shown(each.key): shown(each.value) for each in first.values},
-            tuple(
-                ToldStep(shown(s.name), s.level == DiagnosticStatus.OK, shown(s.message))
-                for s in steps
-            ),
-        )
+def score_packet(message: DiagnosticArray, sequence: int) -> Packet:
+    """Name, description, scene, metrics, and steps with their states, without a payload."""
+    first, *steps = message.status or [DiagnosticStatus()]
+    header = {
+        "name": shown(first.name),
+        "description": shown(first.message),
+        "scene": shown(first.hardware_id),
+        "metrics": {shown(each.key): shown(each.value) for each in first.values},
+        "steps": [_step(status) for status in steps],
+    }
+    return Packet(SCORE, sequence, header, b"")
+
+
+def _step(status: DiagnosticStatus) -> dict[str, Any]:
+    step = {"what": shown(status.name), "seen": shown(status.message)}
+    step["state"] = _STATES.get(status.level, "to do")
+    places = {e.key: _numbers(e.value, _SHAPES[e.key]) for e in status.values if e.key in _SHAPES}
+    return step | {key: numbers for key, numbers in places.items() if numbers}
+
+
+def _numbers(text: str, shape: tuple[int, ...]) -> list[Any]:
+    """The finite numbers of a JSON list; none where it is no such list."""
+    try:
+        numbers = np.array(json.loads(text), np.float64).reshape(shape)
+    except (ValueError, TypeError, ArithmeticError, RecursionError):
+        return []
+    return numbers.tolist() if np.isfinite(numbers).all() else []
+
+
+def _picture(message: CompressedImage, sequence: int) -> Packet:
+    return Packet(PICTURE, sequence, {}, bytes(message.data))

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -25,6 +24,7 @@ from sensor_msgs.msg import CompressedImage
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
 from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
 from us_sim.scene.listing import ListedScene
+from us_sim.viewer.status import Watched
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
 
@@ -60,7 +60,7 @@ class SessionState:
         return self.fraction < 1.0
 
 
-class SessionBoard:
+class SessionBoard(Watched):
     """The newest that is known of the session, and who shows it; for any thread.
 
     Args:
@@ -79,32 +79,13 @@ class SessionBoard:
         *,
         is_own: bool = True,
     ) -> None:
-        self._on_watch, self._send_to_control = on_watch, send
+        super().__init__(on_watch)
+        self._send_to_control = send
         self.folder, self._is_own = folder, is_own
-        self._lock = threading.Lock()
-        self._pages = 0
         self.state = SessionState()
         self.scenes: tuple[ListedScene, ...] = ()  # another object whenever it changes
         self.thumbnails: dict[str, bytes] = {}  # JPEG of the image of a scene, by origins
         self.bags: Mapping[str, str] = {}  # files that can be played, by name
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether a page shows it."""
-        return self._pages > 0
-
-    def watch(self, pages: int = 1) -> None:
-        """Count so many pages more that show it; fewer where negative."""
-        with self._lock:
-            before = self.is_watched
-            self._pages += pages
-            changed = before != self.is_watched
-        if changed:
-            self._on_watch()
-
-    def unwatch(self) -> None:
-        """One page shows it no longer."""
-        self.watch(-1)
 
     def ask(self, **values: object) -> Future[str]:
         """Set parameters of ``session_control``; the future holds why not, or nothing."""

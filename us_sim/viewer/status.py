@@ -85,8 +85,8 @@ class NodeStatus:
         return number if math.isfinite(number) else None
 
 
-class StatusBoard:
-    """The newest report of each node, and the histories that are plotted; for any thread.
+class Watched:
+    """Counts the pages that show something; for any thread.
 
     Args:
         on_watch: called when pages begin to show it, or no longer do.
@@ -95,36 +95,50 @@ class StatusBoard:
     def __init__(self, on_watch: Callable[[], None] = lambda: None) -> None:
         self._on_watch = on_watch
         self._lock = threading.Lock()
-        self._nodes: dict[str, NodeStatus] = {}
-        self._histories: dict[tuple[str, str], deque[Point]] = {}
-        self._forces: deque[Point] = deque(maxlen=int(HISTORY_S * FORCES_A_SECOND))
-        self._pages = self._plots = 0
-        self._since = 0.0  # s, monotonic, since when pages show it; nothing is heard before
+        self._pages = 0
 
     @property
     def is_watched(self) -> bool:
-        """Whether a page shows the nodes."""
+        """Whether a page shows it."""
         return self._pages > 0
 
-    @property
-    def is_force_watched(self) -> bool:
-        """Whether a page plots the force."""
-        return self._plots > 0
+    def watch(self) -> None:
+        """One page more shows it."""
+        self._count(1)
 
-    def watch(self, pages: int = 0, plots: int = 0) -> None:
-        """Count so many pages, or plots of the force, more; fewer where negative.
+    def unwatch(self) -> None:
+        """One page shows it no longer."""
+        self._count(-1)
 
-        Nodes do not count as gone for the time in which nobody listened.
-        """
+    def _count(self, pages: int) -> None:
         with self._lock:
-            before = self.is_watched, self.is_force_watched
+            before = self.is_watched
             self._pages += pages
-            if self.is_watched and not before[0]:
-                self._since = time.monotonic()
-            self._plots += plots
-            changed = before != (self.is_watched, self.is_force_watched)
+            changed = before != self.is_watched
         if changed:
             self._on_watch()
+
+
+class StatusBoard(Watched):
+    """The newest report of each node, and the histories that are plotted; for any thread.
+
+    Args:
+        on_watch: called when pages begin to show it, or to plot the force, or no longer do.
+    """
+
+    def __init__(self, on_watch: Callable[[], None] = lambda: None) -> None:
+        super().__init__(on_watch)
+        self.force = Watched(on_watch)  # the pages that plot it
+        self._nodes: dict[str, NodeStatus] = {}
+        self._histories: dict[tuple[str, str], deque[Point]] = {}
+        self._forces: deque[Point] = deque(maxlen=int(HISTORY_S * FORCES_A_SECOND))
+        self._since = 0.0  # s, monotonic, since when pages show it; nothing is heard before
+
+    def watch(self) -> None:
+        """One page more shows it; nodes do not count as gone for the time in which none did."""
+        if not self.is_watched:
+            self._since = time.monotonic()
+        super().watch()
 
     def tell(self, status: NodeStatus, now: float) -> None:
         """Keep a report, at a time of the monotonic clock in s."""
@@ -205,7 +219,7 @@ class StatusListener(StatusBoard):
 
     def _subscribe(self) -> None:
         self._reports.keep(self.is_watched)
-        self._wrenches.keep(self.is_force_watched)
+        self._wrenches.keep(self.force.is_watched)
 
     def _hear(self, message: DiagnosticArray) -> None:
         now = time.monotonic()

@@ -31,7 +31,6 @@ from rclpy.node import Node
 
 from us_sim.slicing.settings import STRIPS
 from us_sim.viewer.parameters import ParameterBoard
-from us_sim.viewer.score import ScoreBoard
 from us_sim.viewer.session import SessionBoard
 from us_sim.viewer.status import StatusBoard
 
@@ -153,7 +152,7 @@ class Simulator:
     nodes: ParameterBoard = field(default_factory=ParameterBoard)
     status: StatusBoard = field(default_factory=StatusBoard)
     session: SessionBoard = field(default_factory=SessionBoard)
-    score: ScoreBoard = field(default_factory=ScoreBoard)
+    ask_scorer: Callable[[str], object] = lambda _: None  # to "clear" or to "draw"
     leaving: list[Callable[[int], object]] = field(default_factory=list)
     """Called with a page's number when it has gone."""
 

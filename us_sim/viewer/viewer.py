@@ -25,7 +25,7 @@ from us_sim.viewer.feeds import (
 from us_sim.viewer.hand import ViewerHand
 from us_sim.viewer.parameters import Parameter, in_words
 from us_sim.viewer.remote_parameters import RemoteParameters
-from us_sim.viewer.score import ScoreListener
+from us_sim.viewer.score import add_score
 from us_sim.viewer.server import WebServer
 from us_sim.viewer.session import CONTROL, ViewerSession
 from us_sim.viewer.status import StatusListener
@@ -54,14 +54,12 @@ class Viewer(GuardedNode):
             is_own=is_loopback(settings.host),
         )
         self._remote = RemoteParameters(self, post, {CONTROL: self._session.ask})
-        score = ScoreListener(self, post)
         self.simulator = Simulator(
             nodes=self._remote,
             status=StatusListener(self, post),
             session=self._session,
-            score=score,
         )
-        score.take_commands(self.simulator)
+        add_score(self, post, self.simulator)
         rest = RestMesh(self)
         self._hand = ViewerHand(self, post, self.simulator, rest)
         self._probe = ProbeFeeds(self, post, settings.rate)

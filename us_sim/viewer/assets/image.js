@@ -82,9 +82,8 @@ function lookAtScene() {
 new MutationObserver(lookAtScene).observe(headline, { attributeFilter: ["data-scene"] });
 lookAtScene();
 
-/** Whether the frame that is seen is of another scene than runs. */
-export function isOfOtherScene() {
-  const of = shownFrame?.header.scene;
+/** Whether the frame that is seen, or what is of a scene, is of another one than runs. */
+export function isOfOtherScene(of = shownFrame?.header.scene) {
   return Boolean(of && scene && of !== scene);
 }
 

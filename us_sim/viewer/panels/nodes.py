@@ -93,12 +93,12 @@ def build_tissue(simulator: Simulator) -> None:
     parts: list[ParameterSections] = []
 
     def begin() -> None:
-        simulator.status.watch(pages=1)
+        simulator.status.watch()
         for part in parts:
             part.watch()
 
     def end() -> None:
-        simulator.status.watch(pages=-1)
+        simulator.status.unwatch()
         for part in parts:
             part.unwatch()
 
@@ -154,7 +154,7 @@ def build_status(simulator: Simulator) -> None:
         now = time.monotonic()
         table.show(board.nodes(now), now)
 
-    with WhileShown(lambda: board.watch(pages=1), lambda: board.watch(pages=-1), STATUS_S, refresh):
+    with WhileShown(board.watch, board.unwatch, STATUS_S, refresh):
         table = StatusTable(partial(_show_parameters, simulator))
 
 
@@ -273,9 +273,14 @@ def build_plots(simulator: Simulator) -> None:
     plots: list[Plot] = []
 
     def begin() -> None:
-        board.watch(pages=1, plots=1)
+        board.watch()
+        board.force.watch()
         for plot in plots:
             plot.begin()
+
+    def end() -> None:
+        board.unwatch()
+        board.force.unwatch()
 
     def refresh() -> None:
         now = time.monotonic()
@@ -287,7 +292,7 @@ def build_plots(simulator: Simulator) -> None:
         points = [point for point in board.forces(since) if point[0] < settled]
         return {"probe": points} if points else {}
 
-    with WhileShown(begin, lambda: board.watch(pages=-1, plots=-1), STATUS_S, refresh):
+    with WhileShown(begin, end, STATUS_S, refresh):
         plots += [
             Plot("rate", "Hz", partial(board.history, "rate_hz")),
             Plot("latency, median", "ms", partial(board.history, "latency_p50_ms")),

@@ -76,6 +76,11 @@ stream.watch("skin");
 export const skin = {
   mesh,
 
+  /** Its points at rest and as they are now; null where the scene has no skin. */
+  get points() {
+    return isOfScene ? points : null;
+  },
+
   /** Show or hide it; while hidden it is not sent either. */
   setVisible(on) {
     isShown = on;

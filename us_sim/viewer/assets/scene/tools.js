@@ -6,6 +6,7 @@ import { probe } from "./probe.js";
 import { skin } from "./skin.js";
 import { stage } from "./stage.js";
 import { structures } from "./structures.js";
+import { targets } from "./targets.js";
 import { tissue } from "./tissue.js";
 import { VIEWS, view } from "./views.js";
 
@@ -84,6 +85,9 @@ const panel = make(
   row("Probe", "Show the transducer", { onToggle: (on) => probe.setVisible("probe", on) }).line,
   row("Force", "Show the tissue's force on the probe, in N", {
     onToggle: (on) => probe.setVisible("force", on),
+  }).line,
+  row("Targets", "Show where the exercise is to be done: next in orange, done in green", {
+    onToggle: (on) => targets.setVisible(on),
   }).line,
   make("div", { className: "us-caption", textContent: "Tissue" }),
   make("div", { className: "us-choice", role: "group" }, ...tissueButtons),
@@ -173,7 +177,10 @@ tissue.show("off");
 setUnder(false);
 cut.set(false);
 
-/** Show or hide "skin", "structures", "tissue", "probe", "image" or "force"; or one structure. */
+/**
+ * Show or hide "skin", "structures", "tissue", "probe", "image", "force" or "targets"; or one
+ * structure.
+ */
 export function setVisible(name, on) {
   if (name === "tissue") return tissue.show(on ? "mesh" : "off");
   const line = panel.querySelector(`[data-layer="${CSS.escape(name)}"] input[type=checkbox]`);

@@ -1,0 +1,159 @@
+"""A scan that is scored while it is done, at a cost that does not grow with it.
+
+Samples that later ones cannot change any more are added to the score once and for all; only those
+of the last seconds are added anew each time, to a copy.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from copy import deepcopy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.geometry.pose import Pose
+from us_sim.scoring.exercise import Attempt, Exercise, Step
+from us_sim.scoring.lumen import LumenMeter, lumens_of, vessels_in
+from us_sim.scoring.metrics import Force, Metric, Scan, Tally
+from us_sim.scoring.motion import Motion
+from us_sim.scoring.settings import ScoreSettings
+from us_sim.slicing.b_mode import BMode
+from us_sim.volume.volume import Volume
+
+_LATE = 2.0
+"""s after its pose, from which on a force or an image that comes is passed over."""
+
+
+class LiveScan:
+    """A scan that grows while it is done, its metrics, and the steps of an exercise.
+
+    Args:
+        volume: whose vessels are measured, where it has labels.
+        scanner: of that volume at rest, with the probe that scans.
+        exercise: that is followed.
+        limits: of the metrics.
+
+    Raises:
+        ScoreError: the volume lacks a vessel that the exercise needs.
+    """
+
+    def __init__(
+        self,
+        volume: Volume,
+        scanner: BMode,
+        exercise: Exercise | None = None,
+        limits: ScoreSettings | None = None,
+    ) -> None:
+        self.lines, self._thrombi = vessels_in(volume)
+        self._lumens = lumens_of(volume.label_names) if self.lines else {}
+        self._scanner, self._exercise, self._limits = scanner, exercise, limits
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._pose_times: list[float] = []
+        self._poses: list[Pose] = []
+        self._force_times: list[float] = []
+        self._newtons: list[float] = []
+        self._meter = LumenMeter(self._lumens, self._scanner, lines=self.lines)
+        self._settled = -np.inf  # s, until when samples are in the tally and the attempt
+        self._tally = Tally(self._limits)
+        self._attempt = self._exercise.begin(self.lines) if self._exercise is not None else None
+
+    def add_pose(self, time: float, pose: Pose) -> None:
+        """Take a pose of the probe at a time (s) after those before; others are passed over."""
+        if self._is_next(self._pose_times, time):
+            self._pose_times.append(time)
+            self._poses.append(pose)
+
+    def add_force(self, time: float, force: NDArray[np.float64]) -> None:
+        """Take the force (3,) N on the probe, likewise."""
+        if self._is_next(self._force_times, time):
+            self._force_times.append(time)
+            self._newtons.append(float(np.linalg.norm(force)))
+
+    def add_labels(self, time: float, pose: Pose, labels: NDArray[np.uint8]) -> None:
+        """Take the labels (rows, columns) of an image, likewise."""
+        if self._lumens and self._is_next(self._meter.times, time):
+            self._meter.add(time, pose, labels)
+
+    def _is_next(self, times: list[float], time: float) -> bool:
+        return time > self._settled and not (times and time <= times[-1])
+
+    def scan(self, since: float = -np.inf, until: float = np.inf) -> Scan | None:
+        """All so far, or a piece; None before there is a motion, or while a force is alone.
+
+        Args:
+            since: s, end of the piece before.
+            until: s, end of this piece.
+        """
+        begin, end = _span(self._pose_times, since, until, 3)
+        if end - begin < 2:
+            return None
+        poses = self._poses[begin:end]
+        motion = Motion(
+            np.array(self._pose_times[begin:end]),
+            np.array([pose.position for pose in poses]),
+            np.array([pose.orientation for pose in poses]),
+        )
+        begin, end = _span(self._force_times, since, until, 1)
+        force = None
+        if end - begin > 1:
+            times = np.array(self._force_times[begin:end])
+            force = Force(times, np.array(self._newtons[begin:end]))
+        elif end > begin and self._force_times[begin] > since and until < np.inf:
+            return None
+        width = self._scanner.probe.width
+        sections = self._meter.sections(*_span(self._meter.times, since, until, 1))
+        return Scan(motion, force, sections, self.lines, self._thrombi, width, since=since)
+
+    def score(self) -> tuple[list[Metric], list[Step]] | None:
+        """Metrics and steps so far; None before there is a motion."""
+        self._settle()
+        scan = self.scan(self._settled)
+        if scan is None:
+            return None
+        tally, attempt = deepcopy((self._tally, self._attempt))
+        _add(tally, attempt, scan)
+        return list(tally.metrics()), attempt.steps() if attempt is not None else []
+
+    def _settle(self) -> None:
+        """Add what later samples cannot change any more."""
+        until = self._end()
+        piece = self.scan(self._settled, until) if until > self._settled else None
+        if piece is not None:
+            _add(self._tally, self._attempt, piece)
+            self._settled = until
+
+    def _end(self) -> float:
+        """The last time (s) after which a piece may begin.
+
+        It is a force's, so that the force at a pose lies between two of one piece; and the image
+        before it says of every vessel whether it is in view.
+        """
+        if not self._pose_times:
+            return self._settled
+        latest = self._pose_times[-1] - _LATE
+        times = self._force_times
+        if not times or times[-1] <= latest:
+            times = self._pose_times
+        images = self._meter.times
+        for k in range(bisect_right(times, latest) - 1, -1, -1):
+            if times[k] <= self._settled:
+                break
+            image = bisect_right(images, times[k]) - 1
+            if image < 0 or self._meter.is_settled(image):
+                return times[k]
+        return self._settled
+
+
+def _span(times: list[float], since: float, until: float, before: int) -> tuple[int, int]:
+    """The samples of a piece, with so many before it: from an index to another."""
+    return max(bisect_right(times, since) - before, 0), bisect_right(times, until)
+
+
+def _add(tally: Tally, attempt: Attempt | None, scan: Scan) -> None:
+    tally.add(scan)
+    if attempt is not None:
+        attempt.add(scan)
