@@ -145,6 +145,13 @@ def test_a_topic_of_no_use_is_refused(session, wanted, said):
         Episode(read_bag(session), Wanted(**wanted))
 
 
+def test_a_rate_that_is_none_is_refused(session, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("us_sim.run.session_lerobot.require_lerobot", lambda: None)
+    command = ["bag", "to-lerobot", str(session), "--out", str(tmp_path / "data"), "--rate", "0"]
+    assert main(command) == 1
+    assert "--rate: 0 is outside 1 to 1000 frames a second" in capsys.readouterr().err
+
+
 def test_a_bag_of_nothing_that_is_known_is_refused(tmp_path):
     file = write(tmp_path / "a.mcap", [("/p", pose(EPOCH), EPOCH)], {"/p": TYPES["/probe/pose"]})
     with pytest.raises(BagError, match="/p is left out: has 1 message of use, and two are needed"):

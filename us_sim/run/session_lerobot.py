@@ -6,7 +6,6 @@ import contextlib
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from us_sim.recording.wrench import WRENCH_STAMPED
 from us_sim.settings.spelling import counted
 
 _SECOND = 1_000_000_000
-_USUAL_RATES = (1, 240)
+_HIGHEST_RATE = 1000  # Hz
 _MOST_FRAMES = 10_000_000
 """Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""
 _PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
@@ -96,7 +95,8 @@ def to_lerobot(
         EpisodeError: as for `LeRobotWriter`.
     """
     require_lerobot()
-    progress(0.0, sessions[0].name)
+    if wanted.rate is not None and not 1 <= wanted.rate <= _HIGHEST_RATE:
+        raise BagError(f"--rate: {wanted.rate} is outside 1 to {_HIGHEST_RATE} frames a second")
     episode = Episode(read_bag(sessions[0]), wanted)
     rate = wanted.rate or episode.usual_rate
     frames = 0
@@ -105,22 +105,12 @@ def to_lerobot(
             if number:
                 episode = Episode(read_bag(session), wanted)
             moments = episode.moments(rate)
-            part = 1 / len(sessions)
-            show = partial(_show, progress, session.name, number * part, part / len(moments))
-            given = map(show, enumerate(episode.frames(moments)))
+            given = episode.frames(moments, progress)
             writer.write_episode(given, episode.names, task, str(session))
+            progress(1.0, "")
             frames += len(moments)
             yield from (f"{session.name}: {sentence}" for sentence in episode.told(moments))
-    progress(1.0, "")
     yield f"{counted(frames, 'frame')} at {rate} Hz in {folder}"
-
-
-def _show(
-    progress: Progress, text: str, begin: float, step: float, numbered: tuple[int, Frame]
-) -> Frame:
-    """The frame, once it is told how far it is."""
-    progress(begin + step * numbered[0], text)
-    return numbered[1]
 
 
 @dataclass
@@ -232,9 +222,9 @@ class Episode:
 
     @property
     def usual_rate(self) -> int:
-        """Frames a second: of the images, or else of what is fastest; at most 240."""
+        """Frames a second: of the images, or else of what is fastest."""
         steps = [np.median(np.diff(each.times)) for each in self._images or self._numbers]
-        return int(np.clip(round(_SECOND / min(steps)), *_USUAL_RATES))
+        return int(np.clip(round(_SECOND / min(steps)), 1, _HIGHEST_RATE))
 
     @property
     def names(self) -> dict[str, Sequence[str]]:
@@ -269,7 +259,7 @@ class Episode:
             )
         return begin + np.arange(count) * _SECOND // rate
 
-    def frames(self, moments: Times) -> Iterator[Frame]:
+    def frames(self, moments: Times, progress: Progress = lambda *_: None) -> Iterator[Frame]:
         """The features of each moment."""
         tables: dict[str, list[NDArray[np.float32]]] = {}
         for each in self._numbers:
@@ -277,6 +267,7 @@ class Episode:
         rows = {feature: np.hstack(parts) for feature, parts in tables.items()}
         images = {f"{IMAGES}{_key(each.name)}": each.at(moments) for each in self._images}
         for k in range(len(moments)):
+            progress(k / len(moments), self._bag.path.name)
             yield {name: next(pixels) for name, pixels in images.items()} | {
                 name: row[k] for name, row in rows.items()
             }
