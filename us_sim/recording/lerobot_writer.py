@@ -9,6 +9,7 @@ import contextlib
 import importlib.util
 import logging
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -105,7 +106,8 @@ class LeRobotWriter:
             given = {n: _rgb(v) if n.startswith(IMAGES) else v for n, v in frame.items()}
             with self._telling():
                 self._dataset.add_frame({**given, "task": task})
-        with self._telling():
+        with self._telling(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of its statistics of booleans
             self._dataset.save_episode()
 
     def _create(self, frame: Frame, names: Mapping[str, Sequence[str]]) -> Any:
