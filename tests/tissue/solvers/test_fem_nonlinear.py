@@ -1,6 +1,7 @@
 """Large deformation against closed forms and another minimiser, and under rough handling."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,10 +19,13 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material, volumetric_split
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Intervention, TissueModel, TissueState
+from us_sim.tissue.solvers import frame_budget, newton
 from us_sim.tissue.solvers.fem import Fem
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear, FemNonlinearSettings
+from us_sim.tissue.solvers.tuning import TUNING
 
 PLATE = RoundedBox(0.5, 0.4, 0.1, 0.01)  # covers the whole block
 FINE = (13, 7, 6)
@@ -431,6 +435,27 @@ def test_a_frame_whose_time_is_up_is_gone_on_with_in_the_next_and_ends_the_same(
     # A step that has begun is made to its end: 12 iterations and a line search.
     assert np.median(times) < 0.05
     np.testing.assert_allclose(deformation.nodes, expected.nodes, atol=2e-5)
+
+
+@pytest.mark.parametrize(("live", "factors"), [(1e-4, False), (None, True)])
+def test_a_held_probe_in_balance_waits_for_no_factor_where_time_is_short(
+    nearly_incompressible, monkeypatch, live, factors
+):
+    wanted = []
+    monkeypatch.setattr(FactoredStiffness, "prepare", lambda *_: wanted.append(True))
+    monkeypatch.setattr(newton, "TUNING", replace(TUNING, iteration_limit=1))
+    monkeypatch.setattr(frame_budget, "TUNING", replace(TUNING, rest_frames=3))
+    solver = made_anew(nearly_incompressible)
+    solver.frame_limit = None
+    for depth in (0.005, 0.01, 0.015):
+        assert solver.deform(at(z=depth)).is_balanced
+    solver.frame_limit = live
+    frames = 0
+    while not solver.is_settled:
+        solver.deform(at(z=0.015))
+        frames += 1
+    assert frames > (4 if live else 0)
+    assert bool(wanted) == factors
 
 
 @pytest.fixture(scope="module")

@@ -262,7 +262,9 @@ class FemNonlinear(TissueSolver):
         elif len(self._surface):
             self._approach(pose)
             start = self._predict(pose)
-        newton.may_factor = newton.is_small or not (moved or budget.is_hurried)
+        # Factoring takes many frames' time, and what is in balance looks the same without it.
+        is_shown = self._was_balanced and budget.time_limit is not None
+        newton.may_factor = newton.is_small or not (moved or budget.is_hurried or is_shown)
         actions: list[str] = []
         tolerance = settings.frame_tolerance if moved else settings.tolerance
         self._settled = self._solve(tolerance, start, actions)

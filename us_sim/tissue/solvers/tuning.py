@@ -100,7 +100,8 @@ class Tuning:
     least_iterations: int = 4
     """Iterations for which a further step is begun; with fewer its fixed cost is most of it."""
     rest_frames: int = 30
-    """Frames of a probe at rest after which one may take longer than its time, to be solved."""
+    """Frames of a probe at rest after which one that is not in balance may take longer than its
+    time, to be solved."""
     rest_factor: int = 2
     """How many times the iterations of other frames one of a probe at rest may take."""
     restart_factor: int = 6
