@@ -97,7 +97,7 @@ def test_joints_of_several_publishers_and_compressed_images_go_together(tmp_path
         messages += [("/joints", arm if k % 2 else joints(at, gripper=k), at)]
         messages += [("/camera", compressed(at, red), at)]
     file = write(tmp_path / "arm.mcap", messages, {"/joints": JOINTS, "/camera": COMPRESSED})
-    moments, frames, names, _ = frames_of(file, 10, action="/joints")
+    moments, frames, names, _ = frames_of(file, 10, action="joints")
     assert names["action"] == ["joints.gripper", "joints.elbow", "joints.wrist"]
     assert (moments[0], moments[-1]) == (EPOCH + SECOND // 10, EPOCH + 9 * SECOND // 10)
     since = np.arange(1, 10)

@@ -134,7 +134,7 @@ def _frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]
     for step in steps:
         told = step["json"]
         late.append(_pixels(step["image.png"]))
-        frame = {f"{IMAGES}ultrasound": late[0]}
+        frame: dict[str, NDArray[Any]] = {f"{IMAGES}ultrasound": late[0]}
         if observed := told["observed"]:
             frame[STATE] = _float32(np.concatenate([observed[name] for name in sorted(observed)]))
         frame["action"] = _float32(told["action"])

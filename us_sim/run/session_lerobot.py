@@ -206,8 +206,13 @@ class Episode:
         self._left_out += [f"the recorder lost {n} of {name}" for name, n in bag.lost().items()]
         self._images: list[Images] = []
         self._numbers: list[Numbers] = []
-        named = [*wanted.topics, *([wanted.action] if wanted.action else ())]
-        for name in dict.fromkeys(named if wanted.topics else [*_known(bag), *named]):
+        self._action = wanted.action and _whole_name(bag, wanted.action)
+        named = [_whole_name(bag, name) for name in wanted.topics]
+        chosen = named or _known(bag)
+        if self._action:
+            named.append(self._action)
+            chosen = [*chosen, self._action]
+        for name in dict.fromkeys(chosen):
             try:
                 self._take(name)
             except (BagError, TrackingError) as error:
@@ -244,7 +249,8 @@ class Episode:
         Raises:
             BagError: they are never there at once, or for absurdly long.
         """
-        spans = {each.name: each.span for each in (*self._images, *self._numbers)}
+        spans = {each.name: each.span for each in self._images}
+        spans |= {each.name: each.span for each in self._numbers}
         begin, end = (max(s[0] for s in spans.values()), min(s[1] for s in spans.values()))
         count = int(end - begin) * rate // _SECOND + 1
         if end <= begin or count > _MOST_FRAMES:
@@ -276,16 +282,16 @@ class Episode:
         """Sentences on what became of its messages, after the frames were taken."""
         yield counted(len(moments), "frame")
         yield from self._left_out
-        for each in (*self._images, *self._numbers):
-            yield each.told(moments)
+        yield from (each.told(moments) for each in self._images)
+        yield from (each.told(moments) for each in self._numbers)
 
     def _feature(self, numbers: Numbers) -> str:
-        return "action" if numbers.name == self._wanted.action else STATE
+        return "action" if numbers.name == self._action else STATE
 
     def _take(self, name: str) -> None:
         bag, topic = self._bag, self._bag.topic(name.partition(":")[0])
         if topic.type_name in _PIXELS:
-            if name == self._wanted.action:
+            if name == self._action:
                 raise BagError("is a topic of images, which are no action")
             stamp = (not self._wanted.by_log_time and stamp_reader(bag, topic)) or (lambda _: None)
             times, kept, count = [-1], [], 0
@@ -341,6 +347,12 @@ class Episode:
     def _require_several(messages: Any) -> None:
         if len(messages) < 2:
             raise BagError(f"has {counted(len(messages), 'message')} of use, and two are needed")
+
+
+def _whole_name(bag: Bag, name: str) -> str:
+    """A topic's or body's name with its leading slash, where the bag has one."""
+    topic, colon, body = name.partition(":")
+    return bag.topic(topic).name + colon + body
 
 
 def _known(bag: Bag) -> list[str]:
