@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -151,6 +152,15 @@ def test_a_missing_lerobot_and_a_rate_that_is_none_are_told_before_work(
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert main(["dataset", scene, "--out", str(tmp_path / "set"), "--format", "lerobot"]) == 1
     assert "pip install 'lerobot[dataset]>=0.4'" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
+    monkeypatch.undo()
+    monkeypatch.setattr("us_sim.recording.lerobot_writer.require_lerobot", lambda: None)
+    given = yaml.safe_load(Path(scene).read_text())
+    given["episode"]["period"] = "20 ms"
+    (tmp_path / "faster.yaml").write_text(yaml.safe_dump(given))
+    scenes = [scene, str(tmp_path / "faster.yaml")]
+    assert main(["dataset", *scenes, "--out", str(tmp_path / "set"), "--format", "lerobot"]) == 1
+    assert "scenes have [30, 50] steps a second" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
     assert frames_a_second(1 / 30) == 30
     with pytest.raises(EpisodeError, match=r"makes 33\.3333 steps a second.*set it to"):

@@ -1,7 +1,7 @@
 """`us-sim view` used by a person in a real browser: the arm is pressed, and everything is tried.
 
 Each step leaves a picture of the page in the folder that US_SIM_SCREENSHOTS names, or in the test's
-own: `docs/viewer_press.png` is one of them.
+own.
 """
 
 import os

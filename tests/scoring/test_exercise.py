@@ -100,7 +100,7 @@ def test_a_force_is_kept_as_long_as_it_does_not_leave_its_range():
     assert done("keep_force", seen) == [True]
     assert done("keep_force", seen, duration=7.5) == [False]
     assert done("keep_force", seen, tolerance=0.4) == [False]
-    assert steps("keep_force", seen)[0].seen == "7.0 s"
+    assert steps("keep_force", seen)[0].seen == "held for 7.0 s"
 
 
 def with_lateral(lateral, along):
@@ -113,7 +113,7 @@ def with_lateral(lateral, along):
 def test_a_vessel_is_centred_as_long_as_it_is_in_the_middle():
     lateral = np.full(15, 0.001)
     lateral[[4, 9]] = 0.02, np.nan  # lost for a moment
-    assert steps("centre", with_lateral(lateral, 0.0))[0].seen == "4.0 s"
+    assert steps("centre", with_lateral(lateral, 0.0))[0].seen == "held for 4.0 s"
     assert done("centre", with_lateral(lateral, 0.0), duration=4.5) == [False]
     assert done("centre", replace(scan(), sections={})) == [False]
 
@@ -122,7 +122,7 @@ def test_a_vessel_is_followed_where_it_is_in_the_middle():
     along = np.linspace(0.005, 0.055, 15)
     assert done("follow", with_lateral(0.0, along)) == [True]
     aside = np.where(along > 0.03, 0.02, 0.0)
-    assert steps("follow", with_lateral(aside, along))[0].seen == "50 %"
+    assert steps("follow", with_lateral(aside, along))[0].seen == "50 % seen"
     assert done("follow", with_lateral(aside, along)) == [False]
     assert done("follow", with_lateral(aside, along), part=0.4) == [True]
 

@@ -58,7 +58,7 @@ def messages(seed, seconds):
         )
         turn = 0.2 * np.sin(time)
         if holds[k]:
-            x, y, turn = -3.5 * MM, 0.0, 0.0
+            x, y, turn = -3.5 * MM, 20 * MM, 0.0
         pose = Pose([x, y, 0.012 * depth[k]], [0, 0, np.sin(turn / 2), np.cos(turn / 2)])
         sent.append((time + random.uniform(0, 0.01), "add_pose", (time, pose)))
         if random.random() < 0.6:

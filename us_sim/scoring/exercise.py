@@ -326,7 +326,7 @@ class _Followed(Attempt):
     def steps(self) -> list[Step]:
         part = float(self._seen.mean()) if len(self._seen) else 0.0
         what = f"{100 * self._task.part:.0f} % of the {self._task.structure} in the image's middle"
-        return [Step(what, part >= self._task.part, f"{100 * part:.0f} %", self._line.points)]
+        return [Step(what, part >= self._task.part, f"{100 * part:.0f} % seen", self._line.points)]
 
 
 @dataclass(frozen=True)
@@ -462,4 +462,4 @@ def _is_centred(section: Section, offset: float) -> NDArray[np.bool_]:
 
 
 def _held(what: str, hold: _Hold, duration: float) -> Step:
-    return Step(what, hold.longest >= duration, f"{hold.longest:.1f} s")
+    return Step(what, hold.longest >= duration, f"held for {hold.longest:.1f} s")

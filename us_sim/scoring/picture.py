@@ -74,6 +74,7 @@ def _draw_force(axes: Axes, scan: Scan) -> None:
     assert scan.force is not None
     axes.plot(scan.force.times, scan.force.newtons, lw=1)
     axes.set_ylabel("force, N")
+    axes.set_ylim(bottom=0)
 
 
 def _draw_areas(axes: Axes, scan: Scan) -> None:
