@@ -36,6 +36,7 @@ NO_WHEELS = (
     "and platform_machine != 'AMD64')"
 )
 GYMNASIUM = "gymnasium>=1.1,<2"
+RAY = ["ray>=2.40", "universal-pathlib>=0.3"]
 ZENOH = ["eclipse-zenoh>=1.10,<2", "xxhash>=3"]
 STANDALONE = [
     f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}",
@@ -106,6 +107,7 @@ setup(
         "environment": [GYMNASIUM],
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "meshes": ["meshio>=5.3"],
+        "ray": [GYMNASIUM, *RAY],
         "rerun": ["rerun-sdk>=0.41"],
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
@@ -131,6 +133,7 @@ setup(
             "pytest-xdist>=3.6",
             "pytetwild>=0.4,<0.5",
             "python-gdcm>=3.0.20",
+            *RAY,
             "ruff>=0.12",
             "scikit-fem>=10",
             "types-PyYAML",

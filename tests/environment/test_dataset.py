@@ -4,6 +4,8 @@ import hashlib
 import io
 import json
 import resource
+import socket
+import sys
 import tarfile
 
 import cv2
@@ -17,6 +19,7 @@ from us_sim.environment.agents import Wander
 from us_sim.environment.environment import ScanEnvironment
 
 STEPS = 6
+WITHOUT_RAY = "the extra `ray` is not installed"
 
 
 @pytest.fixture(scope="module")
@@ -149,3 +152,79 @@ def test_options_that_make_no_sense_are_refused(scene, tmp_path, capsys, options
     assert status
     assert said in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    cluster_utils = pytest.importorskip("ray.cluster_utils", reason=WITHOUT_RAY)
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    yield cluster
+    cluster.shutdown()
+
+
+def test_a_node_that_is_killed_loses_and_doubles_nothing(cluster, scene, tmp_path, monkeypatch):
+    node, shown = cluster.add_node(num_cpus=1), []
+
+    class Killing(dataset.Progress):
+        """Kills a node after the first episode, when both have been given others."""
+
+        def update(self, done, text=""):
+            shown.append(done)
+            if done == 1:
+                cluster.remove_node(node, allow_graceful=False)
+            super().update(done, text)
+
+    options = "--task", "FindVein", "--episodes", "6"
+    with monkeypatch.context() as patched:
+        patched.setattr(dataset, "Progress", Killing)
+        assert make(scene, tmp_path / "ray", *options, "--ray", cluster.address) == 0
+    assert shown == list(range(7))
+    assert not cluster.worker_nodes
+    assert make(scene, tmp_path / "one", *options) == 0
+    assert digests(tmp_path / "ray") == digests(tmp_path / "one")
+
+
+def test_an_address_of_fsspec_holds_the_same_bytes(scene, made, tmp_path):
+    upath = pytest.importorskip("upath", reason=WITHOUT_RAY)
+    there = upath.UPath("memory://dataset/set")
+    for _ in range(2):  # the second time it is all there
+        assert make(scene, there, "--task", "FindVein") == 0
+    held = {file.name: file.read_bytes() for file in there.iterdir()}
+    assert held == {file.name: file.read_bytes() for file in made.iterdir()}
+    assert make(scene, (tmp_path / "set").as_uri(), "--task", "FindVein") == 0
+    assert digests(tmp_path / "set") == digests(made)
+
+
+def nobody_listens():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+@pytest.mark.parametrize(
+    ("package", "out", "options", "said"),
+    [
+        ("ray", "set", ["--ray", nobody_listens()], "no cluster can be used there: [Errno 111]"),
+        ("ray", "set", ["--ray", "here"], "no cluster can be used there: Invalid address"),
+        ("upath", "nowhere://set", [], "--out nowhere://set: cannot be used: Unsupported"),
+        ("upath", "memory://set", ["--workers", "2"], "each process has its own"),
+    ],
+)
+def test_addresses_that_lead_nowhere_are_one_sentence(
+    package, out, options, said, scene, tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip(package, reason=WITHOUT_RAY)
+    monkeypatch.chdir(tmp_path)
+    assert make(scene, out, *options) == 1
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("package", "out", "options"), [("ray", "set", ["--ray", "auto"]), ("upath", "s3://set", [])]
+)
+def test_what_the_extra_brings_is_said(package, out, options, scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert make(scene, out, *options) == 1
+    assert "pip install 'us_sim[ray]'" in capsys.readouterr().err

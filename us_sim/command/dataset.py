@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import EpisodeError
@@ -21,9 +20,16 @@ def dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="file, name, or case:NAME")
     parser.add_argument(
         "--out",
-        type=Path,
+        metavar="DIR",
         required=True,
-        help="folder; one with part of the same data set is gone on with",
+        help="folder, or an address of fsspec as s3://BUCKET/FOLDER (extra ray); one with part of "
+        "the same data set is gone on with",
+    )
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="have the episodes made on this Ray cluster in place of processes; local: on one that "
+        "is started on this machine (extra ray)",
     )
     add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed"))
     parser.set_defaults(command=_dataset)

@@ -1,4 +1,5 @@
-"""Data sets: episodes with images and every truth, the same bytes for any number of processes.
+"""Data sets: episodes with images and every truth, the same bytes for any number of processes, on
+one machine or on many.
 
 Each episode is one shard of a WebDataset (https://github.com/webdataset/webdataset): a tar file
 whose members of one step have one name. Beside it lies a JSON file of what was drawn. What is there
@@ -10,14 +11,19 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import logging
 import multiprocessing
+import os
+import shutil
 import signal
+import socket
 import tarfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -50,7 +56,7 @@ class DatasetSettings(Settings):
 
     error = EpisodeError
 
-    out: Path = setting(description="folder")
+    out: str = setting(description="folder, or an address of fsspec")
     episodes: int = setting(
         Quantity("number", 1, 10_000_000), "number of episodes of each scene", default=10
     )
@@ -61,6 +67,7 @@ class DatasetSettings(Settings):
         default=None,
     )
     workers: int = setting(Quantity("number", 1, 1024), "number of processes", default=1)
+    ray: str | None = setting(description="address of a Ray cluster, or local", default=None)
     seed: int = setting(Quantity("number", 0, 2**31), "decides every byte", default=0)
 
 
@@ -68,11 +75,12 @@ class DatasetSettings(Settings):
 class _Order:
     """An episode to be made."""
 
-    scene: str
+    scene: Scene
+    scene_name: str  # as it was asked for
     task: str | None
     seed: int
     name: str  # of the shard, without its ending
-    out: Path
+    out: Path  # or what stands for one where files are not on this machine
 
     @property
     def shard(self) -> Path:
@@ -98,57 +106,73 @@ def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
         UsSimError: a scene cannot be used, the folder holds another data set, a file cannot be
             written, or a process was ended.
     """
-    out = settings.out
+    out = _folder(settings)
     loaded = [scene_of(scene) for scene in scenes]
     head = _head(scenes, loaded, settings)
     _require_same(out, head)
-    orders = list(_orders(scenes, loaded, settings))
+    orders = list(_orders(scenes, loaded, settings, out))
     found = {order.name: order.done() for order in orders}
     left = [order for order in orders if found[order.name] is None]
     # In this process first, where kernels are compiled and a volume is made with progress.
-    for scene in dict.fromkeys(order.scene for order in left):
-        _environment(scene, settings.task)
+    for order in {order.scene_name: order for order in left}.values():
+        _environment(order)
     with Progress("making", len(orders), "episodes") as bar:
         bar.update(len(orders) - len(left))
-        for order, facts in _made(left, settings.workers):
+        for order, facts in _made(left, settings):
             found[order.name] = facts
             bar.update(sum(each is not None for each in found.values()))
     made = {name: facts for name, facts in found.items() if facts is not None}
     _write(out / "manifest.json", _json({**head, "episodes": made}))
+    if isinstance(out, Path):
+        for begun in out.glob(".*.partial-*"):  # by processes that were killed
+            shutil.rmtree(begun, ignore_errors=True)
     images = sum(int(facts.get("images", 0)) for facts in made.values())
     failed = {name: facts["error"] for name, facts in made.items() if "error" in facts}
     _write(out / "README.md", _card(head, images, len(made) - len(failed)))
-    print(f"{counted(images, 'image')} in {counted(len(made) - len(failed), 'episode')} in {out}")
+    print(
+        f"{counted(images, 'image')} in {counted(len(made) - len(failed), 'episode')} in "
+        f"{settings.out}"
+    )
     for name, error in failed.items():
         print(f"{name} failed: {error}")
     return int(bool(failed))
 
 
 def _orders(
-    names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings
+    names: Sequence[str], scenes: Sequence[Scene], settings: DatasetSettings, out: Path
 ) -> Iterator[_Order]:
     for k, (name, scene) in enumerate(zip(names, scenes, strict=True)):
         for n in range(settings.episodes):
             words = np.random.SeedSequence([settings.seed, k, n]).generate_state(1)
             shard = f"{k:02d}-{scene.name.replace('/', '_')}-{n:06d}"
-            yield _Order(name, settings.task, int(words[0]), shard, settings.out)
+            yield _Order(scene, name, settings.task, int(words[0]), shard, out)
 
 
-def _made(orders: Sequence[_Order], workers: int) -> Iterator[tuple[_Order, dict[str, Any]]]:
+_Submit = Callable[[_Order], "Future[dict[str, Any]]"]
+
+
+def _made(
+    orders: Sequence[_Order], settings: DatasetSettings
+) -> Iterator[tuple[_Order, dict[str, Any]]]:
     """Each episode with its facts, as they are finished."""
-    if workers == 1 or len(orders) <= 1:
+    workers = min(settings.workers, len(orders))
+    if len(orders) <= 1 or (workers == 1 and settings.ray is None):
         yield from ((order, _episode(order)) for order in orders)
         return
+    with _ray(settings.ray) if settings.ray else _processes(workers) as submit:
+        waiting = {submit(order): order for order in orders}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+
+
+@contextlib.contextmanager
+def _processes(workers: int) -> Iterator[_Submit]:
     context = multiprocessing.get_context("spawn")  # numba and threads are here already
     # Ctrl-C is for this process, which lets the others finish their episodes.
     ignore = signal.SIGINT, signal.SIG_IGN
-    with ProcessPoolExecutor(min(workers, len(orders)), context, signal.signal, ignore) as pool:
-        waiting: dict[Future[dict[str, Any]], _Order] = {
-            pool.submit(_episode, order): order for order in orders
-        }
+    with ProcessPoolExecutor(workers, context, signal.signal, ignore) as pool:
         try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
+            yield lambda order: pool.submit(_episode, order)
         except BrokenProcessPool as error:
             raise EpisodeError(
                 "a process that makes episodes was ended, as for want of memory: give the same "
@@ -158,15 +182,53 @@ def _made(orders: Sequence[_Order], workers: int) -> Iterator[tuple[_Order, dict
             pool.shutdown(cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _ray(address: str) -> Iterator[_Submit]:
+    """A Ray cluster, which makes an episode anew where its worker or node is lost.
+
+    Raises:
+        EpisodeError: Ray is not installed, there is no such cluster, or it has lost an episode
+            several times.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise EpisodeError("--ray needs the package ray: pip install 'us_sim[ray]'") from error
+    # A cluster that is started here would report its use to Ray's makers.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        if ":" in address:  # where nobody listens, Ray would try for minutes
+            host, _, port = address.removeprefix("ray://").rpartition(":")
+            socket.create_connection((host, int(port)), timeout=5.0).close()
+        ray.init(address, log_to_driver=False, logging_level=logging.CRITICAL)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise EpisodeError(
+            f"--ray {address}: no cluster can be used there: {error}; `ray start --head` starts "
+            f"one, and --ray local one for this command alone"
+        ) from error
+    try:
+        make = ray.remote(_episode)
+        yield lambda order: make.remote(order).future()
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error
+    except ray.exceptions.RayError as error:
+        raise EpisodeError(
+            f"--ray {address}: {error}; give the same command again, the episodes made so far are "
+            f"kept"
+        ) from error
+    finally:
+        ray.shutdown()
+
+
 _environments: dict[tuple[str, str | None], ScanEnvironment] = {}
 
 
-def _environment(scene: str, task: str | None) -> ScanEnvironment:
-    """The environment of this process for a scene and a task."""
-    key = scene, task
+def _environment(order: _Order) -> ScanEnvironment:
+    """The environment of this process for an order's scene and task."""
+    key = order.scene_name, order.task
     if key not in _environments:
         cv2.setNumThreads(1)
-        made = ScanEnvironment(task or _WITHOUT_TASK, scene)
+        made = ScanEnvironment(order.task or _WITHOUT_TASK, order.scene)
         _environments.clear()  # one at a time: its volume and its tissue are large
         _environments[key] = made
     return _environments[key]
@@ -180,7 +242,7 @@ def _episode(order: _Order) -> dict[str, Any]:
     """
     facts: dict[str, Any] = {"seed": order.seed}
     try:
-        with partial_file(order.shard, error_type=_FullError) as path:
+        with _whole_file(order.shard, _FullError) as path:
             facts |= _record(order, path)
     except _FullError as error:
         raise EpisodeError(
@@ -198,7 +260,7 @@ class _FullError(UsSimError):
 
 
 def _record(order: _Order, path: Path) -> dict[str, Any]:
-    environment = _environment(order.scene, order.task)
+    environment = _environment(order)
     observation, info = environment.reset(seed=order.seed)
     draw, images, is_success = info["draw"], 0, False
     agent: Any = Wander(order.seed)
@@ -222,7 +284,7 @@ def _record(order: _Order, path: Path) -> dict[str, Any]:
             images += 1
             if done or truncated:
                 break
-    facts = {"scene": order.scene, "images": images, "draw": draw, "labels": labels}
+    facts = {"scene": order.scene_name, "images": images, "draw": draw, "labels": labels}
     return facts | ({"is_success": is_success} if order.task else {})
 
 
@@ -296,10 +358,13 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
             _write(manifest, _json({**head, "episodes": {}}))
             return
         there = json.loads(manifest.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise EpisodeError(f"--out {out}: cannot be used: {error.strerror}") from error
     except ValueError:
         there = {}
+    except UsSimError:
+        raise
+    except Exception as error:  # each kind of address has its own
+        problem = getattr(error, "strerror", None) or error
+        raise EpisodeError(f"--out {out}: cannot be used: {problem}") from error
     other = [key for key in head if not isinstance(there, dict) or there.get(key) != head[key]]
     if other:
         raise EpisodeError(
@@ -326,6 +391,46 @@ def _json(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
 
 
+def _folder(settings: DatasetSettings) -> Path:
+    """The folder of a data set, or what stands for it at an address.
+
+    Raises:
+        EpisodeError: the address cannot be used.
+    """
+    address = settings.out.removeprefix("file://")
+    if "://" not in address:
+        return Path(address).absolute()  # nodes of a cluster work in other folders
+    try:
+        from upath import UPath
+
+        folder: Any = UPath(address)
+        _ = folder.fs  # asks for the packages of its kind
+    except ModuleNotFoundError as error:
+        raise EpisodeError(
+            f"--out {address}: needs the package universal_pathlib: pip install 'us_sim[ray]'"
+        ) from error
+    except (ImportError, ValueError) as error:
+        raise EpisodeError(f"--out {address}: cannot be used: {error}") from error
+    if folder.protocol == "memory" and (settings.ray or settings.workers > 1):
+        raise EpisodeError(f"--out {address}: each process has its own; give another address")
+    return folder
+
+
+@contextlib.contextmanager
+def _whole_file(path: Any, error_type: type[UsSimError] = EpisodeError) -> Iterator[Path]:
+    """A file of this machine to write, which is at ``path`` at the end, whole or not at all."""
+    is_here = isinstance(path, Path)
+    with contextlib.ExitStack() as stack:
+        here = path if is_here else Path(stack.enter_context(TemporaryDirectory()), path.name)
+        with partial_file(here, error_type=error_type) as partial:
+            yield partial
+        if not is_here:
+            try:
+                path.fs.put_file(str(here), path.path)
+            except Exception as error:  # each kind of address has its own
+                raise error_type(f"{path}: cannot be written: {error}") from error
+
+
 def _write(path: Path, content: bytes) -> None:
-    with partial_file(path, error_type=EpisodeError) as partial:
+    with _whole_file(path) as partial:
         partial.write_bytes(content)

@@ -42,12 +42,15 @@ Observation = dict[str, NDArray[Any]]
 
 
 def scene_of(
-    scene: str | None = None, case: str | None = None, settings: Mapping[str, Any] | None = None
+    scene: str | Scene | None = None,
+    case: str | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Scene:
     """The scene of that name or file, or of a case, with keys of its own changed.
 
     Args:
-        scene: name or file; `DEFAULT_SCENE` where neither scene nor case is given.
+        scene: name or file, or one that was read; `DEFAULT_SCENE` where neither scene nor case is
+            given.
         case: name or folder.
         settings: keys of a scene, as its YAML has them.
 
@@ -57,6 +60,8 @@ def scene_of(
     """
     if scene is not None and case is not None:
         raise EpisodeError(f"scene {scene} and case {case} are both given: name one of them")
+    if isinstance(scene, Scene):
+        return scene
     name = f"{CASE_PREFIX}{case}" if case is not None else scene or DEFAULT_SCENE
     document, folders, origin = scene_document(name)
     if settings:
@@ -87,7 +92,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
     def __init__(
         self,
         task: str = "FindVein",
-        scene: str | None = None,
+        scene: str | Scene | None = None,
         case: str | None = None,
         settings: Mapping[str, Any] | None = None,
         render_mode: str | None = None,

@@ -10,8 +10,8 @@ which couples neighbours of neighbours.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from us_sim.tissue.elasticity.materials import TissueMaterials, volumetric_split
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
+@lru_cache(maxsize=1)  # a solver asks for those of its mesh several times
 def shape_gradients(mesh: TetrahedralMesh) -> NDArray[np.float64]:
     """(M, 4, 3) 1/m, gradients of the four linear shape functions of each tetrahedron."""
     corners = mesh.nodes[mesh.tetrahedra]
@@ -123,7 +124,7 @@ def nodal_shear_stiffness(mesh: TetrahedralMesh, materials: TissueMaterials) -> 
 class AveragedPressure:
     """The matrices of the two equations; P nodes have a pressure."""
 
-    element: bsr_array  # (3N, 3N) N/m, K, of shear and the tetrahedra's own bulk stiffness
+    element: bsr_array | csr_array  # (3N, 3N) N/m, K, of shear and the tetrahedra's own bulk
     coupling: csr_array  # (P, 3N) N/m2 m2, B, change of volume around each node times its stiffness
     capacity: NDArray[np.float64]  # (P,) N m, C, volume around each node times its stiffness
     pressure_nodes: NDArray[np.int32]  # (P,)
@@ -140,6 +141,13 @@ class AveragedPressure:
         pressure = (self.coupling @ moved) / self.capacity[:, None]
         held = self.element @ moved + self.coupling.T @ pressure
         return held.reshape(displacement.shape)
+
+    def of(self, nodes: NDArray[np.integer]) -> AveragedPressure:
+        """The equations of some nodes (K,), where the others stay."""
+        kept = (3 * nodes[:, None] + np.arange(3)).ravel()
+        # Rows of numbers are faster than blocks for many displacements at once.
+        element, coupling = self.element.tocsr()[kept][:, kept], self.coupling[:, kept]
+        return replace(self, element=element, coupling=coupling)
 
 
 def averaged_pressure(mesh: TetrahedralMesh, materials: TissueMaterials) -> AveragedPressure:

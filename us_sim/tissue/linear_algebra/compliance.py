@@ -134,7 +134,7 @@ class SurfaceCompliance:
     # (3S, 3S), products of the unbalanced forces that rounding leaves in the fields of two unit
     # forces; nothing where they are compressed
     gram: NDArray[np.float32]
-    compression: float  # unbalanced force in a compressed field, over the force
+    compression: float  # unbalanced force in a compressed field, over the force; NaN: not measured
 
     def __post_init__(self) -> None:
         # Read-only as from the cache, for which numba compiles kernels of their own; and those that
@@ -181,7 +181,10 @@ class SurfaceCompliance:
 
 
 def surface_compliance(
-    model: TissueModel, progress: Callable[[float, str], None] | None = None
+    model: TissueModel,
+    progress: Callable[[float, str], None] | None = None,
+    *,
+    has_error: bool = True,
 ) -> SurfaceCompliance:
     """Solve for a unit force along each axis at each node that the probe can touch.
 
@@ -190,6 +193,7 @@ def surface_compliance(
 
     Args:
         progress: called with the fraction done and a label, if it takes a second or more.
+        has_error: whether `SurfaceCompliance.unbalanced` is asked for, a fifth of the work.
 
     Raises:
         SolverError: the tissue is not held, or its moduli are too different.
@@ -197,7 +201,7 @@ def surface_compliance(
     require_held(model.mesh, model.fixed)
     touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
     if 9 * touched * free < _KEPT:
-        return _compute(model, None)
+        return _compute(model, None, has_error)
 
     def waiting() -> None:
         if progress is not None:
@@ -207,7 +211,9 @@ def surface_compliance(
 
 
 def _compute(
-    model: TissueModel, progress: Callable[[float, str], None] | None
+    model: TissueModel,
+    progress: Callable[[float, str], None] | None,
+    has_error: bool = True,
 ) -> SurfaceCompliance:
     def show(fraction: float) -> None:
         if progress is not None:
@@ -252,6 +258,8 @@ def _compute(
         matrix /= 2
         none = np.zeros((0, 0), np.float32)
         made = SurfaceCompliance(nodes, matrix, found, len(points), none, 0.0)
+        if not has_error:
+            return replace(made, compression=math.nan)
         if isinstance(found, DenseFields):
             return replace(made, gram=_gram(made, found, system, model.fixed))
     return replace(made, compression=_compression(made, points[nodes], system, model.fixed))
@@ -268,17 +276,17 @@ def _gram(
     made: SurfaceCompliance, found: DenseFields, system: AveragedPressure, fixed: NDArray
 ) -> NDArray[np.float32]:
     """(3S, 3S), products of the unbalanced forces in the fields of two unit forces."""
-    size = len(made.matrix)
-    dof = (3 * made.nodes[:, None] + np.arange(3)).ravel()
-    left = np.empty((size, 3 * made.count), np.float32)
+    size, free = len(made.matrix), np.flatnonzero(~fixed)
+    system, place = system.of(free), np.cumsum(~fixed) - 1
+    loaded = (3 * place[made.nodes][:, None] + np.arange(3)).ravel()
+    left = np.empty((size, 3 * len(free)), np.float32)
     for first in range(0, size, 3 * _CHUNK):
         part = np.arange(first, min(first + 3 * _CHUNK, size))
-        moved = np.zeros((made.count, 3, len(part)))
-        moved[found.nodes] = found.fields[part].transpose(2, 1, 0)
-        moved[made.nodes] = made.matrix[:, part].reshape(-1, 3, len(part))
+        moved = np.empty((len(free), 3, len(part)))
+        moved[place[found.nodes]] = found.fields[part].transpose(2, 1, 0)
+        moved[place[made.nodes]] = made.matrix[:, part].reshape(-1, 3, len(part))
         balance = system.forces(moved).reshape(-1, len(part))
-        balance[dof[part], np.arange(len(part))] -= 1.0
-        balance.reshape(-1, 3, len(part))[fixed] = 0.0
+        balance[loaded[part], np.arange(len(part))] -= 1.0
         left[part] = balance.T
     return left @ left.T
 

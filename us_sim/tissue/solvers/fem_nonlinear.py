@@ -162,7 +162,7 @@ class FemNonlinear(TissueSolver):
         self._budget = FrameBudget()
         self._recovery = Recovery(self._newton.displacement)
         if len(self._surface):
-            self._compliance = surface_compliance(model, progress)
+            self._compliance = surface_compliance(model, progress, has_error=False)
         self._restore(self.state)
 
     @property
