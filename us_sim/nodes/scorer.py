@@ -59,6 +59,7 @@ class Scorer(SceneNode):
         self._picture = self.create_publisher(
             CompressedImage, "score/picture", LATCHED, qos_overriding_options=overridable()
         )
+        self._picture.publish(CompressedImage())  # what a page has may be of a node before
         self.listen(PoseStamped, "probe/pose", self._take_pose, EVERY)
         self.listen(WrenchStamped, "probe/wrench", self._take_wrench, EVERY)
         if self._live.lines:

@@ -153,7 +153,7 @@ score: diagnostic_msgs/DiagnosticArray [latched]
     (`pose`) where it is to be done as JSON lists
 score/picture: sensor_msgs/CompressedImage [latched] [on_demand]
     scorer -> viewer | PNG of the way over the skin, force and areas so far, when `scorer/draw` asks
-    for it and once the last step is done; empty after `scorer/clear`
+    for it and once the last step is done; empty at first, and after `scorer/clear`
 session/marker: std_msgs/String
     viewer | a text that marks a moment of the recording; of a page that freezes its image `frozen`
 session/scenes: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
