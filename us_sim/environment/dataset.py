@@ -125,16 +125,17 @@ def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
     # In this process first, where kernels are compiled and a volume is made with progress.
     for order in {order.scene_name: order for order in left}.values():
         _environment(order)
-    with Progress("making", len(orders), "episodes") as bar:
-        bar.update(len(orders) - len(left))
-        for order, facts in _made(left, settings):
-            found[order.name] = facts
-            bar.update(sum(each is not None for each in found.values()))
+    try:
+        with Progress("making", len(orders), "episodes") as bar:
+            bar.update(len(orders) - len(left))
+            for order, facts in _made(left, settings):
+                found[order.name] = facts
+                bar.update(sum(each is not None for each in found.values()))
+    finally:
+        for begun in out.glob(".*.partial-*") if isinstance(out, Path) else ():
+            shutil.rmtree(begun, ignore_errors=True)  # by processes that were killed
     made = {name: facts for name, facts in found.items() if facts is not None}
     _write(out / "manifest.json", _json({**head, "episodes": made}))
-    if isinstance(out, Path):
-        for begun in out.glob(".*.partial-*"):  # by processes that were killed
-            shutil.rmtree(begun, ignore_errors=True)
     images = sum(int(facts.get("images", 0)) for facts in made.values())
     failed = {name: facts["error"] for name, facts in made.items() if "error" in facts}
     _write(out / "README.md", _card(head, images, len(made) - len(failed)))
@@ -393,7 +394,7 @@ def _require_same(out: Path, head: Mapping[str, Any]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         if not manifest.exists():
-            if any(out.iterdir()):
+            if out.exists() and any(out.iterdir()):  # a store of objects has no empty folders
                 raise EpisodeError(f"--out {out}: is not empty; choose another folder")
             _write(manifest, _json({**head, "episodes": {}}))
             return
