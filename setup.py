@@ -107,6 +107,7 @@ setup(
         ],
         "environment": [GYMNASIUM],
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
+        "lerobot": ["lerobot[dataset]>=0.4"],
         "meshes": ["meshio>=5.3"],
         "ray": [GYMNASIUM, *RAY],
         "rerun": ["rerun-sdk>=0.41"],

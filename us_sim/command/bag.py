@@ -61,6 +61,31 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE", help="file to write (default: SESSION.rrd beside it)"
     )
     rerun.set_defaults(command=_to_rerun)
+    lerobot = bag_commands.add_parser(
+        "to-lerobot", help="sessions as the episodes of a LeRobot data set, resampled to one rate"
+    )
+    lerobot.add_argument("files", type=Path, nargs="+", metavar="SESSION")
+    lerobot.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to make")
+    lerobot.add_argument(
+        "--rate", type=int, metavar="HZ", help="frames a second (default: that of the images)"
+    )
+    lerobot.add_argument(
+        "--topics",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="topics, or bodies such as /tf:probe (default: all images, poses, wrenches, twists "
+        "and joint states)",
+    )
+    lerobot.add_argument("--action", metavar="NAME", help="topic or body that is the action")
+    lerobot.add_argument(
+        "--task", default="Scan the patient.", metavar="TEXT", help="in words: %(default)s"
+    )
+    lerobot.add_argument(
+        "--by-log-time", action="store_true", help="go by when messages were recorded, not stamped"
+    )
+    lerobot.add_argument("--video", action="store_true", help="images as MP4, not as PNG")
+    lerobot.set_defaults(command=_to_lerobot)
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -122,9 +147,9 @@ def _extract(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_all(files: Iterable[Path]) -> None:
-    for file in files:
-        print(file)
+def _print_all(lines: Iterable[object]) -> None:
+    for line in lines:
+        print(line)
 
 
 def _repair(args: argparse.Namespace) -> int:
@@ -148,4 +173,14 @@ def _to_rerun(args: argparse.Namespace) -> int:
     for sentence in to_rerun(session, file, late_progress(f"bag to-rerun {session.name}")):
         print(sentence)
     print(file)
+    return 0
+
+
+def _to_lerobot(args: argparse.Namespace) -> int:
+    from us_sim.progress import late_progress
+    from us_sim.run.session_lerobot import Wanted, to_lerobot
+
+    wanted = Wanted(args.topics, args.action, args.rate, args.by_log_time)
+    show = late_progress("bag to-lerobot")
+    _print_all(to_lerobot(args.files, args.out, wanted, args.task, show, is_video=args.video))
     return 0

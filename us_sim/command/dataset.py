@@ -31,7 +31,7 @@ def dataset_options(parser: argparse.ArgumentParser) -> None:
         help="have the episodes made on this Ray cluster in place of processes; local: on one that "
         "is started on this machine (extra ray)",
     )
-    add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed"))
+    add_setting_options(parser, DatasetSettings, ("episodes", "task", "workers", "seed", "format"))
     parser.set_defaults(command=_dataset)
 
 

@@ -48,6 +48,8 @@ _COMPUTING = ("python", "us_sim_code", "numpy", "scipy", "numba", "opencv-python
 _CARD = Path(__file__).with_name("data_card.md")
 _WITHOUT_TASK = "HoldContact"
 """The task whose environment moves the probe where none is asked for; it judges nothing then."""
+_FORMATS = {"webdataset": None, "lerobot": False, "lerobot-video": True}
+"""Whether images are a video, where the format is LeRobot's."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,12 @@ class DatasetSettings(Settings):
     workers: int = setting(Quantity("number", 1, 1024), "number of processes", default=1)
     ray: str | None = setting(description="address of a Ray cluster, or local", default=None)
     seed: int = setting(Quantity("number", 0, 2**31), "decides every byte", default=0)
+    format: str = setting(
+        description="of the data set; the last two are written from the first, into its folder, "
+        "with images as PNG or as MP4",
+        choices=tuple(_FORMATS),
+        default="webdataset",
+    )
 
 
 @dataclass(frozen=True)
@@ -108,6 +116,7 @@ def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
     """
     out = _folder(settings)
     loaded = [scene_of(scene) for scene in scenes]
+    _require_format(loaded, out, settings)
     head = _head(scenes, loaded, settings)
     _require_same(out, head)
     orders = list(_orders(scenes, loaded, settings, out))
@@ -135,7 +144,37 @@ def make_dataset(scenes: Sequence[str], settings: DatasetSettings) -> int:
     )
     for name, error in failed.items():
         print(f"{name} failed: {error}")
+    is_video, whole = _FORMATS[settings.format], {n: made[n] for n in made.keys() - failed}
+    if is_video is not None and whole:
+        from us_sim.environment.lerobot_episodes import write_lerobot
+
+        folder, period = out / settings.format, loaded[0].episode.period
+        write_lerobot(folder, out, whole, settings.task, period, is_video=is_video)
+        print(folder)
     return int(bool(failed))
+
+
+def _require_format(scenes: Sequence[Scene], out: Path, settings: DatasetSettings) -> None:
+    """Refuse before anything is made what the format cannot be written from or to.
+
+    Raises:
+        EpisodeError: the format is LeRobot's, and it is not installed, the folder is not on this
+            machine, or the scenes have several periods, or one that it cannot have.
+    """
+    if _FORMATS[settings.format] is None:
+        return
+    from us_sim.environment.lerobot_episodes import frames_a_second
+    from us_sim.recording.lerobot_writer import require_lerobot
+
+    require_lerobot()
+    if not isinstance(out, Path):
+        raise EpisodeError(f"--out {settings.out}: {settings.format} needs a folder, no address")
+    rates = {frames_a_second(scene.episode.period) for scene in scenes}
+    if len(rates) > 1:
+        raise EpisodeError(
+            f"scenes have {sorted(rates)} steps a second, and a LeRobot data set one rate: make a "
+            f"data set of each"
+        )
 
 
 def _orders(

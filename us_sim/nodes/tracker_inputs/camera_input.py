@@ -20,27 +20,27 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.source import CameraSource, practice
 from us_sim.tracking.settings import CameraSettings
 
-# Bytes a pixel, and OpenCV's conversion to grey where one is needed. A Bayer pattern is named by
+# Bytes a pixel, and OpenCV's name of the colours where it is no grey. A Bayer pattern is named by
 # ROS after its first row's first two pixels, and by OpenCV after its second row's second two.
-_ENCODINGS: dict[str, tuple[int, int | None]] = {
-    "mono8": (1, None),
-    "8UC1": (1, None),
-    "mono16": (2, None),
-    "16UC1": (2, None),
-    "bgr8": (3, cv2.COLOR_BGR2GRAY),
-    "8UC3": (3, cv2.COLOR_BGR2GRAY),
-    "rgb8": (3, cv2.COLOR_RGB2GRAY),
-    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
-    "8UC4": (4, cv2.COLOR_BGRA2GRAY),
-    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUY2),
-    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUY2),
-    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
-    "bayer_rggb8": (1, cv2.COLOR_BayerBG2GRAY),
-    "bayer_bggr8": (1, cv2.COLOR_BayerRG2GRAY),
-    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2GRAY),
-    "bayer_grbg8": (1, cv2.COLOR_BayerGB2GRAY),
+_ENCODINGS: dict[str, tuple[int, str]] = {
+    "mono8": (1, ""),
+    "8UC1": (1, ""),
+    "mono16": (2, ""),
+    "16UC1": (2, ""),
+    "bgr8": (3, "BGR2{}"),
+    "8UC3": (3, "BGR2{}"),
+    "rgb8": (3, "RGB2{}"),
+    "bgra8": (4, "BGRA2{}"),
+    "8UC4": (4, "BGRA2{}"),
+    "rgba8": (4, "RGBA2{}"),
+    "yuv422_yuy2": (2, "YUV2{}_YUY2"),
+    "yuyv": (2, "YUV2{}_YUY2"),
+    "yuv422": (2, "YUV2{}_UYVY"),
+    "uyvy": (2, "YUV2{}_UYVY"),
+    "bayer_rggb8": (1, "BayerBG2{}"),
+    "bayer_bggr8": (1, "BayerRG2{}"),
+    "bayer_gbrg8": (1, "BayerGR2{}"),
+    "bayer_grbg8": (1, "BayerGB2{}"),
 }
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
@@ -72,7 +72,16 @@ def camera_from(message: CameraInfo) -> CameraModel:
 
 
 def grey_from(message: Image) -> NDArray[np.uint8]:
-    """(rows, columns) grey pixels.
+    """(rows, columns) grey pixels, as `decoded`."""
+    return decoded(message, "GRAY")
+
+
+def decoded(message: Image, colours: str) -> NDArray[np.uint8]:
+    """The pixels of an image: (rows, columns) of a grey one, else as ``colours`` says.
+
+    Args:
+        message: the image.
+        colours: ``GRAY`` for (rows, columns), ``RGB`` for (rows, columns, 3).
 
     Raises:
         TrackingError: the encoding is not known, or there are fewer bytes than the size says.
@@ -82,6 +91,7 @@ def grey_from(message: Image) -> NDArray[np.uint8]:
             f"the image's encoding is '{message.encoding}'; known are {', '.join(_ENCODINGS)}"
         )
     size, conversion = _ENCODINGS[message.encoding]
+    code = getattr(cv2, f"COLOR_{conversion.format(colours)}", None)  # none of RGB to itself
     try:
         rows = rows_from(message, size)
     except VolumeError as error:
@@ -89,20 +99,27 @@ def grey_from(message: Image) -> NDArray[np.uint8]:
     if message.encoding in ("mono16", "16UC1"):
         high = 0 if message.is_bigendian else 1  # the more significant byte is enough
         return np.ascontiguousarray(rows[:, high::2])
-    if conversion is None:
+    if not conversion:
         return np.ascontiguousarray(rows)
     pixels = rows if size == 1 else rows.reshape(message.height, message.width, size)
+    if code is None:
+        return np.ascontiguousarray(pixels)
     try:
-        grey = cv2.cvtColor(np.ascontiguousarray(pixels), conversion)
+        converted = cv2.cvtColor(np.ascontiguousarray(pixels), code)
     except cv2.error as error:  # an odd width of pairs, say, or a Bayer pattern of one pixel
         raise TrackingError(
             f"an image of {message.width} × {message.height} pixels cannot be {message.encoding}"
         ) from error
-    return np.asarray(grey, dtype=np.uint8)
+    return np.asarray(converted, dtype=np.uint8)
 
 
 def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
-    """(rows, columns) grey pixels of a JPEG or PNG.
+    """(rows, columns) grey pixels of a JPEG or PNG, as `decompressed`."""
+    return decompressed(message, "GRAY")
+
+
+def decompressed(message: CompressedImage, colours: str) -> NDArray[np.uint8]:
+    """The pixels of a JPEG or PNG, as ``colours`` says: see `decoded`.
 
     Raises:
         TrackingError: it cannot be decoded, or is larger than any camera's.
@@ -112,13 +129,15 @@ def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
     pixels = None
     if columns * rows <= _MOST_PIXELS:
         with contextlib.suppress(cv2.error):
-            pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if columns and rows else None
+            flag = cv2.IMREAD_GRAYSCALE if colours == "GRAY" else cv2.IMREAD_COLOR
+            pixels = cv2.imdecode(data, flag) if columns and rows else None
     if pixels is None:
         raise TrackingError(
             f"the compressed image ('{message.format}', {data.size} bytes for {columns} × {rows} "
             f"pixels) cannot be decoded: it must be a JPEG or PNG of {_MOST_PIXELS} pixels at most"
         )
-    return np.asarray(pixels, dtype=np.uint8)
+    found = np.asarray(pixels, dtype=np.uint8)
+    return found if found.ndim == 2 else np.ascontiguousarray(found[..., ::-1])  # of BGR
 
 
 def _stated_size(data: bytes) -> tuple[int, int]:

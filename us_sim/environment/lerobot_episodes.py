@@ -1,0 +1,178 @@
+"""Episodes of a data set as a LeRobot data set.
+
+Features ``observation.…`` are what was seen, late and noisy as the episode drew it, so that a
+policy learns from what it will get; features ``truth.…`` are of the moment, and exact.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import tarfile
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.environment.tasks import TASKS
+from us_sim.errors import EpisodeError
+from us_sim.progress import Progress
+from us_sim.recording.lerobot_writer import (
+    IMAGES,
+    POSE_PARTS,
+    STATE,
+    WRENCH_PARTS,
+    Frame,
+    LeRobotWriter,
+)
+
+_PARTS = {"pose": POSE_PARTS, "goal": POSE_PARTS, "wrench": WRENCH_PARTS, "contact": ("contact",)}
+_ACTION = ("x", "y", "z", "rx", "ry", "rz")  # of the probe's velocity in its frame, -1 to 1
+_USED = ("image.png", "labels.png", "json")
+_Step = Mapping[str, Any]  # members by their endings
+
+
+def write_lerobot(
+    folder: Path,
+    shards: Path,
+    episodes: Mapping[str, Mapping[str, Any]],
+    task: str | None,
+    period: float,
+    *,
+    is_video: bool,
+) -> None:
+    """Write a data set's episodes, in the order of their names, as a LeRobot data set.
+
+    Args:
+        folder: to make; one that is there already is left as it is.
+        shards: folder of the episodes' tar files.
+        episodes: their facts, by their names.
+        task: that they are of, if any.
+        period: s, of a step.
+        is_video: code images as video, which loses speckle.
+
+    Raises:
+        EpisodeError: lerobot is not installed, the folder cannot be written or has other episodes,
+            or episodes differ in their labels, observations or sizes of images.
+    """
+    if folder.exists():
+        _require_whole(folder, len(episodes))
+        return
+    about = inspect.getdoc(TASKS[task]) if task else "Scan the skin."
+    with (
+        LeRobotWriter(folder, frames_a_second(period), is_video=is_video) as writer,
+        Progress("writing for LeRobot", len(episodes), "episodes") as bar,
+    ):
+        for done, (name, facts) in enumerate(sorted(episodes.items()), 1):
+            frames, names = read_episode(shards / f"{name}.tar", facts)
+            writer.write_episode(frames, names, str(about), f"{name} of {facts['scene']}")
+            bar.update(done)
+
+
+def frames_a_second(period: float) -> int:
+    """The frames a second of steps of a period (s).
+
+    Raises:
+        EpisodeError: it is no whole number.
+    """
+    rate = round(1 / period)
+    if abs(rate * period - 1) > 1e-6:
+        raise EpisodeError(
+            f"episode.period: {period:g} s makes {1 / period:g} steps a second, and LeRobot needs "
+            f"a whole number: set it to {1000 / rate:.9g} ms"
+        )
+    return rate
+
+
+def read_episode(
+    shard: Path, facts: Mapping[str, Any]
+) -> tuple[Iterator[Frame], Mapping[str, Sequence[str]]]:
+    """The frames of an episode by LeRobot's names of features, and the names of their numbers.
+
+    Args:
+        shard: the episode's tar file.
+        facts: of the episode.
+    """
+    steps = list(_steps(shard))
+    return _frames(steps, facts), _names(steps[0], facts)
+
+
+def _steps(shard: Path) -> Iterator[_Step]:
+    """The members of each step that are used."""
+    members: dict[str, dict[str, Any]] = {}
+    with shard.open("rb") as stream, tarfile.open(fileobj=stream, mode="r|") as tar:
+        for member in tar:
+            name, _, ending = member.name.partition(".")
+            content = tar.extractfile(member)
+            if content is not None and ending in _USED:
+                members.setdefault(name, {})[ending] = content.read()
+    for step in members.values():
+        step["json"] = json.loads(step["json"])
+        yield step
+
+
+def _names(step: _Step, facts: Mapping[str, Any]) -> dict[str, Sequence[str]]:
+    """Of the numbers of each feature, and of the labels."""
+    told = step["json"]
+    state = [f"{name}.{part}" for name in sorted(told["observed"]) for part in _PARTS[name]]
+    return {
+        STATE: state,
+        "action": _ACTION,
+        "truth.pose": POSE_PARTS,
+        "truth.wrench": WRENCH_PARTS,
+        "truth.areas": sorted(told.get("areas", ())),
+        "truth.labels": [f"{number} {name}" for number, name in facts["labels"].items()],
+    }
+
+
+def _frames(steps: Sequence[_Step], facts: Mapping[str, Any]) -> Iterator[Frame]:
+    late: deque[NDArray[np.uint8]] = deque(maxlen=facts["draw"]["delay"] + 1)
+    for step in steps:
+        told = step["json"]
+        late.append(_pixels(step["image.png"]))
+        frame: dict[str, NDArray[Any]] = {f"{IMAGES}ultrasound": late[0]}
+        if observed := told["observed"]:
+            frame[STATE] = _float32(np.concatenate([observed[name] for name in sorted(observed)]))
+        frame["action"] = _float32(told["action"])
+        if "reward" in told:
+            frame["next.reward"] = _float32([told["reward"]])
+            frame["next.success"] = np.array([told["is_success"]])
+        frame["next.done"] = np.array([step is steps[-1]])
+        frame["truth.pose"] = _float32(told["pose"])
+        frame["truth.wrench"] = _float32(told["wrench"])
+        frame["truth.is_balanced"] = np.array([told["is_balanced"]])
+        frame["truth.contact"] = _float32([told["contact"]])
+        if "areas" in told:
+            frame["truth.areas"] = _float32([area for _, area in sorted(told["areas"].items())])
+            frame["truth.labels"] = _pixels(step["labels.png"])
+        yield frame
+
+
+def _float32(numbers: Any) -> NDArray[np.float32]:
+    return np.array(numbers, np.float32)
+
+
+def _pixels(png: bytes) -> NDArray[np.uint8]:
+    found = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return np.asarray(found, np.uint8)
+
+
+def _require_whole(folder: Path, count: int) -> None:
+    """Refuse a LeRobot data set of another number of episodes.
+
+    Raises:
+        EpisodeError: it is one, or none.
+    """
+    try:
+        there = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
+        has = there["total_episodes"]
+    except (OSError, ValueError, TypeError, KeyError):
+        has = "no"
+    if has != count:
+        raise EpisodeError(
+            f"{folder}: has {has} episodes of {count}: remove the folder and give the command again"
+        )

@@ -1,0 +1,394 @@
+"""Recorded sessions as a LeRobot data set: each is an episode, resampled to one rate."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from us_sim.errors import BagError, TrackingError
+from us_sim.nodes.tracker_inputs.camera_input import decoded, decompressed
+from us_sim.recording.lerobot_writer import (
+    IMAGES,
+    POSE_PARTS,
+    STATE,
+    WRENCH_PARTS,
+    Frame,
+    LeRobotWriter,
+    require_lerobot,
+)
+from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
+from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.resampling import Times, latest, linear, slerp
+from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.topic import BagTopic
+from us_sim.recording.wrench import WRENCH_STAMPED
+from us_sim.settings.spelling import counted
+
+_SECOND = 1_000_000_000
+_HIGHEST_RATE = 1000  # Hz
+_MOST_FRAMES = 10_000_000
+"""Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""
+_PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
+    "sensor_msgs/msg/Image": decoded,
+    "sensor_msgs/msg/CompressedImage": decompressed,
+}
+_NUMBERS: Mapping[str, Callable[[Any], Iterator[tuple[str, float]]]] = {
+    WRENCH_STAMPED: lambda m: zip(
+        WRENCH_PARTS, _components(m.wrench.force, m.wrench.torque), strict=True
+    ),
+    "geometry_msgs/msg/TwistStamped": lambda m: zip(
+        ("x", "y", "z", "rx", "ry", "rz"), _components(m.twist.linear, m.twist.angular), strict=True
+    ),
+    "sensor_msgs/msg/JointState": lambda m: zip(m.name, m.position, strict=False),
+}
+"""Numbers of messages that have a header, with their names."""
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The parts of sessions that are wanted, and how they are to be resampled.
+
+    Args:
+        topics: or bodies, as ``/tf:probe``; where there are none, all topics of a type that is
+            known, and bodies of others only without any PoseStamped.
+        action: a topic or body that is the action; it may be named here alone.
+        rate: frames a second; by default that of the first session's images, or else of the
+            fastest topic.
+        by_log_time: go by when messages were recorded, and not by their stamps.
+    """
+
+    topics: Sequence[str] = ()
+    action: str | None = None
+    rate: int | None = None
+    by_log_time: bool = False
+
+
+def to_lerobot(
+    sessions: Sequence[Path],
+    folder: Path,
+    wanted: Wanted,
+    task: str,
+    progress: Progress,
+    *,
+    is_video: bool = False,
+) -> Iterator[str]:
+    """Write sessions as episodes, and say of each topic what became of its messages.
+
+    Args:
+        sessions: bags of any kind.
+        folder: to make.
+        wanted: their parts.
+        task: in words.
+        progress: takes the fraction done, and what is being done.
+        is_video: code images as video, which loses speckle.
+
+    Raises:
+        BagError: a session cannot be read, or has nothing that is wanted, or at no time all of it.
+        EpisodeError: as for `LeRobotWriter`.
+    """
+    require_lerobot()
+    if wanted.rate is not None and not 1 <= wanted.rate <= _HIGHEST_RATE:
+        raise BagError(f"--rate: {wanted.rate} is outside 1 to {_HIGHEST_RATE} frames a second")
+    episode = Episode(read_bag(sessions[0]), wanted)
+    rate = wanted.rate or episode.usual_rate
+    frames = 0
+    with LeRobotWriter(folder, rate, is_video=is_video) as writer:
+        for number, session in enumerate(sessions):
+            if number:
+                episode = Episode(read_bag(session), wanted)
+            moments = episode.moments(rate)
+            given = episode.frames(moments, progress)
+            writer.write_episode(given, episode.names, task, str(session))
+            progress(1.0, "")
+            frames += len(moments)
+            yield from (f"{session.name}: {sentence}" for sentence in episode.told(moments))
+    yield f"{counted(frames, 'frame')} at {rate} Hz in {folder}"
+
+
+@dataclass
+class Images:
+    """A topic of images, which are read when they are shown."""
+
+    bag: Bag
+    name: str
+    times: Times
+    numbers: NDArray[np.int64]  # (K,) of the messages, in the order of the recording
+    count: int  # of messages
+    damaged: int = field(default=0, init=False)  # of those that were to be shown
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last time, ns."""
+        return int(self.times[0]), int(self.times[-1])
+
+    def at(self, moments: Times) -> Iterator[NDArray[np.uint8]]:
+        """The latest image of each moment; for one that is damaged the one before."""
+        shown = self.numbers[latest(self.times, moments)]
+        number, pixels = -1, None
+        messages = enumerate(self.bag.messages([self.name]))
+        for wanted in shown:
+            if number < wanted:
+                number, raw = next(each for each in messages if each[0] == wanted)
+                try:
+                    pixels = _pixels(self.bag, raw)
+                except TrackingError as error:
+                    self.damaged += 1
+                    if pixels is None:
+                        raise BagError(f"{self.bag.path}: {self.name}: {error}") from error
+            assert pixels is not None
+            yield pixels
+
+    def told(self, moments: Times) -> str:
+        """The images in numbers, after they were shown."""
+        shown = latest(self.times, moments)
+        count = len(np.unique(shown))
+        oldest = (moments - self.times[shown]).max() / _SECOND
+        return (
+            f"{self.name}: {count} of {counted(self.count, 'image')} shown, "
+            f"{counted(len(moments) - count, 'frame repeats', 'frames repeat')} the one before, "
+            f"which is {oldest:.3f} s old at most"
+            + (f"; {self.damaged} cannot be decoded" if self.damaged else "")
+        )
+
+
+@dataclass
+class Numbers:
+    """A topic of numbers, or a body's poses."""
+
+    name: str
+    times: Times
+    values: NDArray[np.float64]  # (K, N), NaN where a message has them not
+    parts: list[str]  # names of the N
+    is_pose: bool
+    rejected: int  # messages without a finite number, or poses without an orientation
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last time of which all numbers are known, ns."""
+        there = np.isfinite(self.values)
+        first, last = there.argmax(axis=0), there[::-1].argmax(axis=0)
+        return int(self.times[first.max()]), int(self.times[-1 - last.max()])
+
+    def at(self, moments: Times) -> NDArray[np.float32]:
+        """(M, N) interpolated."""
+        between = slerp if self.is_pose else linear
+        return between(self.times, self.values, moments).astype(np.float32)
+
+    def told(self, moments: Times) -> str:
+        """The messages in numbers."""
+        begin, end = np.searchsorted(self.times, moments[[0, -1]])
+        gap = np.diff(self.times[max(begin - 1, 0) : end + 1]).max() / _SECOND
+        return (
+            f"{self.name}: {'slerp' if self.is_pose else 'linear'} between "
+            f"{counted(len(self.times), 'message')}, {gap:.3f} s apart at most"
+            + (f"; {self.rejected} are not finite and left out" if self.rejected else "")
+        )
+
+
+class Episode:
+    """The wanted parts of a session.
+
+    Raises:
+        BagError: the session has none, or one that was named cannot be used.
+    """
+
+    def __init__(self, bag: Bag, wanted: Wanted) -> None:
+        self._bag, self._wanted = bag, wanted
+        self._left_out = [fault.text for fault in bag.opening_faults]
+        self._left_out += [f"the recorder lost {n} of {name}" for name, n in bag.lost().items()]
+        self._images: list[Images] = []
+        self._numbers: list[Numbers] = []
+        self._action = wanted.action and _whole_name(bag, wanted.action)
+        named = [_whole_name(bag, name) for name in wanted.topics]
+        chosen = named or _known(bag)
+        if self._action:
+            named.append(self._action)
+            chosen = [*chosen, self._action]
+        for name in dict.fromkeys(chosen):
+            try:
+                self._take(name)
+            except (BagError, TrackingError) as error:
+                if name in named:
+                    raise BagError(f"{bag.path}: {name}: {error}") from error
+                self._left_out.append(f"{name} is left out: {error}")
+        if not self._images and not self._numbers:
+            raise BagError(
+                f"{bag.path} has no images, poses, wrenches, twists or joint states that can be "
+                f"used; {'; '.join(self._left_out) or 'it has other topics alone'}"
+            )
+
+    @property
+    def usual_rate(self) -> int:
+        """Frames a second: of the images, or else of what is fastest."""
+        steps = [np.median(np.diff(each.times)) for each in self._images or self._numbers]
+        return int(np.clip(round(_SECOND / min(steps)), 1, _HIGHEST_RATE))
+
+    @property
+    def names(self) -> dict[str, Sequence[str]]:
+        """Of the numbers of each feature."""
+        names: dict[str, Sequence[str]] = {STATE: [], "action": []}
+        for each in self._numbers:
+            head = each.name.strip("/")
+            names[self._feature(each)] = [
+                *names[self._feature(each)],
+                *(f"{head}.{part}" for part in each.parts),
+            ]
+        return names
+
+    def moments(self, rate: int) -> Times:
+        """Times of frames, ns: from when all topics have begun until one of them ends.
+
+        Raises:
+            BagError: they are never there at once, or for absurdly long.
+        """
+        spans = {each.name: each.span for each in self._images}
+        spans |= {each.name: each.span for each in self._numbers}
+        begin, end = (max(s[0] for s in spans.values()), min(s[1] for s in spans.values()))
+        count = int(end - begin) * rate // _SECOND + 1
+        if end <= begin or count > _MOST_FRAMES:
+            first = min(s[0] for s in spans.values())
+            told = ", ".join(
+                f"{name} from {(a - first) / _SECOND:.3f} to {(b - first) / _SECOND:.3f} s"
+                for name, (a, b) in spans.items()
+            )
+            raise BagError(
+                f"{self._bag.path}: by their stamps there is {told}: name those that go together "
+                f"with --topics, or give --by-log-time where clocks differ"
+            )
+        return begin + np.arange(count) * _SECOND // rate
+
+    def frames(self, moments: Times, progress: Progress = lambda *_: None) -> Iterator[Frame]:
+        """The features of each moment."""
+        tables: dict[str, list[NDArray[np.float32]]] = {}
+        for each in self._numbers:
+            tables.setdefault(self._feature(each), []).append(each.at(moments))
+        rows = {feature: np.hstack(parts) for feature, parts in tables.items()}
+        images = {f"{IMAGES}{_key(each.name)}": each.at(moments) for each in self._images}
+        for k in range(len(moments)):
+            progress(k / len(moments), self._bag.path.name)
+            yield {name: next(pixels) for name, pixels in images.items()} | {
+                name: row[k] for name, row in rows.items()
+            }
+
+    def told(self, moments: Times) -> Iterator[str]:
+        """Sentences on what became of its messages, after the frames were taken."""
+        yield counted(len(moments), "frame")
+        yield from self._left_out
+        yield from (each.told(moments) for each in self._images)
+        yield from (each.told(moments) for each in self._numbers)
+
+    def _feature(self, numbers: Numbers) -> str:
+        return "action" if numbers.name == self._action else STATE
+
+    def _take(self, name: str) -> None:
+        bag, topic = self._bag, self._bag.topic(name.partition(":")[0])
+        if topic.type_name in _PIXELS:
+            if name == self._action:
+                raise BagError("is a topic of images, which are no action")
+            stamp = (not self._wanted.by_log_time and stamp_reader(bag, topic)) or (lambda _: None)
+            times, kept, count = [-1], [], 0
+            for raw in bag.messages([topic.name]):
+                with _telling(topic):
+                    time = stamp(raw.data) or raw.log_time
+                if not count:
+                    _pixels(bag, raw)  # refused at once where nothing of it can be decoded
+                if time > times[-1]:  # else it came too late to be shown
+                    times.append(time)
+                    kept.append(count)
+                count += 1
+            self._require_several(kept)
+            arrays = _times(times[1:]), np.array(kept, np.int64)
+            self._images.append(Images(bag, name, *arrays, count))
+            return
+        is_pose = topic.type_name not in _NUMBERS
+        table: dict[int, dict[str, float]] = {}  # numbers of the same time go together
+        rejected, frames = 0, dict[str, None]()
+        rows = self._poses(name, frames) if is_pose else self._vectors(topic)
+        for time, numbers in rows:
+            finite = {part: value for part, value in numbers.items() if np.isfinite(value)}
+            if is_pose and (
+                len(finite) < 7 or np.linalg.norm([finite[q] for q in POSE_PARTS[3:]]) < 1e-6
+            ):
+                finite = {}
+            rejected += not finite
+            if finite:
+                table.setdefault(time, {}).update(finite)
+        if len(frames) > 1:
+            raise BagError(f"has poses in the frames {', '.join(frames)}, and a path has one")
+        self._require_several(table)
+        parts = list(dict.fromkeys(part for row in table.values() for part in row))
+        times = sorted(table)
+        values = np.array([[table[t].get(part, np.nan) for part in parts] for t in times])
+        self._numbers.append(Numbers(name, _times(times), values, parts, is_pose, rejected))
+
+    def _poses(self, name: str, frames: dict[str, None]) -> Iterator[tuple[int, dict[str, float]]]:
+        for row in pose_rows(self._bag, name):
+            frames[row.frame_id] = None
+            time = row.log_time if self._wanted.by_log_time else row.stamp or row.log_time
+            yield time, dict(zip(POSE_PARTS, row.pose, strict=True))
+
+    def _vectors(self, topic: BagTopic) -> Iterator[tuple[int, dict[str, float]]]:
+        for raw in self._bag.messages([topic.name]):
+            message = self._bag.deserialize(raw)
+            with _telling(topic):
+                stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
+                numbers = {str(part): float(x) for part, x in _NUMBERS[topic.type_name](message)}
+            yield raw.log_time if self._wanted.by_log_time else stamp or raw.log_time, numbers
+
+    @staticmethod
+    def _require_several(messages: Any) -> None:
+        if len(messages) < 2:
+            raise BagError(f"has {counted(len(messages), 'message')} of use, and two are needed")
+
+
+def _whole_name(bag: Bag, name: str) -> str:
+    """A topic's or body's name with its leading slash, where the bag has one."""
+    topic, colon, body = name.partition(":")
+    return bag.topic(topic).name + colon + body
+
+
+def _known(bag: Bag) -> list[str]:
+    """Topics with messages of a type that is known; bodies of others without a PoseStamped."""
+    there = [topic for topic in bag.topics if topic.message_count]
+    stamped = [topic.name for topic in there if topic.type_name == POSE_STAMPED]
+    return [
+        *(topic.name for topic in there if topic.type_name in (*_PIXELS, *_NUMBERS)),
+        *(stamped or [name for names in bodies_in(bag).values() for name in names]),
+    ]
+
+
+@contextlib.contextmanager
+def _telling(topic: BagTopic) -> Iterator[None]:
+    """Refuse messages that are not what their type is in ROS 2."""
+    try:
+        yield
+    except (AttributeError, IndexError, TypeError, ValueError, struct.error) as error:
+        raise BagError(f"holds {topic.type_name} unlike that of ROS 2: {error}") from None
+
+
+def _pixels(bag: Bag, raw: Any) -> NDArray[np.uint8]:
+    return _PIXELS[bag.topic(raw.topic).type_name](bag.deserialize(raw), "RGB")
+
+
+def _components(*vectors: Any) -> list[float]:
+    return [each for vector in vectors for each in (vector.x, vector.y, vector.z)]
+
+
+def _times(nanoseconds: list[int]) -> Times:
+    try:
+        return np.array(nanoseconds, np.int64)
+    except OverflowError as error:
+        raise BagError("has a time that is no number of 64 bits") from error
+
+
+def _key(topic: str) -> str:
+    """A topic's name as part of a feature's, in which lerobot allows no slash."""
+    return topic.strip("/").replace("/", "_")
