@@ -46,8 +46,18 @@ def test_the_least_damping_without_overshoot():
     assert forces_on_tissue(stiffness, delay, 0.6 * least).max() > 4.1
 
 
-def test_the_default_presses_stiff_tissue_without_overshoot_four_frames_late():
-    assert RobotSettings().damping >= math.e * 2000.0 * 4 / 60
+def test_the_defaults_press_stiff_tissue_without_overshoot_four_frames_late():
+    """The bound holds, and the limits of speed and acceleration do not spoil it."""
+    settings, stiffness, late = RobotSettings(), 2000.0, 4
+    assert settings.damping >= math.e * stiffness * late / settings.rate
+    robot, forces = Robot(settings), [0.0] * (late + 1)
+    for step in range(600):
+        time = step / settings.rate
+        robot.feel(time, forces[-1 - late])
+        robot.ask_force(time, 20.0)
+        forces.append(stiffness * max(robot.move(time).position[2], 0.0))
+    assert max(forces) <= 20.0 + 0.01
+    assert forces[-60:] == pytest.approx([20.0] * 60, abs=0.01)
 
 
 twists = st.lists(st.floats(-5.0, 5.0), min_size=6, max_size=6).map(np.array)
