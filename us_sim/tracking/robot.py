@@ -7,8 +7,8 @@ to the tissue by an admittance without mass, a damper: it moves at (wanted - fel
 >>> robot = Robot(RobotSettings(damping=400.0, lift="10 mm"))
 >>> robot.ask_force(0.0, 4.0)
 >>> robot.feel(0.0, 3.0)
->>> robot.move(0.0).position[2], round(robot.move(0.1).position[2], 5)  # m, 1 N / 400 N s/m * 0.1 s
-(-0.01, -0.00975)
+>>> [round(1e3 * float(robot.move(time).position[2]), 3) for time in (0.0, 0.1)]  # mm
+[-10.0, -9.75]
 """
 
 from __future__ import annotations
