@@ -354,7 +354,8 @@ def _members(
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:
-    _, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    how = cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
+    _, content = cv2.imencode(".png", image, how)
     return content.tobytes()
 
 

@@ -45,7 +45,7 @@ class SlicePlane:
         require_pixel_counts(self.columns, self.rows)
         if self.spans is not None:
             object.__setattr__(self, "spans", _runs_within(self.spans, self.rows, self.columns))
-        area = np.linalg.norm(np.cross(self.column_step, self.row_step))
+        area = np.linalg.norm(self._normal)
         scale = np.linalg.norm(self.column_step) * np.linalg.norm(self.row_step)
         if not area > 1e-6 * scale:
             raise ProbeError(
@@ -56,10 +56,12 @@ class SlicePlane:
     @cached_property
     def basis(self) -> NDArray[np.float64]:
         """(3, 3) m: column_step, row_step and a normal about as long as a pixel, as columns."""
-        normal = np.cross(self.column_step, self.row_step)
-        return np.column_stack(
-            [self.column_step, self.row_step, normal / np.sqrt(np.linalg.norm(normal))]
-        )
+        normal = self._normal / np.sqrt(np.linalg.norm(self._normal))
+        return np.column_stack([self.column_step, self.row_step, normal])
+
+    @cached_property
+    def _normal(self) -> NDArray[np.float64]:  # m², as long as a pixel is large
+        return np.cross(self.column_step, self.row_step)
 
     @cached_property
     def to_pixel(self) -> NDArray[np.float64]:
