@@ -116,7 +116,7 @@ class Robot:
 
     def __init__(self, settings: RobotSettings) -> None:
         self._settings = settings
-        self.pose = Pose([0.0, 0.0, -settings.lift])
+        self.pose = Pose(np.array([0.0, 0.0, -settings.lift]))
         self._velocity = np.zeros(6)  # of the probe in its own frame
         self._time: float | None = None  # of the last motion
         self._commands: deque[tuple[float, NDArray[np.float64] | float]] = deque()
