@@ -12,6 +12,7 @@ NODES = [
     "nodes.image_writer",
     "nodes.openigtlink_bridge",
     "nodes.path_player",
+    "nodes.probe_robot",
     "nodes.probe_tracker",
     "nodes.scorer",
     "nodes.session_player",

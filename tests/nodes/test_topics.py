@@ -15,6 +15,7 @@ from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.image_writer import ImageWriter
 from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
 from us_sim.nodes.path_player import PathPlayer
+from us_sim.nodes.probe_robot import ProbeRobot
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.session_monitor import SessionMonitor
 from us_sim.nodes.session_player import SessionPlayer
@@ -123,6 +124,7 @@ def test_players_drivers_and_writers_do_too(bench, tmp_path):
         ),
         bench.make(CameraDriver, source="/dev/no_camera"),
         bench.make(SpaceMouseDriver),
+        bench.make(ProbeRobot),
         bench.add(SessionMonitor(context=bench.context)),
     ]
     found = {endpoint for node in nodes for endpoint in endpoints_of(node)}
@@ -156,6 +158,7 @@ def all_nodes(scenes, tmp_path):
             bench.make(OpenIGTLinkBridge, scene=scene, port=0),
             bench.make(CameraDriver, source="/dev/no_camera"),
             bench.make(SpaceMouseDriver),
+            bench.make(ProbeRobot),
             bench.add(SessionMonitor(context=bench.context)),
         ]
 

@@ -27,10 +27,11 @@ from us_sim.environment.simulation import Draw, Simulation, State
 from us_sim.environment.tasks import TASKS
 from us_sim.errors import EpisodeError, SceneError
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import exp, rotation_log
+from us_sim.geometry.se3 import exp
 from us_sim.scene.reading import merged, parse_scene, scene_document
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.settings.spelling import unknown
+from us_sim.tracking.robot import approach_speed, kept_within
 
 DEFAULT_SCENE = "upper_arm_learning"
 
@@ -153,7 +154,7 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.task.begin(self.draw.start)
         self._step = 0
         self._late: deque[Observation] = deque(maxlen=self.draw.delay + 1)
-        self._state = self.simulation.step(self._within(self.draw.start, Pose()))
+        self._state = self.simulation.step(kept_within(self.draw.start, Pose(), self._settings))
         return self._observe(), {"draw": self.draw.document()}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -170,9 +171,8 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._state is None:
             raise EpisodeError("no episode has begun: call reset first")
         velocity = self._velocity(_checked(action))
-        pose = self._within(
-            self._state.pose @ exp(velocity * self._settings.period), self._state.pose
-        )
+        moved = self._state.pose @ exp(velocity * self._settings.period)
+        pose = kept_within(moved, self._state.pose, self._settings)
         self._state = state = self.simulation.step(pose)
         self._step += 1
         reward, is_done = self.task.judge(state)
@@ -215,17 +215,9 @@ class ScanEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):
         velocity = action * np.repeat([given.speed, given.angular_speed], 3)
         if given.control == "force":
             wanted = 0.5 * (action[2] + 1.0) * given.force
-            part = (wanted - self.state.force) / given.force_error
-            velocity[2] = given.speed * min(max(part, -1.0), 1.0)
+            damping = given.force_error / given.speed
+            velocity[2] = approach_speed(wanted, self.state.force, damping, given.speed)
         return velocity
-
-    def _within(self, pose: Pose, before: Pose) -> Pose:
-        """The pose, within the space around the scene's start that the probe may be in."""
-        given = self._settings
-        low = [-given.aside, -given.aside, -given.lift]
-        position = np.clip(pose.position, low, [given.aside, given.aside, given.press])
-        leans = float(np.linalg.norm(rotation_log(pose.orientation))) > given.lean
-        return Pose(position, before.orientation if leans else pose.orientation)
 
     def _observe(self) -> Observation:
         state, draw, made = self.state, self.draw, {}

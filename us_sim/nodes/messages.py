@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, PoseStamped, TransformStamped, WrenchStamped
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped, TwistStamped, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh, MeshTriangle
@@ -206,6 +206,19 @@ def wrench_from(message: WrenchStamped, frame: str | None = None) -> NDArray[np.
     if not np.isfinite(wrench).all():
         raise MessageError(f"the wrench is not finite: {wrench.tolist()}")
     return wrench
+
+
+def twist_from(message: TwistStamped) -> NDArray[np.float64]:
+    """Linear and angular velocity (6,) m/s, rad/s along the axes of the message's frame.
+
+    Raises:
+        MessageError: a number is not finite.
+    """
+    v, w = message.twist.linear, message.twist.angular
+    twist = np.array([v.x, v.y, v.z, w.x, w.y, w.z])
+    if not np.isfinite(twist).all():
+        raise MessageError(f"the velocity is not finite: {twist.tolist()}")
+    return twist
 
 
 def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:

@@ -26,6 +26,7 @@ from us_sim.settings.viewer import ViewerSettings
 from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 from us_sim.slicing.settings import OVERLAYS, TISSUE_PARAMETERS, Imaging
+from us_sim.tracking.robot import RobotSettings
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 _AGE = Quantity("time", 0.01, 3600.0)
@@ -529,6 +530,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "session_control": (SessionControlSettings,),
     "camera_driver": (CameraDriverSettings, AwaitedSettings),
     "space_mouse_driver": (SpaceMouseDriverSettings,),
+    "probe_robot": (RobotSettings,),
     "image_writer": (ImageWriterSettings,),
     "viewer": (ViewerSettings,),
     "volume_reconstructor": (LiveVolume, LiveBox),

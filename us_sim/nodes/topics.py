@@ -27,7 +27,7 @@ class Topic:
     @property
     def from_drivers(self) -> bool:
         """Whether it comes from outside this package, or from a node in place of a driver."""
-        stand_ins = {"path_player", "camera_driver", "space_mouse_driver", "viewer"}
+        stand_ins = {"path_player", "camera_driver", "space_mouse_driver", "probe_robot", "viewer"}
         return set(self.publishers) <= stand_ins
 
 
@@ -51,8 +51,8 @@ def _topic(entry: str) -> Topic:
 
 _TABLE = """
 tracker/pose: geometry_msgs/PoseStamped
-    path_player, viewer -> probe_tracker | the tracked body in the device's frame, stamped when it
-    was measured; source `pose`
+    path_player, probe_robot, viewer -> probe_tracker | the tracked body in the device's frame,
+    stamped when it was measured; source `pose`
 tracker/poses: geometry_msgs/PoseArray
     drivers -> probe_tracker | several bodies at once; source `pose_array`
 tf: tf2_msgs/TFMessage
@@ -79,6 +79,11 @@ haptic/clutch: std_msgs/Bool
     `haptic`
 haptic/wrench: geometry_msgs/WrenchStamped
     haptic_renderer | what the hand shall feel, `tracker.haptic.rate` times a second
+robot/twist: geometry_msgs/TwistStamped
+    drivers -> probe_robot | the velocity that a robot arm's probe is to have, in frame `probe` or
+    `patient`
+robot/force: geometry_msgs/WrenchStamped
+    drivers -> probe_robot | z, in frame `probe`: N by which it is to press
 probe/pose: geometry_msgs/PoseStamped
     probe_tracker -> viewer, tissue_deformer, skin_deformer, slice_interpolator, openigtlink_bridge,
     volume_reconstructor, scorer | the probe in `patient`: registered, checked, filtered; once for
@@ -90,8 +95,8 @@ probe/marker: visualization_msgs/MarkerArray [latched]
     probe_tracker -> viewer | a transducer as the scene's probe is shaped, and the outline of its
     image, in frame `probe`
 probe/wrench: geometry_msgs/WrenchStamped
-    tissue_deformer -> viewer, scorer | the tissue's force and torque on the probe, in frame
-    `probe`; none for a pose at which the tissue's forces are not in balance
+    tissue_deformer -> viewer, scorer, probe_robot | the tissue's force and torque on the probe, in
+    frame `probe`; none for a pose at which the tissue's forces are not in balance
 tissue/nodes: sensor_msgs/PointCloud2
     tissue_deformer -> slice_interpolator, viewer | where the deformed mesh's nodes are, in mesh
     order
@@ -173,9 +178,9 @@ events/rosbag2_messages_lost: rosbag2_interfaces/MessagesLostEvent
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
     scorer, openigtlink_bridge, composed, path_player, session_player, session_recorder,
-    camera_driver, space_mouse_driver, session_monitor, volume_reconstructor, session_control,
-    viewer -> session_monitor, viewer | once a second: state, rate, latency, what was dropped or
-    refused; of `session_monitor` which nodes ended or hung
+    camera_driver, space_mouse_driver, probe_robot, session_monitor, volume_reconstructor,
+    session_control, viewer -> session_monitor, viewer | once a second: state, rate, latency, what
+    was dropped or refused; of `session_monitor` which nodes ended or hung
 """
 
 MARKERS = "session/marker"

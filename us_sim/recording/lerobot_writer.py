@@ -68,7 +68,11 @@ class LeRobotWriter:
     def __enter__(self) -> LeRobotWriter:
         with self._telling():
             self._folder.parent.mkdir(parents=True, exist_ok=True)
-            partial = TemporaryDirectory(prefix=f".{self._folder.name}-", dir=self._folder.parent)
+            partial = TemporaryDirectory(
+                prefix=f".{self._folder.name}.partial-",
+                dir=self._folder.parent,
+                ignore_cleanup_errors=True,  # lerobot's threads may still write there
+            )
         self._partial = Path(self._stack.enter_context(partial)) / self._folder.name
         return self
 

@@ -1,0 +1,73 @@
+"""Holds the probe as a robot arm does: follows a wanted velocity, and seeks a wanted force."""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+
+from us_sim.errors import MessageError
+from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.messages import pose_message, twist_from, wrench_from
+from us_sim.nodes.parameters import declared
+from us_sim.nodes.process import run_node
+from us_sim.nodes.qos import FOREIGN, STREAM
+from us_sim.nodes.scene_node import LEAD_TOPIC
+from us_sim.tracking.robot import Robot, RobotSettings
+
+
+class ProbeRobot(GuardedNode):
+    """``robot/twist`` and ``robot/force`` in, ``tracker/pose`` out; it feels ``probe/wrench``.
+
+    Its parameters are those of `RobotSettings`.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("probe_robot", **kwargs)
+        self._settings = declared(self, RobotSettings())
+        self._robot = Robot(self._settings)
+        self.goes_first = True  # it stands for a device
+        self.health = Health(self, "robot arm")
+        self.health.state = self._robot.action
+        self._poses = self.stream(PoseStamped, LEAD_TOPIC)
+        self.create_subscription(TwistStamped, "robot/twist", self._take_twist, FOREIGN)
+        self.create_subscription(WrenchStamped, "robot/force", self._take_force, FOREIGN)
+        self.create_subscription(WrenchStamped, "probe/wrench", self._feel, STREAM)
+        self.create_timer(1.0 / self._settings.rate, self._move)
+
+    def _take_twist(self, message: TwistStamped) -> None:
+        twist, frame = twist_from(message), message.header.frame_id
+        if frame == "patient":
+            turn = self._robot.pose.rotation
+            twist = np.concatenate([twist[:3] @ turn, twist[3:] @ turn])
+        elif frame != "probe":
+            raise MessageError(f"is in frame '{frame}', neither 'probe' nor 'patient'")
+        self._robot.ask_velocity(time.monotonic(), twist)
+
+    def _take_force(self, message: WrenchStamped) -> None:
+        wanted, most = float(wrench_from(message, "probe")[2]), self._settings.force
+        if not 0.0 <= wanted <= most:
+            self.health.problem(
+                "force", f"robot/force: {wanted:g} N is outside 0 to {most:g} N: the nearer is used"
+            )
+        self._robot.ask_force(time.monotonic(), wanted)
+
+    def _feel(self, message: WrenchStamped) -> None:
+        self._robot.feel(time.monotonic(), -float(wrench_from(message, "probe")[2]))
+
+    def _move(self) -> None:
+        pose = self._robot.move(time.monotonic())
+        self.health.state = self._robot.action
+        self._poses.publish(pose_message(pose, self.get_clock().now().to_msg(), "patient"))
+        self.health.published(LEAD_TOPIC)
+
+
+main = partial(run_node, ProbeRobot)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
