@@ -14,6 +14,8 @@ from us_sim.evaluation.independent_forces import averaged_hooke_forces, neo_hook
 from us_sim.evaluation.independent_residual import IndependentResidual
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
+from us_sim.scene.building import tissue_model_of, volume_of
+from us_sim.scene.reading import load_scene
 from us_sim.tissue.contact.probe_gap import only_forward
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
@@ -497,6 +499,26 @@ def test_tissue_inside_out_is_begun_anew_at_once_only_where_time_is_short(
     assert (Intervention.RESTARTED in shown.interventions) == anew
     solver.frame_limit = None
     assert solver.deform(at(z=0.01)).residual < 0.01
+
+
+def test_a_probe_that_leaps_deep_into_an_arm_is_followed_step_by_step(small_scene):
+    scene = load_scene(str(small_scene))
+    solver = FemNonlinear(
+        tissue_model_of(scene, volume_of(scene)), FemNonlinearSettings(most_iterations=12)
+    )
+    solver.frame_limit = 10.0  # s: live, and yet only iterations end a frame
+    solver.deform(at(z=-0.01))
+    frames = [solver.deform(at(z=0.025))]
+    while not frames[-1].is_balanced:
+        assert len(frames) < 60
+        frames.append(solver.deform(at(z=0.025)))
+    assert any(Intervention.RESTARTED in each.interventions for each in frames)
+    alone = FemNonlinear(solver.model)
+    for depth in np.linspace(0.0, 0.025, 26):
+        alone.deform(at(z=depth))
+    # Tissue that folds has more than one balance.
+    expected = settle(alone, at(z=0.025)).force[2]
+    assert settle(solver, at(z=0.025)).force[2] == pytest.approx(expected, rel=0.1)
 
 
 def test_a_single_tetrahedron_with_one_free_corner():

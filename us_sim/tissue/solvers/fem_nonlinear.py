@@ -19,7 +19,7 @@ a probe at rest, until the forces balance. A tissue that is inside out is worked
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -225,6 +225,7 @@ class FemNonlinear(TissueSolver):
         self._greatest_norm = 0.0  # N, of contact forces since rest; before, of the residual
         self._target: Pose | None = None  # the pose that the tissue is at or on its way to
         self._was_balanced = False  # at the end of the last frame
+        self._catches_up = False  # with the probe, after it was begun anew from rest
         if state.displacement.any():
             displacement = np.ascontiguousarray(state.displacement.T)
             # The way out of tissue inside out may end in a minimum where it is folded over.
@@ -239,7 +240,7 @@ class FemNonlinear(TissueSolver):
 
     def _advance(self, pose: Pose | None) -> Deformation:
         newton, budget, settings = self._newton, self._budget, self.settings
-        moved = not same_pose(pose, self._target)
+        asked, moved = pose, not same_pose(pose, self._target)
         budget.begin(
             settings.most_iterations,
             settings.frame_budget,
@@ -260,16 +261,26 @@ class FemNonlinear(TissueSolver):
         elif not moved:
             motion = newton.update_contact() if self._was_balanced else np.inf
         elif len(self._surface):
-            self._approach(pose)
-            start = self._predict(pose)
+            if self._catches_up:
+                pose = self._next_step(pose)
+            else:
+                self._approach(pose)
+            if pose is not self._target:
+                start = self._predict(pose)
         # Factoring takes many frames' time, and what is in balance looks the same without it.
         is_shown = self._was_balanced and budget.time_limit is not None
         newton.may_factor = newton.is_small or not (moved or budget.is_hurried or is_shown)
-        actions: list[str] = []
+        is_behind = pose is not asked
+        actions = ["it follows the probe in steps"] if is_behind else []
         tolerance = settings.frame_tolerance if moved else settings.tolerance
         self._settled = self._solve(tolerance, start, actions)
         self._was_balanced = not self._exceeds(settings.frame_tolerance)
-        return self._outcome(pose, motion, actions)
+        self._catches_up &= is_behind or not self._was_balanced
+        outcome = self._outcome(pose, motion, actions)
+        if is_behind:
+            self._settled = False
+            return replace(outcome, is_balanced=False)
+        return outcome
 
     def _solve(
         self, tolerance: float, start: NDArray[np.float64] | None, actions: list[str]
@@ -326,13 +337,22 @@ class FemNonlinear(TissueSolver):
             return False
         return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
 
+    def _next_step(self, pose: Pose) -> Pose:
+        """The next load step on the way to a pose, or the last one until that is in balance."""
+        newton, last = self._newton, self._target
+        if last is not None and newton.residual_norm > TUNING.load_step_tolerance * self._reference:
+            return last
+        return (*self._load_steps(pose), pose)[0]
+
+    def _load_steps(self, pose: Pose) -> list[Pose]:
+        newton, box = self._newton, self.model.collider.offset_box
+        last = self._target if newton.contact_norm > 0.0 else None
+        return load_steps(last, pose, newton.depth(pose), math.hypot(box[0], box[1]))
+
     def _approach(self, pose: Pose) -> None:
         """Go most of a long way in load steps, as far as the budget allows."""
         newton, budget = self._newton, self._budget
-        last = self._target if newton.contact_norm > 0.0 else None
-        box = self.model.collider.offset_box
-        arm = math.hypot(box[0], box[1])
-        for nearer in load_steps(last, pose, newton.depth(pose), arm):
+        for nearer in self._load_steps(pose):
             if not budget.allows_load_step:
                 break
             start: NDArray[np.float64] | None = self._predict(nearer)
@@ -411,11 +431,11 @@ class FemNonlinear(TissueSolver):
             relaxed = overstress is None or overstress.load <= tolerance * reference
             balanced = residual <= tolerance and motion <= self._settled_motion
             self._settled = relaxed and (self._settled or balanced)
-        elif recovery.must_restart(hurried=self._budget.is_hurried):
+        elif recovery.must_restart(hurried=self._budget.is_hurried and not self._catches_up):
             actions.append("begun anew from rest")
             interventions |= Intervention.RESTARTED
             self._restore(TissueState.at_rest(len(nodes)))
-            recovery.restarts = True
+            recovery.restarts = self._catches_up = True
         else:
             newton.set_displacement(reached)
         return Deformation(
