@@ -9,10 +9,17 @@ import pytest
 from chromium import chromium
 from hypothesis import settings
 
-import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
+import us_sim.nodes  # provides rclpy where ROS 2 is not installed
 
 settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")
+
+# Programs that tests start import the package from where it is tested, and not from the folder that
+# they are in: kernels are kept for each place, and would all be compiled a second time.
+_PLACE = str(Path(us_sim.nodes.__file__).parents[2])
+_SEARCHED = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([_PLACE, *filter(None, _SEARCHED)]))
+os.environ["PYTHONSAFEPATH"] = "1"
 
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -16,7 +16,7 @@ def fuzz(*args, **environment):
     return subprocess.run(
         [sys.executable, "-m", "tests.fuzz", *map(str, args)],
         cwd=ROOT,
-        env=os.environ | environment,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         capture_output=True,
         text=True,
         check=False,

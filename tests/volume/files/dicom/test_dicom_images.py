@@ -1,5 +1,6 @@
 """Images of DICOM files: grey values, claims of sizes, decoders."""
 
+import os
 import sys
 import zlib
 
@@ -215,7 +216,7 @@ def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):
     for name in ("PIL", "gdcm", "pylibjpeg"):
         (shadow / name).mkdir(parents=True)
         (shadow / name / "__init__.py").write_text("raise ImportError")
-    monkeypatch.setenv("PYTHONPATH", str(shadow))
+    monkeypatch.setenv("PYTHONPATH", str(shadow), prepend=os.pathsep)
     refused(path, r"JPEG Baseline.*us_sim\[dicom\]")
 
 
