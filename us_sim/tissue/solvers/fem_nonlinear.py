@@ -225,7 +225,7 @@ class FemNonlinear(TissueSolver):
         self._greatest_norm = 0.0  # N, of contact forces since rest; before, of the residual
         self._target: Pose | None = None  # the pose that the tissue is at or on its way to
         self._was_balanced = False  # at the end of the last frame
-        self._catches_up = False  # with the probe, after it was begun anew from rest
+        self._catches_up = False  # with the probe, where a live frame began anew from rest
         if state.displacement.any():
             displacement = np.ascontiguousarray(state.displacement.T)
             # The way out of tissue inside out may end in a minimum where it is folded over.
@@ -435,7 +435,7 @@ class FemNonlinear(TissueSolver):
             actions.append("begun anew from rest")
             interventions |= Intervention.RESTARTED
             self._restore(TissueState.at_rest(len(nodes)))
-            recovery.restarts = self._catches_up = True
+            recovery.restarts, self._catches_up = True, self._budget.time_limit is not None
         else:
             newton.set_displacement(reached)
         return Deformation(
