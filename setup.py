@@ -37,7 +37,7 @@ NO_WHEELS = (
     "and platform_machine != 'AMD64')"
 )
 GYMNASIUM = "gymnasium>=1.1,<2"
-RAY = ["ray>=2.40", "universal-pathlib>=0.3"]
+UPATH = "universal-pathlib>=0.3"
 ZENOH = ["eclipse-zenoh>=1.10,<2", "xxhash>=3"]
 STANDALONE = [
     f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}",
@@ -109,7 +109,7 @@ setup(
         "evaluate": ["scikit-fem>=10", "vtk>=9.4"],
         "lerobot": ["lerobot[dataset]>=0.4"],
         "meshes": ["meshio>=5.3"],
-        "ray": [GYMNASIUM, *RAY],
+        "ray": [GYMNASIUM, "ray>=2.40", UPATH],
         "rerun": ["rerun-sdk>=0.41"],
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
@@ -135,11 +135,11 @@ setup(
             "pytest-xdist>=3.6",
             "pytetwild>=0.4,<0.5",
             "python-gdcm>=3.0.20",
-            *RAY,
             "ruff>=0.12",
             "scikit-fem>=10",
             "types-PyYAML",
             "types-tqdm",
+            UPATH,
             "vtk>=9.4",
         ],
     },

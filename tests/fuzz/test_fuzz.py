@@ -68,7 +68,7 @@ def refuses():
 def test_every_kind_of_failure_is_noticed_and_the_others_go_on(tmp_path):
     (tmp_path / "traps.py").write_text(TRAPS)
     out = tmp_path / "failures"
-    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join(map(str, [tmp_path, ROOT]))
     ran = fuzz(
         "--module", "traps", "--cases", 1, "--run", 2, "--limit", 0.1, "--out", out, PYTHONPATH=path
     )

@@ -50,7 +50,7 @@ def test_a_scene_needs_no_kernel_beside_those_of_its_parts(played_scene, tmp_pat
     ran = subprocess.run(program, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     count, missed = json.loads(ran.stdout.splitlines()[-1])
-    assert count > 60
+    assert count > 30
     assert missed == []
 
 
