@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from us_sim.geometry.pose import Pose
 from us_sim.volume.volume import Volume
@@ -70,8 +71,6 @@ class CentreLine:
 
     def along(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N,) m along the line, of its points nearest to these (N, 3) m."""
-        from scipy.spatial import cKDTree  # the page needs none of it
-
         return np.asarray(self.lengths[cKDTree(self.points).query(points)[1]])
 
     def at(self, along: float) -> NDArray[np.float64]:

@@ -11,7 +11,6 @@ from typing import Any
 
 from nicegui import ui
 
-from us_sim.scoring.exercise import result_of
 from us_sim.viewer.panels.controls import WhileShown
 from us_sim.viewer.score import PICTURE, SCORE
 from us_sim.viewer.stream import Feed, Simulator
@@ -147,6 +146,8 @@ def told_score(simulator: Simulator) -> Mapping[str, Any]:
 
 def result_page(told: Mapping[str, Any], picture: bytes, when: str) -> str:
     """A page in one file, with steps, picture and metrics of a score as its stream tells it."""
+    from us_sim.scoring.exercise import result_of  # it brings scipy, which only this takes
+
     steps = [(_LOOKS[s["state"]][0], s["what"], s["seen"]) for s in told.get("steps", [])]
     result = result_of(_done(told["steps"])) if steps else ""
     title = escape(told["name"])
