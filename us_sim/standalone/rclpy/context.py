@@ -5,16 +5,18 @@ main thread), while SIGTERM ends nothing by itself: `spin` raises ExternalShutdo
 """
 
 import _thread
+import math
 import os
 import signal
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from enum import Enum
 from inspect import ismethod
-from threading import TIMEOUT_MAX, RLock
+from threading import RLock
 from types import FrameType
 from typing import Any
 
@@ -24,6 +26,10 @@ from .exceptions import NotInitializedException, RCLError
 from .logging import configure, get_logger, release
 
 _logger = get_logger("rclpy")
+
+
+_MISSED_S = 0.5
+"""After which a wait looks for signals: Python sees one that came right before it only then."""
 
 
 class WakeUp:
@@ -49,9 +55,11 @@ class WakeUp:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for `wake`; False after `timeout` seconds without."""
-        if timeout is None:
-            return self._lock.acquire()
-        return self._lock.acquire(True, min(max(timeout, 0.0), TIMEOUT_MAX))
+        end = math.inf if timeout is None else time.monotonic() + timeout
+        while not self._lock.acquire(True, min(max(end - time.monotonic(), 0.0), _MISSED_S)):
+            if time.monotonic() >= end:
+                return False
+        return True
 
 
 class SignalHandlerOptions(Enum):
