@@ -102,6 +102,18 @@ def test_the_arm_speeds_up_slowly_and_stops_when_nothing_is_asked_any_more():
     assert robot.action == "at rest"
 
 
+def test_a_velocity_along_the_patients_axes_is_one_however_the_probe_is_turned():
+    robot = Robot(RobotSettings(acceleration=1000.0, angular_acceleration=1e4))
+    for step in range(3):
+        robot.ask_velocity(0.1 * step, np.array([0, 0, 0, 0.2, 0.4, 0.3]))
+        before = robot.move(0.1 * step)
+    robot.ask_velocity(0.2, np.array([0.02, 0.01, 0, 0, 0, 0]), in_patient=True)
+    after = robot.move(0.3)
+    assert np.degrees(2 * math.acos(before.orientation[3])) > 5
+    np.testing.assert_allclose(after.position - before.position, [0.002, 0.001, 0], atol=1e-9)
+    np.testing.assert_allclose(after.orientation, before.orientation, atol=1e-9)
+
+
 def test_a_force_is_not_sought_where_none_is_felt():
     robot = Robot(RobotSettings())
     robot.ask_force(0.0, 4.0)

@@ -7,7 +7,6 @@ import time
 from functools import partial
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 
 from us_sim.errors import MessageError
@@ -41,12 +40,9 @@ class ProbeRobot(GuardedNode):
 
     def _take_twist(self, message: TwistStamped) -> None:
         twist, frame = twist_from(message), message.header.frame_id
-        if frame == "patient":
-            turn = self._robot.pose.rotation
-            twist = np.concatenate([twist[:3] @ turn, twist[3:] @ turn])
-        elif frame != "probe":
+        if frame not in ("probe", "patient"):
             raise MessageError(f"is in frame '{frame}', neither 'probe' nor 'patient'")
-        self._robot.ask_velocity(time.monotonic(), twist)
+        self._robot.ask_velocity(time.monotonic(), twist, in_patient=frame == "patient")
 
     def _take_force(self, message: WrenchStamped) -> None:
         wanted, most = float(wrench_from(message, "probe")[2]), self._settings.force

@@ -51,7 +51,7 @@ class Step(NamedTuple):
 
 
 class Attempt(ABC):
-    """What was done of a task so far: a scan is added whole, or in pieces one after another."""
+    """An attempt at a task: a scan is added to it whole, or in pieces one after another."""
 
     @abstractmethod
     def add(self, scan: Scan) -> None:
@@ -149,7 +149,7 @@ class _Points(Attempt):
 
 
 class _Point:
-    """What was seen of a vein around one point of it.
+    """A point of a vein, and all that was seen around it.
 
     Args:
         task: with the limits.

@@ -124,8 +124,12 @@ class Robot:
         self._wanted = self._felt = (-math.inf, 0.0)
         self.action = "at rest"  # for a person
 
-    def ask_velocity(self, time: float, twist: NDArray[np.float64]) -> None:
-        """Ask for a velocity (6,) m/s, rad/s in the probe's frame."""
+    def ask_velocity(
+        self, time: float, twist: NDArray[np.float64], *, in_patient: bool = False
+    ) -> None:
+        """Ask for a velocity (6,) m/s, rad/s along the axes of the probe, or of ``patient``."""
+        if in_patient:
+            twist = (twist.reshape(2, 3) @ self.pose.rotation).ravel()
         self._commands.append((time + self._settings.delay, twist))
 
     def ask_force(self, time: float, force: float) -> None:
