@@ -28,22 +28,18 @@ FOLDER = Path(__file__).resolve().parent
 BY_COLCON = bool({"install", "develop"} & set(sys.argv))
 """colcon calls `setup.py install` or `setup.py develop`; pip builds a wheel."""
 
-CYCLONEDDS_HAS_WHEELS = (
-    "python_version < '3.14' and (sys_platform == 'darwin' or platform_machine == 'x86_64' "
-    "or platform_machine == 'AMD64')"
-)
-NO_WHEELS = (
-    "python_version >= '3.14' or (sys_platform != 'darwin' and platform_machine != 'x86_64' "
-    "and platform_machine != 'AMD64')"
-)
 GYMNASIUM = "gymnasium>=1.1,<2"
 UPATH = "universal-pathlib>=0.3"
-ZENOH = ["eclipse-zenoh>=1.10,<2", "xxhash>=3"]
-STANDALONE = [
-    f"cyclonedds>=11.0,<12; {CYCLONEDDS_HAS_WHEELS}",
-    *(f"{each}; {NO_WHEELS}" for each in ZENOH),
-]
-"""The middleware that stands in for ROS 2, which brings its own."""
+HAS_ROS_WHEELS = "platform_system == 'Linux' and platform_machine == 'x86_64'"
+ROS = (
+    []
+    if BY_COLCON
+    else [
+        f"ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2; {HAS_ROS_WHEELS}",
+        f"ros-jazzy-common-interfaces>=5.3.6,<5.4; {HAS_ROS_WHEELS}",
+    ]
+)
+"""The real rclpy, messages and Fast DDS; a workspace has its own."""
 
 
 def console_scripts() -> list[str]:
@@ -78,7 +74,7 @@ setup(
     },
     python_requires=">=3.11",
     install_requires=[  # .ci/ubuntu tests the versions of Ubuntu 24.04, which are the oldest here
-        *([] if BY_COLCON else STANDALONE),
+        *ROS,
         "matplotlib>=3.6.3",
         "filelock>=3.12",
         "lz4>=4",
@@ -114,10 +110,8 @@ setup(
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
         "viewer": ["nicegui>=3.6,<4"],
-        "zenoh": ZENOH,
         "test": [
             "axe-playwright-python>=0.1.4",
-            *ZENOH,
             "fast-simplification>=0.1.7",
             GYMNASIUM,
             "hypothesis>=6.100",

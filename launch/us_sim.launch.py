@@ -47,7 +47,6 @@ ARGUMENTS = {
 SUPERVISION = {
     name: (str(getattr(SupervisionSettings(), name)), rule.description)
     for name, rule in rules_of(SupervisionSettings).items()
-    if name != "standby"  # launch starts processes when they are needed
 }
 
 

@@ -9,14 +9,14 @@ import pytest
 from chromium import chromium
 from hypothesis import settings
 
-import us_sim.nodes  # provides rclpy where ROS 2 is not installed
+import us_sim
 
 settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")
 
 # Programs that tests start import the package from where it is tested, and not from the folder that
 # they are in: kernels are kept for each place, and would all be compiled a second time.
-_PLACE = str(Path(us_sim.nodes.__file__).parents[2])
+_PLACE = str(Path(us_sim.__file__).parents[1])
 _SEARCHED = os.environ.get("PYTHONPATH", "").split(os.pathsep)
 os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([_PLACE, *filter(None, _SEARCHED)]))
 os.environ["PYTHONSAFEPATH"] = "1"
@@ -134,15 +134,13 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_corner() -> None:
-    """Keep the tests on this host and out of other simulations' domain and zenoh router."""
+    """Keep the tests on this host and out of other simulations' domain."""
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     worker = os.environ.get(_WORKER, "")
     own = 1 + (os.getppid() if worker else os.getpid()) % 100
     # The workers must not hear each other: the second one is on the next domain.
     domain = int(os.environ.get("ROS_DOMAIN_ID") or own) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(domain)
-    router = f'connect/endpoints=["tcp/127.0.0.1:{17_500 + domain}"]'
-    os.environ.setdefault("ZENOH_CONFIG_OVERRIDE", router)
 
 
 @pytest.fixture(scope="session")

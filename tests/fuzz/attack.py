@@ -29,7 +29,7 @@ from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.settings import NODES
 from us_sim.progress import Progress
 from us_sim.run.plan import NodeProcess, simulation_nodes
-from us_sim.run.processes import ProcessGroup, keep_on_this_host
+from us_sim.run.processes import ProcessGroup, prepare_ros
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import kinds_of
@@ -334,7 +334,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("attack_failures"))
     args = parser.parse_args(arguments)
-    keep_on_this_host(network=False)
+    prepare_ros(network=False)
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     rclpy.init(args=[])
     failed = 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed  # isort: skip
 from geometry_msgs.msg import Pose, PoseArray, PoseStamped, TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Joy

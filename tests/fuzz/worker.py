@@ -19,7 +19,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
 from tests.fuzz.mutation import mutated
 from tests.fuzz.target import TARGETS, Target, add_targets
 from us_sim.errors import UsSimError

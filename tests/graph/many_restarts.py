@@ -20,8 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
-
 SCENE = """
 name: restarts
 based_on: upper_arm

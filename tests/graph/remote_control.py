@@ -5,8 +5,6 @@ import subprocess
 import sys
 import time
 
-import us_sim.nodes  # noqa: F401 - provides rclpy where ROS 2 is not installed
-
 
 class RemoteControl:
     """Sets parameters, of ``session_control`` or another node, and hears what nodes report."""

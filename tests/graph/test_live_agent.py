@@ -12,8 +12,8 @@ from geometry_msgs.msg import TwistStamped, WrenchStamped
 from sensor_msgs.msg import Image
 
 from us_sim.environment.agents import VisualServo
-from us_sim.nodes.messages import pixels_from
 from us_sim.nodes.probe_robot import ProbeRobot
+from us_sim.recording.decoding import pixels_from
 from us_sim.slicing.settings import WALLS_TOUCH
 
 SCENE = "name: live\nbased_on: upper_arm_learning\ntissue: {solver: fem}\n"

@@ -25,7 +25,6 @@ def processor_time(pid: int) -> float:
 
 def main(rate: float, duration: float, folder: Path) -> int:
     """Publish ``rate`` MB/s for ``duration`` s to a recorder in ``folder``."""
-    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
     import rclpy
     from rclpy.node import Node
     from rclpy.qos import QoSProfile

@@ -11,10 +11,10 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 
-from us_sim.nodes.messages import pixels_from
 from us_sim.nodes.settings import CompressedSettings
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.streams.compressed import compressed
+from us_sim.recording.decoding import pixels_from
 
 IMAGE = "ultrasound/image"
 

@@ -15,8 +15,9 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Int32MultiArray
 
 from us_sim.errors import ProbeError, SceneError
-from us_sim.nodes.messages import cloud_message, field_from, pose_from, tetrahedra_message
+from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.slice_interpolator import SliceInterpolator
+from us_sim.recording.decoding import field_from, pose_from
 from us_sim.scene.building import blood_of, probe_of, scanner_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.flow.doppler import ColourDoppler

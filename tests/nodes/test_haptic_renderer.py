@@ -18,11 +18,11 @@ from us_sim.nodes.haptic_renderer import HapticRenderer, PeriodicThread
 from us_sim.nodes.messages import (
     contact_model_from,
     contact_model_message,
-    pose_from,
     wrench_message,
     wrench_serialized,
 )
 from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.recording.decoding import pose_from
 from us_sim.tracking.haptic import ContactModel
 
 TRACKER = (

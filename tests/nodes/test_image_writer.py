@@ -13,8 +13,9 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import VolumeError
 from us_sim.nodes.image_writer import ImageWriter
-from us_sim.nodes.messages import field_from, field_message, image_message
+from us_sim.nodes.messages import field_message, image_message
 from us_sim.nodes.qos import STREAM
+from us_sim.recording.decoding import field_from
 
 WATCHER = """
 import numpy as np
@@ -22,7 +23,7 @@ import us_sim.nodes
 import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-from us_sim.nodes.messages import pixels_from
+from us_sim.recording.decoding import (pixels_from)
 from us_sim.nodes.qos import STREAM
 
 sums = []

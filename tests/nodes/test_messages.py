@@ -17,27 +17,29 @@ from visualization_msgs.msg import Marker, MarkerArray
 from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
-    affine_from,
     affine_message,
     cloud_message,
     colour_image_message,
     image_message,
-    line_from,
-    markers_stamp,
-    mesh_from,
     mesh_message,
-    nanoseconds_of,
-    pixels_from,
-    pose_from,
-    pose_from_text,
     pose_message,
     pose_text,
     stamp_message,
     structure_markers,
     surface_marker,
-    tetrahedra_from,
     tetrahedra_message,
     transducer_markers,
+)
+from us_sim.recording.decoding import (
+    affine_from,
+    line_from,
+    markers_stamp,
+    mesh_from,
+    nanoseconds_of,
+    pixels_from,
+    pose_from,
+    pose_from_text,
+    tetrahedra_from,
     triangles_from,
     vectors_from,
 )

@@ -11,8 +11,8 @@ from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.messages import vectors_from
 from us_sim.nodes.skin_deformer import SkinDeformer
+from us_sim.recording.decoding import vectors_from
 from us_sim.scene.building import membrane_of
 from us_sim.scene.reading import load_scene
 

@@ -13,16 +13,11 @@ from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.errors import ProbeError
 from us_sim.nodes import slice_interpolator
-from us_sim.nodes.messages import (
-    affine_from,
-    cloud_message,
-    pixels_from,
-    pose_from,
-    tetrahedra_message,
-)
+from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.streams.stream import MModeStream
+from us_sim.recording.decoding import affine_from, pixels_from, pose_from
 from us_sim.scene.building import probe_of, skin_surface_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane

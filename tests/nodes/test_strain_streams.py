@@ -9,8 +9,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Int32MultiArray
 
-from us_sim.nodes.messages import cloud_message, field_from, pose_from, tetrahedra_message
+from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.slice_interpolator import SliceInterpolator
+from us_sim.recording.decoding import field_from, pose_from
 from us_sim.scene.building import scanner_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.slicing.settings import Strain

@@ -16,8 +16,9 @@ from visualization_msgs.msg import MarkerArray
 from us_sim.errors import SceneError, SettingsError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes import tissue_deformer as live_tissue
-from us_sim.nodes.messages import contact_model_from, tetrahedra_from, vectors_from
+from us_sim.nodes.messages import contact_model_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
+from us_sim.recording.decoding import tetrahedra_from, vectors_from
 from us_sim.scene.building import structures_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.tissue.solvers.solver import create_solver

@@ -7,9 +7,9 @@ import sys
 import time
 
 import pytest
+from us_sim.run.fork_server import ProcessState, process_state
 
 from us_sim.errors import SettingsError
-from us_sim.run.fork_server import ProcessState, process_state
 from us_sim.run.plan import NodeProcess
 from us_sim.run.supervision import going_on
 from us_sim.run.watch import Restarts, SupervisionSettings, Watch

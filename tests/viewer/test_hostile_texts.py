@@ -11,7 +11,6 @@ import pytest
 from awaiting import until
 from fake_hand import FakeHand
 
-import us_sim.nodes  # provides rclpy where ROS 2 is not installed
 import us_sim.viewer
 
 from bench import Bench  # isort: skip

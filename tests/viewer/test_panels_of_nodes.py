@@ -7,8 +7,6 @@ from typing import Any
 import pytest
 from awaiting import until
 
-import us_sim.nodes  # noqa: F401  provides rclpy where ROS 2 is not installed
-
 from bench import Bench  # isort: skip
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node

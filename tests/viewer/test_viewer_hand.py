@@ -17,15 +17,10 @@ from std_msgs.msg import Int32MultiArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.messages import (
-    cloud_message,
-    mesh_message,
-    nanoseconds_of,
-    pose_message,
-    tetrahedra_message,
-)
+from us_sim.nodes.messages import cloud_message, mesh_message, pose_message, tetrahedra_message
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.qos import LATCHED
+from us_sim.recording.decoding import nanoseconds_of
 from us_sim.skin.surface import bent_surface, plane_surface
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.feeds import RestMesh

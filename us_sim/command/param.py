@@ -56,9 +56,9 @@ def param_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Namespace) -> int:
-    from us_sim.run.processes import keep_on_this_host
+    from us_sim.run.processes import prepare_ros
 
-    keep_on_this_host(network=args.network)
+    prepare_ros(network=args.network)
     with _asker() as asker:
         return command(asker, args)
 

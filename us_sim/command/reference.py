@@ -238,7 +238,6 @@ def _parameters(settings: type[Settings]) -> str:
 
 def _scene_sections() -> Iterator[Section]:
     """The keys of a scene."""
-    import us_sim.nodes  # noqa: F401 - provides rclpy, which sources of poses import
     from us_sim.geometry.pose import Placement
     from us_sim.scene.scene import Scene
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from us_sim.errors import BagError, UsSimError
-from us_sim.nodes.messages import nanoseconds_of
+from us_sim.recording.decoding import nanoseconds_of
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.topic import BagTopic
 from us_sim.settings.spelling import counted

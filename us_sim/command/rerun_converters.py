@@ -20,7 +20,7 @@ from us_sim.command.rerun import STAMP, RerunFile
 from us_sim.errors import MeshError, MessageError, PoseError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.triangles import vertex_normals
-from us_sim.nodes.messages import (
+from us_sim.recording.decoding import (
     affine_from,
     colour_pixels_from,
     field_from,

@@ -62,24 +62,20 @@ def demo_options(demo: argparse.ArgumentParser) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from us_sim.run.fork_server import ForkServer
+    from us_sim.run.live import demo
 
-    with ForkServer() as forks:  # which imports what the nodes need while this process does
-        from us_sim.run.live import demo
-
-        return demo(
-            scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
-            args.volume,
-            args.out,
-            node_parameters(args.param),
-            network=args.network,
-            supervision=supervision(args),
-            source=args.source,
-            path=args.path,
-            topic=args.topic,
-            view=viewed(args),
-            forks=forks,
-        )
+    return demo(
+        scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
+        args.volume,
+        args.out,
+        node_parameters(args.param),
+        network=args.network,
+        supervision=supervision(args),
+        source=args.source,
+        path=args.path,
+        topic=args.topic,
+        view=viewed(args),
+    )
 
 
 @dataclass(frozen=True)
@@ -114,21 +110,17 @@ def run_options(run: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from us_sim.run.fork_server import ForkServer
-
     asked = read_settings(args, RunSettings)
     if args.dry_run:
         return _dry_run(args, asked)
     parameters = node_parameters(args.param)
-    with ForkServer() as forks:  # which imports what the nodes need while this process does
-        from us_sim.run.live import run
+    from us_sim.run.live import run
 
-        return run(
-            _request(args, asked, parameters),
-            network=args.network,
-            supervision=supervision(args),
-            forks=forks,
-        )
+    return run(
+        _request(args, asked, parameters),
+        network=args.network,
+        supervision=supervision(args),
+    )
 
 
 def _request(
@@ -256,8 +248,6 @@ def view_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from us_sim.run.fork_server import ForkServer
-
     parameters = node_parameters(args.param)
     if args.attach:
         given = (args.scene, args.case, args.volume, args.path)
@@ -274,24 +264,23 @@ def _view(args: argparse.Namespace) -> int:
         )
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
-    with ForkServer() as forks:  # which imports what the nodes need while this process does
-        from us_sim.run.live import run
-        from us_sim.run.plan import Request
-        from us_sim.scene.reading import load_scene
+    from us_sim.run.live import run
+    from us_sim.run.plan import Request
+    from us_sim.scene.reading import load_scene
 
-        asked = read_settings(args, RunSettings, ("record", "composed"))
-        request = Request(
-            load_scene(scene_name(args, "upper_arm"), volume=args.volume),
-            parameters,
-            record=asked.record,
-            composed=asked.composed,
-            path=args.path,
-            topic=args.topic,
-            view=viewer(args),
-            by_hand=not args.tracker,
-            playing={"stay": True, "loop": args.loop} if args.path is not None else {},
-        )
-        return run(request, network=args.network, supervision=supervision(args), forks=forks)
+    asked = read_settings(args, RunSettings, ("record", "composed"))
+    request = Request(
+        load_scene(scene_name(args, "upper_arm"), volume=args.volume),
+        parameters,
+        record=asked.record,
+        composed=asked.composed,
+        path=args.path,
+        topic=args.topic,
+        view=viewer(args),
+        by_hand=not args.tracker,
+        playing={"stay": True, "loop": args.loop} if args.path is not None else {},
+    )
+    return run(request, network=args.network, supervision=supervision(args))
 
 
 _OF_THE_PLAYER = ("rate", "loop", "start_offset", "playback_duration", "delay")

@@ -155,7 +155,6 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
     Args:
         viewer: whether it also takes the annotated image and the structures.
     """
-    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
     import rclpy
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
@@ -210,7 +209,6 @@ def publishing_ms(side: int) -> float | None:
 
 def _run_nodes(nodes: str) -> None:
     """Run nodes, a JSON list of their names and parameters, each in a thread, until SIGTERM."""
-    import us_sim.nodes  # noqa: F401, I001 - provides rclpy where ROS 2 is not installed
     import rclpy
 
     from us_sim.run.lockstep import node_in_process
@@ -265,7 +263,6 @@ def _own_peak() -> int | None:
 
 
 def _watch_images() -> None:
-    import us_sim.nodes  # noqa: F401
 
     import rclpy  # isort: skip
     from rclpy.node import Node
@@ -280,7 +277,6 @@ def _watch_images() -> None:
 
 
 def _publish_images(side: str) -> None:
-    import us_sim.nodes  # noqa: F401
 
     import rclpy  # isort: skip
     from rclpy.node import Node

@@ -1,17 +1,21 @@
-"""The rclpy nodes. Importing this package provides rclpy where ROS 2 is not installed.
+"""The rclpy nodes.
 
-It also ends a node's process without a word when Ctrl-C comes while its modules are imported: an
-import that a KeyboardInterrupt breaks off fails in ways of its own, with pages of traceback.
+Importing this package imports no rclpy, so that tables of topics and parameters can be read
+without. It ends a node's process without a word when Ctrl-C comes while its modules are imported:
+an import that a KeyboardInterrupt breaks off fails in ways of its own, with pages of traceback.
 `us_sim.nodes.process.run_node` takes over once it runs.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import os
 import signal
 import sys
 from pathlib import Path
+
+from us_sim.errors import UsSimError
 
 # Before NumPy loads its BLAS: several node processes share few cores, and small dense solves are
 # far slower on many threads.
@@ -19,18 +23,31 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
-STANDBY = "US_SIM_STANDBY"  # set in the environment of a node's process that is to wait
-STANDING_BY = "standing by"  # said by such a process once it is ready
 
 
-def end_at_once_when_interrupted() -> None:
-    """Do so from now on, where this process is a node and was not told to ignore Ctrl-C."""
-    if is_node(sys.orig_argv) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+def require_rclpy() -> None:
+    """Raise UsSimError, which says how to get it, where rclpy is not installed."""
+    if importlib.util.find_spec("rclpy") is None:
+        raise UsSimError(
+            "rclpy is not installed: on Linux x86-64 `pip install .` brings it; elsewhere use "
+            "`pixi run sim` (RoboStack), the Dockerfile, or ROS 2's own packages"
+        )
+
+
+def prepare_process() -> None:
+    """Where this process is a node, require rclpy, and end at once on Ctrl-C from now on."""
+    if not is_node(sys.orig_argv):
+        return
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    try:
+        require_rclpy()
+    except UsSimError as error:
+        sys.exit(f"us_sim: {error}")
 
 
 def is_node(command: list[str]) -> bool:
-    """Whether a command line runs a node: as a module, or by the script that colcon installs.
+    """Return whether a command line runs a node: as a module, or by the script of colcon.
 
     >>> is_node(["python3", "-X", "dev", "-m", "us_sim.nodes.path_player", "--ros-args"])
     True
@@ -49,8 +66,4 @@ def is_node(command: list[str]) -> bool:
     return False
 
 
-end_at_once_when_interrupted()  # before the imports that take a second
-
-from us_sim.standalone import install  # noqa: E402
-
-install()
+prepare_process()  # before the imports that take a second

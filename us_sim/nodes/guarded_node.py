@@ -27,8 +27,8 @@ from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Nodetype
 
 from us_sim.errors import MessageError, UsSimError, printable
-from us_sim.nodes.messages import nanoseconds_of, require_stamp
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.recording.decoding import nanoseconds_of, require_stamp
 from us_sim.recording.schemas import jazzy_definitions
 
 

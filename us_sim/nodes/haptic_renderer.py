@@ -18,15 +18,11 @@ from numpy.typing import NDArray
 from std_msgs.msg import Bool, Float64MultiArray
 
 from us_sim.errors import SceneError, StampError, UsSimError
-from us_sim.nodes.messages import (
-    contact_model_from,
-    nanoseconds_of,
-    pose_from,
-    wrench_serialized,
-)
+from us_sim.nodes.messages import contact_model_from, wrench_serialized
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.scene.building import haptic_rendering_of, source_settings
 
 _MEASURED = 2000  # ticks of which the jitter is told

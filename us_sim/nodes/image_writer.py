@@ -14,11 +14,11 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.messages import field_from, nanoseconds_of, pixels_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY
 from us_sim.nodes.settings import ImageWriterSettings
+from us_sim.recording.decoding import field_from, nanoseconds_of, pixels_from
 
 REMEMBERED = 1000
 """Images whose numbers are kept for what is known of them, and messages that wait for theirs."""

@@ -1,8 +1,4 @@
-"""Messages to values of the domain and back: the only place that knows their layouts.
-
-A type allows values that the domain does not: numbers that are not finite, quaternions of zero
-length, stamps that are no time, sizes that their buffers do not have. The readers here refuse
-those in one sentence.
+"""Messages from values of the domain; `us_sim.recording.decoding` is the way back.
 
 Bulk data are handed over as ``array.array('B', …)``, which rclpy takes without looking at each
 element.
@@ -10,7 +6,6 @@ element.
 
 from __future__ import annotations
 
-import re
 import struct
 from array import array
 from collections.abc import Sequence
@@ -18,23 +13,20 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, PoseStamped, TransformStamped, TwistStamped, WrenchStamped
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from shape_msgs.msg import Mesh, MeshTriangle
 from std_msgs.msg import Float64MultiArray, Header, Int32MultiArray, MultiArrayDimension
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
 from us_sim.errors import (
-    MeshError,
-    MessageError,
     PoseError,
-    ProbeError,
     StampError,
     TrackingError,
-    VolumeError,
 )
 from us_sim.geometry.pose import Pose
+from us_sim.recording.decoding import LAST_SECOND, SECOND, nanoseconds_since
 from us_sim.tracking.haptic import ContactModel
 
 CDR_LITTLE_ENDIAN = b"\0\1\0\0"  # what serialized messages begin with
@@ -47,82 +39,16 @@ def packed(code: str, values: NDArray[Any]) -> array[Any]:
     return data
 
 
-_SECOND = 1_000_000_000  # ns
-_LAST = 2**31 - 1 - 86_400
-"""s since 1970, a day before a stamp can count no further: what is added must be counted, too."""
-
-
-def nanoseconds_of(stamp: Time) -> int:
-    """The ns since 1970 of a stamp; 0 for one that was never set.
-
-    Raises:
-        StampError: it is no time: before 1970, with a second's worth of nanoseconds or more, or
-            so late that ROS cannot count any further.
-    """
-    return nanoseconds_since(stamp.sec, stamp.nanosec)
-
-
-def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
-    """Likewise, of a stamp's two parts."""
-    if not 0 <= seconds <= _LAST or not 0 <= nanoseconds < _SECOND:
-        raise StampError(
-            f"the stamp of {seconds} s and {nanoseconds} ns is no time: let the sender stamp its "
-            f"messages with its clock"
-        )
-    return int(_SECOND * seconds + nanoseconds)
-
-
 def stamp_message(nanoseconds: int) -> Time:
     """The stamp of a time in ns since 1970; of 1970 itself where it is before.
 
     Raises:
         StampError: it is so late that ROS cannot count any further.
     """
-    seconds, rest = divmod(max(int(nanoseconds), 0), _SECOND)
-    if seconds > _LAST:
+    seconds, rest = divmod(max(int(nanoseconds), 0), SECOND)
+    if seconds > LAST_SECOND:
         raise StampError(f"a time of {seconds} s after 1970 is later than a stamp can say")
     return Time(sec=seconds, nanosec=rest)
-
-
-def require_stamp(message: Any) -> None:
-    """Check the stamp that a message has in its header, or as a clock.
-
-    Raises:
-        StampError: there is one, and it is no time.
-    """
-    header = getattr(message, "header", None)
-    stamp = getattr(message, "clock", None) if header is None else header.stamp
-    if stamp is not None:
-        nanoseconds_of(stamp)
-
-
-def require_frame(header: Header, frame: str | None) -> None:
-    """Check the frame of a message; None is any.
-
-    Raises:
-        MessageError: it is another one.
-    """
-    if frame is not None and header.frame_id != frame:
-        raise MessageError(f"is in frame '{header.frame_id}', not '{frame}'")
-
-
-_FARTHEST_POSE = 1e7
-"""m, beyond which a position is in another unit, or nonsense."""
-
-
-def pose_from(message: PoseStamped, frame: str | None = None) -> Pose:
-    """The pose in a message.
-
-    Args:
-        message: of any device or node.
-        frame: that it must be in; None is any.
-
-    Raises:
-        PoseError: it is not finite, beyond any place, or its quaternion has no length to speak of.
-        MessageError: it is in another frame.
-    """
-    require_frame(message.header, frame)
-    return _pose(message.pose.position, message.pose.orientation)
 
 
 def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
@@ -137,40 +63,6 @@ def pose_message(pose: Pose, stamp: Time, frame: str) -> PoseStamped:
 def pose_text(pose: Pose) -> str:
     """Position (m) and quaternion x, y, z, w, as a value of diagnostics."""
     return " ".join(repr(float(number)) for number in (*pose.position, *pose.orientation))
-
-
-def pose_from_text(text: str) -> Pose:
-    """The pose in a text of `pose_text`.
-
-    Raises:
-        PoseError: it is no pose.
-    """
-    try:
-        numbers = np.array([float(word) for word in text.split()])
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) != 7:
-        raise PoseError(f"{text[:80]!r} is no pose: 7 numbers are one, x y z and a quaternion")
-    return Pose(numbers[:3], numbers[3:])
-
-
-def transform_from(message: TransformStamped) -> Pose:
-    """The child's pose in the frame of a transform's header.
-
-    Raises:
-        PoseError: as for `pose_from`.
-    """
-    return _pose(message.transform.translation, message.transform.rotation)
-
-
-def _pose(p: Any, q: Any) -> Pose:
-    pose = Pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
-    if max(map(abs, (p.x, p.y, p.z))) > _FARTHEST_POSE:
-        raise PoseError(
-            f"the pose is at ({p.x:.3g}, {p.y:.3g}, {p.z:.3g}) m, which is no place: positions are "
-            f"in metres"
-        )
-    return pose
 
 
 def transform_message(pose: Pose, stamp: Time, frame: str, child: str) -> TransformStamped:
@@ -192,33 +84,6 @@ def wrench_message(
     f.x, f.y, f.z = map(float, force)
     t.x, t.y, t.z = map(float, torque)
     return message
-
-
-def wrench_from(message: WrenchStamped, frame: str | None = None) -> NDArray[np.float64]:
-    """Force and torque (6,) N, N m about the origin of the message's frame.
-
-    Raises:
-        MessageError: a number is not finite, or it is in another frame.
-    """
-    require_frame(message.header, frame)
-    f, t = message.wrench.force, message.wrench.torque
-    wrench = np.array([f.x, f.y, f.z, t.x, t.y, t.z])
-    if not np.isfinite(wrench).all():
-        raise MessageError(f"the wrench is not finite: {wrench.tolist()}")
-    return wrench
-
-
-def twist_from(message: TwistStamped) -> NDArray[np.float64]:
-    """Linear and angular velocity (6,) m/s, rad/s along the axes of the message's frame.
-
-    Raises:
-        MessageError: a number is not finite.
-    """
-    v, w = message.twist.linear, message.twist.angular
-    twist = np.array([v.x, v.y, v.z, w.x, w.y, w.z])
-    if not np.isfinite(twist).all():
-        raise MessageError(f"the velocity is not finite: {twist.tolist()}")
-    return twist
 
 
 def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> bytes:
@@ -270,11 +135,6 @@ def contact_model_from(message: Float64MultiArray) -> ContactModel:
     return ContactModel(stamp, pose, values[9:15], values[15:].reshape(6, 6))
 
 
-_KINDS = {PointField.FLOAT32: "f4", PointField.FLOAT64: "f8"}
-_FARTHEST = 1e6
-"""m: coordinates beyond are no place, and their squares do not fit single precision for long."""
-
-
 def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: str) -> PointCloud2:
     """A float32 cloud whose fields are the ``columns``, each (N,), in their order."""
     table = np.column_stack(list(columns.values())).astype("<f4")
@@ -291,57 +151,6 @@ def cloud_message(columns: dict[str, NDArray[np.floating]], stamp: Time, frame: 
     return message
 
 
-def vectors_from(message: PointCloud2, frame: str | None = None) -> NDArray[np.float64]:
-    """The x, y, z fields of a cloud, (N, 3) m.
-
-    Args:
-        message: of one row of points or of several.
-        frame: that it must be in; None is any.
-
-    Raises:
-        MeshError: a field is missing, no float, or outside of its point; the data do not fill the
-            stated size; a coordinate is not finite, or too large to be one.
-        MessageError: it is in another frame.
-    """
-    require_frame(message.header, frame)
-    # In Python's integers, which are as wide as need be.
-    rows, columns, step = int(message.height), int(message.width), int(message.point_step)
-    stride = int(message.row_step) if rows > 1 else columns * step
-    kinds = {name: _kind_of(message, name) for name in "xyz"}
-    needed = (rows - 1) * stride + columns * step if rows * columns else 0
-    if stride < columns * step or len(message.data) < needed:
-        raise MeshError(
-            f"the point cloud holds {len(message.data)} bytes, but says it has {rows * columns} "
-            f"points of {step} bytes" + (f" in rows of {stride} bytes" if rows > 1 else "")
-        )
-    vectors = np.empty((rows * columns, 3))
-    for axis, (kind, offset) in enumerate(kinds.values() if len(vectors) else ()):
-        grid = np.ndarray((rows, columns), kind, message.data, offset, (stride, step))
-        vectors[:, axis] = grid.ravel()
-    if not (np.abs(vectors) <= _FARTHEST).all():  # nor is it for what is no number
-        raise MeshError(
-            "the point cloud has a coordinate that is not finite, or beyond any place: it must be "
-            "in metres"
-        )
-    return vectors
-
-
-def _kind_of(message: PointCloud2, name: str) -> tuple[str, int]:
-    """NumPy's name of a field's type, and where in its point it begins."""
-    fields = {field.name: field for field in message.fields}
-    field = fields.get(name)
-    kind = _KINDS.get(field.datatype) if field is not None else None
-    if field is None or kind is None or field.count > 1:
-        raise MeshError(f"the point cloud has no float field for '{name}'; it needs x, y and z")
-    offset, end = int(field.offset), int(field.offset) + int(kind[1])
-    if end > message.point_step:
-        raise MeshError(
-            f"the point cloud's field '{name}' ends {end} bytes into a point of "
-            f"{message.point_step} bytes"
-        )
-    return (">" if message.is_bigendian else "<") + kind, offset
-
-
 def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
     """(M, 4) node indices."""
     message = Int32MultiArray()
@@ -354,20 +163,6 @@ def tetrahedra_message(tetrahedra: NDArray[np.integer]) -> Int32MultiArray:
     return message
 
 
-def tetrahedra_from(message: Int32MultiArray) -> NDArray[np.int32]:
-    """(M, 4) node indices.
-
-    Raises:
-        MeshError: the number of indices is not a multiple of four, or one is negative.
-    """
-    indices = np.frombuffer(message.data, dtype=np.int32)
-    if len(indices) % 4:
-        raise MeshError(f"{len(indices)} node indices do not make whole tetrahedra")
-    if (indices < 0).any():
-        raise MeshError(f"node index {indices.min()} is of no node: they count from 0")
-    return indices.reshape(-1, 4)
-
-
 def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> Mesh:
     """(N, 3) m and (T, 3) as a shape."""
     return Mesh(
@@ -376,30 +171,8 @@ def mesh_message(vertices: NDArray[np.floating], triangles: NDArray[np.integer])
     )
 
 
-def mesh_from(message: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (N, 3) m and triangles (T, 3) of a shape.
-
-    Raises:
-        MeshError: a vertex is not finite, or a triangle names one that is not there.
-    """
-    vertices = np.array([(p.x, p.y, p.z) for p in message.vertices]).reshape(-1, 3)
-    indices = [triangle.vertex_indices for triangle in message.triangles]
-    triangles = np.array(indices, dtype=np.int64).reshape(-1, 3)
-    if not np.isfinite(vertices).all():
-        raise MeshError("a vertex of the mesh is not finite")
-    if triangles.size and triangles.max() >= len(vertices):
-        raise MeshError(
-            f"the mesh's triangles name vertex {triangles.max()}, but it has {len(vertices)}"
-        )
-    return vertices, triangles
-
-
 def _points(vertices: NDArray[np.floating]) -> list[Point]:
     return [Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
-
-
-_FIELD = re.compile(r"32FC([1-4])")
-_LARGEST_OFFSET = 1e6  # m, of a pixel, or to the first one
 
 
 def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
@@ -433,67 +206,6 @@ def _image(pixels: NDArray[Any], encoding: str, size: int, stamp: Time, frame: s
     return message
 
 
-def pixels_from(message: Image) -> NDArray[np.uint8]:
-    """The (rows, columns) pixels of a ``mono8`` image.
-
-    Raises:
-        VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
-    """
-    if message.encoding not in ("mono8", "8UC1"):
-        raise VolumeError(f"the image is {message.encoding}; it must be mono8")
-    return rows_from(message, 1)
-
-
-def colour_pixels_from(message: Image) -> NDArray[np.uint8]:
-    """The (rows, columns, 3) pixels of an ``rgb8`` image: red, green, blue.
-
-    Raises:
-        VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
-    """
-    if message.encoding != "rgb8":
-        raise VolumeError(f"the image is {message.encoding}; it must be rgb8")
-    return rows_from(message, 3).reshape(int(message.height), int(message.width), 3)
-
-
-def field_from(message: Image) -> NDArray[np.float32]:
-    """The (rows, columns, K) values of a ``32FC…`` image, (rows, columns) where K is 1.
-
-    Raises:
-        VolumeError: another encoding, big-endian values, no pixels, or fewer bytes than the stated
-            size.
-    """
-    form = _FIELD.fullmatch(message.encoding)
-    if form is None or message.is_bigendian:
-        what = f"big-endian {message.encoding}" if message.is_bigendian else message.encoding
-        raise VolumeError(f"the image is {what}; it must be 32FC1 to 32FC4, little-endian")
-    count = int(form[1])
-    values = np.ascontiguousarray(rows_from(message, 4 * count)).view("<f4")
-    rows, columns = int(message.height), int(message.width)
-    return values.reshape((rows, columns) if count == 1 else (rows, columns, count))
-
-
-def rows_from(message: Image, size: int) -> NDArray[np.uint8]:
-    """The bytes of an image, row by row, without padding.
-
-    Args:
-        message: the image.
-        size: bytes of a pixel.
-
-    Raises:
-        VolumeError: no pixels, or fewer bytes than the stated size.
-    """
-    rows, columns = int(message.height), int(message.width)
-    step = int(message.step) or size * columns
-    if not rows or not columns or step < size * columns or len(message.data) < rows * step:
-        bytes_each = f" of {size} bytes" if size > 1 else ""
-        raise VolumeError(
-            f"the image holds {len(message.data)} bytes, but says it has {rows} rows of {columns} "
-            f"pixels{bytes_each} in {step} bytes each"
-        )
-    flat = np.frombuffer(message.data, dtype=np.uint8, count=rows * step)
-    return flat.reshape(rows, step)[:, : size * columns]
-
-
 def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
     """A (4, 4) affine map, row after row."""
     message = Float64MultiArray()
@@ -505,44 +217,10 @@ def affine_message(matrix: NDArray[np.floating]) -> Float64MultiArray:
     return message
 
 
-def affine_from(message: Float64MultiArray) -> NDArray[np.float64]:
-    """The (4, 4) affine map in a message.
-
-    Raises:
-        ProbeError: it is no 4 by 4 matrix, its last row is not 0 0 0 1, or a number of it is not
-            finite, or so large that products of it would not be.
-    """
-    sizes = tuple(dimension.size for dimension in message.layout.dim)
-    strides = tuple(dimension.stride for dimension in message.layout.dim)
-    count, offset = len(message.data), message.layout.data_offset
-    if sizes != (4, 4) or strides[1] != 4 or count != offset + 16:
-        raise ProbeError(
-            f"the matrix has {count} numbers from {offset} on in dimensions {list(sizes)} with "
-            f"strides {list(strides)}; it must be 4 by 4, row after row (strides 16 and 4)"
-        )
-    matrix = np.array(message.data[offset:], dtype=np.float64).reshape(4, 4)
-    if not (
-        (np.abs(matrix) <= _LARGEST_OFFSET).all() and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()
-    ):
-        raise ProbeError(
-            f"the matrix {matrix.tolist()} is not an affine map: give finite numbers, and "
-            f"0 0 0 1 as the last row"
-        )
-    return matrix
-
-
 Surface = tuple[str, tuple[float, float, float, float], NDArray[np.floating], NDArray[np.integer]]
 """A marker's namespace, its red, green, blue and alpha, (V, 3) m vertices and (T, 3) triangles."""
-
-MarkedTriangles = tuple[str, tuple[float, float, float], NDArray[np.float64]]
-"""A marker's namespace, its red, green and blue, and three (3 T, 3) m corners of each triangle."""
-
 _LINE_WIDTH = 4e-4  # m, of an image's outline
 _OUTLINE_COLOUR = (0.31, 0.70, 0.75, 1.0)
-
-_FIRST_STAMP = 8
-"""Where it is in a serialized array: after the encapsulation and the number of markers."""
-
 _EMPTY = (1, b"\0")  # a string
 _MARKER_TAIL = struct.pack(
     "@II1siII1sI1sIII1sI1sI1sI?",
@@ -584,73 +262,6 @@ def transducer_markers(
         *(stamp, frame, sum(map(len, whole[1:]))),
     )
     return b"".join(whole)
-
-
-def triangles_from(message: MarkerArray, frame: str) -> list[MarkedTriangles]:
-    """The triangles of each TRIANGLE_LIST that an array adds, those of a namespace together.
-
-    Raises:
-        MeshError: corners do not make whole triangles, or one is not finite.
-        MessageError: a marker is in another frame.
-    """
-    corners: dict[str, list[NDArray[np.float64]]] = {}
-    colours: dict[str, tuple[float, float, float]] = {}
-    for marker in message.markers:
-        if marker.type != Marker.TRIANGLE_LIST or marker.action != Marker.ADD or not marker.points:
-            continue
-        require_frame(marker.header, frame)
-        points = _points_of(marker)
-        if len(points) % 3:
-            raise MeshError(f"{marker.ns}: {len(points)} corners do not make whole triangles")
-        corners.setdefault(marker.ns, []).append(points)
-        channels = np.nan_to_num([marker.color.r, marker.color.g, marker.color.b])
-        red, green, blue = np.clip(channels, 0.0, 1.0).tolist()
-        colours.setdefault(marker.ns, (red, green, blue))
-    return [(name, colours[name], np.concatenate(found)) for name, found in corners.items()]
-
-
-def line_from(message: MarkerArray, frame: str) -> NDArray[np.float64]:
-    """(P, 3) m, the points of the first LINE_STRIP that an array adds, without the repeated last.
-
-    Raises:
-        MeshError: a point is not finite.
-        MessageError: the marker is in another frame.
-    """
-    for marker in message.markers:
-        if marker.type == Marker.LINE_STRIP and marker.action == Marker.ADD and marker.points:
-            require_frame(marker.header, frame)
-            points = _points_of(marker)
-            return points[:-1] if (points[0] == points[-1]).all() else points
-    return np.zeros((0, 3))
-
-
-def markers_stamp(data: bytes) -> int | None:
-    """The ns since 1970 at which the first marker of a serialized array is; None where it has none.
-
-    Nothing else of it is decoded: an array may hold megabytes.
-
-    Raises:
-        StampError: it is no time.
-    """
-    order = "<" if data[1:2] == b"\1" else ">"
-    if len(data) < _FIRST_STAMP + 8 or struct.unpack_from(f"{order}I", data, 4)[0] == 0:
-        return None
-    return nanoseconds_since(*struct.unpack_from(f"{order}iI", data, _FIRST_STAMP))
-
-
-def _points_of(marker: Marker) -> NDArray[np.float64]:
-    """(P, 3) m, in the marker's frame."""
-    points = np.array([(p.x, p.y, p.z) for p in marker.points], dtype=np.float64)
-    if not np.isfinite(points).all():
-        raise MeshError(f"{marker.ns}: a point is not finite")
-    p, q = marker.pose.position, marker.pose.orientation
-    if q.x == q.y == q.z == q.w == 0.0:  # as of a message in which nobody set it
-        q.w = 1.0
-    try:
-        pose = Pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
-    except PoseError as error:
-        raise MeshError(f"{marker.ns}: {error}") from error
-    return pose.apply(points)
 
 
 def _marker(surface: Surface, stamp: Time, frame: str, offset: int) -> list[bytes]:

@@ -13,12 +13,12 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64MultiArray
 
 from us_sim.errors import ProbeError
-from us_sim.nodes.messages import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import OpenIGTLinkBridgeSettings
+from us_sim.recording.decoding import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.tracking.openigtlink import OpenIGTLinkServer, image_message, transform_message
 
 REMEMBERED = 256  # poses kept for the images that carry their stamps

@@ -16,13 +16,14 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.messages import nanoseconds_of, pose_message, stamp_message
+from us_sim.nodes.messages import pose_message, stamp_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited, Playback
 from us_sim.nodes.sessions.rosbag2_services import offer_player_services
 from us_sim.nodes.settings import PathPlayerSettings
+from us_sim.recording.decoding import nanoseconds_of
 from us_sim.recording.path import ProbePath, read_path
 from us_sim.settings.spelling import counted
 from us_sim.share import find_bag

@@ -11,11 +11,12 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 
 from us_sim.errors import MessageError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.messages import pose_message, twist_from, wrench_from
+from us_sim.nodes.messages import pose_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import FOREIGN, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
+from us_sim.recording.decoding import twist_from, wrench_from
 from us_sim.tracking.robot import Robot, RobotSettings
 
 

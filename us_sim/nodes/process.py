@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import json
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -17,45 +15,10 @@ import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from us_sim.errors import UsSimError, memory_limit
-from us_sim.nodes import INTERRUPTED, STANDBY, STANDING_BY
+from us_sim.nodes import INTERRUPTED
 from us_sim.nodes.guarded_node import GuardedNode
-
-_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-
-
-def stand_by(create: Callable[[], Node], args: list[str] | None) -> list[str] | None:
-    """Wait for a line on stdin: the arguments to run with, as JSON; None at the end of stdin.
-
-    Meanwhile the node is made once where nobody can discover it, and thrown away: its modules and
-    kernels are loaded then. That is done by a thread of low priority, which the nodes that run do
-    not notice.
-    """
-    rehearsal = threading.Thread(target=_rehearse, args=(create, args), daemon=True)
-    rehearsal.start()
-    rehearsal.join()
-    print(STANDING_BY, flush=True)
-    line = sys.stdin.readline()
-    return list(json.loads(line)) if line else None
-
-
-def _rehearse(create: Callable[[], Node], args: list[str] | None) -> None:
-    with contextlib.suppress(AttributeError, OSError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
-    before = os.environ.get(_RANGE)
-    os.environ[_RANGE] = "OFF"
-    # A fault of the node is reported when it is made in earnest.
-    with contextlib.suppress(Exception):
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        create().destroy_node()
-    with contextlib.suppress(Exception):
-        rclpy.try_shutdown()
-    del os.environ[_RANGE]
-    if before is not None:
-        os.environ[_RANGE] = before
-    gc.collect()
 
 
 def go_first(priority: int = 1) -> str:
@@ -112,16 +75,11 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
 
     A node with a ``finished`` future ends when that is done; told to end before, or while it is
     made, its status is `INTERRUPTED`, so that nobody takes its work for done. Bad input, also as
-    the exception of that future, is one sentence on stderr and exit status 1. With `STANDBY` in
-    the environment it waits first.
+    the exception of that future, is one sentence on stderr and exit status 1.
     """
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
     try:
-        if os.environ.get(STANDBY):
-            args = stand_by(create, args)
-            if args is None:
-                return INTERRUPTED
         rclpy.init(args=args)
     except KeyboardInterrupt:
         return INTERRUPTED

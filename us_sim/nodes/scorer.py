@@ -16,12 +16,12 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.messages import nanoseconds_of, pixels_from, pose_from, wrench_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, LATCHED, overridable
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
+from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scoring.exercise import Step, read_exercise
 from us_sim.scoring.live import LiveScan

@@ -12,17 +12,12 @@ from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
 from us_sim.errors import UsSimError
-from us_sim.nodes.messages import (
-    cloud_message,
-    mesh_message,
-    nanoseconds_of,
-    pose_from,
-    surface_marker,
-)
+from us_sim.nodes.messages import cloud_message, mesh_message, surface_marker
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import SkinDeformerSettings
+from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.scene.building import membrane_of
 from us_sim.settings.setting import rules_of
 from us_sim.skin.settings import MembraneSettings, SkinSettings

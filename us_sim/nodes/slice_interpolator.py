@@ -15,13 +15,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.messages import (
-    affine_message,
-    nanoseconds_of,
-    pose_from,
-    tetrahedra_from,
-    vectors_from,
-)
+from us_sim.nodes.messages import affine_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import LATCHED
@@ -29,6 +23,7 @@ from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import is_live
 from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
+from us_sim.recording.decoding import nanoseconds_of, pose_from, tetrahedra_from, vectors_from
 from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings

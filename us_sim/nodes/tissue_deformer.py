@@ -24,8 +24,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
     cloud_message,
     contact_model_message,
-    nanoseconds_of,
-    pose_from,
     structure_markers,
     tetrahedra_message,
     wrench_message,
@@ -35,6 +33,7 @@ from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import StructureMarkersSettings, TissueDeformerSettings
 from us_sim.progress import late_progress
+from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.scene.building import Structure, materials_of, structures_of, tissue_model_of, volume_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.spelling import counted

@@ -17,10 +17,10 @@ from std_srvs.srv import Trigger
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.messages import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, LATCHED
+from us_sim.recording.decoding import affine_from, nanoseconds_of, pixels_from, pose_from
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.reconstruction import LiveReconstruction
 from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume

@@ -23,7 +23,7 @@ from typing import Any
 
 from us_sim.errors import BagError, UsSimError
 from us_sim.recording.metadata import read_metadata
-from us_sim.run.fork_server import end_with_parent, package_on_path
+from us_sim.run.processes import end_with_parent, package_on_path
 from us_sim.scene.building import volume_of
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
 from us_sim.scene.reading import load_scene

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
 from us_sim.progress import Progress, late_progress
-from us_sim.run.fork_server import ForkServer
 from us_sim.run.losses import IMAGES, Outcome
 from us_sim.run.monitored import Monitored, alone_on_domain, domain
 from us_sim.run.plan import (
@@ -23,7 +22,7 @@ from us_sim.run.plan import (
     plan_of,
     viewer_process,
 )
-from us_sim.run.processes import ProcessGroup, keep_on_this_host
+from us_sim.run.processes import ProcessGroup, prepare_ros
 from us_sim.run.ros_arguments import ros_arguments
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import IMAGER, Supervisor, say
@@ -48,7 +47,6 @@ def follow(
     log: Path | None,
     settings: SupervisionSettings,
     request: Request | None = None,
-    forks: ForkServer | None = None,
 ) -> Outcome:
     """Start the plan's processes and stay with them until they are done; how it went.
 
@@ -58,13 +56,12 @@ def follow(
         settings: when a node hangs, and how often it is started again.
         request: that the plan was made for, which may change while it runs. None where what runs
             is no simulation, of which there is one on a domain.
-        forks: that the processes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: a node cannot start, or another simulation runs on this domain.
     """
     with contextlib.nullcontext() if request is None else alone_on_domain():
-        group = ProcessGroup(log, forks)
+        group = ProcessGroup(log)
         supervisor = simulation = None
         startup = 0.0
         # A page loads while the others are looked for and started.
@@ -214,7 +211,6 @@ def run(
     *,
     network: bool,
     supervision: SupervisionSettings,
-    forks: ForkServer | None = None,
 ) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
 
@@ -222,7 +218,6 @@ def run(
         request: the scene, and what is recorded, played and shown.
         network: talk beyond this host.
         supervision: when a node hangs, and how often it is started again.
-        forks: that the nodes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: bad input, or something was lost: a node ended or hung, images were not
@@ -230,10 +225,10 @@ def run(
     """
     if request.topic and request.path is None:
         raise UsSimError(f"--topic {request.topic}: is of a path: name its file with --path")
-    keep_on_this_host(network=network)
+    prepare_ros(network=network)
     plan = plan_of(request).with_free_port()
     prepare_volume(request.scene, request.path, plan.topic)
-    outcome = follow(plan, None, supervision, request, forks)
+    outcome = follow(plan, None, supervision, request)
     for file in outcome.files:
         print(f"recorded to {file}")
     _require_nothing_lost(outcome)
@@ -252,7 +247,6 @@ def demo(
     path: Path | None = None,
     topic: str | None = None,
     view: ViewerSettings | None = None,
-    forks: ForkServer | None = None,
 ) -> int:
     """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
@@ -268,13 +262,12 @@ def demo(
         path: bag or recording that is played in place of the scene's own path.
         topic: of the body in it whose poses are played.
         view: address of the page that shows the simulation; None is no page.
-        forks: that the nodes are forked from; None starts each as a program.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or something was lost: a node ended
             or hung, images were not recorded.
     """
-    keep_on_this_host(network=network)
+    prepare_ros(network=network)
     if ros_arguments():
         raise UsSimError(
             "--ros-args: the demo's report is of topics under their usual names: use `us-sim run "
@@ -300,7 +293,7 @@ def demo(
         plan = plan_of(request).with_free_port()
         prepare_volume(scene, played, plan.topic)
     started = time.monotonic()
-    outcome = follow(plan, out / "nodes.log", supervision, request, forks)
+    outcome = follow(plan, out / "nodes.log", supervision, request)
     try:
         _report(scene, out, outcome, time.monotonic() - started, video)
     except UsSimError as error:
@@ -341,7 +334,7 @@ def view_running(
     Raises:
         UsSimError: the viewer cannot start, or one is there already.
     """
-    keep_on_this_host(network=network)
+    prepare_ros(network=network)
     viewer = viewer_process(view, checked_parameters("viewer", None, given.get("viewer", {})))
     others = sorted(set(given) - {viewer.node})
     if others:
@@ -369,7 +362,7 @@ def play(
     """
     from us_sim.recording.path import read_path
 
-    keep_on_this_host(network=network)
+    prepare_ros(network=network)
     settings: dict[str, object] = {
         "path": str(full_path(bag)),
         **{name: value for name, value in vars(player).items() if value is not None},

@@ -26,7 +26,7 @@ from us_sim.run.plan import (
     scene_settings,
     simulation_nodes,
 )
-from us_sim.run.processes import keep_on_this_host
+from us_sim.run.processes import prepare_ros
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.spelling import counted
@@ -69,7 +69,7 @@ def render_scene(
     Raises:
         UsSimError: no path, an output folder that is not empty, or what :func:`render` raises.
     """
-    keep_on_this_host(network=False)
+    prepare_ros(network=False)
     path = path or (Path(scene.path) if scene.path else None)
     if path is None:
         raise UsSimError(f"{scene.origin}: path: is missing; give a bag with --path")

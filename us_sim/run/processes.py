@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import ctypes
 import os
 import signal
 import subprocess
@@ -17,10 +17,24 @@ from typing import IO
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError, memory_limit, printable
-from us_sim.nodes import INTERRUPTED, STANDBY, STANDING_BY
+from us_sim.nodes import INTERRUPTED, require_rclpy
 from us_sim.nodes.settings import RECORDER, VIEWER
-from us_sim.run.fork_server import ForkedProcess, ForkServer, end_with_parent, package_on_path
 from us_sim.run.plan import NodeProcess
+
+_THIS_PROGRAM = ctypes.CDLL(None)  # loaded before any fork
+
+
+def end_with_parent() -> None:
+    """Have this new process get SIGTERM when its parent ends, before its program begins (Linux)."""
+    set_death_signal = 1  # PR_SET_PDEATHSIG
+    _THIS_PROGRAM.prctl(set_death_signal, signal.SIGTERM)
+
+
+def package_on_path() -> str:
+    """PYTHONPATH with which a program finds this very package."""
+    package = str(Path(__file__).resolve().parents[2])
+    return os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
+
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -59,31 +73,19 @@ class RunningNode:
 
     Args:
         node: what it runs.
-        show: what is done with its lines; None for one that stands by.
-        forks: that it is forked from, where that can be.
+        show: what is done with its lines.
     """
 
-    def __init__(
-        self,
-        node: NodeProcess,
-        show: Callable[[str], None] | None,
-        forks: ForkServer | None = None,
-    ) -> None:
-        command = node.command()
-        environment = os.environ | {"PYTHONPATH": package_on_path()}
-        environment |= node.secrets
-        environment |= {} if show else {STANDBY: "1"}
+    def __init__(self, node: NodeProcess, show: Callable[[str], None]) -> None:
         self.node = node
-        is_fed = show is None
-        forked = forks.fork(node.node, command, environment, is_fed=is_fed) if forks else None
-        self.process: subprocess.Popen[str] | ForkedProcess = forked or subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE if is_fed else subprocess.DEVNULL,
+        self.process = subprocess.Popen(
+            node.command(),
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=environment,
+            env=os.environ | {"PYTHONPATH": package_on_path()} | node.secrets,
             start_new_session=True,
             preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
@@ -107,22 +109,7 @@ class RunningNode:
                 self.said = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
             if line.startswith(COMPLAINT):
                 self.complaint = self.said
-            if self._show is not None:
-                self._show(line)
-
-    def go_on(self, node: NodeProcess, show: Callable[[str], None]) -> bool:
-        """Run the node in earnest, as it is wanted now, after standing by; whether it can."""
-        assert self.process.stdin is not None
-        if self.said != STANDING_BY:
-            self.kill()
-            return False
-        self.node, self._show = node, show
-        try:
-            self.process.stdin.write(json.dumps(node.arguments()) + "\n")
-            self.process.stdin.close()
-        except OSError:
-            return False
-        return True
+            self._show(line)
 
     def tell_to_end(self) -> None:
         """SIGTERM, which one that was stopped gets, too."""
@@ -148,11 +135,18 @@ RECORDER_STOP_S = 10.0  # how long the recorder may take to write what it still 
 HUNG_STOP_S = 2.0  # how long a node that hangs may take to end by itself, before it is killed
 
 
-def keep_on_this_host(*, network: bool) -> None:
-    """Keep the processes started from here on this host, unless the environment says otherwise.
+def prepare_ros(*, network: bool) -> None:
+    """Require rclpy, and keep what is started from here on this host.
 
     Nobody on a hospital's network should meet a simulator by accident.
+
+    Args:
+        network: talk beyond this host, as the environment says.
+
+    Raises:
+        UsSimError: rclpy is not installed.
     """
+    require_rclpy()
     if not network:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
@@ -162,13 +156,10 @@ class ProcessGroup:
 
     Args:
         log: where their output goes; None shows it on this terminal, above any progress.
-        forks: that they are forked from; None starts each as a program.
     """
 
-    def __init__(self, log: Path | None = None, forks: ForkServer | None = None) -> None:
-        self._forks = forks
+    def __init__(self, log: Path | None = None) -> None:
         self._running: dict[str, RunningNode] = {}
-        self._standbys: dict[str, RunningNode] = {}
         self._leaving: list[tuple[str, RunningNode, float]] = []  # and until when they may take
         self._log_path = log
         self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
@@ -176,27 +167,14 @@ class ProcessGroup:
     def start(self, processes: Iterable[NodeProcess]) -> None:
         """Start each from this very package; they end with this process, whatever happens to it.
 
-        A node of the same name that has ended is replaced, by one that stands by if there is one;
-        one that runs as it shall goes on.
+        A node of the same name that has ended is replaced; one that runs as it shall goes on.
         """
         for process in processes:
             if self.is_running(process.node) and self._running[process.node].node == process:
                 continue
             with deferred_signals():
-                standby = self._standbys.pop(process.node, None)
                 show = self._tell if process.node == VIEWER else self._show
-                if standby is None or not standby.go_on(process, show):
-                    standby = RunningNode(process, show, self._forks)
-                self._running[process.node] = standby
-
-    def stand_by(self, process: NodeProcess) -> bool:
-        """Have a second process of a node; whether it is ready."""
-        standby = self._standbys.get(process.node)
-        if standby is None or standby.process.poll() is not None:
-            with deferred_signals():
-                standby = RunningNode(process, None, self._forks)
-                self._standbys[process.node] = standby
-        return standby.said == STANDING_BY
+                self._running[process.node] = RunningNode(process, show)
 
     def _tell(self, line: str) -> None:
         """Show a line to the person, too, whom it tells where the page is."""
@@ -260,9 +238,6 @@ class ProcessGroup:
 
     def dismiss(self, node: str) -> None:
         """Tell one to end, without waiting for that: `leaving` says when it has."""
-        standby = self._standbys.pop(node, None)
-        if standby is not None:
-            standby.kill()
         running = self._running.pop(node, None)
         if running is not None:
             limit = RECORDER_STOP_S if node == RECORDER else STOP_S
@@ -303,9 +278,7 @@ class ProcessGroup:
             running.wait(until - time.monotonic())
         every = [*self._running.items(), *((node, running) for node, running, _ in self._leaving)]
         killed = [node for node, running in every if running.kill()]
-        for running in self._standbys.values():
-            running.kill()
-        for running in (*(running for _, running in every), *self._standbys.values()):
+        for _, running in every:
             running.reader.join(STOP_S)
         if self._log is not None:
             with contextlib.suppress(OSError):

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, UsSimError, printable
-from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
+from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagMessage

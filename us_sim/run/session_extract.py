@@ -16,7 +16,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from us_sim.errors import BagError
-from us_sim.nodes.messages import colour_pixels_from, pixels_from
+from us_sim.recording.decoding import colour_pixels_from, pixels_from
 from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader

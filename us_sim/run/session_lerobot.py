@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, TrackingError
-from us_sim.nodes.tracker_inputs.camera_input import decoded, decompressed
 from us_sim.recording.lerobot_writer import (
     IMAGES,
     POSE_PARTS,
@@ -30,14 +29,15 @@ from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagTopic
 from us_sim.recording.wrench import WRENCH_STAMPED
 from us_sim.settings.spelling import counted
+from us_sim.tracking.camera.encodings import decode_image, decompress_image
 
 _SECOND = 1_000_000_000
 _HIGHEST_RATE = 1000  # Hz
 _MOST_FRAMES = 10_000_000
 """Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""
 _PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
-    "sensor_msgs/msg/Image": decoded,
-    "sensor_msgs/msg/CompressedImage": decompressed,
+    "sensor_msgs/msg/Image": decode_image,
+    "sensor_msgs/msg/CompressedImage": decompress_image,
 }
 _NUMBERS: Mapping[str, Callable[[Any], Iterator[tuple[str, float]]]] = {
     WRENCH_STAMPED: lambda m: zip(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.messages import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.nodes.topics import published_counts
+from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.camera_video import PathVideo
 from us_sim.scene.building import scanner_of, volume_of

@@ -12,7 +12,6 @@ from tqdm import tqdm
 from us_sim.errors import printable
 from us_sim.nodes import INTERRUPTED
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER
-from us_sim.run.fork_server import SLOW
 from us_sim.run.losses import IMAGES, Loss, Outcome, Recordings, images_in
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
@@ -153,8 +152,6 @@ class Supervisor:
             self._lose(node, how, said)
         self._welcome()
         self._note_full_disk()
-        if self._settings.standby:
-            self._prepare()
 
     def _start_due(self) -> None:
         """Start nodes that are due, unless a dismissed one may still publish beside them.
@@ -247,14 +244,6 @@ class Supervisor:
             loss.back_after = self._back[node] - since
             self._publish()
             say(f"{node} is back after {loss.back_after:.1f} s")
-
-    def _prepare(self) -> None:
-        if self.waiting:
-            return
-        for node in SLOW:
-            running = node in self._processes and self._group.is_running(node)
-            if running and not self._group.stand_by(self._processes[node]):
-                return
 
     def _loss(self, node: str, what: str, said: str) -> Loss:
         return Loss(node, what, time.monotonic() - self._began, said)

@@ -11,12 +11,13 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 
-from us_sim.run.fork_server import ProcessState, process_state
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
@@ -39,11 +40,27 @@ class SupervisionSettings(Settings):
         "seconds without a report after which a node hangs; six times as long while it works",
         default=10.0,
     )
-    standby: bool = setting(
-        description="keep a second process of each node that takes long to start, which takes over "
-        "at once; needs twice the memory",
-        default=False,
-    )
+
+
+@dataclass(frozen=True)
+class ProcessState:
+    """A process at one moment, as the system sees it."""
+
+    is_stopped: bool  # by SIGSTOP
+    is_waiting: bool  # for a processor or a disk
+    cpu: float  # s of processor time that it has used
+
+
+def process_state(pid: int) -> ProcessState | None:
+    """The state of a process; None where it has ended, or the system does not say (not Linux)."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        fields = text.rpartition(")")[2].split()
+        ticks = int(fields[11]) + int(fields[12])  # utime and stime, see proc_pid_stat(5)
+    except (OSError, ValueError, IndexError):
+        return None
+    cpu = ticks / os.sysconf("SC_CLK_TCK")
+    return ProcessState(fields[0] == "T", fields[0] in "RD", cpu)
 
 
 STEP_S = 0.5

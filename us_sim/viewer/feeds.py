@@ -25,7 +25,8 @@ from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, decoded
-from us_sim.nodes.messages import (
+from us_sim.nodes.qos import LATCHED, STREAM
+from us_sim.recording.decoding import (
     affine_from,
     colour_pixels_from,
     line_from,
@@ -39,7 +40,6 @@ from us_sim.nodes.messages import (
     vectors_from,
     wrench_from,
 )
-from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.slicing.settings import STRIPS
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.stream import Feed, Packet, Posted

@@ -27,10 +27,11 @@ from shape_msgs.msg import Mesh
 from us_sim.errors import MessageError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
-from us_sim.nodes.messages import mesh_from, pose_from, pose_from_text, pose_message
+from us_sim.nodes.messages import pose_message
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.nodes.settings import PLAYERS
+from us_sim.recording.decoding import mesh_from, pose_from, pose_from_text
 from us_sim.settings.spelling import shown
 from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance

@@ -32,7 +32,7 @@ from us_sim.recording.reader import read_bag
 from us_sim.run.live import prepare_volume
 from us_sim.run.lockstep import render
 from us_sim.run.plan import NodeProcess, player_settings, recorder_of, simulation_nodes
-from us_sim.run.processes import ProcessGroup, keep_on_this_host
+from us_sim.run.processes import ProcessGroup, prepare_ros
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
@@ -224,7 +224,7 @@ def live_cases(
         run: runs one, on this host only.
         row: makes the row of one that broke, from the case and its ``failure`` in words.
     """
-    keep_on_this_host(network=False)
+    prepare_ros(network=False)
     prepare_volume(load_scene("upper_arm"))
     points: list[Any] = []
     done = 0.0

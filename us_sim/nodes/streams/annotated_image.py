@@ -13,12 +13,13 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.messages import colour_image_message, nanoseconds_of
+from us_sim.nodes.messages import colour_image_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode, poses_ended
 from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
 from us_sim.nodes.streams.compressed import Compressed
 from us_sim.nodes.streams.stream import FrameStream
+from us_sim.recording.decoding import nanoseconds_of
 from us_sim.scene.building import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
 from us_sim.slicing.drawing.label_outlines import onto_border

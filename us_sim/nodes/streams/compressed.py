@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 
-from us_sim.nodes.messages import colour_pixels_from, pixels_from
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import COMPRESSED, CompressedSettings
+from us_sim.recording.decoding import colour_pixels_from, pixels_from
 
 
 class Compressed:

@@ -15,9 +15,9 @@ from std_msgs.msg import Header
 from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import kind_of
-from us_sim.nodes.messages import nanoseconds_of, pose_from
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
+from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.settings.setting import Settings
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.probe_tracking import ProbeTracking

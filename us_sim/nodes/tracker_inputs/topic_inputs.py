@@ -12,8 +12,8 @@ from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
 from us_sim.geometry.pose import FrameTree
-from us_sim.nodes.messages import transform_from
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
+from us_sim.recording.decoding import transform_from
 from us_sim.settings.spelling import counted
 from us_sim.tracking.haptic import HapticDevice
 from us_sim.tracking.measurement import PATIENT, Measurement

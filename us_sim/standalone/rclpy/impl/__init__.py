@@ -1,1 +1,0 @@
-"""Where rclpy keeps its logger."""
