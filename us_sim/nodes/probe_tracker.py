@@ -9,7 +9,6 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.geometry.transducer import transducer_mesh
@@ -24,6 +23,7 @@ from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.scene_node import poses_ended
 from us_sim.nodes.settings import ProbeTrackerSettings
+from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import (
     collider_of,
@@ -56,8 +56,8 @@ class ProbeTracker(Device):
     latched, says whether the probe is ``tracked``, ``coasting`` or ``lost``, each time that
     changes, and where it was last when it is tracked no more. ``probe/marker``, latched, is the
     transducer to look at. ``tf_static`` has the device's frame in ``patient``, where it has one of
-    its own and tf is not the source: a driver's tree may hold it. The filter and its settings may
-    change while running.
+    its own and tf is not the source: a driver's tree may hold it. Both need ``tf2_msgs``. The
+    filter and its settings may change while running.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -76,12 +76,10 @@ class ProbeTracker(Device):
         self._last: Measurement | None = None  # that was published
         self._is_contested = False
         self._poses = self.stream(PoseStamped, "probe/pose")
-        self._transforms = self.stream(TFMessage, "tf")
-        device = self.scene.tracker.frame
-        if self._source != "tf" and device != PATIENT:
-            place, _ = tracker_poses_of(self.scene)
-            placed = transform_message(place, TimeMessage(), PATIENT, device)
-            self.latched(TFMessage, "tf_static").publish(TFMessage(transforms=[placed]))
+        self._transforms = None
+        if TFMessage is not None:
+            self._transforms = self.stream(TFMessage, "tf")
+            self._publish_device_frame()
         self._status = self.latched(DiagnosticStatus, "probe/status")
         self.latched(MarkerArray, "probe/marker").publish(self._transducer())
         self._input: TrackerInput = TRACKERS.load(self._source)(
@@ -91,6 +89,13 @@ class ProbeTracker(Device):
         self._say_status()
         if not self.lockstep:
             self.create_timer(1.0 / CHECKS, self._check)
+
+    def _publish_device_frame(self) -> None:
+        device = self.scene.tracker.frame
+        if self._source != "tf" and device != PATIENT:
+            place, _ = tracker_poses_of(self.scene)
+            placed = transform_message(place, TimeMessage(), PATIENT, device)
+            self.latched(TFMessage, "tf_static").publish(TFMessage(transforms=[placed]))
 
     def _transducer(self) -> bytes:
         """The scene's transducer and the outline of its image; without a collider the latter."""
@@ -139,7 +144,7 @@ class ProbeTracker(Device):
         self._last = probe
         self._poses.publish(pose_message(probe.pose, stamp, PATIENT))
         self.health.published("probe/pose", stamp)
-        if self._transforms.get_subscription_count():
+        if self._transforms is not None and self._transforms.get_subscription_count():
             transform = transform_message(probe.pose, stamp, PATIENT, "probe")
             self._transforms.publish(TFMessage(transforms=[transform]))
             self.health.published("tf")

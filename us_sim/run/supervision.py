@@ -52,6 +52,7 @@ class Supervisor:
         self._processes: dict[str, NodeProcess] = {}  # that were started, by node
         self._due: list[NodeProcess] = []  # that are started when others have ended
         self.recordings = Recordings()
+        self._images = monitor.node.resolve_topic_name(IMAGES)  # also once the node has ended
         self._is_disk_full = False
         self._began = time.monotonic()
         self._changes = 0
@@ -187,11 +188,10 @@ class Supervisor:
     def outcome(self, startup: float) -> Outcome:
         """How it went, once all has ended."""
         files = self.recordings.files()
-        images = self._monitor.node.resolve_topic_name(IMAGES)
-        recorded = images_in(files, images)
+        recorded = images_in(files, self._images)
         # How many images were to be recorded is only known where all that were made were.
         recorder = recorder_of(self._plan.processes)
-        all_were = recorder and recorder.at_once and recorder.records(images, namespace())
+        all_were = recorder and recorder.at_once and recorder.records(self._images, namespace())
         is_known = all_were and self._changes == 1
         made = self._monitor.node.count(IMAGER, IMAGES) if is_known else recorded
         poses = None if self._plan.loops else self._plan.poses

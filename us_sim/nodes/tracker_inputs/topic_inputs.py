@@ -8,10 +8,10 @@ from geometry_msgs.msg import PoseArray, PoseStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
-from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import PoseError, SceneError
 from us_sim.geometry.pose import FrameTree
+from us_sim.nodes.tf import TFMessage, require_tf
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.recording.decoding import transform_from
 from us_sim.settings.spelling import counted
@@ -138,6 +138,7 @@ class TfInput(TrackerInput):
 
     def __init__(self, device: Device, settings: Any) -> None:
         super().__init__(device, settings)
+        require_tf()
         tracker = device.scene.tracker
         if tracker.body is None:
             raise SceneError(
