@@ -22,6 +22,7 @@ from us_sim.errors import UsSimError
 from us_sim.run.monitored import Monitored, alone_on_domain
 from us_sim.run.plan import RECORDER, Request, enclave_of, plan_of
 from us_sim.run.processes import HUNG_STOP_S, INTERRUPTED, ending
+from us_sim.run.shared_memory import remove_abandoned_segments
 from us_sim.run.supervision import going_on
 from us_sim.run.watch import Restarts, SupervisionSettings, Watch
 from us_sim.scene.reading import load_scene
@@ -91,6 +92,7 @@ class Supervised:
         self.resources = contextlib.ExitStack()
         self.resources.enter_context(alone_on_domain(namespace))
         self.monitor = Monitored(plan.nodes, supervised=True, namespace=namespace)
+        self.resources.callback(remove_abandoned_segments)
         self.resources.callback(self.monitor.close)
         self.monitor.refuse_company(plan.nodes)
 

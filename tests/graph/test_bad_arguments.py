@@ -74,6 +74,28 @@ def test_so_does_its_process(node, arguments, words):
     assert_one_sentence(result.stderr, words)
 
 
+@pytest.mark.parametrize(
+    "command", [["us_sim.nodes.probe_tracker"], ["us_sim", "run", "upper_arm"]]
+)
+@pytest.mark.parametrize("keystore", [False, True])
+def test_a_secured_domain_without_keys_is_said(command, keystore, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
+    monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
+    if keystore:
+        monkeypatch.setenv("ROS_SECURITY_KEYSTORE", str(tmp_path))
+        for node in ("probe_tracker", "session_control"):
+            (tmp_path / "enclaves" / "us_sim" / node).mkdir(parents=True)
+    result = subprocess.run(
+        [sys.executable, "-m", *command.split()],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 1
+    assert_one_sentence(result.stderr.replace("us-sim", "us_sim"), "ROS_SECURITY_KEYSTORE")
+
+
 def assert_one_sentence(stderr, words):
     """No traceback, and those words in the one sentence that there is."""
     said = [line for line in stderr.splitlines() if line.startswith("us_sim: ")]

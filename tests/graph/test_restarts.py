@@ -138,36 +138,3 @@ def test_one_that_was_stopped_ends_by_itself_when_it_is_told_to():
     group.start([NodeProcess("session_recorder", {"file": "/nowhere/session.mcap"})])
     os.kill(group.pids["session_recorder"], signal.SIGSTOP)
     assert group.stop() == []
-
-
-def test_one_that_stands_by_takes_over_as_it_is_wanted_by_then(played_scene, tmp_path):
-    skin = NodeProcess("skin_deformer", {"scene": str(played_scene)})
-    log = tmp_path / "nodes.log"
-    group = ProcessGroup(log)
-    try:
-        deadline = time.monotonic() + 100
-        while not group.stand_by(skin):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        assert not group.pids
-        assert log.read_text() == ""  # nobody needs to know
-        group.start([skin])
-        taken_over = group.pids["skin_deformer"]
-        while group.last_words("skin_deformer") != "ready":
-            assert time.monotonic() < deadline
-            assert group.is_running("skin_deformer")
-            time.sleep(0.05)
-        assert b"US_SIM_STANDBY=1" in Path(f"/proc/{taken_over}/environ").read_bytes()
-        group.end("skin_deformer")
-        while not group.stand_by(skin):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        group.start([NodeProcess("skin_deformer", {"scene": "nowhere"})])
-        taken_over = group.pids["skin_deformer"]
-        assert b"US_SIM_STANDBY=1" in Path(f"/proc/{taken_over}/environ").read_bytes()
-        while group.is_running("skin_deformer"):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        assert "no scene file nowhere" in str(group.failure("skin_deformer", 1))
-    finally:
-        group.stop()

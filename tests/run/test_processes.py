@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+from pathlib import Path
 
 import pytest
 
@@ -13,31 +15,13 @@ from us_sim.run import monitored as domain_lock
 from us_sim.run.monitored import alone_on_domain
 from us_sim.run.plan import NodeProcess
 from us_sim.run.processes import ProcessGroup
+from us_sim.run.watch import process_state
 
 
 @pytest.mark.parametrize("value", ["\udcff.mcap", ["a", "\udcff"]])
 def test_a_name_that_is_no_text_is_refused(value):
     with pytest.raises(UsSimError, match=r"file: .*udcff.* is no text in UTF-8"):
         NodeProcess("session_recorder", {"file": value})
-
-
-def test_ctrl_c_while_a_process_is_started_is_heard():
-    """Python itself forgets what is raised in what `logging` does around a fork."""
-    forking = []
-
-    def interrupt():
-        if forking and forking.pop() == os.getpid():
-            os.kill(os.getpid(), signal.SIGINT)
-
-    os.register_at_fork(after_in_parent=interrupt)
-    group = ProcessGroup()
-    forking.append(os.getpid())
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            group.start([NodeProcess("probe_tracker")])
-        assert group.is_running("probe_tracker")  # and so it can be ended
-    finally:
-        group.stop()
 
 
 def test_without_threads_no_process_is_left(monkeypatch):
@@ -50,6 +34,69 @@ def test_without_threads_no_process_is_left(monkeypatch):
         group.start([NodeProcess("probe_tracker")])
     monkeypatch.undo()
     assert group.stop() == []
+
+
+def wait_until(condition):
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def files_of(pid):
+    """Lock files of Fast DDS that a process holds."""
+    links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()]
+    return [Path(link) for link in links if link.startswith("/dev/shm/fastrtps_")]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere these files are not in /dev/shm")
+def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "24")
+    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")
+    groups = [ProcessGroup(), ProcessGroup()]
+    try:
+        for group in groups:
+            group.start([NodeProcess("volume_reconstructor"), NodeProcess("scorer")])
+        nodes = [pid for group in groups for pid in group.pids.values()]
+        wait_until(lambda: all(len(files_of(pid)) >= 3 for pid in nodes))
+        killed, living = nodes[0], nodes[2:]
+        left, used = files_of(killed), [file for pid in living for file in files_of(pid)]
+        os.kill(killed, signal.SIGKILL)
+        wait_until(lambda: not groups[0].is_running("volume_reconstructor"))
+        assert all(file.exists() for file in left)
+        groups[0].stop()
+        assert not any(file.exists() for file in left)
+        assert used
+        assert all(file.exists() for file in used)
+    finally:
+        for group in groups:
+            group.stop()
+
+
+STARTS = """
+import time
+from us_sim.run.background import Background
+from us_sim.run.plan import NodeProcess
+from us_sim.run.processes import ProcessGroup
+group = ProcessGroup()
+group.start([NodeProcess("scorer")])
+work = Background("list", nice=1)
+print(group.pids["scorer"], work._process.pid, flush=True)
+while not group.last_words("scorer"):
+    time.sleep(0.05)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("after", [0.0, 2.0])
+def test_what_was_started_ends_with_a_killed_parent(after):
+    parent = subprocess.Popen([sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True)
+    pids = [int(word) for word in parent.stdout.readline().split()]
+    time.sleep(after)  # while they import, or as they run
+    parent.kill()
+    parent.wait()
+    assert len(pids) == 2
+    wait_until(lambda: not any(process_state(pid) for pid in pids))
 
 
 BEGIN = """

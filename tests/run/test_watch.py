@@ -7,12 +7,17 @@ import sys
 import time
 
 import pytest
-from us_sim.run.fork_server import ProcessState, process_state
 
 from us_sim.errors import SettingsError
 from us_sim.run.plan import NodeProcess
 from us_sim.run.supervision import going_on
-from us_sim.run.watch import Restarts, SupervisionSettings, Watch
+from us_sim.run.watch import (
+    ProcessState,
+    Restarts,
+    SupervisionSettings,
+    Watch,
+    process_state,
+)
 
 NODE, PID = "tissue_deformer", 7
 

@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 
 def start_program(name: str, *arguments: str) -> subprocess.Popen[str]:
-    """Start a program of this module with this process's packages, on this host only."""
-    path = os.pathsep.join(part for part in sys.path if part)
-    environment = {**os.environ, "PYTHONPATH": path}
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    """Start a program of this module, on this host only; it ends with this process."""
+    from us_sim.run.processes import LIFELINE, child_environment
+
     return subprocess.Popen(
-        [sys.executable, "-m", "us_sim.evaluation.processes", name, *arguments],
-        env=environment,
+        [sys.executable, "-P", "-m", "us_sim.evaluation.processes", name, *arguments],
+        stdin=LIFELINE,
+        env={"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **child_environment()},
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,

@@ -13,6 +13,7 @@ import itertools
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 from us_sim.errors import UsSimError
@@ -23,6 +24,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 INTERRUPTED = 130  # the exit status of a node that was told to end before its work was done
+ENDS_WITH_INPUT = "US_SIM_ENDS_WITH_INPUT"
+"""Environment variable of programs that end with whoever holds the other end of their input."""
+
+
+def end_with_input() -> None:
+    """End this process as SIGTERM does, once its standard input has ended."""
+    os.read(0, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if os.environ.pop(ENDS_WITH_INPUT, None):
+    threading.Thread(target=end_with_input, daemon=True).start()
 
 
 def require_rclpy() -> None:
@@ -32,6 +45,17 @@ def require_rclpy() -> None:
             "rclpy is not installed: on Linux x86-64 `pip install .` brings it; elsewhere use "
             "`pixi run sim` (RoboStack), the Dockerfile, or ROS 2's own packages"
         )
+
+
+def ros_refusal(error: Exception) -> UsSimError:
+    """Return what rcl refused as one sentence, with what a secured domain needs."""
+    sentence = f"ROS cannot be used: {' '.join(str(error).split())}"
+    if os.environ.get("ROS_SECURITY_ENABLE") == "true":
+        sentence += (
+            "; ROS_SECURITY_ENABLE is true: each node needs its keys in ROS_SECURITY_KEYSTORE, "
+            "and a DDS that was built with security"
+        )
+    return UsSimError(sentence)
 
 
 def prepare_process() -> None:

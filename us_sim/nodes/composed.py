@@ -47,7 +47,7 @@ class Composed(GuardedNode):
         for name in names:
             if name not in COMPOSABLE:
                 raise SettingsError(f"composed.nodes: {unknown(name, COMPOSABLE)}")
-        self.finished = Future()
+        self.finished: Future | None = None  # with what a part has failed of
         self.parts = [node_class(name)(context=self.context) for name in names]
         self.goes_first = any(getattr(part, "goes_first", False) for part in self.parts)
         self.health = Health(self, ", ".join(names))
@@ -66,7 +66,9 @@ class Composed(GuardedNode):
         except Exception as error:
             if self.context.ok():
                 self.failed(part.get_name(), error)
+                self.finished = Future()
                 self.finished.set_exception(UsSimError(self.last_failure))
+                self.context.try_shutdown()
 
     def destroy_node(self) -> None:
         """End all of them."""

@@ -27,6 +27,7 @@ from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Nodetype
 
 from us_sim.errors import MessageError, UsSimError, printable
+from us_sim.nodes import ros_refusal
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.recording.decoding import nanoseconds_of, require_stamp
 from us_sim.recording.schemas import jazzy_definitions
@@ -84,7 +85,10 @@ class GuardedNode(Node):
         """When what is being worked on came, ns of the monotonic clock."""
         self._said: dict[str, float] = {}
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        super().__init__(name, **kwargs)
+        try:
+            super().__init__(name, **kwargs)
+        except RuntimeError as error:  # an RCLError
+            raise ros_refusal(error) from error
         if self.get_clock().ros_time_is_active:
             self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock)
 

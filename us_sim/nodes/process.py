@@ -17,7 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from us_sim.errors import UsSimError, memory_limit
-from us_sim.nodes import INTERRUPTED
+from us_sim.nodes import INTERRUPTED, ros_refusal
 from us_sim.nodes.guarded_node import GuardedNode
 
 
@@ -84,7 +84,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
-        return _refused(error)
+        return _refused(ros_refusal(error))
     node: Any = None
     try:
         node = create()
@@ -93,16 +93,15 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
             node.health.scheduling = go_first()
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        return _interrupted(node)
+        pass
     except (UsSimError, ParameterException) as error:
         return _refused(error)
     except MemoryError:
         told = ["there is not enough memory", memory_limit()]
         return _refused(UsSimError("; ".join(filter(None, told))))
     except Exception:
-        if rclpy.ok():
+        if rclpy.ok():  # a compiler that a signal breaks off fails with its own error
             raise
-        return _interrupted(node)  # a compiler that a signal breaks off fails with its own error
     finally:
         for number in _ENDINGS:
             signal.signal(number, signal.SIG_IGN)  # a late one would spoil the exit status

@@ -23,7 +23,7 @@ from typing import Any
 
 from us_sim.errors import BagError, UsSimError
 from us_sim.recording.metadata import read_metadata
-from us_sim.run.processes import end_with_parent, package_on_path
+from us_sim.run.processes import LIFELINE, child_environment
 from us_sim.scene.building import volume_of
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
 from us_sim.scene.reading import load_scene
@@ -44,14 +44,13 @@ class Background:
         self._said: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "us_sim.run.background", *arguments],
-            stdin=subprocess.DEVNULL,
+            stdin=LIFELINE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
             errors="replace",
-            env=os.environ | {"PYTHONPATH": package_on_path()},
+            env=child_environment(),
             start_new_session=True,
-            preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
         with contextlib.suppress(AttributeError, OSError):
             os.setpriority(os.PRIO_PROCESS, self._process.pid, os.getpriority(0, 0) + nice)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock, Timeout
 
 from us_sim.errors import UsSimError
+from us_sim.nodes import ros_refusal
 from us_sim.run.plan import NodeProcess, enclave_of
 from us_sim.run.ros_arguments import namespace, ros_arguments
 
@@ -109,7 +110,7 @@ def ros_context(number: int | None = None) -> Context:
     try:
         rclpy.init(args=given, context=context, domain_id=number, signal_handler_options=silent)
     except Exception as error:  # what rcl raises differs between its versions
-        raise UsSimError(f"ROS cannot be used: {' '.join(str(error).split())}") from error
+        raise ros_refusal(error) from error
     return context
 
 

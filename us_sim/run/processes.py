@@ -3,65 +3,33 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
 from tqdm import tqdm
 
 from us_sim.errors import UsSimError, memory_limit, printable
-from us_sim.nodes import INTERRUPTED, require_rclpy
+from us_sim.nodes import ENDS_WITH_INPUT, INTERRUPTED, require_rclpy
 from us_sim.nodes.settings import RECORDER, VIEWER
 from us_sim.run.plan import NodeProcess
+from us_sim.run.shared_memory import remove_abandoned_segments
 
-_THIS_PROGRAM = ctypes.CDLL(None)  # loaded before any fork
-
-
-def end_with_parent() -> None:
-    """Have this new process get SIGTERM when its parent ends, before its program begins (Linux)."""
-    set_death_signal = 1  # PR_SET_PDEATHSIG
-    _THIS_PROGRAM.prctl(set_death_signal, signal.SIGTERM)
+LIFELINE, _OTHER_END = os.pipe()
+"""Standard input of what is started from here: it ends with this process, whatever ends that."""
 
 
-def package_on_path() -> str:
-    """PYTHONPATH with which a program finds this very package."""
+def child_environment() -> dict[str, str]:
+    """Environment of a program that finds this very package, and ends with its standard input."""
     package = str(Path(__file__).resolve().parents[2])
-    return os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
-
-
-_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-@contextlib.contextmanager
-def deferred_signals() -> Iterator[None]:
-    """SIGINT, SIGTERM and SIGHUP that come within the context are handled at its end.
-
-    Where they are ignored, or not handled in Python, nothing changes; in other threads than the
-    main one neither, since no handler runs there.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    handlers = {
-        number: handler for number in _NUMBERS if callable(handler := signal.getsignal(number))
-    }
-    for number in handlers:
-        signal.signal(number, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for each in came:
-            handlers[signal.Signals(each)](each, None)
+    path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
+    return os.environ | {"PYTHONPATH": path, ENDS_WITH_INPUT: "1"}
 
 
 COMPLAINT = "us_sim: "  # with which a node begins to say why it cannot work
@@ -80,14 +48,13 @@ class RunningNode:
         self.node = node
         self.process = subprocess.Popen(
             node.command(),
-            stdin=subprocess.DEVNULL,
+            stdin=LIFELINE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=os.environ | {"PYTHONPATH": package_on_path()} | node.secrets,
+            env=child_environment() | node.secrets,
             start_new_session=True,
-            preexec_fn=end_with_parent if sys.platform == "linux" else None,
         )
         self.complaint = ""  # why it cannot work
         self.said = ""
@@ -169,12 +136,12 @@ class ProcessGroup:
 
         A node of the same name that has ended is replaced; one that runs as it shall goes on.
         """
+        remove_abandoned_segments()  # of one that is replaced
         for process in processes:
             if self.is_running(process.node) and self._running[process.node].node == process:
                 continue
-            with deferred_signals():
-                show = self._tell if process.node == VIEWER else self._show
-                self._running[process.node] = RunningNode(process, show)
+            show = self._tell if process.node == VIEWER else self._show
+            self._running[process.node] = RunningNode(process, show)
 
     def _tell(self, line: str) -> None:
         """Show a line to the person, too, whom it tells where the page is."""
@@ -280,6 +247,7 @@ class ProcessGroup:
         killed = [node for node, running in every if running.kill()]
         for _, running in every:
             running.reader.join(STOP_S)
+        remove_abandoned_segments()
         if self._log is not None:
             with contextlib.suppress(OSError):
                 self._log.close()
