@@ -122,6 +122,20 @@ def test_a_further_file_is_begun_and_the_recording_stopped_on_command(bench, qui
     assert texts(tmp_path) == ["one", "two"]
 
 
+def test_what_waits_at_the_end_is_recorded(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
+    note = bench.publisher(String, "note")
+    bench.executor.remove_node(recorder)  # its turn does not come
+    for k in range(50):
+        note.publish(String(data=str(k)))
+    bench.spin_for(10)
+    assert not recorder.health.received
+    bench.context.shutdown()  # as a signal does
+    recorder.destroy_node()
+    assert texts(file) == [str(k) for k in range(50)]
+
+
 def test_a_snapshot_holds_what_was_before_it(bench, quiet):
     recorder, note, _mesh, file = quiet(snapshot_mode=True, max_cache_size=200)
     said = [f"{k:010}" for k in range(30)]  # 19 bytes each

@@ -19,7 +19,7 @@ from std_msgs.msg import String
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import let_receivers_go_first, run_node
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.sessions.triggers import offer
@@ -106,6 +106,9 @@ class SessionRecorder(GuardedNode):
 
     def stop(self) -> None:
         """End the recording: its file gets its index, and can be moved away."""
+        for topic in self._topics.values() if self._bag is not None else ():
+            with contextlib.suppress(Exception):  # what the rest raises must not cost what is there
+                topic.take_rest()
         bag, self._bag = self._bag, None
         if bag is None:
             return
@@ -265,7 +268,13 @@ def give_back_large_buffers() -> None:
 def main(args: list[str] | None = None) -> int:
     """Record until interrupted."""
     give_back_large_buffers()
-    return run_node(SessionRecorder, args)
+
+    def create() -> SessionRecorder:
+        node = SessionRecorder()
+        let_receivers_go_first()
+        return node
+
+    return run_node(create, args)
 
 
 if __name__ == "__main__":

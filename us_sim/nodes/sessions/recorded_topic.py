@@ -88,10 +88,12 @@ class RecordedTopic:
             self._subscription = self._subscribed()
         return new
 
-    def close(self) -> None:
-        """Take no more."""
+    def take_rest(self) -> None:
+        """Take the messages that wait for the executor; also after ROS was shut down."""
         for subscription in filter(None, (self._old, self._subscription)):
-            self._node.destroy_subscription(subscription)
+            with subscription.handle:
+                while taken := subscription.handle.take_message(self._type, True):
+                    self._receive(*taken)
 
     def _subscribed(self) -> Subscription:
         events = SubscriptionEventCallbacks(message_lost=self._count_lost)
