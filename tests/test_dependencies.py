@@ -140,7 +140,7 @@ def test_so_has_an_environment_of_robostack(set_up):
     found["matplotlib"] = found.pop("matplotlib-base")
     assert {name: found[name].partition(",")[0] for name in asked} == asked
     for each in ElementTree.parse(ROOT / "package.xml").iter("exec_depend"):
-        of_base = not each.text.startswith(("rosbag2_", "tf2_", "visualization_"))
+        of_base = not each.text.startswith(("tf2_", "visualization_"))
         name = f"ros-jazzy-{each.text.replace('_', '-')}"
         assert each.text.startswith("python3-") or of_base or name in found
 

@@ -30,6 +30,7 @@ def node():
     node.declare_parameter("numbers", [1, 2])
     node.declare_parameter("fixed", "x", ParameterDescriptor(read_only=True))
     node.declare_parameter("on", True)
+    node.declare_parameter("small", 1e-06)
     node.declare_parameter("word", "x")
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -42,7 +43,8 @@ def node():
     context.try_shutdown()
 
 
-NAMES = "  deep.count\n  fixed\n  names\n  numbers\n  on\n  rate\n  use_sim_time\n  word\n"
+NAMES = "  deep.count\n  fixed\n  names\n  numbers\n  on\n  rate\n  small\n"
+NAMES += "  start_type_description_service\n  use_sim_time\n  word\n"
 DESCRIBED = """\
 Parameter name: rate
   Type: double
@@ -75,6 +77,8 @@ DUMPED = """\
     - 2
     'on': true
     rate: 30.0
+    small: 0.000001
+    start_type_description_service: true
     use_sim_time: false
     word: x
 

@@ -26,8 +26,6 @@ TOPICS = {
     "/ultrasound/image": "sensor_msgs/msg/Image",
     "/ultrasound/image_to_probe": "std_msgs/msg/Float64MultiArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-    "/events/write_split": "rosbag2_interfaces/msg/WriteSplitEvent",
-    "/events/rosbag2_messages_lost": "rosbag2_interfaces/msg/MessagesLostEvent",
     "/tf": "tf2_msgs/msg/TFMessage",
 }
 POSES = 90

@@ -1,9 +1,10 @@
-"""The recorder's services, events, markers and attachments, and what it is asked to survive."""
+"""The recorder's commands, losses, markers and attachments, and what it is asked to survive."""
 
 import dataclasses
 import errno
 import hashlib
 import os
+import subprocess
 import sys
 import threading
 from collections import Counter
@@ -13,11 +14,11 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
-from bench import pose_at
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from us_sim.errors import BagError
 from us_sim.nodes.session_recorder import SessionRecorder
@@ -30,27 +31,25 @@ from us_sim.recording.writer import BagWriter
 from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
 
-srv = pytest.importorskip("rosbag2_interfaces.srv")
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-standalone_only = pytest.mark.skipif(
-    rclpy.__name__ == "rclpy", reason="needs writers of foreign types, which rclpy does not make"
-)
 over_dds = pytest.mark.skipif(
     rclpy.get_rmw_implementation_identifier() == "rmw_zenoh_cpp",
     reason="over zenoh every publisher fits every subscription, and there are no DDS writers",
 )
-newer_than_jazzy = pytest.mark.skipif(
-    not hasattr(srv, "Record"), reason="this rosbag2_interfaces has neither Record nor losses"
-)
 
 
-def call(bench, service, name, **fields):
-    """The answer of one of the recorder's services."""
-    client = bench.peer.create_client(service, f"/session_recorder/{name}")
+def call(bench, name):
+    """Give one of the recorder's commands; why it was refused."""
+    client = bench.peer.create_client(Trigger, f"/session_recorder/{name}")
     bench.spin_until(client.service_is_ready)
-    answer = client.call_async(service.Request(**fields))
+    answer = client.call_async(Trigger.Request())
     bench.spin_until(answer.done)
-    return answer.result()
+    assert answer.result().success == (not answer.result().message)
+    return answer.result().message
+
+
+def pause(recorder, paused):
+    assert recorder.set_parameters([Parameter("paused", value=paused)])[0].successful
 
 
 def end(bench, recorder):
@@ -91,76 +90,63 @@ def quiet(bench, tmp_path):
 
 
 def test_pause_and_resume(bench, quiet):
-    recorder, note, mesh, file = quiet(start_paused=True)
-    assert call(bench, srv.IsPaused, "is_paused").paused
+    recorder, note, mesh, file = quiet(paused=True)
+    assert recorder.health.state == "paused"
     say(bench, recorder, note, "paused")
-    call(bench, srv.Resume, "resume")
-    assert not call(bench, srv.IsPaused, "is_paused").paused
+    pause(recorder, False)
+    assert recorder.health.state == "recording"
     say(bench, recorder, note, "one")
-    call(bench, srv.TogglePaused, "toggle_paused")
+    pause(recorder, True)
     say(bench, recorder, note, "paused again")
     say(bench, recorder, mesh, "other mesh")
-    call(bench, srv.Pause, "pause")
-    call(bench, srv.TogglePaused, "toggle_paused")
+    pause(recorder, False)
     say(bench, recorder, note, "two")
     end(bench, recorder)
     assert texts(file) == ["one", "two"]
     assert texts(file, "/mesh") == ["mesh", "other mesh"]  # what came while paused still holds
 
 
-def test_split_says_which_files(bench, quiet, tmp_path):
-    from rosbag2_interfaces.msg import WriteSplitEvent
-
+def test_a_further_file_is_begun_and_the_recording_stopped_on_command(bench, quiet, tmp_path):
     recorder, note, _, file = quiet()
-    events = bench.collect(WriteSplitEvent, "events/write_split")
-    bench.spin_until(lambda: bench.peer.count_publishers("events/write_split") > 0)
     say(bench, recorder, note, "one")
-    call(bench, srv.SplitBagfile, "split_bagfile")
-    bench.spin_until(lambda: events)
+    assert not call(bench, "split")
     say(bench, recorder, note, "two")
-    call(bench, srv.Stop, "stop")
-    bench.spin_until(lambda: len(events) == 2)
-    further = str(tmp_path / "session_1.mcap")
-    assert [(e.closed_file, e.opened_file) for e in events] == [(str(file), further), (further, "")]
-    assert events[0].node_name == "/session_recorder"
+    assert "`snapshot_mode`" in call(bench, "snapshot")
+    assert not call(bench, "stop")
+    assert recorder.health.state == "stopped"
+    further = tmp_path / "session_1.mcap"
     assert (texts(file), texts(further), texts(tmp_path)) == (["one"], ["two"], ["one", "two"])
-
-
-@newer_than_jazzy
-def test_stop_and_record(bench, quiet, tmp_path):
-    recorder, note, _, file = quiet()
-    say(bench, recorder, note, "one")
-    assert call(bench, srv.Record, "record").error_string == (
-        "a recording is running: stop it first"
-    )
-    call(bench, srv.Stop, "stop")
-    assert not read_bag(file).note
     say(bench, recorder, note, "nobody records")
-    for taken in (str(file), "/", ".", "a\0b", f"{'a' * 5000}.mcap"):
-        answer = call(bench, srv.Record, "record", uri=taken)
-        assert answer.return_code == 1
-        assert "exists already" in answer.error_string or "cannot be made" in answer.error_string
-    other = tmp_path / "other" / "two.mcap"
-    assert call(bench, srv.Record, "record", uri=str(other)).return_code == 0
-    say(bench, recorder, note, "two")
-    end(bench, recorder)
-    assert (texts(file), texts(other)) == (["one"], ["two"])
+    for name in ("split", "snapshot", "stop"):
+        assert call(bench, name) == "nothing is recorded any more"
+    assert texts(tmp_path) == ["one", "two"]
+
+
+def test_what_waits_at_the_end_is_recorded(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
+    note = bench.publisher(String, "note")
+    bench.executor.remove_node(recorder)  # its turn does not come
+    for k in range(50):
+        note.publish(String(data=str(k)))
+    bench.spin_for(10)
+    assert not recorder.health.received
+    bench.context.shutdown()  # as a signal does
+    recorder.destroy_node()
+    assert texts(file) == [str(k) for k in range(50)]
 
 
 def test_a_snapshot_holds_what_was_before_it(bench, quiet):
     recorder, note, _mesh, file = quiet(snapshot_mode=True, max_cache_size=200)
     said = [f"{k:010}" for k in range(30)]  # 19 bytes each
     say(bench, recorder, note, *said)
-    assert call(bench, srv.Snapshot, "snapshot").success
+    pause(recorder, True)
+    pause(recorder, False)  # which is no snapshot
+    assert not call(bench, "snapshot")
     say(bench, recorder, note, "not written")
     end(bench, recorder)
     assert texts(file) == said[-10:]
     assert texts(file, "/mesh") == ["mesh"]
-
-
-def test_no_snapshot_without_its_mode(bench, quiet):
-    quiet()
-    assert not call(bench, srv.Snapshot, "snapshot").success
 
 
 def test_markers(bench, tmp_path):
@@ -272,47 +258,60 @@ def may_write(monkeypatch):
     return allowed
 
 
-@newer_than_jazzy
 def test_losses_are_told(bench, quiet, may_write):
-    from rosbag2_interfaces.msg import MessagesLostEvent
-
     recorder, note, _, file = quiet(max_cache_size=1000)
-    events = bench.collect(MessagesLostEvent, "events/rosbag2_messages_lost")
-    bench.spin_until(lambda: bench.peer.count_publishers("events/rosbag2_messages_lost") > 0)
+    reports = bench.collect(DiagnosticArray, "diagnostics")
     try:
         say(bench, recorder, note, *("x" * 93 for _ in range(30)))  # 100 bytes each
-        bench.spin_until(lambda: events)
-        bench.spin_until(lambda: recorder.health.dropped > 0)
+        bench.spin_until(lambda: recorder.health.problems("lost") > 0)
+        bench.spin_until(
+            lambda: any("/note not recorded" in each.status[0].message for each in reports)
+        )
     finally:
         may_write.set()
     end(bench, recorder)
-    told = {}
-    for event in events:
-        for each in event.messages_lost_statistics:
-            assert each.messages_lost_in_transport == 0
-            told[each.topic_name] = told.get(each.topic_name, 0) + each.messages_lost_in_recorder
-    assert told == read_bag(file).lost() == {"/note": 30 - len(texts(file))}
     assert 0 < len(texts(file)) < 10
+    assert read_bag(file).lost() == {"/note": 30 - len(texts(file))}
+    assert recorder.health.dropped == 30 - len(texts(file))
 
 
-@newer_than_jazzy
-def test_losses_are_recorded_under_the_name_that_rosbag2_uses(bench, quiet, may_write):
-    lost = "/events/rosbag2_messages_lost"
-    recorder, note, _, file = quiet(max_cache_size=1000, also=[lost])
-    bench.spin_until(lambda: bench.peer.count_subscribers(lost) > 0)
+OVERWRITING = """
+import sys, time
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import String
+
+rclpy.init()
+node = Node("flood")
+publisher = node.create_publisher(String, "note", QoSProfile(depth=1))
+while not publisher.get_subscription_count():
+    time.sleep(0.01)
+publisher.publish(String(data="first"))
+time.sleep(1.0)
+for k in range(300):
+    publisher.publish(String(data=f"{k:03}" + 100_000 * "x"))
+time.sleep(0.5)
+publisher.publish(String(data="last"))
+time.sleep(1.0)
+"""
+
+
+@over_dds
+def test_what_a_publisher_overwrites_before_it_was_sent_is_counted(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
+    flood = subprocess.Popen([sys.executable, "-c", OVERWRITING])
     try:
-        say(bench, recorder, note, *("x" * 93 for _ in range(30)))
-        received = recorder.health.received
+        bench.spin_until(lambda: flood.poll() is not None)
     finally:
-        may_write.set()
-    bench.spin_until(lambda: recorder.health.received > received)  # which is an event
+        flood.kill()
+        flood.wait()
     end(bench, recorder)
-    bag, told = read_bag(file), 0
-    for message in bag.messages([lost]):
-        for each in bag.deserialize(message).messages_lost_statistics:
-            assert each.topic_name == "/note"
-            told += each.messages_lost_in_recorder
-    assert 0 < told <= bag.lost()["/note"]
+    assert flood.returncode == 0
+    assert texts(file)[-1] == "last"
+    assert 2 < len(texts(file)) < 302
+    assert read_bag(file).lost() == {"/note": 302 - len(texts(file))}
 
 
 @over_dds
@@ -383,44 +382,6 @@ def test_publishers_of_one_quality_are_not_taken_for_one(bench):
     assert not lost
 
 
-@standalone_only
-@over_dds
-def test_foreign_types_are_said_once_and_nothing_is_imported_for_them(bench, tmp_path, monkeypatch):
-    from us_sim.standalone.middleware import EndpointQos
-    from us_sim.standalone.transport import Participant
-
-    package = tmp_path / "innocent"
-    package.mkdir()
-    (package / "__init__.py").write_text("raise SystemExit('code of a stranger runs')")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    file = tmp_path / "session.mcap"
-    foreign = {
-        "/a": "a::b::c::msg::dds_::X_",
-        "/innocent": "innocent::msg::dds_::X_",
-        "/plain": "X",
-        "/empty": "::msg::dds_::_",
-        "/lower": "std_msgs::msg::dds_::string_",
-        "/dotted": "os.path::msg::dds_::X_",
-    }
-    with Participant(bench.context.get_domain_id()) as stranger:
-        writers = [
-            stranger.create_writer(f"rt{topic}", dds_type, EndpointQos())
-            for topic, dds_type in foreign.items()
-        ]
-        poses = bench.peer.create_publisher(PoseStamped, "tracker/pose", 10)
-        recorder = bench.make(SessionRecorder, file=str(file))
-        said = recorder.health
-        bench.spin_until(lambda: said.problems("topic") >= len(writers))
-        bench.spin_until(lambda: poses.get_subscription_count() > 0)
-        poses.publish(pose_at(0.001, 1))
-        bench.spin_until(lambda: said.problems("topic") >= len(writers))
-        bench.spin_for(30)
-        assert said.problems("topic") == len(writers)
-    end(bench, recorder)
-    assert "innocent" not in sys.modules
-    assert read_bag(file).topic("/tracker/pose").message_count == 1
-
-
 @pytest.mark.parametrize("name", ["a/b/c/msg/X", "X", "", "os/msg/path", "std_msgs/srv/String"])
 def test_names_that_are_no_types(name):
     with pytest.raises(BagError, match="is no message type"):
@@ -483,31 +444,3 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
     end(bench, recorder)
     assert texts(tmp_path)[-1] == "three"
     assert sum(read_bag(tmp_path).lost().values()) > 0
-
-
-@newer_than_jazzy
-def test_what_is_recorded_and_where_is_told(bench, quiet):
-    *_, file = quiet()
-    assert call(bench, srv.IsRecording, "is_recording").recording
-    assert call(bench, srv.GetUri, "get_uri").uri == str(file)
-    topics = call(bench, srv.GetSubscribedTopics, "get_subscribed_topics").topics
-    assert list(topics) == ["/mesh", "/note"]
-    call(bench, srv.Stop, "stop")
-    assert not call(bench, srv.IsRecording, "is_recording").recording
-    assert call(bench, srv.GetUri, "get_uri").uri == ""
-
-
-@newer_than_jazzy
-def test_without_discovery_new_topics_are_left_out(bench, tmp_path):
-    recorder = bench.make(SessionRecorder, file=str(tmp_path / "a.mcap"))
-    assert call(bench, srv.IsDiscoveryRunning, "is_discovery_running").running
-    assert call(bench, srv.StartDiscovery, "start_discovery").return_code == 1  # it runs already
-    assert call(bench, srv.StopDiscovery, "stop_discovery").return_code == 0
-    assert call(bench, srv.StopDiscovery, "stop_discovery").return_code == 1
-    assert not call(bench, srv.IsDiscoveryRunning, "is_discovery_running").running
-    late = bench.peer.create_publisher(String, "late", 1)
-    bench.spin_for(30)
-    assert not late.get_subscription_count()
-    assert call(bench, srv.StartDiscovery, "start_discovery").return_code == 0
-    bench.spin_until(late.get_subscription_count)
-    assert "/late" in recorder.topics

@@ -86,7 +86,7 @@ def told(nodes):
 
 
 def is_there(type_name):
-    """Whether there is such a type: rosbag2_interfaces may be missing, or older."""
+    """Whether there is such a type: tf2_msgs may be missing."""
     package, name = type_name.split("/")
     try:
         return hasattr(import_module(f"{package}.msg"), name)

@@ -117,7 +117,7 @@ def test_a_player_at_its_end_is_no_loss(session):
         ({"exclude": ["/probe/pose"]}, True),
         ({"topics": ["/probe/pose"]}, False),
         ({"topics": ["/ultrasound/image"]}, True),
-        ({"start_paused": True}, False),
+        ({"paused": True}, False),
         ({"snapshot_mode": True}, False),
     ],
 )

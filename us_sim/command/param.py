@@ -1,4 +1,4 @@
-"""The command `us-sim param`: what `ros2 param` does and prints, where ROS 2 is not installed."""
+"""The command `us-sim param`: what `ros2 param` does and prints, where ros2cli is not installed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from us_sim.command.options import add_network_option
@@ -19,8 +20,8 @@ from us_sim.errors import UsSimError
 from us_sim.settings.spelling import unknown
 from us_sim.settings.text_files import YamlError, load_yaml, read_yaml
 
-DISCOVERY_S = 2.0  # to discover a node
-ALL_S = 1.0  # to discover all of them
+DISCOVERY_S = 7.0  # to discover a node: Fast DDS may miss an announcement, and repeats it after 3 s
+ALL_S = 3.5  # to discover all of them
 ANSWER_S = 5.0  # for a node to answer
 
 _TYPES = (  # by rcl_interfaces/msg/ParameterType: its name, the field of a value, and its label
@@ -144,8 +145,21 @@ def _dump(asker: _Asker, args: argparse.Namespace) -> int:
         for group in groups:
             inner = inner.setdefault(group, {})
         inner[last] = _python(value)
-    print(yaml.dump({node: {"ros__parameters": nested}}, default_flow_style=False))
+    print(yaml.dump({node: {"ros__parameters": nested}}, Dumper=_Dumper, default_flow_style=False))
     return 0
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes no exponents, of which ROS's readers of YAML take some for texts."""
+
+    def represent_float(self, data: float) -> yaml.ScalarNode:
+        if not np.isfinite(data):
+            return super().represent_float(data)
+        text = np.format_float_positional(data, trim="0")
+        return self.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+_Dumper.add_representer(float, _Dumper.represent_float)
 
 
 def _load(asker: _Asker, args: argparse.Namespace) -> int:
@@ -231,10 +245,7 @@ class _Asker:
 
         client = AsyncParameterClient(self._node, node)
         if not client.wait_for_services(timeout_sec=ANSWER_S):
-            raise UsSimError(
-                f"{node} offers no parameter services that can be called from here; where it runs "
-                f"on Fast DDS, use ros2 param"
-            )
+            raise UsSimError(f"{node} offers no parameter services")
         answer = getattr(client, request)(*arguments)
         self._executor.spin_until_future_complete(answer, timeout_sec=ANSWER_S)
         if not answer.done():

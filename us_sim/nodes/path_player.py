@@ -21,7 +21,6 @@ from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited, Playback
-from us_sim.nodes.sessions.rosbag2_services import offer_player_services
 from us_sim.nodes.settings import PathPlayerSettings
 from us_sim.recording.decoding import nanoseconds_of
 from us_sim.recording.path import ProbePath, read_path
@@ -69,12 +68,11 @@ class PathPlayer(GuardedNode):
             int(self._ages[-1]),
             self._go_to,
             self._step,
+            self._end,
             self._say_progress,
         )
         self._playhead = self._playback.head
         self._starting = self.create_timer(CHECK_S, self._begin)
-        if not lockstep:
-            offer_player_services(self, self._playback, lambda: self._settings, self._stop)
         self.pose_count = len(self._path)
         self.get_logger().info(
             f"{counted(self.pose_count, 'pose')} of {self._path.topic} in {path}"
@@ -219,10 +217,6 @@ class PathPlayer(GuardedNode):
         if self._playback.loops:
             self._playback.restart(gap=int(self._period))
         else:
-            self._end()
-
-    def _stop(self) -> None:
-        if self._playback.stop():
             self._end()
 
     def _end(self) -> None:

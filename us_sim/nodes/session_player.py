@@ -19,7 +19,6 @@ from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
 from us_sim.nodes.sessions.playback import Playback
 from us_sim.nodes.sessions.recorded_topic import message_type
-from us_sim.nodes.sessions.rosbag2_services import offer_player_services
 from us_sim.nodes.settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
@@ -36,7 +35,7 @@ _SHOWN = 100_000_000
 class SessionPlayer(GuardedNode):
     """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace.
 
-    Its parameters are those of `SessionPlayerSettings`.
+    Its parameters are those of `SessionPlayerSettings`, its services those of `Playback`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -77,11 +76,11 @@ class SessionPlayer(GuardedNode):
             (self._bag.end or 0) - self._first,
             self._go_to,
             self._step,
+            lambda: self._end(early=True),
             self._say_progress,
         )
         self._playhead = self._playback.head
         self._start = self.create_timer(START_S, self._begin)
-        offer_player_services(self, self._playback, lambda: self._settings, self._stop)
 
     @property
     def _settings(self) -> SessionPlayerSettings:
@@ -123,7 +122,7 @@ class SessionPlayer(GuardedNode):
                 self._playback.restart()
             return
         elapsed = self._shown
-        if not self._settings.paused:  # then nothing is sent by itself, as rosbag2's
+        if not self._settings.paused:  # then nothing is sent by itself
             elapsed = max(elapsed, self._playhead.position(self._playback.now))
         while self._age() <= elapsed and self._step():
             pass
@@ -150,10 +149,6 @@ class SessionPlayer(GuardedNode):
         self._sent += 1
         self._waiting = self._next()
         return True
-
-    def _stop(self) -> None:
-        if self._playback.stop():
-            self._end(early=True)
 
     def _end(self, *, early: bool = False) -> None:
         self._playback.finish()

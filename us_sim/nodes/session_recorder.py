@@ -7,24 +7,25 @@ import ctypes
 import functools
 import os
 import sys
-from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.type_support import check_for_type_support
 from std_msgs.msg import String
 
-from us_sim.errors import BagError, UsSimError
+from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.parameters import Group, LiveSettings
+from us_sim.nodes.process import let_receivers_go_first, run_node
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
-from us_sim.nodes.sessions.rosbag2_services import RecorderEvents, offer_services
+from us_sim.nodes.sessions.triggers import offer
 from us_sim.nodes.settings import SessionRecorderSettings
-from us_sim.nodes.topics import MARKERS
+from us_sim.nodes.topics import MARKERS, TOPICS
+from us_sim.recording.schemas import normalized_type, type_hash
 from us_sim.recording.topic import MARKER
 from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, losses_between
 from us_sim.recording.writer import BagWriter
@@ -35,13 +36,14 @@ _WITHOUT_METADATA = (
     "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
     "be read and played without"
 )
+_STOPPED = "nothing is recorded any more"
 
 
 class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
-    Its parameters are those of `SessionRecorderSettings`; its services and events are those of
-    rosbag2's recorder. Topics that are made on demand, such as ``ultrasound/image_annotated``, are
+    Its parameters are those of `SessionRecorderSettings`, its services ``~/split``, ``~/snapshot``
+    and ``~/stop``. Topics that are made on demand, such as ``ultrasound/image_annotated``, are
     recorded only where ``topics`` or ``also`` names them: they are large, and follow from others.
 
     A text on ``session/marker`` marks a moment of the recording.
@@ -49,67 +51,64 @@ class SessionRecorder(GuardedNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_recorder", **kwargs)
-        self._settings = declared(self, SessionRecorderSettings())
+        group = Group(SessionRecorderSettings())
+        self._live = LiveSettings(self, {"recorder": group}, use=lambda _: self._use())
         settings = self._settings
         self._is_wanted = functools.cache(
             lambda topic: settings.records(topic, self.get_namespace())
         )
+        _load_types()
         self._marker_topic = self.resolve_topic_name(MARKERS)
         self._attachments = session_attachments(settings)
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
         self._topics: dict[str, RecordedTopic] = {}
         self._types: dict[str, str] = {}
-        self._told: dict[str, Loss] = {}  # losses of which an event told
-        self._splits: deque[tuple[str, str]] = deque()
-        self._bag: WriteBehind | None = None
-        self.paused = settings.start_paused
-        self.discovers = True  # new topics are subscribed to
+        self._told: dict[str, Loss] = {}  # losses of which a person was told
+        self._bag: WriteBehind | None = None  # None once it was stopped
         self.health = Health(self, settings.file)
-        self._begin(settings.file, further=settings.if_exists == "further")
-        self._events = RecorderEvents(self)
-        if not offer_services(self):
-            self.get_logger().info(
-                "rosbag2_interfaces is not installed, so there are no services to control this"
-            )
+        self._begin()
+        offer(self, "split", self._split)
+        offer(self, "snapshot", self._snapshot)
+        offer(self, "stop", self._stop)
         self.create_timer(0.1, self._discover)
         self.create_timer(1.0, self._follow_publishers)
 
     @property
-    def file(self) -> str:
-        """The file that is recorded to now; empty where nothing is."""
-        return "" if self._bag is None else self._bag.path
+    def _settings(self) -> SessionRecorderSettings:
+        settings: SessionRecorderSettings = self._live.values["recorder"]
+        return settings
 
-    @property
-    def topics(self) -> list[str]:
-        """The topics that it has subscribed to."""
-        return sorted(self._topics)
-
-    def pause(self) -> None:
-        """Record nothing until `resume`, but keep the newest of latched messages for that."""
-        self.paused = True
-        self._tell_state()
-
-    def resume(self) -> None:
-        """Go on recording."""
-        if self.paused and self._bag is not None and not self._settings.snapshot_mode:
+    def _use(self) -> None:
+        """Pause or go on, as the parameter says."""
+        if self._bag is not None and self._settings.at_once:
             self._bag.put_all(self._kept.take())
-        self.paused = False
         self._tell_state()
 
-    def split(self) -> None:
-        """Go on in a further file."""
-        if self._bag is not None:
-            self._bag.split()
+    def _split(self) -> str:
+        if self._bag is None:
+            return _STOPPED
+        self._bag.split()
+        return ""
 
-    def snapshot(self) -> bool:
-        """Write the messages kept in memory; False where none are kept."""
-        if self._bag is None or not self._settings.snapshot_mode:
-            return False
+    def _snapshot(self) -> str:
+        if self._bag is None:
+            return _STOPPED
+        if not self._settings.snapshot_mode:
+            return "nothing is kept in memory: that is what `snapshot_mode` is for"
         self._bag.put_all(self._kept.take())
-        return True
+        return ""
+
+    def _stop(self) -> str:
+        if self._bag is None:
+            return _STOPPED
+        self.stop()
+        return ""
 
     def stop(self) -> None:
         """End the recording: its file gets its index, and can be moved away."""
+        for topic in self._topics.values() if self._bag is not None else ():
+            with contextlib.suppress(Exception):  # what the rest raises must not cost what is there
+                topic.take_rest()
         bag, self._bag = self._bag, None
         if bag is None:
             return
@@ -122,59 +121,45 @@ class SessionRecorder(GuardedNode):
             if problem:
                 self.health.problem("disk", problem)
             self._tell_losses(bag)
-            self._tell_splits()
-        self._tell_state()
-
-    def record(self, file: str) -> str:
-        """Begin a further recording; why that cannot be, or nothing."""
-        if self._bag is not None:
-            return "a recording is running: stop it first"
-        try:
-            self._begin(file or self._settings.file, further=not file)
-        except UsSimError as error:
-            return str(error)
-        return ""
+            self._tell_state()
 
     def destroy_node(self) -> None:
         """Close the file, so that it has its index and metadata."""
         self.stop()
         super().destroy_node()
 
-    def _begin(self, file: str, *, further: bool) -> None:
+    def _begin(self) -> None:
         settings = self._settings
-        beside = Path(file).parent / "metadata.yaml"
-        taken = file.endswith(".mcap") and os.path.exists(beside)
+        further = settings.if_exists == "further"
+        beside = Path(settings.file).parent / "metadata.yaml"
+        taken = settings.file.endswith(".mcap") and os.path.exists(beside)
         note = _WITHOUT_METADATA if taken and not further else ""
         if note:
             self.get_logger().info(note)
         compression: Any = settings.compression
         bag = BagWriter(
-            file,
+            settings.file,
             compression=compression,
             max_size=settings.max_bagfile_size,
             max_duration=settings.max_bagfile_duration,
             sidecar=not taken,
             further=further,
         )
-        bag.on_split = lambda *files: self._splits.append(files)
         self._bag = WriteBehind(bag, settings.max_cache_size)
-        self._told = {}
         self._kept = PreRoll(
             settings.max_cache_size if settings.snapshot_mode else 0, settings.snapshot_duration
         )
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
             self._bag.attach(name, media_type, data, now)
-        for topic in self._topics.values():
-            self._bag.add_topic(topic.name, self._types[topic.name], topic.offered)
-        self.health.values = {"note": note} if note else {}
+        if note:
+            self.health.values["note"] = note
         self._tell_state()
         self.get_logger().info(f"recording to {bag.path}")
 
     def _discover(self) -> None:
-        self._tell_splits()
         has_time = bool(self.get_clock().now().nanoseconds)  # simulated time has begun
-        for topic, types in self.get_topic_names_and_types() if self.discovers and has_time else ():
+        for topic, types in self.get_topic_names_and_types() if has_time else ():
             if not self._is_wanted(topic):
                 continue
             for type_name in types:
@@ -212,7 +197,7 @@ class SessionRecorder(GuardedNode):
             return
         if topic == self._marker_topic:
             self._mark(data, now)
-        if self.paused or self._settings.snapshot_mode:
+        if not self._settings.at_once:
             self._kept.add(message, latched=self._topics[topic].is_latched)
         elif self._bag.put(topic, data, now, message.publish_time):
             self.health.published(topic)
@@ -228,7 +213,7 @@ class SessionRecorder(GuardedNode):
         self._bag.note(MARKER, {"time": str(now), "text": text})
 
     def _lost(self, topic: str, count: int) -> None:
-        if self._bag is not None and not self.paused:
+        if self._bag is not None and not self._settings.paused:
             self._bag.losses.add(topic, in_transport=count)
 
     def _follow_publishers(self) -> None:
@@ -248,23 +233,27 @@ class SessionRecorder(GuardedNode):
         while bag.untold:
             self.health.problem(*bag.untold.popleft())
         if new:
-            self._events.lost(new)
             count = sum(map(sum, new.values()))
             self.health.problem(
                 "lost", f"{counted(count, 'message')} of {', '.join(new)} not recorded"
             )
 
-    def _tell_splits(self) -> None:
-        while self._splits:
-            self._events.split(*self._splits.popleft())
-
     def _tell_state(self) -> None:
         if self._bag is None:
             self.health.state = "stopped"
-        elif self.paused:
+        elif self._settings.paused:
             self.health.state = "paused"
         else:
             self.health.state = "waiting" if self._settings.snapshot_mode else "recording"
+
+
+def _load_types() -> None:
+    """Import the types of the graph's messages: while messages come there is no time for it."""
+    for type_name in {topic.type_name for topic in TOPICS}:
+        with contextlib.suppress(BagError):  # not every type is everywhere
+            cls = message_type(normalized_type(type_name))
+            check_for_type_support(cls)
+            type_hash(normalized_type(type_name))
 
 
 def give_back_large_buffers() -> None:
@@ -279,7 +268,13 @@ def give_back_large_buffers() -> None:
 def main(args: list[str] | None = None) -> int:
     """Record until interrupted."""
     give_back_large_buffers()
-    return run_node(SessionRecorder, args)
+
+    def create() -> SessionRecorder:
+        node = SessionRecorder()
+        let_receivers_go_first()
+        return node
+
+    return run_node(create, args)
 
 
 if __name__ == "__main__":

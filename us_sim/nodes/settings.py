@@ -120,7 +120,6 @@ BEGUN = Quantity("time", 0.0, 1e10)  # when something began, since 1970
 _SPEED = Quantity("number", 0.01, 100.0)
 _SPAN = Quantity("time", 0.0, 1e6)
 _BYTES = Quantity("number", 0, 2**53)
-LOST = "events/rosbag2_messages_lost"
 NOT_THE_SESSION = ("/rosout", "/parameter_events")
 """Topics that are not recorded."""
 SHARED = ("/tf", "/tf_static")
@@ -242,7 +241,11 @@ class SessionRecorderSettings(Settings):
     max_bagfile_duration: float = setting(
         _SPAN, "after which a further file is begun; 0: never", default=0.0
     )
-    start_paused: bool = setting(description="wait for the service ~/resume", default=False)
+    paused: bool = setting(
+        description="record nothing, but keep the newest of latched messages for when it goes on",
+        default=False,
+        live=True,
+    )
     snapshot_mode: bool = setting(
         description="keep messages in memory, max_cache_size at most, until ~/snapshot writes them",
         default=False,
@@ -285,7 +288,7 @@ class SessionRecorderSettings(Settings):
     @property
     def at_once(self) -> bool:
         """Whether it records from its start, and not only when told to."""
-        return not (self.start_paused or self.snapshot_mode)
+        return not (self.paused or self.snapshot_mode)
 
 
 @dataclass(frozen=True)

@@ -170,11 +170,6 @@ session/thumbnails: sensor_msgs/CompressedImage [latched] [on_demand]
 session/bags: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
     session_control -> viewer | bags that can be played: those of the folder `us-sim` runs in, and
     installed ones
-events/write_split: rosbag2_interfaces/WriteSplitEvent
-    session_recorder | a file of the recording was ended, and which one was begun
-events/rosbag2_messages_lost: rosbag2_interfaces/MessagesLostEvent
-    session_recorder | how many messages were lost, by topic; where ROS has this type, which Jazzy
-    has not
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
     scorer, openigtlink_bridge, composed, path_player, session_player, session_recorder,

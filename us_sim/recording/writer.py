@@ -16,7 +16,7 @@ import contextlib
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
@@ -88,7 +88,6 @@ class BagWriter:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
         self.custom_data: dict[str, str] = {}  # free text for the metadata
         self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
-        self.on_split: Callable[[str, str], None] | None = None
         self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
         self._files: list[FileEntry] = []  # that are closed
@@ -315,8 +314,6 @@ class BagWriter:
                 self._add_metadata(self._output)
                 self._finish()
             self._closed_because = f"{self.path} is closed: nothing can be written to it any more"
-            if self.on_split is not None:
-                self.on_split(str(self._output.path), "")
         self._write_metadata_file()
         self._tell_taken_away()
 
@@ -397,8 +394,6 @@ class BagWriter:
         self._finish()
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._output = self._opened(self._further_file())
-        if self.on_split is not None:
-            self.on_split(str(closed.path), str(self._output.path))
 
     def _finish(self) -> None:
         """Give the present file its index, close it and count its messages."""

@@ -21,6 +21,7 @@ import dataclasses
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -198,7 +199,9 @@ def _default(value: Any, rule: Rule) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
-        return amount(value, rule.quantity.dimension if rule.quantity else "number")
+        text = amount(value, rule.quantity.dimension if rule.quantity else "number")
+        # Without exponents, of which `ros2 param load` takes some for texts.
+        return re.sub(r"^-?[\d.]+e-\d+", lambda found: f"{Decimal(found[0]):f}", text)
     if isinstance(value, str):
         return f"`{value}`" if value else "none"
     if isinstance(value, tuple | list):

@@ -15,6 +15,7 @@ from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import stamp_message
 from us_sim.nodes.parameters import declared
+from us_sim.nodes.sessions.triggers import offer
 from us_sim.nodes.settings import RECORDER, AwaitedSettings, PlayerSettings
 from us_sim.recording.playhead import Playhead
 
@@ -74,7 +75,7 @@ class Awaited:
 
 
 class Playback:
-    """Does as a player's parameters and services say.
+    """Does as a player's parameters say, and its services ``~/play_next`` and ``~/stop``.
 
     The player publishes ``/clock`` where its parameter ``clock`` asks for it, and then goes by the
     computer's clock itself; else by its node's, also where that is set back.
@@ -87,6 +88,7 @@ class Playback:
         go_to: has the node play on at a time of the recording, ns, from a time of `now` on; without
             that at once, and then what is there is shown even if it is paused.
         step: sends the next message before ``until``; False where there is none.
+        stop: ends playing early.
         say: puts into the node's health how far it is.
     """
 
@@ -98,16 +100,18 @@ class Playback:
         length: int,
         go_to: Callable[[int, int | None], None],
         step: Callable[[], bool],
+        stop: Callable[[], None],
         say: Callable[[], None],
     ) -> None:
         self._node, self._settings, self._go_to, self._say = node, settings, go_to, say
-        self.first, self.length, self.step = first, length, step
+        self.first, self.length = first, length
         self.head = Playhead(settings().rate)
         self.has_begun = self.is_stopped = False
         self._latest = 0  # ns, of `now`
         self.delay = round(1e9 * settings().delay)
-        duration = round(1e9 * settings().playback_duration)
-        self._select(round(1e9 * settings().start_offset), duration, until=-1)
+        self.start, self.until = round(1e9 * settings().start_offset), length  # ns, of the part
+        if settings().playback_duration >= 0.0:
+            self.until = self.start + round(1e9 * settings().playback_duration)
         if self.start > length:
             raise BagError(
                 f"{settings().path} ends after {1e-9 * length:g} s, and so before `start_offset`, "
@@ -118,6 +122,9 @@ class Playback:
             self._clock = node.stream(ClockMessage, "/clock")
             node.create_timer(1.0 / settings().clock, self.tell_time)
         node.add_post_set_parameters_callback(self._seek)
+        if not getattr(settings(), "lockstep", False):
+            offer(node, "play_next", lambda: self._play_next(step))
+            offer(node, "stop", lambda: self._stop(stop))
 
     @property
     def now(self) -> int:
@@ -163,24 +170,6 @@ class Playback:
         """Whether it begins again at the end."""
         return self._settings().loop and not self.is_stopped
 
-    def may_step(self) -> bool:
-        """Whether single messages may be asked for: only while it is paused."""
-        return self.has_begun and self._node.health.state == "paused"
-
-    def play(self, offset: int, duration: int, until: int) -> bool:
-        """Play a part, ns from the start and since 1970; False where something is played already.
-
-        As rosbag2's player, it takes the later of both ends, or the recording's where both are
-        negative; a duration of 0 is no end.
-        """
-        if self._node.health.state != "finished" or offset > self.length:
-            return False
-        self._select(offset, duration, until)
-        self.is_stopped = False
-        self.restart()
-        self._report()
-        return True
-
     def restart(self, gap: int = 0) -> None:
         """Play from the start on, after the delay and a gap, ns."""
         self._node.health.state = "paused" if self._settings().paused else "playing"
@@ -191,19 +180,17 @@ class Playback:
         self._node.health.state = "finished"
         self._report()
 
-    def stop(self) -> bool:
-        """Play no more until `play` or a seek; False where nothing is played."""
-        if not self.has_begun or self._node.health.state == "finished":
-            return False
-        self.is_stopped = True
-        return True
+    def _play_next(self, step: Callable[[], bool]) -> str:
+        if not self.has_begun or self._node.health.state != "paused":
+            return "single messages may be asked for only while it is paused"
+        return "" if step() else "there is no further message"
 
-    def _select(self, start: int, duration: int, until: int) -> None:
-        self.start = start
-        self.until = self.length
-        if duration >= 0 or until >= 0:
-            by_duration = start + duration if duration else -1
-            self.until = max(by_duration, until - self.first)
+    def _stop(self, stop: Callable[[], None]) -> str:
+        if not self.has_begun or self._node.health.state == "finished":
+            return "nothing is played"
+        self.is_stopped = True
+        stop()
+        return ""
 
     def _seek(self, parameters: list[Parameter]) -> None:
         """Continue at a time, whenever it is set, even to the same value."""

@@ -9,11 +9,12 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from rclpy.node import Node
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from us_sim.errors import BagError
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.recording.schemas import schema_text
 from us_sim.recording.topic import QosProfile
 
@@ -38,7 +39,7 @@ class RecordedTopic:
 
     def __init__(
         self,
-        node: Node,
+        node: GuardedNode,
         name: str,
         message_type: Any,
         offered: Iterable[QoSProfile],
@@ -87,14 +88,17 @@ class RecordedTopic:
             self._subscription = self._subscribed()
         return new
 
-    def close(self) -> None:
-        """Take no more."""
+    def take_rest(self) -> None:
+        """Take the messages that wait for the executor; also after ROS was shut down."""
         for subscription in filter(None, (self._old, self._subscription)):
-            self._node.destroy_subscription(subscription)
+            with subscription.handle:
+                while taken := subscription.handle.take_message(self._type, True):
+                    self._receive(*taken)
 
     def _subscribed(self) -> Subscription:
+        events = SubscriptionEventCallbacks(message_lost=self._count_lost)
         return self._node.create_subscription(
-            self._type, self.name, self._receive, self._adopted, raw=True
+            self._type, self.name, self._receive, self._adopted, raw=True, event_callbacks=events
         )
 
     def _receive(self, data: bytes, info: Mapping[str, Any]) -> None:
@@ -111,8 +115,9 @@ class RecordedTopic:
     def _count(self, sequence: int | None) -> None:
         """Notice messages that are missing in the numbers of the only publisher.
 
-        Not every middleware gives numbers, and those of several publishers cannot be told apart: a
-        number that is lower is of another one, of which the graph will tell.
+        These show every loss, also in the queue of the subscription. But not every middleware gives
+        numbers, and those of several publishers cannot be told apart: a number that is lower is of
+        another one, of which the graph will tell.
         """
         if sequence is None or self._publishers != 1:
             return
@@ -122,6 +127,11 @@ class RecordedTopic:
         if self._sequence is not None and sequence > self._sequence + 1:
             self._lost(self.name, sequence - self._sequence - 1)
         self._sequence = sequence
+
+    def _count_lost(self, status: QoSMessageLostInfo) -> None:
+        """Notice what was lost on the way, as the middleware says, where numbers do not tell."""
+        if self._publishers != 1 or self._sequence is None:
+            self._lost(self.name, status.total_count_change)
 
 
 def _adopted(offered: Iterable[QosProfile]) -> QoSProfile:
