@@ -1,9 +1,9 @@
-"""The rclpy nodes.
+"""The rclpy nodes. Importing this package imports no rclpy.
 
-Importing this package imports no rclpy, so that tables of topics and parameters can be read
-without. It ends a node's process without a word when Ctrl-C comes while its modules are imported:
-an import that a KeyboardInterrupt breaks off fails in ways of its own, with pages of traceback.
-`us_sim.nodes.process.run_node` takes over once it runs.
+So tables of topics and parameters can be read without one. It ends a node's process without a word
+when Ctrl-C comes while its modules are imported: an import that a KeyboardInterrupt breaks off
+fails in ways of its own, with pages of traceback. `us_sim.nodes.process.run_node` takes over once
+it runs.
 """
 
 from __future__ import annotations
