@@ -1,5 +1,6 @@
 """Package `us_sim` for pip (one command, `us-sim`) and for colcon (one executable a node)."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -31,15 +32,15 @@ BY_COLCON = bool({"install", "develop"} & set(sys.argv))
 GYMNASIUM = "gymnasium>=1.1,<2"
 UPATH = "universal-pathlib>=0.3"
 HAS_ROS_WHEELS = "platform_system == 'Linux' and platform_machine == 'x86_64'"
-ROS = (
-    []
-    if BY_COLCON
-    else [
-        f"ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2; {HAS_ROS_WHEELS}",
-        f"ros-jazzy-common-interfaces>=5.3.6,<5.4; {HAS_ROS_WHEELS}",
-    ]
-)
-"""The real rclpy, messages and Fast DDS; a workspace has its own."""
+ROS = [
+    f"ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2; {HAS_ROS_WHEELS}",
+    f"ros-jazzy-common-interfaces>=5.3.6,<5.4; {HAS_ROS_WHEELS}",
+]
+"""The real rclpy, messages and Fast DDS."""
+if BY_COLCON:
+    ROS = []
+elif os.environ.get("AMENT_PREFIX_PATH"):  # a sourced ROS 2, whose messages need Ubuntu's NumPy
+    ROS = ["numpy<2; python_version < '3.13'"]
 
 
 def console_scripts() -> list[str]:

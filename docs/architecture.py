@@ -33,9 +33,6 @@ LAYERS = (
 )
 """Layers from the top, each of rows of rooms ("" is a gap); no arrow leads to a layer above."""
 
-BESIDE = "standalone"
-"""The room that stands beside the others: it imports none, and the nodes alone know of it."""
-
 FILES = {
     ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
     for file in sorted(PACKAGE.rglob("*.py"))
@@ -137,7 +134,6 @@ def places() -> dict[str, tuple[float, float]]:
                     found[room] = (2.8 * (column - (len(row) - 1) / 2), y)
             y += 1.25
         y += 0.45
-    found[BESIDE] = (8.0, found["nodes"][1])
     return found
 
 
@@ -150,7 +146,7 @@ def draw() -> None:
     from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
     at = places()
-    figure, axes = plt.subplots(figsize=(11, 9))
+    figure, axes = plt.subplots(figsize=(9, 9))
     for (name, rows), colour in zip(LAYERS, ("#dce9f7", "#fbe6cf", "#e0f0dc"), strict=True):
         high = max(at[room][1] for row in rows for room in row if room) + 0.6
         low = min(at[room][1] for row in rows for room in row if room) - 0.6
@@ -170,7 +166,7 @@ def draw() -> None:
         )
         arrow.set(mutation_scale=16, color="#555555", linewidth=1.4, zorder=2)
         axes.add_patch(arrow)
-    axes.set_xlim(-6.6, 9.2)
+    axes.set_xlim(-6.6, 6.2)
     axes.set_ylim(-0.8, max(y for _, y in at.values()) + 0.8)
     axes.axis("off")
     picture = Path(__file__).with_suffix(".png")

@@ -8,11 +8,10 @@ import pytest
 
 import us_sim
 
-SKIPPED = ("us_sim.standalone", "us_sim.nodes")
 MODULES = sorted(
     info.name
     for info in pkgutil.walk_packages(us_sim.__path__, "us_sim.")
-    if not info.name.startswith(SKIPPED)
+    if not info.name.startswith("us_sim.nodes")
 )
 
 

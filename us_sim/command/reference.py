@@ -175,7 +175,7 @@ def _nodes() -> Iterator[Section]:
                     f"are the scene's."
                 )
             elif each is not SceneNodeSettings:
-                about = first_sentence(each)
+                about = first_sentence(each.__doc__)
                 text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
         if node == "slice_interpolator":
             text.append(
@@ -242,4 +242,4 @@ def _scene_sections() -> Iterator[Section]:
     from us_sim.scene.scene import Scene
 
     yield from sections_of(Scene, "", {Placement: POSE})
-    yield Section("pose", POSE, f"{first_sentence(Placement)}\n\n{table(Placement)}")
+    yield Section("pose", POSE, f"{first_sentence(Placement.__doc__)}\n\n{table(Placement)}")

@@ -1,9 +1,9 @@
-"""The rclpy nodes.
+"""The rclpy nodes. Importing this package imports no rclpy.
 
-Importing this package imports no rclpy, so that tables of topics and parameters can be read
-without. It ends a node's process without a word when Ctrl-C comes while its modules are imported:
-an import that a KeyboardInterrupt breaks off fails in ways of its own, with pages of traceback.
-`us_sim.nodes.process.run_node` takes over once it runs.
+So tables of topics and parameters can be read without one. It ends a node's process without a word
+when Ctrl-C comes while its modules are imported: an import that a KeyboardInterrupt breaks off
+fails in ways of its own, with pages of traceback. `us_sim.nodes.process.run_node` takes over once
+it runs.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import os
+import re
 import signal
 import sys
 import threading
@@ -39,11 +40,43 @@ if os.environ.pop(ENDS_WITH_INPUT, None):
 
 
 def require_rclpy() -> None:
-    """Raise UsSimError, which says how to get it, where rclpy is not installed."""
-    if importlib.util.find_spec("rclpy") is None:
+    """Require one rclpy of one ROS 2, without importing it.
+
+    rclpy's wheels start the interpreter again with their libraries on LD_LIBRARY_PATH, in any order
+    with those of a sourced ROS 2, and not where a parent process has done so already.
+
+    Raises:
+        UsSimError: rclpy is not installed, of another Python, or mixed of two installations; says
+            what to do.
+    """
+    found = importlib.util.find_spec("rclpy")
+    if found is None or found.origin is None:
         raise UsSimError(
             "rclpy is not installed: on Linux x86-64 `pip install .` brings it; elsewhere use "
             "`pixi run sim` (RoboStack), the Dockerfile, or ROS 2's own packages"
+        )
+    path = map(Path, os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep))
+    loaded = {each.resolve() for each in path if each.match("ros_*.libs")}
+    sourced = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)[-1]
+    if sourced and loaded:
+        raise UsSimError(
+            f"two ROS 2 would be mixed, {sourced} and that of pip in {sys.prefix}: start in a "
+            f"shell in which none is sourced, or `pip install .` in this shell into a new "
+            f"environment, which then has no other"
+        )
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    of = re.search(r"/python(3\.\d+)/", found.origin)
+    if of is not None and of[1] != version:
+        raise UsSimError(
+            f"{found.origin} is of Python {of[1]}, and this is {version}: use that Python, or "
+            f"install and start us_sim in a shell in which no ROS 2 is sourced"
+        )
+    own = {each.resolve() for each in Path(found.origin).parents[1].glob("ros_*.libs")}
+    if own != loaded:
+        raise UsSimError(
+            f"the libraries of {found.origin} are not those of LD_LIBRARY_PATH, since the Python "
+            f"of another environment started this one: start it without the variables "
+            f"_ROS_WHEELS_BOOTSTRAP_COMPLETE and LD_LIBRARY_PATH"
         )
 
 

@@ -15,12 +15,15 @@ us_sim.errors.SettingsError: number 'fractoin' is not one of fraction; did you m
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.metadata
+import importlib.util
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from us_sim.errors import SettingsError, UsSimError
@@ -47,6 +50,16 @@ class Option:
             SettingsError: a package that adds it cannot be imported.
         """
         return self._imported(self.target)
+
+    def docstring(self) -> str | None:
+        """Read the docstring of the class, without importing it: that may need rclpy."""
+        module, _, name = self.target.partition(":")
+        spec = importlib.util.find_spec(module)
+        if spec is not None and spec.origin is not None:
+            for defined in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+                if isinstance(defined, ast.ClassDef) and defined.name == name:
+                    return ast.get_docstring(defined)
+        return getattr(self.load(), "__doc__", None)
 
     def load_settings(self) -> type[Settings]:
         """Import the settings."""

@@ -58,7 +58,7 @@ def sections_of(
             elsewhere.
     """
     shared = shared or {}
-    text = [first_sentence(settings), table(settings, path, shared)]
+    text = [first_sentence(settings.__doc__), table(settings, path, shared)]
     yield Section(path, path or OUTERMOST, _joined(text))
     kinds = kinds_of(settings)
     for name, rule in rules_of(settings).items():
@@ -122,9 +122,9 @@ def default_text(settings: type[Settings], name: str) -> str:
     return _default(default, rules_of(settings)[name])
 
 
-def first_sentence(documented: Any) -> str:
+def first_sentence(docstring: str | None) -> str:
     """The first line of a docstring, as Markdown."""
-    text = (getattr(documented, "__doc__", None) or "").strip().partition("\n")[0]
+    text = (docstring or "").strip().partition("\n")[0]
     return re.sub(r"``(.+?)``", r"`\1`", text)
 
 
@@ -142,13 +142,13 @@ def _option_sections(
     for name in choice.importable:
         has = bool(rules_of(choice.settings(name)))
         keys = f"[keys](#{anchor(options.title(name))})" if has else "none"
-        rows.append((f"`{name}`", first_sentence(choice.load(name)), keys))
+        rows.append((f"`{name}`", first_sentence(choice.option(name).docstring()), keys))
     head = (choice.what if options.by_name else f"`{choice.key}`", "what it is", "its own")
     yield Section(options.at, options.at, _markdown(head, rows))
     for name in choice.importable:
         own = choice.settings(name)
         if rules_of(own):
-            text = _joined([first_sentence(own), table(own, path, shared)])
+            text = _joined([first_sentence(own.__doc__), table(own, path, shared)])
             yield Section(options.path(name), options.title(name), text)
 
 

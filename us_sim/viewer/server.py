@@ -10,12 +10,14 @@ import secrets
 import socket
 import threading
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
 from us_sim.viewer.access import Access, is_loopback
-from us_sim.viewer.stream import Simulator
+
+if TYPE_CHECKING:  # since `us_sim.run.plan` asks for a free port where there is no rclpy
+    from us_sim.viewer.stream import Simulator
 
 
 def require_free(host: str, port: int) -> None:

@@ -22,7 +22,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,7 +31,9 @@ from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, s
 from us_sim.evaluation.report import Row, percentile
 from us_sim.evaluation.timing import Tell
 from us_sim.share import find_bag
-from us_sim.viewer.stream import Packet
+
+if TYPE_CHECKING:
+    from us_sim.viewer.stream import Packet
 
 
 @dataclass(frozen=True)
@@ -276,6 +278,8 @@ class Taker:
             self._socket.send(json.dumps(message))
 
     def _take(self) -> None:
+        from us_sim.viewer.stream import Packet
+
         try:
             for data in self._socket:
                 if isinstance(data, str):
