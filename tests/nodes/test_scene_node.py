@@ -1,42 +1,36 @@
 """Newest wins: what came while a node worked is skipped and counted."""
 
+import pytest
 from bench import pose_at
 from geometry_msgs.msg import PoseStamped
-from rclpy.node import Node
 
-from us_sim.nodes.guarded_node import Health
-from us_sim.nodes.qos import EVERY
-from us_sim.nodes.scene_node import Newest
+from us_sim.nodes.scene_node import SceneNode
 
 
-def consumer(bench, publisher_count, *, lockstep):
-    """A node that is sent ``publisher_count`` more poses while it works on the first."""
-    node = bench.add(Node("consumer", context=bench.context))
-    health = Health(node, "test")
-    worked = []
+class Consumer(SceneNode):
+    """A node that is sent eight more poses while it works on the first."""
 
-    def work(message):
-        worked.append(message.header.stamp.sec)
-        if len(worked) == 1:
-            for second in range(2, 2 + publisher_count):
-                publisher.publish(pose_at(0.0, second))
+    def __init__(self, **kwargs):
+        super().__init__("consumer", **kwargs)
+        self.worked = []
+        self.newest(PoseStamped, "probe/pose", self._work)
 
-    take = Newest(node, health, work, lockstep=lockstep)
-    node.create_subscription(PoseStamped, "probe/pose", take, EVERY)
-    publisher = bench.publisher(PoseStamped, "probe/pose")
-    publisher.publish(pose_at(0.0, 1))
-    bench.spin_until(lambda: health.received == 1 + publisher_count)
+    def _work(self, message):
+        self.worked.append(message.header.stamp.sec)
+        if len(self.worked) == 1:
+            for second in range(2, 10):
+                self.sender.publish(pose_at(0.0, second))
+
+
+@pytest.mark.parametrize(
+    ("lockstep", "worked", "dropped"), [(False, [1, 9], 7), (True, [*range(1, 10)], 0)]
+)
+def test_live_the_last_of_a_burst_is_worked_on_and_in_lockstep_all(
+    bench, small_scene, lockstep, worked, dropped
+):
+    node = bench.make(Consumer, scene=str(small_scene), lockstep=lockstep)
+    node.sender = bench.publisher(PoseStamped, "probe/pose")
+    node.sender.publish(pose_at(0.0, 1))
+    bench.spin_until(lambda: node.health.received == 9)
     bench.spin_for(10)
-    return worked, health
-
-
-def test_live_the_last_of_a_burst_is_worked_on_and_the_rest_counted(bench):
-    worked, health = consumer(bench, 8, lockstep=False)
-    assert worked == [1, 9]
-    assert health.dropped == 7
-
-
-def test_lockstep_works_on_every_one_in_order(bench):
-    worked, health = consumer(bench, 8, lockstep=True)
-    assert worked == list(range(1, 10))
-    assert health.dropped == 0
+    assert (node.worked, node.health.dropped) == (worked, dropped)

@@ -65,7 +65,6 @@ class CameraDriver(GuardedNode):
         self._state = "opening"
         self._ended = False
         self._closing = threading.Event()
-        self._guard = self.create_guard_condition(self._work)
         if self._video.is_file and not self._video.open():
             raise TrackingError(f"{source}: is no video that OpenCV can read; convert it to MP4")
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
@@ -135,7 +134,7 @@ class CameraDriver(GuardedNode):
                 continue
             number += 1
         self._ended = True
-        self._guard.trigger()
+        self.call_soon(self._work)
 
     def _keep(self, taken: int) -> bool:
         """Decode the newest image, for the node's thread to publish.
@@ -152,13 +151,13 @@ class CameraDriver(GuardedNode):
             self.health.dropped += self._newest is not None
             self._newest = stamp, pixels
             self._state = "publishing"
-        self._guard.trigger()
+        self.call_soon(self._work)
         return True
 
     def _tell(self, state: str, problem: str = "") -> None:
         with self._lock:
             self._state, self._problem = state, problem
-        self._guard.trigger()
+        self.call_soon(self._work)
 
     # In the node's thread.
 

@@ -11,54 +11,25 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType, ROSClock
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
-from rosbags.interfaces import Nodetype
 
-from us_sim.errors import MessageError, UsSimError, printable
+from us_sim.errors import UsSimError, printable
 from us_sim.nodes import ros_refusal
 from us_sim.nodes.qos import LATCHED, STREAM, overridable
 from us_sim.recording.decoding import nanoseconds_of, require_stamp
-from us_sim.recording.schemas import jazzy_definitions
-
-
-def require_sequences(data: bytes, message_type: Any) -> None:
-    """Check the sequences of a serialized message, where its type is one of Jazzy's with any.
-
-    Raises:
-        Exception: what rosbags raises, where the bytes are no such message.
-    """
-    name = f"{message_type.__module__.partition('.')[0]}/msg/{message_type.__name__}"
-    if _has_sequences(name):
-        jazzy_definitions().deserialize_cdr(data, name)
-
-
-@cache
-def _has_sequences(name: str) -> bool:
-    fields = jazzy_definitions().fielddefs.get(name, ((), ()))[1]
-    return any(_is_sequence(*kind) for _, kind in fields)
-
-
-def _is_sequence(kind: Nodetype, of: Any) -> bool:
-    if kind is Nodetype.ARRAY:
-        return _is_sequence(*of[0])
-    return kind is Nodetype.SEQUENCE or (kind is Nodetype.NAME and _has_sequences(of))
-
 
 CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
 SAY_S = 1.0  # how long the same failure is not said again
-HEADER_SIZE = 4  # bytes that every serialized message begins with
 FAILED = "it failed; see the node's log"
 _DONE, _CODE, _REASON = ("success", "successful"), ("return_code",), ("error_string", "message")
 """Fields by which responses usually say whether what was asked for was done, and why not."""
@@ -72,8 +43,7 @@ class GuardedNode(Node):
     exception is a *failure*: counted by where it happened, said once a second at most, its
     traceback at log level debug. `Health` puts both in diagnostics.
 
-    Messages are taken as bytes and decoded here, so that those which cannot be are refused, too,
-    and so are those whose stamps are no time. Subscribers that ask for ``raw`` get the bytes.
+    Messages whose stamps are no time are refused, too, but for those that are asked for ``raw``.
     """
 
     health: Health  # where the node has one
@@ -89,8 +59,14 @@ class GuardedNode(Node):
             super().__init__(name, **kwargs)
         except RuntimeError as error:  # an RCLError
             raise ros_refusal(error) from error
-        if self.get_clock().ros_time_is_active:
+        if self.time_is_simulated:
             self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock)
+
+    @property
+    def time_is_simulated(self) -> bool:
+        """Whether the node's time is that of ``/clock``."""
+        clock = self.get_clock()
+        return isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def _look_for_a_clock(self) -> None:
         """Say that simulated time does not begin."""
@@ -168,13 +144,10 @@ class GuardedNode(Node):
         """
         if not topic.startswith("/"):
             options.setdefault("qos_overriding_options", overridable())
-        if not options.pop("raw", False):
-            callback = decoded(msg_type, callback)
-        where = self.resolve_topic_name(topic)
-        entered = self._entered(where, callback)
-        return super().create_subscription(
-            msg_type, topic, entered, qos_profile, raw=True, **options
-        )
+        if not options.get("raw"):
+            callback = _with_a_stamp(callback)
+        entered = self._entered(self.resolve_topic_name(topic), callback)
+        return super().create_subscription(msg_type, topic, entered, qos_profile, **options)
 
     def create_timer(self, timer_period_sec: float, callback: Any, *args: Any, **kw: Any) -> Any:
         """As `rclpy.node.Node.create_timer`, guarded, and by real time unless a clock is given.
@@ -186,9 +159,10 @@ class GuardedNode(Node):
             timer_period_sec, entered, *args, **{"clock": self._steady, **kw}
         )
 
-    def create_guard_condition(self, callback: Any, *args: Any, **kw: Any) -> Any:
-        """As `rclpy.node.Node.create_guard_condition`, guarded."""
-        return super().create_guard_condition(self._entered(_name(callback), callback), *args, **kw)
+    def call_soon(self, callback: Callable[[], Any]) -> None:
+        """Have the executor call ``callback``, guarded; any thread may ask for that."""
+        if self.executor is not None:  # else it has ended, or has not begun
+            self.executor.create_task(self._entered(_name(callback), callback))
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, **options: Any) -> Any:
         """As `rclpy.node.Node.create_service`, guarded: a request that fails is told that."""
@@ -255,27 +229,12 @@ class Subscriptions:
         return True
 
 
-def decoded(message_type: Any, work: Callable[[Any], None]) -> Callable[[bytes], None]:
-    """A callback that takes a message's bytes and hands ``work`` the message.
+def _with_a_stamp(work: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return ``work``, which raises StampError for messages whose stamps are no time."""
 
-    It raises MessageError for bytes that are none, and StampError where its stamp is no time. That
-    is not left to subscriptions: of a message that is cut off, rmw_fastrtps says nothing, and
-    rmw_cyclonedds hands on what it had read until then; and of one whose sequences claim more than
-    there is, `require_sequences` says what may become.
-    """
-
-    def take(data: bytes) -> None:
-        try:
-            if len(data) < HEADER_SIZE:
-                raise ValueError("there is not even a header")  # and nobody else looks for one
-            require_sequences(data, message_type)
-            message = deserialize_message(data, message_type)
-        except Exception as error:  # which, differs between middlewares
-            raise MessageError(
-                f"{len(data)} bytes came that are no {message_type.__name__} ({error})"
-            ) from error
+    def take(message: Any) -> Any:
         require_stamp(message)
-        work(message)
+        return work(message)
 
     return take
 
@@ -334,7 +293,7 @@ class Health:
         hardware_id: the scene's name, or what else the node works on.
     """
 
-    def __init__(self, node: Node, hardware_id: str) -> None:
+    def __init__(self, node: GuardedNode, hardware_id: str) -> None:
         self._node = node
         self._hardware_id = hardware_id
         self._latencies: deque[float] = deque(maxlen=1000)
@@ -368,17 +327,17 @@ class Health:
             self._latencies.append(1e3 * self._age(nanoseconds_of(stamp)))
 
     def _age(self, stamp: int) -> float:
-        clock = self._node.get_clock()
-        age = 1e-9 * (clock.now().nanoseconds - stamp)
-        if abs(age) < ANOTHER_CLOCK_S and not clock.ros_time_is_active:
+        age = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp)
+        is_simulated = self._node.time_is_simulated
+        if abs(age) < ANOTHER_CLOCK_S and not is_simulated:
             return age
-        if not self._clock_differs and not clock.ros_time_is_active:
+        if not self._clock_differs and not is_simulated:
             self._clock_differs = True
             self._node.get_logger().warning(
                 f"stamps are {abs(age):.1f} s {'old' if age > 0 else 'ahead'}, so they are of "
                 f"another clock: latency counts from arrival"
             )
-        return 1e-9 * (time.monotonic_ns() - getattr(self._node, "arrived", time.monotonic_ns()))
+        return 1e-9 * (time.monotonic_ns() - self._node.arrived)
 
     def problem(self, kind: str, sentence: str) -> None:
         """Count a problem of that kind; one that goes on is logged ever more rarely."""
@@ -405,7 +364,7 @@ class Health:
         total = max(self._published.values(), default=0)
         rate = (total - self._last_total) / max(now - self._last_time, 1e-9)
         self._last_time, self._last_total = now, total
-        failures: Counter[str] = Counter(getattr(self._node, "failures", ()))
+        failures = self._node.failures
         values = {
             "state": self.state,
             "pid": str(os.getpid()),

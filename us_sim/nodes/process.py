@@ -14,7 +14,8 @@ from typing import Any
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from us_sim.errors import UsSimError, memory_limit
@@ -80,6 +81,9 @@ def scheduling_of(pid: int) -> str:
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""
 
+TURN_S = 1.0
+"""For a turn in which nothing comes; without a limit the executor would wait in a busy loop."""
+
 _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -139,13 +143,13 @@ def spin(node: Node) -> None:
         Exception: what rclpy raises, where nothing but that has happened for ten seconds.
     """
     finished = getattr(node, "finished", None)
-    executor = _Executor(context=node.context)
+    executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
     executor.add_node(node)
     worked = time.monotonic()
     try:
         while node.context.ok() and (finished is None or not finished.done()):
             try:
-                executor.spin_once()
+                executor.spin_once(timeout_sec=TURN_S)
                 worked = time.monotonic()
             except ExternalShutdownException:
                 raise
@@ -157,31 +161,6 @@ def spin(node: Node) -> None:
                 node.failed("what came in", error)
     finally:
         executor.remove_node(node)
-
-
-class _Executor(SingleThreadedExecutor):
-    """rclpy's own never serves a node again that has failed to take a message."""
-
-    def _take_subscription(self, entity: Any) -> Any:
-        return self._taken(super()._take_subscription, entity)
-
-    def _take_service(self, entity: Any) -> Any:
-        return self._taken(super()._take_service, entity)
-
-    def _take_client(self, entity: Any) -> Any:
-        return self._taken(super()._take_client, entity)
-
-    def _taken(self, take: Callable[[Any], Any], entity: Any) -> Any:
-        """The work that rclpy makes of an entity; a failure to take it is raised by that work."""
-        try:
-            return take(entity)
-        except Exception as error:
-            failure = error
-
-        async def fail() -> None:
-            raise failure
-
-        return fail
 
 
 def _interrupted(node: Any) -> int:

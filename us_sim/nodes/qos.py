@@ -15,8 +15,9 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CATALOGUE = QoSProfile(depth=200, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Likewise, where each message is about another thing."""
 
-FOREIGN = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Input from drivers, many of which publish best effort."""
+FOREIGN = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Input from drivers, many of which publish best effort. A tracker's filter wants every pose, so
+some may wait while the process does not get a processor."""
 
 
 def overridable() -> QoSOverridingOptions:

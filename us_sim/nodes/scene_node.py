@@ -2,61 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
-from us_sim.nodes.guarded_node import GuardedNode, Health, decoded
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
-
-
-class Newest:
-    """A subscription callback that hands ``work`` the newest message once the queue is drained.
-
-    An executor takes one message of a subscription per turn, so working in the callback would
-    fall behind a fast publisher. The callback therefore only stores, and a guard condition works
-    in the first turn that brought nothing new. In lockstep every message is worked on at once.
-    """
-
-    def __init__(
-        self, node: GuardedNode, health: Health, work: Callable[[Any], None], *, lockstep: bool
-    ) -> None:
-        self._node = node
-        self._health = health
-        self._work = work
-        self._lockstep = lockstep
-        self._waiting: Any = None
-        self._arrived = 0  # ns of the monotonic clock
-        self._fresh = False
-        self._guard = node.create_guard_condition(self._turn)
-
-    def __call__(self, message: Any) -> None:
-        """Take a message from the subscription."""
-        self._health.received += 1
-        if self._lockstep:
-            self._work(message)
-            return
-        if self._waiting is not None:
-            self._health.dropped += 1
-        self._waiting, self._arrived = message, time.monotonic_ns()
-        self._fresh = True
-        self._guard.trigger()
-
-    def _turn(self) -> None:
-        if self._fresh:
-            self._fresh = False
-            self._guard.trigger()
-            return
-        message, self._waiting = self._waiting, None
-        if message is not None:
-            self._node.arrived = self._arrived
-            self._work(message)
 
 
 class SceneNode(GuardedNode):
@@ -84,11 +41,27 @@ class SceneNode(GuardedNode):
     ) -> None:
         """Call ``work`` with the newest message of ``topic`` (with each one in lockstep).
 
-        What is skipped is not even decoded.
+        An executor takes one message of a subscription per turn, so a slow ``work`` would fall
+        behind a fast publisher. What else waits is therefore taken here, and counted as dropped.
         """
-        guarded = self.guarded(self.resolve_topic_name(topic), decoded(message_type, work))
-        newest = Newest(self, self.health, guarded, lockstep=self.lockstep)
-        self.listen(message_type, topic, newest, qos, raw=True)
+
+        def take(message: Any) -> None:
+            self.health.received += 1
+            work(message if self.lockstep else self._take_last(subscription, message))
+
+        subscription = self.listen(message_type, topic, take, qos)
+
+    def _take_last(self, subscription: Subscription, message: Any) -> Any:
+        """Take all that waits in a subscription's queue; return the last, else ``message``."""
+        with subscription.handle:
+            for _ in range(subscription.qos_profile.depth):
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    break
+                message = taken[0]
+                self.health.received += 1
+                self.health.dropped += 1
+        return message
 
     def listen(
         self,
@@ -96,11 +69,11 @@ class SceneNode(GuardedNode):
         topic: str,
         callback: Callable[[Any], None],
         qos: QoSProfile | None = None,
-        **options: Any,
-    ) -> None:
+    ) -> Subscription:
         """Subscribe to every message of ``topic``."""
         qos = qos or (EVERY if self.lockstep else STREAM)
-        self.create_subscription(message_type, topic, callback, qos, **options)
+        subscription: Subscription = self.create_subscription(message_type, topic, callback, qos)
+        return subscription
 
 
 LEAD_TOPIC = "tracker/pose"

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
@@ -48,6 +49,8 @@ class SessionRecorder(GuardedNode):
 
     A text on ``session/marker`` marks a moment of the recording.
     """
+
+    executor_class = SingleThreadedExecutor  # rclpy's EventsExecutor hands on no message's number
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("session_recorder", **kwargs)

@@ -39,7 +39,6 @@ class SpaceMouseDriver(GuardedNode):
         self._newest: tuple[int, list[float], list[int]] | None = None
         self._problem, self._name = "", ""
         self._closing = threading.Event()
-        self._guard = self.create_guard_condition(self._work)
         self._thread = threading.Thread(target=self._run, name="space mouse", daemon=True)
         self._thread.start()
 
@@ -60,7 +59,7 @@ class SpaceMouseDriver(GuardedNode):
             except TrackingError as error:
                 with self._lock:
                     self._problem = f"{error}; it is tried again"
-                self._guard.trigger()
+                self.call_soon(self._work)
                 self._closing.wait(RETRY_S)
             except Exception as error:  # so that the thread does not end silently
                 self.failed("SpaceMouse", error)
@@ -73,7 +72,7 @@ class SpaceMouseDriver(GuardedNode):
             with self._lock:
                 self._name = mouse.name
                 self._newest = now, mouse.axes, mouse.buttons
-            self._guard.trigger()
+            self.call_soon(self._work)
 
     def _work(self) -> None:
         with self._lock:

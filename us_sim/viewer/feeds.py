@@ -18,13 +18,14 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Image, PointCloud2
 from shape_msgs.msg import Mesh
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import MeshError, VolumeError
-from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, decoded
+from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.recording.decoding import (
     affine_from,
@@ -35,6 +36,7 @@ from us_sim.recording.decoding import (
     nanoseconds_of,
     pixels_from,
     pose_from,
+    require_stamp,
     tetrahedra_from,
     triangles_from,
     vectors_from,
@@ -66,10 +68,13 @@ def made_of(
     node: GuardedNode, message_type: Any, topic: str, data: bytes, make: Callable[[Any], Any]
 ) -> Any:
     """The result of ``make`` for a message's bytes; None, and reported, where it refuses them."""
-    made: list[Any] = []
-    take = decoded(message_type, lambda message: made.append(make(message)))
-    node.guarded(node.resolve_topic_name(topic), take)(data)
-    return made[0] if made else None
+
+    def made() -> Any:
+        message = deserialize_message(data, message_type)
+        require_stamp(message)
+        return make(message)
+
+    return node.guarded(node.resolve_topic_name(topic), made)()
 
 
 def topic_feed(

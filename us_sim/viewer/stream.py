@@ -27,8 +27,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
-from rclpy.node import Node
-
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.slicing.settings import STRIPS
 from us_sim.viewer.parameters import ParameterBoard
 from us_sim.viewer.session import SessionBoard
@@ -265,9 +264,9 @@ class Posted:
         node: that is spun.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: GuardedNode) -> None:
         self._work: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
-        self._guard = node.create_guard_condition(self._turn)
+        self._node = node
         self._closed = False
 
     def __call__(self, work: Callable[[], T]) -> Future[T]:
@@ -277,7 +276,7 @@ class Posted:
             future.cancel()
             return future
         self._work.append((work, future))
-        self._guard.trigger()
+        self._node.call_soon(self._turn)
         return future
 
     def close(self) -> None:

@@ -132,8 +132,7 @@ class Device(SceneNode):
 
     def in_tracker(self, work: Callable[[], None]) -> Callable[[], None]:
         """A function that another thread calls to have ``work`` done in the tracker's own."""
-        trigger: Callable[[], None] = self.create_guard_condition(self._of_source(work)).trigger
-        return trigger
+        return functools.partial(self.call_soon, self._of_source(work))
 
     def every(self, seconds: float, work: Callable[[], None]) -> Any:
         """A timer, which has ``cancel``."""
