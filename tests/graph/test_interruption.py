@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from command import us_sim
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
@@ -104,3 +105,11 @@ def message_count(recording: Path, topic: str) -> int:
     except BagError:
         return -1
     return {topic.name: topic.message_count for topic in bag.topics}.get(topic, 0)
+
+
+def test_a_run_ends_after_its_duration_with_its_summary(played_scene, tmp_path):
+    recording = tmp_path / "session.mcap"
+    result = us_sim("run", played_scene, "--record", recording, "--duration", 2)
+    assert (result.returncode, result.stdout) == (0, f"recorded to {recording}\n"), result.stderr
+    assert "Traceback" not in result.stderr
+    assert read_bag(recording).topic("/diagnostics").message_count > 0
