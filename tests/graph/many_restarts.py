@@ -146,11 +146,11 @@ def restart(listener, node, number):
     return Restart(node, number, seconds, others)
 
 
-def start(folder, scene, path, *more):
+def start(folder, scene, path):
     """`us-sim run` with a path that begins again at its end, recorded; it may restart for ever."""
     command = [sys.executable, "-m", "us_sim", "run", str(scene), "--path", str(path)]
     command += ["--record", str(folder / "session.mcap"), "--param", "path_player.loop=true"]
-    command += ["--restarts", "1000000", "--restarts-per-minute", "1000000", *more]
+    command += ["--restarts", "1000000", "--restarts-per-minute", "1000000"]
     with (folder / "said.txt").open("w") as said:
         return subprocess.Popen(command, stderr=said, stdout=said)
 
@@ -160,7 +160,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--standby", action="store_true", help="as of `us-sim run`")
     parser.add_argument("--minutes", type=float, default=1e9, help="end after so long")
     asked = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -169,8 +168,8 @@ def main():
     scene = folder / "scene.yaml"
     scene.write_text(SCENE)
     listener = Listener()
-    more = ["--standby"] if asked.standby else []
-    run = start(folder, scene, "press_and_slide.mcap", *more)
+    segments = set(Path("/dev/shm").glob("*fastrtps_*"))
+    run = start(folder, scene, "press_and_slide.mcap")
     done = []
     try:
         while len(listener.times) < 120:
@@ -187,9 +186,13 @@ def main():
             for file in sorted(folder.glob("*.mcap"), key=lambda f: f.stat().st_mtime)[:-2]:
                 file.unlink()
     finally:
+        nodes = nodes_of(run.pid)
         run.send_signal(signal.SIGINT)
         run.wait(30)
         listener.close()
+    assert not any(Path(f"/proc/{pid}").exists() for pid in nodes.values())
+    left = set(Path("/dev/shm").glob("*fastrtps_*")) - segments
+    print("left in shared memory:", *sorted(file.name for file in left))  # of this and other runs
     print(f"{len(done)} restarts, status {run.returncode}; what was said is in {folder}/said.txt")
     for name in (*sorted({each.node for each in done}), ""):
         seconds = [each.seconds for each in done if name in ("", each.node)]

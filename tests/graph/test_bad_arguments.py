@@ -74,9 +74,7 @@ def test_so_does_its_process(node, arguments, words):
     assert_one_sentence(result.stderr, words)
 
 
-@pytest.mark.parametrize(
-    "command", [["us_sim.nodes.probe_tracker"], ["us_sim", "run", "upper_arm"]]
-)
+@pytest.mark.parametrize("command", ["us_sim.nodes.probe_tracker", "us_sim run upper_arm"])
 @pytest.mark.parametrize("keystore", [False, True])
 def test_a_secured_domain_without_keys_is_said(command, keystore, tmp_path, monkeypatch):
     monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from command import us_sim
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
@@ -78,6 +79,25 @@ def test_more_than_one_ctrl_c_does_not_break_off_the_end(tmp_path):
     assert (tmp_path / "metadata.yaml").is_file()
 
 
+INTERRUPTED_AS_IT_SPINS = """
+import os, signal, sys
+from us_sim.nodes import composed, process
+spin = process.spin
+def interrupt(node):
+    os.kill(os.getpid(), signal.SIGINT)
+    spin(node)
+process.spin = interrupt
+sys.exit(composed.main())
+"""
+
+
+def test_composed_nodes_have_done_their_work_when_they_are_told_to_end(small_scene):
+    command = [sys.executable, "-c", INTERRUPTED_AS_IT_SPINS, "--ros-args"]
+    command += ["-p", "nodes:=[probe_tracker]", "-p", f"probe_tracker:scene:={small_scene}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def message_count(recording: Path, topic: str) -> int:
     """Messages of a topic in the recording so far; -1 while it has no header yet."""
     try:
@@ -85,3 +105,11 @@ def message_count(recording: Path, topic: str) -> int:
     except BagError:
         return -1
     return {topic.name: topic.message_count for topic in bag.topics}.get(topic, 0)
+
+
+def test_a_run_ends_after_its_duration_with_its_summary(played_scene, tmp_path):
+    recording = tmp_path / "session.mcap"
+    result = us_sim("run", played_scene, "--record", recording, "--duration", 2)
+    assert (result.returncode, result.stdout) == (0, f"recorded to {recording}\n"), result.stderr
+    assert "Traceback" not in result.stderr
+    assert read_bag(recording).topic("/diagnostics").message_count > 0
