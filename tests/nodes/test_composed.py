@@ -30,7 +30,7 @@ def test_nodes_in_one_process_make_images_and_report_each(small_scene):
             if len(images) > 5 and names >= {f"/{node}" for node in (*NODES, "composed")}:
                 break
         assert len(images) > 5
-        assert composed.goes_first
+        assert composed.realtime_priority
         pids = {v.value for r in reports for s in r.status for v in s.values if v.key == "pid"}
         assert len(pids) == 1
     finally:

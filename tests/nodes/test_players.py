@@ -54,7 +54,7 @@ def nanoseconds(message):
 def test_poses_are_played_in_order_at_their_pace_with_new_stamps(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     player = bench.make(PathPlayer, path=str(path))
-    assert player.goes_first  # as a device, whose poses come regularly
+    assert player.realtime_priority  # as a device, whose poses come regularly
     bench.spin_until(player.finished.done)
     bench.spin_until(lambda: len(poses) == 10)
     assert [round(pose.pose.position.z * 1e3) for pose in poses] == list(range(10))
@@ -101,7 +101,7 @@ def test_recorded_stamps_can_be_kept(bench, path):
 def test_in_lockstep_the_next_pose_waits_for_the_image(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     player = bench.make(PathPlayer, path=str(path), lockstep=True)
-    assert not player.goes_first
+    assert not player.realtime_priority
     images = bench.publisher(Image, "ultrasound/image")
     bench.spin_until(lambda: len(poses) == 1)
     bench.spin_for(10)

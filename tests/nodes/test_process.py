@@ -88,7 +88,7 @@ def test_a_node_asks_for_it_and_says_what_it_got(
 ):
     node = bench.make(ProbeTracker, scene=str(small_scene), **parameters)
     times = []
-    monkeypatch.setattr(process, "go_first", lambda: times.append(1) or "realtime")
+    monkeypatch.setattr(process, "go_first", lambda priority: times.append(priority) or "realtime")
     monkeypatch.setattr(process, "spin", lambda _: None)
     monkeypatch.setattr(process.rclpy, "init", lambda **_: None)
     monkeypatch.setattr(process.rclpy, "try_shutdown", lambda: None)
@@ -96,7 +96,7 @@ def test_a_node_asks_for_it_and_says_what_it_got(
     monkeypatch.setattr(process.signal, "signal", lambda *_: None)
     monkeypatch.setattr(process.gc, "freeze", lambda: None)
     assert process.run_node(lambda: node) == 0
-    assert (len(times), node.health.scheduling) == ((1, "realtime") if asked else (0, ""))
+    assert (times, node.health.scheduling) == (([2], "realtime") if asked else ([], ""))
 
 
 UNUSED = [

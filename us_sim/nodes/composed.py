@@ -19,7 +19,7 @@ from rclpy.task import Future
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node, spin
+from us_sim.nodes.process import COMPUTING, run_node, spin
 from us_sim.nodes.settings import COMPOSABLE, ComposedSettings
 from us_sim.settings.spelling import unknown
 
@@ -49,7 +49,8 @@ class Composed(GuardedNode):
                 raise SettingsError(f"composed.nodes: {unknown(name, COMPOSABLE)}")
         self.finished: Future | None = None  # with what a part has failed of
         self.parts = [node_class(name)(context=self.context) for name in names]
-        self.goes_first = any(getattr(part, "goes_first", False) for part in self.parts)
+        are_realtime = any(getattr(part, "realtime_priority", 0) for part in self.parts)
+        self.realtime_priority = COMPUTING if are_realtime else 0
         self.health = Health(self, ", ".join(names))
         self.health.state = "running"
         self._threads = [

@@ -18,7 +18,7 @@ from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import pose_message, stamp_message
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import MEASURING, run_node
 from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited, Playback
 from us_sim.nodes.settings import PathPlayerSettings
@@ -47,7 +47,7 @@ class PathPlayer(GuardedNode):
         self._path = read_path(path, settings.topic, option="its parameter `topic`")
         lockstep = settings.lockstep
         # It stands for a device, whose poses come regularly however busy the computer is.
-        self.goes_first = not lockstep
+        self.realtime_priority = 0 if lockstep else MEASURING
         self._stamps = _rising_stamps(self._path) if lockstep else self._path.stamps
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next, self._sent = 0, -1  # pose to be sent, and that which was sent last

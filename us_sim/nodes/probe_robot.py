@@ -13,7 +13,7 @@ from us_sim.errors import MessageError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import pose_message
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import run_node
+from us_sim.nodes.process import MEASURING, run_node
 from us_sim.nodes.qos import FOREIGN, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.recording.decoding import twist_from, wrench_from
@@ -30,7 +30,7 @@ class ProbeRobot(GuardedNode):
         super().__init__("probe_robot", **kwargs)
         self._settings = declared(self, RobotSettings())
         self._robot = Robot(self._settings)
-        self.goes_first = True  # it stands for a device
+        self.realtime_priority = MEASURING  # it stands for a device
         self.health = Health(self, "robot arm")
         self.health.state = self._robot.action
         self._poses = self.stream(PoseStamped, LEAD_TOPIC)

@@ -22,8 +22,12 @@ from us_sim.errors import UsSimError, memory_limit
 from us_sim.nodes import INTERRUPTED, ros_refusal
 from us_sim.nodes.guarded_node import GuardedNode
 
+COMPUTING, MEASURING = 1, 2
+"""Realtime priorities of nodes. Those that hand on what a device measures take a millisecond, and
+go before those that compute for tens; drivers of devices may go before both."""
 
-def go_first(priority: int = 1) -> str:
+
+def go_first(priority: int = COMPUTING) -> str:
     """Let all present threads of this process go before ordinary ones, and none that they start.
 
     Args:
@@ -50,7 +54,7 @@ def let_receivers_go_first() -> None:
     messages that they keep for whoever does not.
     """
     if hasattr(os, "sched_setscheduler"):
-        _schedule(os.SCHED_RR, 1, {thread.native_id for thread in threading.enumerate()})
+        _schedule(os.SCHED_RR, MEASURING, {thread.native_id for thread in threading.enumerate()})
 
 
 def _schedule(policy: int, priority: int, but: Collection[int | None] = ()) -> bool:
@@ -106,8 +110,8 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     try:
         node = create()
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
-        if getattr(node, "goes_first", False):
-            node.health.scheduling = go_first()
+        if priority := getattr(node, "realtime_priority", 0):
+            node.health.scheduling = go_first(priority)
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -10,6 +10,7 @@ from rclpy.subscription import Subscription
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
+from us_sim.nodes.process import COMPUTING
 from us_sim.nodes.qos import EVERY, STREAM
 from us_sim.nodes.settings import VIEWER, SceneNodeSettings
 from us_sim.scene.reading import load_scene
@@ -22,14 +23,17 @@ class SceneNode(GuardedNode):
     Its parameters are those of `SceneNodeSettings`.
     """
 
+    live_priority = COMPUTING
+
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         settings = declared(self, SceneNodeSettings())
         self.scene: Scene = load_scene(settings.scene, volume=settings.volume)
         self.lockstep = settings.lockstep
         self.threads = settings.threads
-        #: Whether its process should go before ordinary ones.
-        self.goes_first = settings.realtime and not settings.lockstep
+        #: With which its process goes before ordinary ones; 0 is as one of them.
+        is_realtime = settings.realtime and not settings.lockstep
+        self.realtime_priority = self.live_priority if is_realtime else 0
         self.health: Health = Health(self, self.scene.name)
 
     def newest(

@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from us_sim.errors import PoseError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import kind_of
+from us_sim.nodes.process import MEASURING
 from us_sim.nodes.qos import EVERY, FOREIGN
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.recording.decoding import nanoseconds_of, pose_from
@@ -50,6 +51,8 @@ class TrackerInput:
 
 class Device(SceneNode):
     """The tracker as its input uses it: where measurements go, and how messages are got."""
+
+    live_priority = MEASURING
 
     _input: TrackerInput
     _tracking: ProbeTracking
