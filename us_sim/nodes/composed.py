@@ -12,14 +12,14 @@ import threading
 from functools import partial
 from typing import Any
 
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 from rclpy.task import Future
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import declared
-from us_sim.nodes.process import COMPUTING, run_node, spin
+from us_sim.nodes.process import COMPUTING, create_executor, run_node, spin
 from us_sim.nodes.settings import COMPOSABLE, ComposedSettings
 from us_sim.settings.spelling import unknown
 
@@ -54,14 +54,15 @@ class Composed(GuardedNode):
         self.health = Health(self, ", ".join(names))
         self.health.state = "running"
         self._threads = [
-            threading.Thread(target=self._run, args=(part,), daemon=True) for part in self.parts
+            threading.Thread(target=self._run, args=(part, create_executor(part)), daemon=True)
+            for part in self.parts
         ]
         for thread in self._threads:
             thread.start()
 
-    def _run(self, part: Node) -> None:
+    def _run(self, part: Node, executor: Executor) -> None:
         try:
-            spin(part)
+            spin(part, executor)
         except ExternalShutdownException:
             pass
         except Exception as error:

@@ -52,7 +52,6 @@ class PathPlayer(GuardedNode):
         self._ages = self._path.log_times - self._path.log_times[0]  # ns
         self._next, self._sent = 0, -1  # pose to be sent, and that which was sent last
         self._begun = round(1e9 * settings.begun)  # ns
-        self._ticking: Timer | None = None
         self._sent_at = 0.0  # s, of the monotonic clock
         self.finished = Future()
         self.health = Health(self, str(path))
@@ -72,6 +71,8 @@ class PathPlayer(GuardedNode):
             self._say_progress,
         )
         self._playhead = self._playback.head
+        self._ticking = self._timer_at_its_pace()  # now, so that its thread goes first, too
+        self._ticking.cancel()
         self._starting = self.create_timer(CHECK_S, self._begin)
         self.pose_count = len(self._path)
         self.get_logger().info(
@@ -100,14 +101,13 @@ class PathPlayer(GuardedNode):
         self._go_to(max(start, round(1e9 * self._settings.time)), begun)
         self._skip(now)
         self.get_logger().info(f"playing from pose {self._next}")
-        self._tick_at_its_pace()
+        self._ticking.reset()
         self._playback.begin()
 
-    def _tick_at_its_pace(self) -> None:
-        if self._ticking is not None:
-            self.destroy_timer(self._ticking)
+    def _timer_at_its_pace(self) -> Timer:
         period = max(1e-9 * self._period, 1e-4)
-        self._ticking = self.create_timer(period, self._tick, clock=self._playback.clock)
+        timer: Timer = self.create_timer(period, self._tick, clock=self._playback.clock)
+        return timer
 
     @property
     def _period(self) -> float:
@@ -134,10 +134,12 @@ class PathPlayer(GuardedNode):
         }
 
     def _use(self, _: object) -> None:
-        if self._ticking is not None and self._settings.rate != self._playhead.rate:
-            self._tick_at_its_pace()
-        if not self._settings.lockstep:
-            self._playback.use()
+        if self._settings.lockstep:
+            return
+        if self._playback.has_begun and self._settings.rate != self._playhead.rate:
+            self.destroy_timer(self._ticking)
+            self._ticking = self._timer_at_its_pace()
+        self._playback.use()
 
     def _go_to(self, position: int, at: int | None = None) -> None:
         """Play on there, and send at once the pose that is held there while it is paused."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
@@ -110,9 +110,10 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     try:
         node = create()
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
+        executor = create_executor(node)  # which starts threads for timers
         if priority := getattr(node, "realtime_priority", 0):
             node.health.scheduling = go_first(priority)
-        spin(node)
+        spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (UsSimError, ParameterException) as error:
@@ -136,7 +137,14 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     return _interrupted(node)
 
 
-def spin(node: Node) -> None:
+def create_executor(node: Node) -> Executor:
+    """Return the executor that the node asks for, with the node."""
+    executor: Executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
+    executor.add_node(node)
+    return executor
+
+
+def spin(node: Node, executor: Executor) -> None:
     """Run the node's callbacks until its future ``finished``, if it has one, or rclpy is shut down.
 
     Callbacks of a `GuardedNode` raise nothing, but rclpy does, for instance for a request of a
@@ -147,8 +155,6 @@ def spin(node: Node) -> None:
         Exception: what rclpy raises, where nothing but that has happened for ten seconds.
     """
     finished = getattr(node, "finished", None)
-    executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
-    executor.add_node(node)
     worked = time.monotonic()
     try:
         while node.context.ok() and (finished is None or not finished.done()):
