@@ -103,6 +103,7 @@ class PathPlayer(GuardedNode):
         self.get_logger().info(f"playing from pose {self._next}")
         self._ticking.reset()
         self._playback.begin()
+        self._tick()
 
     def _timer_at_its_pace(self) -> Timer:
         period = max(1e-9 * self._period, 1e-4)
