@@ -8,8 +8,8 @@ from geometry_msgs.msg import Pose, PoseArray, PoseStamped, TransformStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
-from tf2_msgs.msg import TFMessage
 
+from us_sim.nodes.tf import TFMessage
 from us_sim.scene.scene import Scene
 
 __all__ = ["GoodInput", "good_input"]

@@ -84,22 +84,6 @@ def nearly(good):
     )
 
 
-def damaged(data):
-    """Serialized messages: cut off, with bytes changed, or with anything behind the header."""
-    cut = st.integers(0, len(data)).map(lambda size: data[:size])
-    flipped = st.lists(
-        st.tuples(st.integers(0, len(data) - 1), st.integers(0, 255)), min_size=1, max_size=4
-    ).map(lambda changes: _flipped(data, changes))
-    return cut | flipped | st.binary(max_size=64).map(lambda tail: data[:4] + tail)
-
-
-def _flipped(data, changes):
-    bytes_ = bytearray(data)
-    for place, value in changes:
-        bytes_[place] = value
-    return bytes(bytes_)
-
-
 def _sequences(kind, least, most):
     if kind in ("uint8", "char", "octet"):
         return st.binary(min_size=least, max_size=max(most, least)).map(

@@ -14,11 +14,11 @@ from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy, PointCloud2
 from std_msgs.msg import Bool
-from tf2_msgs.msg import TFMessage
 
 from us_sim.errors import SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.probe_tracker import ProbeTracker
+from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tracker_inputs.camera_input import grey_from_compressed
 from us_sim.recording.path import ProbePath, read_path, write_path
 from us_sim.tracking.camera.model import CameraModel
@@ -120,6 +120,7 @@ def transform(parent, child, z, second):
     return TFMessage(transforms=[message])
 
 
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 def test_tf_leads_from_the_device_to_the_patient_and_to_the_probe(bench, tracker):
     """A tool of the device is where the probe is, by the transforms alone."""
     turned = "{position: [0.1, 0.2, 0.3], orientation: [0, 0, 1, 0]}"
@@ -144,6 +145,7 @@ def place_of(transform):
     return np.array([p.x, p.y, p.z])
 
 
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 def test_nothing_is_said_of_frames_that_a_tree_of_tf_may_hold(bench, tracker):
     tracker("{source: tf, frame: world, body: stylus, registration: {position: [0, 0, 1]}}")
     tracker("{source: pose}")
@@ -152,6 +154,7 @@ def test_nothing_is_said_of_frames_that_a_tree_of_tf_may_hold(bench, tracker):
     assert not static
 
 
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 def test_a_frame_of_tf_is_followed_through_the_tree(bench, tracker):
     node, poses = tracker("{source: tf, frame: world, body: stylus}")
     moving = bench.publisher(TFMessage, "tf")
@@ -169,6 +172,7 @@ def test_a_frame_of_tf_is_followed_through_the_tree(bench, tracker):
     np.testing.assert_allclose(place(poses[0]), [0, 0, 0.134])
 
 
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 def test_a_frame_of_tf_is_not_missed_among_those_of_others(bench, tracker):
     node, poses = tracker("{source: tf, frame: world, body: stylus}", lockstep=False)
     moving = bench.publisher(TFMessage, "tf")
@@ -179,6 +183,7 @@ def test_a_frame_of_tf_is_not_missed_among_those_of_others(bench, tracker):
     bench.spin_until(lambda: poses)
 
 
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 def test_a_way_in_tf_that_never_moves_is_said(bench, tracker):
     node, _ = tracker("{source: tf, frame: world, body: stylus}")
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -197,10 +202,17 @@ def test_a_pose_in_millimetres_is_not_believed(bench, tracker):
     assert node.health.problems("far") == 1
 
 
+@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 @pytest.mark.parametrize("body", ["", ", body: probe"])
 def test_tf_needs_the_name_of_a_frame_that_is_not_its_own(tracker, body):
     with pytest.raises(SceneError, match=r"tracker\.body"):
         tracker(f"{{source: tf{body}}}")
+
+
+@pytest.mark.skipif(TFMessage is not None, reason="tf2_msgs is installed")
+def test_tf_without_tf2_msgs_is_refused(tracker):
+    with pytest.raises(TrackingError, match="tf2_msgs"):
+        tracker("{source: tf, frame: world, body: stylus}")
 
 
 def joy(axes, second, buttons=(0, 0)):
