@@ -23,7 +23,6 @@ NODES = [
     "nodes.space_mouse_driver",
     "nodes.tissue_deformer",
     "viewer.viewer",
-    "nodes.volume_reconstructor",
 ]
 FOLDER = Path(__file__).resolve().parent
 BY_COLCON = bool({"install", "develop"} & set(sys.argv))

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.parameter import Parameter
@@ -32,10 +31,6 @@ from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-over_dds = pytest.mark.skipif(
-    rclpy.get_rmw_implementation_identifier() == "rmw_zenoh_cpp",
-    reason="over zenoh every publisher fits every subscription, and there are no DDS writers",
-)
 
 
 def call(bench, name):
@@ -277,7 +272,6 @@ def test_losses_are_told(bench, quiet, may_write):
 
 OVERWRITING = """
 import sys, time
-import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
@@ -297,7 +291,6 @@ time.sleep(1.0)
 """
 
 
-@over_dds
 def test_what_a_publisher_overwrites_before_it_was_sent_is_counted(bench, tmp_path):
     file = tmp_path / "session.mcap"
     recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
@@ -314,7 +307,6 @@ def test_what_a_publisher_overwrites_before_it_was_sent_is_counted(bench, tmp_pa
     assert read_bag(file).lost() == {"/note": 302 - len(texts(file))}
 
 
-@over_dds
 def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_path):
     file = tmp_path / "session.mcap"
     recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])

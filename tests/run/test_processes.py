@@ -56,13 +56,13 @@ def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(mo
     groups = [ProcessGroup(), ProcessGroup()]
     try:
         for group in groups:
-            group.start([NodeProcess("volume_reconstructor"), NodeProcess("scorer")])
+            group.start([NodeProcess("image_writer"), NodeProcess("scorer")])
         nodes = [pid for group in groups for pid in group.pids.values()]
         wait_until(lambda: all(len(files_of(pid)) >= 3 for pid in nodes))
         killed, living = nodes[0], nodes[2:]
         left, used = files_of(killed), [file for pid in living for file in files_of(pid)]
         os.kill(killed, signal.SIGKILL)
-        wait_until(lambda: not groups[0].is_running("volume_reconstructor"))
+        wait_until(lambda: not groups[0].is_running("image_writer"))
         assert all(file.exists() for file in left)
         groups[0].stop()
         assert not any(file.exists() for file in left)

@@ -27,7 +27,6 @@ from us_sim.skin.settings import MembraneSettings
 from us_sim.slicing.acoustics.settings import SoundSettings, TissueAcoustics
 from us_sim.slicing.settings import OVERLAYS, TISSUE_PARAMETERS, Imaging
 from us_sim.tracking.robot import RobotSettings
-from us_sim.volume.reconstruction.settings import LiveBox, LiveVolume
 
 _AGE = Quantity("time", 0.01, 3600.0)
 
@@ -536,7 +535,6 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "probe_robot": (RobotSettings,),
     "image_writer": (ImageWriterSettings,),
     "viewer": (ViewerSettings,),
-    "volume_reconstructor": (LiveVolume, LiveBox),
 }
 """The settings whose fields are a node's parameters; those of parts of a scene come on top."""
 

@@ -86,7 +86,7 @@ robot/force: geometry_msgs/WrenchStamped
     drivers -> probe_robot | z, in frame `probe`: N by which it is to press
 probe/pose: geometry_msgs/PoseStamped
     probe_tracker -> viewer, tissue_deformer, skin_deformer, slice_interpolator, openigtlink_bridge,
-    volume_reconstructor, scorer | the probe in `patient`: registered, checked, filtered; once for
+    scorer | the probe in `patient`: registered, checked, filtered; once for
     each measurement
 probe/status: diagnostic_msgs/DiagnosticStatus [latched]
     probe_tracker -> viewer | `waiting`, `tracked`, `coasting` or `lost`, each time that changes;
@@ -117,7 +117,7 @@ skin/nodes: sensor_msgs/PointCloud2
 skin/marker: visualization_msgs/Marker
     skin_deformer | the deformed skin as triangles
 ultrasound/image: sensor_msgs/Image
-    slice_interpolator -> openigtlink_bridge, image_writer, path_player, volume_reconstructor,
+    slice_interpolator -> openigtlink_bridge, image_writer, path_player,
     viewer | `mono8`, in frame `probe`: columns along the array, rows along the depth
 ultrasound/image/compressed: sensor_msgs/CompressedImage [on_demand]
     slice_interpolator | the same as JPEG or PNG, as image_transport's plugin `compressed` makes it
@@ -150,7 +150,7 @@ ultrasound/spectrum: sensor_msgs/Image [on_demand]
 ultrasound/m_mode: sensor_msgs/Image [on_demand]
     slice_interpolator | `rgb8`, for the eye: the image's echoes along a line over time
 ultrasound/image_to_probe: std_msgs/Float64MultiArray [latched]
-    slice_interpolator -> openigtlink_bridge, volume_reconstructor, viewer | 4 × 4, from (column,
+    slice_interpolator -> openigtlink_bridge, viewer | 4 × 4, from (column,
     row, 0, 1) of a pixel to metres in frame `probe`
 score: diagnostic_msgs/DiagnosticArray [latched]
     scorer -> viewer | once a second: metrics so far as values of the first status; one of each step
@@ -173,7 +173,7 @@ session/bags: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
     scorer, openigtlink_bridge, composed, path_player, session_player, session_recorder,
-    camera_driver, space_mouse_driver, probe_robot, session_monitor, volume_reconstructor,
+    camera_driver, space_mouse_driver, probe_robot, session_monitor,
     session_control, viewer -> session_monitor, viewer | once a second: state, rate, latency, what
     was dropped or refused; of `session_monitor` which nodes ended or hung
 """

@@ -19,7 +19,7 @@ from us_sim.volume.reconstruction.grid import (
     proposed_spacing,
 )
 from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
-from us_sim.volume.reconstruction.settings import Compounding, ImagePart, LiveBox
+from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
 
@@ -222,7 +222,7 @@ def _pair(
     planned: Plan, made: Reconstruction, k: int, image: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """The used pixels of a frame whose eight voxels are covered, their prediction, and how many."""
-    from scipy import ndimage  # which live reconstruction does not need
+    from scipy import ndimage
 
     to_index = planned.grid.reference_to_index
     index = (planned.points(k) @ to_index[:3, :3].T + to_index[:3, 3]).T
@@ -236,49 +236,3 @@ def _pair(
         made.volume.intensities, index[:, used], np.float64, order=1, mode="nearest"
     )
     return image[planned.used][used].astype(np.float64), predicted, float(used.mean())
-
-
-class LiveReconstruction:
-    """A volume that grows while a probe scans: images inserted at poses, in a box that is fixed.
-
-    Raises:
-        VolumeError: it has too many voxels, or more than the free memory holds.
-    """
-
-    def __init__(self, box: LiveBox) -> None:
-        self.box = box
-        grid = grid_around(np.array([box.lower, box.upper]), box.spacing)
-        self._insertion = Insertion(grid, method=box.method, compounding=box.compounding)
-        self._used = np.ones((0, 0), dtype=np.bool_)
-        self.frames = 0
-
-    def insert(self, image: NDArray[np.uint8], image_to_patient: NDArray[np.float64]) -> None:
-        """Insert an image (rows, columns), given the (4, 4) m from (column, row, 0, 1).
-
-        Pixels that were black in all images so far lie beside the beams.
-        """
-        if self._used.shape != image.shape:
-            self._used = np.zeros(image.shape, dtype=np.bool_)
-        self._used |= image > 0
-        self._insertion.insert(np.ascontiguousarray(image), image_to_patient, self._used)
-        self.frames += 1
-
-    def clear(self) -> None:
-        """Begin anew."""
-        self._insertion.clear()
-        self.frames = 0
-
-    def volume(self) -> Volume:
-        """The volume of all images so far, its holes filled.
-
-        Raises:
-            VolumeError: no pixel lies within the box.
-        """
-        grey, covered = self._insertion.result()
-        if not covered.any():
-            raise VolumeError(
-                f"nothing of the {self.frames} images lies in the box from "
-                f"{list(self.box.lower)} to {list(self.box.upper)} m; set lower and upper"
-            )
-        fill_holes(grey, covered, self.box.hole_radius / self.box.spacing)
-        return Volume(grey, self._insertion.grid.index_to_reference)
