@@ -22,6 +22,31 @@ class Consumer(SceneNode):
                 self.sender.publish(pose_at(0.0, second))
 
 
+class Slow(SceneNode):
+    """A node to which more comes while it works than its queue of ten holds."""
+
+    def __init__(self, **kwargs):
+        super().__init__("slow", **kwargs)
+        self.worked = []
+        self.newest(PoseStamped, "probe/pose", self._work)
+
+    def _work(self, message):
+        self.worked.append(message.header.stamp.sec)
+        for _ in range(self.more.pop(0) if self.more else 0):
+            self.sent += 1
+            self.sender.publish(pose_at(0.0, self.sent))
+
+
+def test_what_a_full_queue_overwrites_counts_as_dropped(bench, small_scene):
+    node = bench.make(Slow, scene=str(small_scene))
+    node.sender, node.sent, node.more = bench.publisher(PoseStamped, "probe/pose"), 1, [3, 40]
+    node.sender.publish(pose_at(0.0, 1))
+    bench.spin_until(lambda: node.worked[-1:] == [44])
+    assert node.worked == [1, 4, 44]
+    assert node.health.dropped == 44 - len(node.worked)
+    assert node.health.received < 44
+
+
 @pytest.mark.parametrize(
     ("lockstep", "worked", "dropped"), [(False, [1, 9], 7), (True, [*range(1, 10)], 0)]
 )

@@ -17,6 +17,35 @@ from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 
 
+class Overwritten:
+    """Counts messages that a full queue has overwritten, by the numbers that a publisher gives.
+
+    A callback of rclpy's EventsExecutor is not told a message's number, but one that is taken from
+    a queue has it, and a queue that was full has several.
+
+    >>> overwritten = Overwritten()
+    >>> overwritten.received = 3
+    >>> overwritten.count(3)  # the first number says nothing
+    0
+    >>> overwritten.received = 13
+    >>> overwritten.count(20)
+    7
+    """
+
+    def __init__(self) -> None:
+        self.received = 0  # messages so far
+        self._last: tuple[int, int] | None = None  # a number, and how many were received by then
+
+    def count(self, number: int | None) -> int:
+        """Return how many messages before this one were overwritten since the last number."""
+        if number is None:  # not every middleware has them
+            return 0
+        last, self._last = self._last, (number, self.received)
+        if last is None or number < last[0]:  # another publisher's
+            return 0
+        return max(number - last[0] - (self.received - last[1]), 0)
+
+
 class SceneNode(GuardedNode):
     """A node that works on a scene.
 
@@ -49,22 +78,33 @@ class SceneNode(GuardedNode):
         behind a fast publisher. What else waits is therefore taken here, and counted as dropped.
         """
 
+        overwritten = Overwritten()
+
         def take(message: Any) -> None:
             self.health.received += 1
-            work(message if self.lockstep else self._take_last(subscription, message))
+            overwritten.received += 1
+            work(message if self.lockstep else self._take_last(subscription, message, overwritten))
 
         subscription = self.listen(message_type, topic, take, qos)
 
-    def _take_last(self, subscription: Subscription, message: Any) -> Any:
+    def _take_last(self, subscription: Subscription, message: Any, overwritten: Overwritten) -> Any:
         """Take all that waits in a subscription's queue; return the last, else ``message``."""
+        taken: Any = None
         with subscription.handle:
             for _ in range(subscription.qos_profile.depth):
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if taken is None:
+                further = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if further is None:
                     break
-                message = taken[0]
+                taken = further
                 self.health.received += 1
+                overwritten.received += 1
                 self.health.dropped += 1
+        if taken is None:
+            return message
+        message, info = taken
+        lost = overwritten.count(info.get("publication_sequence_number"))
+        if lost and self.count_publishers(subscription.topic_name) == 1:
+            self.health.dropped += lost
         return message
 
     def listen(
