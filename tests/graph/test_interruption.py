@@ -83,9 +83,9 @@ INTERRUPTED_AS_IT_SPINS = """
 import os, signal, sys
 from us_sim.nodes import composed, process
 spin = process.spin
-def interrupt(node):
+def interrupt(node, executor):
     os.kill(os.getpid(), signal.SIGINT)
-    spin(node)
+    spin(node, executor)
 process.spin = interrupt
 sys.exit(composed.main())
 """

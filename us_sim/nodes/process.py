@@ -86,8 +86,9 @@ def scheduling_of(pid: int) -> str:
 HELPLESS_S = 10.0
 """A node in which nothing has worked for so long ends: then somebody can start it again."""
 
-TURN_S = 1.0
-"""For a turn in which nothing comes; without a limit the executor would wait in a busy loop."""
+TURN_S = 0.1
+"""For a turn in which nothing comes: Python's handlers of signals run between turns, and without a
+limit the events executor would wait in a busy loop."""
 
 _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
