@@ -6,6 +6,7 @@ intra-process communication nor loaned messages.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
 import threading
@@ -70,11 +71,13 @@ class Composed(GuardedNode):
                 self.failed(part.get_name(), error)
                 self.finished = Future()
                 self.finished.set_exception(UsSimError(self.last_failure))
-                self.context.try_shutdown()
+                with contextlib.suppress(RuntimeError):  # rclpy's signal thread may be doing the same
+            self.context.try_shutdown()
 
     def destroy_node(self) -> None:
         """End all of them."""
-        self.context.try_shutdown()
+        with contextlib.suppress(RuntimeError):  # rclpy's signal thread may be doing the same
+            self.context.try_shutdown()
         for thread in getattr(self, "_threads", ()):
             thread.join(END_S)
         for part in reversed(getattr(self, "parts", ())):
