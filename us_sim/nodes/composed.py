@@ -71,12 +71,11 @@ class Composed(GuardedNode):
                 self.failed(part.get_name(), error)
                 self.finished = Future()
                 self.finished.set_exception(UsSimError(self.last_failure))
-                with contextlib.suppress(RuntimeError):  # rclpy's signal thread may be doing the same
-            self.context.try_shutdown()
+                self.context.try_shutdown()
 
     def destroy_node(self) -> None:
         """End all of them."""
-        with contextlib.suppress(RuntimeError):  # rclpy's signal thread may be doing the same
+        with contextlib.suppress(RuntimeError):  # rclpy's signal thread may do the same
             self.context.try_shutdown()
         for thread in getattr(self, "_threads", ()):
             thread.join(END_S)

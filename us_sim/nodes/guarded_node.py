@@ -25,7 +25,7 @@ from rclpy.qos import QoSProfile
 
 from us_sim.errors import UsSimError, printable
 from us_sim.nodes import ros_refusal
-from us_sim.nodes.qos import LATCHED, STREAM, overridable
+from us_sim.nodes.qos import LATCHED, SENT, overridable
 from us_sim.recording.decoding import nanoseconds_of, require_stamp
 
 CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
@@ -126,7 +126,7 @@ class GuardedNode(Node):
 
         return call
 
-    def stream(self, message_type: Any, topic: str, qos: QoSProfile = STREAM) -> Publisher:
+    def stream(self, message_type: Any, topic: str, qos: QoSProfile = SENT) -> Publisher:
         """Create a publisher whose quality of service may be overridden by parameters."""
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
 
@@ -315,7 +315,7 @@ class Health:
         self.preparing = ""  # what it goes on without until that is ready
         self.scheduling = ""  # how its process goes before others, if that was asked for
         self._publisher = node.create_publisher(
-            DiagnosticArray, "diagnostics", STREAM, qos_overriding_options=overridable()
+            DiagnosticArray, "diagnostics", SENT, qos_overriding_options=overridable()
         )
         node.create_timer(1.0, self.report)
         self._first = node.create_timer(0.01, self._report_first)

@@ -19,7 +19,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import pose_message, stamp_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import MEASURING, run_node
-from us_sim.nodes.qos import EVERY, STREAM
+from us_sim.nodes.qos import EVERY, SENT
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited, Playback
 from us_sim.nodes.settings import PathPlayerSettings
 from us_sim.recording.decoding import nanoseconds_of
@@ -55,7 +55,7 @@ class PathPlayer(GuardedNode):
         self._sent_at = 0.0  # s, of the monotonic clock
         self.finished = Future()
         self.health = Health(self, str(path))
-        self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else STREAM)
+        self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else SENT)
         if lockstep:
             self.create_subscription(Image, "ultrasound/image", self._imaged, EVERY)
         self._awaited = Awaited(self, self._poses)

@@ -4,7 +4,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 STREAM = QoSProfile(depth=10)  # reliable, volatile, keep last, as rclpy's is where nothing is said
-"""Poses, nodes and images inside the graph."""
+"""Poses, nodes and images inside the graph, as whoever wants the newest hears them."""
+
+SENT = QoSProfile(depth=100)
+"""The same as they are published: kept until all have acknowledged them, so that a recorder that
+gets no processor for a second loses none."""
 
 EVERY = QoSProfile(depth=1000)
 """A lockstep consumer, which must not lose one."""
