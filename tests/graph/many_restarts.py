@@ -179,7 +179,7 @@ def main():
         while len(done) < asked.count and time.monotonic() < ends:
             listener.spin(1.0 + chance.random())
             listener.wait_for_full_rate()
-            node = chance.choice(sorted(listener.pids))
+            node = chance.choice(sorted(nodes_of(run.pid)))
             done.append(restart(listener, node, chance.choice(SIGNALS)))
             print(len(done), node, done[-1].number.name, f"{done[-1].seconds:.2f} s", flush=True)
             assert not done[-1].others, done[-1]
