@@ -272,6 +272,7 @@ def test_losses_are_told(bench, quiet, may_write):
 
 OVERWRITING = """
 import sys, time
+import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
