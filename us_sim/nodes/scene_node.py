@@ -60,8 +60,8 @@ class SceneNode(GuardedNode):
         self.scene: Scene = load_scene(settings.scene, volume=settings.volume)
         self.lockstep = settings.lockstep
         self.threads = settings.threads
-        #: With which its process goes before ordinary ones; 0 is as one of them.
         is_realtime = settings.realtime and not settings.lockstep
+        #: With which its process goes before ordinary ones; 0 is as one of them.
         self.realtime_priority = self.live_priority if is_realtime else 0
         self.health: Health = Health(self, self.scene.name)
 
