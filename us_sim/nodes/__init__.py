@@ -15,6 +15,7 @@ import re
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 from us_sim.errors import UsSimError
@@ -29,10 +30,16 @@ ENDS_WITH_INPUT = "US_SIM_ENDS_WITH_INPUT"
 """Environment variable of programs that end with whoever holds the other end of their input."""
 
 
+ENDING_S = 15.0
+"""For a process to end by itself, a recorder with what it still has to write."""
+
+
 def end_with_input() -> None:
-    """End this process as SIGTERM does, once its standard input has ended."""
+    """End this process as SIGTERM does, once its standard input has ended, or kill it."""
     os.read(0, 1)
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(ENDING_S)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 if os.environ.pop(ENDS_WITH_INPUT, None):

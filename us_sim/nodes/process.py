@@ -92,6 +92,9 @@ limit the events executor would wait in a busy loop."""
 
 _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
+_told_to_end = threading.Event()
+"""An exception of a handler is lost where it meets a destructor or a compiler's callback."""
+
 
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin the node until it is done or told to stop; the exit status.
@@ -161,6 +164,8 @@ def spin(node: Node, executor: Executor) -> None:
     worked = time.monotonic()
     try:
         while node.context.ok() and (finished is None or not finished.done()):
+            if _told_to_end.is_set():
+                raise KeyboardInterrupt
             try:
                 executor.spin_once(timeout_sec=TURN_S)
                 worked = time.monotonic()
@@ -185,6 +190,7 @@ def _interrupt_once(*_: object) -> None:
     """End the node; a second signal, such as launch's after the terminal's, must not disturb it."""
     for number in _ENDINGS:
         signal.signal(number, lambda *_: None)
+    _told_to_end.set()
     sys.unraisablehook = lambda _: None  # a compiler's callback has nobody to pass this on to
     raise KeyboardInterrupt
 
