@@ -1,5 +1,6 @@
 """Nodes given what they cannot use: one sentence, status 1, no traceback."""
 
+import gc
 import importlib
 import signal
 import subprocess
@@ -11,14 +12,15 @@ from rclpy.signals import uninstall_signal_handlers
 
 
 @pytest.fixture
-def _own_signals() -> Iterator[None]:
-    """Undo the changes that a node makes to signals at its end."""
+def _own_end() -> Iterator[None]:
+    """Undo the changes that a node makes to signals, and remove what is left of it from ROS."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     kept = [signal.getsignal(number) for number in numbers]
     yield
     uninstall_signal_handlers()
     for number, handler in zip(numbers, kept, strict=True):
         signal.signal(number, handler)
+    gc.collect()
 
 
 @pytest.mark.parametrize(
@@ -45,7 +47,7 @@ def _own_signals() -> Iterator[None]:
         ("session_recorder", ["-p", "compression:=rar"], "rar"),
     ],
 )
-@pytest.mark.usefixtures("_own_signals")
+@pytest.mark.usefixtures("_own_end")
 def test_a_node_refuses_in_one_sentence(node, arguments, words, tmp_path, capfd):
     volume = tmp_path / "broken.mha"
     volume.write_bytes(b"ObjectType = Image\nNDims = 3\n")

@@ -59,7 +59,8 @@ class Graph:
             for status in report.status:
                 values = {item.key: item.value for item in status.values}
                 told.setdefault(status.name.strip("/"), []).append(
-                    {"level": status.level, "stamp": report.header.stamp, **values}
+                    {"level": status.level, "message": status.message, **values}
+                    | {"stamp": report.header.stamp}
                 )
         return told
 
@@ -92,8 +93,9 @@ def require_sound(reports):
     for node in NODES:
         assert len(reports[node]) >= 2
         last = reports[node][-1]
-        # On a busy machine poses at five times their pace may be late, which is a warning.
-        assert last["level"] in (DiagnosticStatus.OK, DiagnosticStatus.WARN), last
+        # Poses that a busy machine plays after the recording's end all have the time of its end.
+        late = "not newer" in last["message"]
+        assert last["level"] == DiagnosticStatus.OK or late, last
         assert 0.0 < float(last["latency_p50_ms"]) < 1000.0
     assert reports["probe_tracker"][-1]["state"] == "tracked"
 
@@ -127,11 +129,11 @@ def test_nothing_ages_while_the_clock_stands(graph):
 
 @pytest.mark.parametrize("back", [0.3, 2.0])  # s: less and more than a late pose may be late
 def test_the_graph_goes_along_when_the_clock_jumps_back(graph, back):
-    graph.set(paused=False, time=3.0)
+    graph.set(paused=False, time=3.0, rate=0.25)  # a busy machine must not miss the jump
     graph.bench.spin_until(lambda: stamps(graph.images)[-1] > 3.3e9)
     sought = stamps(graph.images)[-1] - 1e9 * back
     graph.set(time=1e-9 * sought)
-    graph.bench.spin_until(lambda: stamps(graph.images)[-1] < sought + 0.25e9)
+    graph.bench.spin_until(lambda: (np.diff(stamps(graph.images)) < 0).any())
     graph.images.clear()
     graph.bench.spin_until(lambda: len(graph.images) > 20)
     assert (np.diff(stamps(graph.images)) > 0).all()
