@@ -41,25 +41,34 @@ class RemoteControl:
         """Set them together; the reason where that is refused."""
         from rclpy.parameter import Parameter
 
-        client = self._asking(of)
-        self.until(client.services_are_ready)
-        asked = client.set_parameters_atomically(
-            [Parameter(name, value=value) for name, value in values.items()]
-        )
-        self.until(asked.done)
-        return asked.result().result.reason
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        answer = self._answer(of, lambda client: client.set_parameters_atomically(parameters))
+        return answer.result.reason
 
     def value(self, name, of="session_control"):
         """A parameter's value now."""
         from rcl_interfaces.msg import Parameter as ParameterMessage
         from rclpy.parameter import Parameter
 
-        self.until(self._asking(of).services_are_ready)
-        asked = self._asking(of).get_parameters([name])
-        self.until(asked.done)
+        answer = self._answer(of, lambda client: client.get_parameters([name]))
         return Parameter.from_parameter_msg(
-            ParameterMessage(name=name, value=asked.result().values[0])
+            ParameterMessage(name=name, value=answer.values[0])
         ).value
+
+    def _answer(self, of, ask):
+        """Ask until there is an answer: a service of a killed node is seen for 20 s more."""
+        client = self._asking(of)
+        self.until(client.services_are_ready)
+        asked, again = ask(client), time.monotonic() + 5
+
+        def has_come():
+            nonlocal asked, again
+            if time.monotonic() > again:
+                asked, again = ask(client), time.monotonic() + 5
+            return asked.done()
+
+        self.until(has_come)
+        return asked.result()
 
     def until(self, condition, seconds=100):
         """Listen until that is so."""
