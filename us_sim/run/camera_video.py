@@ -73,8 +73,8 @@ def path_video(
     truth = video_poses(path)
     seen = [registration.inverse() @ pose @ calibration.inverse() for pose in truth]
     _require_in_view(scene, body, seen)
-    numbers = [CAMERA.lens[0], body.corners, body.ids, path.log_times - path.log_times[0]]
-    numbers += [path.positions, path.orientations]
+    numbers = [CAMERA.matrix, CAMERA.distortion, body.corners, body.ids]
+    numbers += [path.log_times - path.log_times[0], path.positions, path.orientations]
     for pose in (registration, calibration):
         numbers += [pose.position, pose.orientation]
     digest = hashlib.sha256(f"{_FORM} {RATE} {_EXPOSURE} {_CODEC} {body.dictionary}".encode())

@@ -13,12 +13,16 @@ MATRIX = np.array([[600.0, 0, 320], [0, 610, 240], [0, 0, 1]])
 LENSES = {
     "plumb_bob": [-0.3, 0.1, 0.01, -0.02, 0.05],
     "rational_polynomial": [0.1, 0.02, 0.001, 0.002, 0.01, 0.05, 0.02, 0.01],
+    "tilted": [0.1, 0.02, 0.001, 0.002, 0.01, 0.05, 0.02, 0.01, 1e-3, 2e-3, 1e-3, 5e-4, 0.02, 0.01],
     "equidistant": [0.1, 0.02, 0.01, 0.001],
 }
+NAMES = {"tilted": "rational_polynomial"}
 
 
 def camera(model, lens=None):
-    return CameraModel(640, 480, MATRIX, LENSES[model] if lens is None else lens, model)
+    return CameraModel(
+        640, 480, MATRIX, LENSES[model] if lens is None else lens, NAMES.get(model, model)
+    )
 
 
 def opencv_pixels(model, points):
@@ -40,14 +44,15 @@ def test_points_are_where_opencv_sees_them(model, points):
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_the_derivative_is_that_of_the_pixels(model, points):
-    slopes = camera(model).linearise(points)[1]
-    steps = 1e-6 * np.eye(3)
-    measured = [
-        (camera(model).project(points + step) - camera(model).project(points - step)) / 2e-6
-        for step in steps
-    ]
-    assert np.allclose(slopes, np.stack(measured, axis=-1), atol=1e-5)
+def test_the_derivatives_are_those_of_the_pixels(model, points):
+    shift = np.array([0.1, -0.05, 0.2])
+    slopes = camera(model).linearise(points, shift)[1]
+    for axis, step in enumerate(1e-6 * np.eye(3)):
+        sides = [camera(model).project(points + shift + sign * step) for sign in (1, -1)]
+        assert np.allclose(slopes[:, axis], (sides[0] - sides[1]).ravel() / 2e-6, atol=1e-5)
+        turns = [cv2.Rodrigues(sign * step)[0] for sign in (1, -1)]
+        sides = [camera(model).project(points @ turn.T + shift) for turn in turns]
+        assert np.allclose(slopes[:, 3 + axis], (sides[0] - sides[1]).ravel() / 2e-6, atol=1e-5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -80,7 +85,11 @@ def test_what_is_behind_the_camera_or_beyond_its_lens_is_nowhere():
 def test_a_file_gives_back_the_camera(model, tmp_path):
     write_camera_info(tmp_path / "camera.yaml", camera(model))
     again = read_camera_info(tmp_path / "camera.yaml")
-    assert (again.width, again.height, again.distortion_model) == (640, 480, model)
+    assert (again.width, again.height, again.distortion_model) == (
+        640,
+        480,
+        NAMES.get(model, model),
+    )
     assert np.array_equal(again.matrix, MATRIX)
     assert np.array_equal(again.distortion, LENSES[model])
     with pytest.raises(TrackingError, match=r"camera.yaml: exists already"):
@@ -118,47 +127,48 @@ projection_matrix:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "word"),
     [
         ((640, 480, np.zeros(9), np.zeros(5)), "focal length"),
-        ((0, 480, MATRIX, np.zeros(5)), "width is 0"),
-        ((640, 480, MATRIX[:2], np.zeros(5)), "has 6 numbers"),
-        ((640, 480, MATRIX.T, np.zeros(5)), r"must be \[\[fx, skew, cx\]"),
-        ((640, 480, MATRIX, np.zeros(3)), "has 3 coefficients; plumb_bob has 4 or 5"),
-        ((640, 480, MATRIX, np.zeros(4), "omnidirectional"), "'omnidirectional' is not known"),
-        ((640, 480, MATRIX, [np.nan, 0, 0, 0]), "the distortion is not finite"),
-        ((640, 480, "wide", np.zeros(5)), "the camera matrix must be numbers"),
+        ((0, 480, MATRIX, np.zeros(5)), "width"),
+        ((640, 480, MATRIX[:2], np.zeros(5)), "6 numbers"),
+        ((640, 480, MATRIX.T, np.zeros(5)), "fx"),
+        ((640, 480, MATRIX + np.eye(3, k=1), np.zeros(5)), "fx"),  # skewed
+        ((640, 480, MATRIX, np.zeros(3)), "3 coefficients"),
+        ((640, 480, MATRIX, np.zeros(5), "equidistant"), "5 coefficients"),
+        ((640, 480, MATRIX, np.zeros(4), "omnidirectional"), "omnidirectional"),
+        ((640, 480, MATRIX, [np.nan, 0, 0, 0]), "finite"),
+        ((640, 480, MATRIX, [1e30, 0, 0, 0]), "large"),
+        ((640, 480, "wide", np.zeros(5)), "numbers"),
     ],
 )
-def test_what_is_no_camera_is_refused(arguments, sentence):
-    with pytest.raises(TrackingError, match=sentence):
+def test_what_is_no_camera_is_refused(arguments, word):
+    with pytest.raises(TrackingError, match=word):
         CameraModel(*arguments)
 
 
-def test_a_driver_without_calibration_data_is_an_ideal_pinhole():
+def test_drivers_have_other_names_for_lenses():
     assert CameraModel(640, 480, MATRIX, [], "").distortion.tolist() == [0.0] * 5
+    assert CameraModel(640, 480, MATRIX, [0.1] * 4, "fisheye").distortion_model == "equidistant"
 
 
 REST = "image_width: 640\ncamera_matrix: 0\ndistortion_coefficients: 0\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "word"),
     [
-        ("- 1", "it must be a mapping"),
-        ("a: [", "not a YAML file"),
-        ("image_width: 640", "image_height is missing"),
-        (f"image_height: 48.5\n{REST}", "whole"),
-        (f"image_height: 48\n{REST}", "camera_matrix must be a mapping"),
+        ("- 1", "mapping"),
+        ("a: [", "YAML"),
+        ("image_width: 640", "image_height"),
+        (f"image_height: 48.5\n{REST}", "height"),
+        (f"image_height: 48\n{REST}", "camera_matrix"),
+        (None, "No such file"),
     ],
 )
-def test_a_bad_file_is_refused(text, sentence, tmp_path):
+def test_a_bad_file_is_refused(text, word, tmp_path):
     path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(TrackingError, match=f"camera.yaml: .*{sentence}"):
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(TrackingError, match=f"camera.yaml: .*{word}"):
         read_camera_info(path)
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(TrackingError, match=r"none.yaml: No such file"):
-        read_camera_info(tmp_path / "none.yaml")

@@ -4,12 +4,15 @@ import cv2
 import numpy as np
 import pytest
 from camera_views import WEBCAM, faceted_grip, random_views, turned
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.calibration.camera import Board
 from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.tracking.camera.corner_refinement import refined_corners
+from us_sim.tracking.camera.encodings import decode_image
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector, detect_corners
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
@@ -329,3 +332,32 @@ def test_markers_are_of_the_family_that_is_asked_for():
     refused(
         image, "no marker", RigidBody.single("APRILTAG_25h9", 3, 0.04), view_angle_limit="60 deg"
     )
+
+
+def tag_poses(folder):
+    """Where each recording of a folder has tag 13, m."""
+    tag, found = RigidBody.single("APRILTAG_36h11", 13, 0.127), {}
+    for file in sorted(folder.glob("*.mcap")):
+        with AnyReader([file], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+            sent = {
+                each.topic: bag.deserialize(data, each.msgtype) for each, _, data in bag.messages()
+            }
+        info, image = sent["/camera/camera_info"], sent["/camera/image_raw"]
+        camera = CameraModel(info.width, info.height, info.k, info.d, info.distortion_model)
+        seen = CameraSource(camera, tag).measure(decode_image(image, "GRAY"), 0)
+        found[file.name[:2]] = seen.pose.position
+    return found
+
+
+def test_one_tag_is_at_one_place_by_every_name_of_one_lens(shared_file):
+    found = tag_poses(shared_file("cases/camera-info"))
+    for one, other, depth in (("02", "03", 1.320), ("06", "07", 1.21), ("09", "10", 1.21)):
+        np.testing.assert_allclose(found[one], found[other], atol=1e-3)
+        assert found[one][2] == pytest.approx(depth, rel=0.015)
+
+
+def test_one_tag_is_at_one_place_in_every_encoding(shared_file):
+    found = tag_poses(shared_file("cases/camera-encodings"))
+    assert set(found) == {"01", "02", "06", "13"}
+    for place in found.values():
+        assert np.linalg.norm(place - found["01"]) < 2e-3

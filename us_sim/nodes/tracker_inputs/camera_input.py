@@ -17,8 +17,6 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.source import CameraSource, practice
 from us_sim.tracking.settings import CameraSettings
 
-_LARGEST = 1e9  # pixels, or a coefficient of the distortion
-
 
 def camera_from(message: CameraInfo) -> CameraModel:
     """The camera that a driver describes.
@@ -26,18 +24,12 @@ def camera_from(message: CameraInfo) -> CameraModel:
     Raises:
         TrackingError: it is not calibrated, or the numbers are none of a camera.
     """
-    numbers = np.array([*message.k, *message.d], dtype=np.float64)
-    if (bad := numbers[~(np.abs(numbers) <= _LARGEST)]).size:
-        raise TrackingError(
-            f"the camera's matrix or its distortion holds {bad[0]:g}, which is not finite or far "
-            f"too large: calibrate the camera again"
-        )
     return CameraModel(
         message.width,
         message.height,
         np.array(message.k, dtype=np.float64).reshape(3, 3),
         np.array(message.d, dtype=np.float64),
-        message.distortion_model or "plumb_bob",
+        message.distortion_model,
     )
 
 

@@ -17,7 +17,6 @@ array([0.02, 0.01, 0.4 ])
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -26,8 +25,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_between
-from us_sim.kernels import njit
-from us_sim.tracking.camera.model import CameraModel, project_points
+from us_sim.tracking.camera.model import CameraModel
 
 _TURN = cv2.Rodrigues(np.array([0.3, 0.5, 0.7]))[0]
 """Turns points before OpenCV sees them: its rotation vectors fail at half a turn, which every
@@ -130,10 +128,11 @@ def _by_nearness(found: list[BodyPose], before: Pose) -> list[BodyPose]:
 CORNER_DEVIATION = 0.1  # pixels, of a corner's coordinates in a sharp image with little noise
 
 _FLAT = 1e-3  # thickness of a body, of its extent, up to which one homography shows all of it
-_DISTINCT = np.radians(1.0)
+_SAME = 1.0 + 2.0 * np.cos(np.radians(1.0))  # trace of the rotation between poses that are one
 _TRIED = 3  # markers from which a pose is guessed
 _REFINED = 3  # guesses that are refined
 _ITERATIONS = 25
+_STEADY = 1e-6  # of the misfit: a gain after which the pose moves by a thousandth of its deviation
 _DETERMINED = 1e-9  # least eigenvalue of the normal matrix with a unit diagonal
 _HUBER = 2.0  # standard deviations beyond which a corner pulls no harder
 
@@ -185,18 +184,18 @@ def body_poses(
     guesses = _guesses(points, rays, pixels, owners)
     if guess is not None:
         guesses.append((guess.rotation, guess.position))
-    ranked = sorted(
-        (_misfit(camera.project(points @ turn.T + place) - pixels, deviation), i)
-        for i, (turn, place) in enumerate(guesses)
-    )
+    if not guesses:
+        return []
+    places = np.concatenate([points @ turn.T + place for turn, place in guesses])
+    offsets = camera.project(places).reshape(-1, len(points), 2) - pixels
+    misfits = [_misfit(each, deviation) for each in offsets]
     found: list[BodyPose] = []
-    for misfit, i in ranked[: _REFINED + 1]:
-        if not np.isfinite(misfit):
+    for i in np.argsort(misfits, kind="stable")[: _REFINED + 1].tolist():
+        if not np.isfinite(misfits[i]):
             break
-        pose = _refined(camera, points, pixels, *guesses[i], deviation)
-        if pose is not None and all(
-            rotation_angle(pose.pose, other.pose) > _DISTINCT for other in found
-        ):
+        turn, place = guesses[i]
+        pose = _refined(camera, points, pixels, turn, place, deviation, found)
+        if pose is not None:
             found.append(pose)
     return sorted(found, key=lambda each: each.misfit)[:2]
 
@@ -244,183 +243,60 @@ def _refined(
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
     deviation: float,
+    known: list[BodyPose],
 ) -> BodyPose | None:
-    """The pose of least misfit near a first one; None where that leads behind the camera, or
-    the points do not determine a pose."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, position
-    normal = np.empty((6, 6))
-    residuals = np.empty_like(pixels)
-    points = points.view()
-    points.flags.writeable = False  # as a body's are, or numba would compile the kernel twice
-    misfit = _descend(points, pixels, *camera.lens, deviation, matrix, normal, residuals)
-    if not np.isfinite(misfit):
-        return None
-    squares = float((residuals**2).sum())
-    freedom = max(1, residuals.size - 6)
-    found = max(deviation, float(np.sqrt(min(squares, misfit * deviation**2) / freedom)))
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
-    if not values[0] > _DETERMINED:
-        return None
-    half = scale[:, None] * vectors / np.sqrt(values)
-    covariance = half @ half.T * (found / deviation) ** 2
-    return BodyPose(
-        Pose.from_matrix(matrix),
-        0.5 * (covariance + covariance.T),
-        float(np.sqrt(squares / len(points))),
-        found,
-        residuals,
-        misfit,
-    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _descend(points, pixels, lens, fisheye, deviation, matrix, normal, residuals):
-    """Levenberg-Marquardt on SE(3) with Huber's weights, from the pose in ``matrix`` (4, 4).
+    """Descend to the pose of least misfit: Levenberg-Marquardt on SE(3) with Huber's weights.
 
     A step is a shift and a rotation about the camera's axes through the body's origin, so that
     the inverse of the normal matrix is the covariance as ROS has it.
 
     Returns:
-        The misfit, infinite where points are not before the camera; the pose, the normal matrix
-        (6, 6) in deviations and the residuals (N, 2) pixels in place.
+        None where that leads to a known pose or behind the camera, or the points do not determine
+        a pose.
     """
-    count = len(points)
-    arms = np.empty((count, 3))
-    seen = np.empty((count, 2))
-    slopes = np.empty((count, 2, 3))
-    gradient = np.empty(6)
-    damped = np.empty((6, 6))
-    step = np.empty(6)
-    turn = np.empty((3, 3))
-    trial = matrix.copy()
-    damping = 1e-4
-    misfit = np.inf
-    for iteration in range(_ITERATIONS + 1):
-        _turn_points(points, trial, arms, seen, slopes, lens, fisheye)
-        new_misfit = 0.0
-        for i in range(count):
-            x, y = seen[i, 0] - pixels[i, 0], seen[i, 1] - pixels[i, 1]
-            square = (x * x + y * y) / (deviation * deviation)
-            if square <= _HUBER * _HUBER:
-                new_misfit += square
-            else:
-                new_misfit += 2 * _HUBER * np.sqrt(square) - _HUBER * _HUBER
-        if new_misfit < misfit or (iteration == 0 and np.isfinite(new_misfit)):
-            gain = misfit - new_misfit
-            misfit = new_misfit
-            for a in range(3):
-                for b in range(4):
-                    matrix[a, b] = trial[a, b]
-            for i in range(count):
-                residuals[i, 0] = seen[i, 0] - pixels[i, 0]
-                residuals[i, 1] = seen[i, 1] - pixels[i, 1]
-            _normal_equations(arms, slopes, residuals, deviation, normal, gradient)
-            damping = max(damping * 0.1, 1e-9)
-            if gain <= 1e-9 * misfit + 1e-12:
+    misfit, damping = np.inf, 1e-4
+    for _ in range(_ITERATIONS + 1):
+        if any(np.vdot(rotation, other.pose.rotation) > _SAME for other in known):
+            return None
+        seen, slopes = camera.linearise(points @ rotation.T, position)
+        offsets = seen - pixels
+        loss = _misfit(offsets, deviation)
+        if loss < misfit:
+            gain, misfit, damping = misfit - loss, loss, max(damping * 0.1, 1e-9)
+            matrix, residuals = np.eye(4), offsets
+            matrix[:3, :3], matrix[:3, 3] = rotation, position
+            lengths = np.sqrt(np.einsum("ij,ij->i", residuals, residuals))
+            weights = np.minimum(1.0, _HUBER * deviation / np.maximum(lengths, 1e-12))
+            weighted = slopes.T * np.repeat(weights / deviation**2, 2)
+            normal, gradient = weighted @ slopes, weighted @ residuals.ravel()
+            if gain <= _STEADY * misfit + 1e-12:
                 break
+        elif not np.isfinite(misfit) or damping > 1e7:
+            break
         else:
-            if iteration == 0:
-                return np.inf
             damping *= 10.0
-            if damping > 1e8:
-                break
-        if iteration == _ITERATIONS:
+        try:
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        except np.linalg.LinAlgError:
             break
-        for a in range(6):
-            for b in range(6):
-                damped[a, b] = normal[a, b]
-            damped[a, a] *= 1.0 + damping
-            step[a] = -gradient[a]
-        if not solve_definite(damped, step):
-            break
-        _rotation(step[3], step[4], step[5], turn)
-        for a in range(3):
-            trial[a, 3] = matrix[a, 3] + step[a]
-            for b in range(3):
-                trial[a, b] = 0.0
-                for c in range(3):
-                    trial[a, b] += turn[a, c] * matrix[c, b]
-    return misfit
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _turn_points(points, matrix, arms, seen, slopes, lens, fisheye):
-    """The points turned (``arms``), and where they are seen at the pose, with derivatives."""
-    places = np.empty((len(points), 3))
-    for i in range(len(points)):
-        for a in range(3):
-            arms[i, a] = 0.0
-            for b in range(3):
-                arms[i, a] += matrix[a, b] * points[i, b]
-            places[i, a] = arms[i, a] + matrix[a, 3]
-    project_points(places, lens, fisheye, seen, slopes)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _normal_equations(arms, slopes, residuals, deviation, normal, gradient):
-    """JᵀWJ (6, 6) and JᵀWr (6,) in deviations, of the shift and then the rotation."""
-    row = np.empty(6)
-    normal[:] = 0.0
-    gradient[:] = 0.0
-    for i in range(len(arms)):
-        length = np.sqrt(residuals[i, 0] ** 2 + residuals[i, 1] ** 2)
-        weight = min(1.0, _HUBER * deviation / max(length, 1e-12)) / (deviation * deviation)
-        x, y, z = arms[i, 0], arms[i, 1], arms[i, 2]
-        for side in range(2):
-            a, b, c = slopes[i, side, 0], slopes[i, side, 1], slopes[i, side, 2]
-            # A rotation w moves a point by w × arm: the slope of that is (arm × slope) · w.
-            row[0], row[1], row[2] = a, b, c
-            row[3], row[4], row[5] = y * c - z * b, z * a - x * c, x * b - y * a
-            for j in range(6):
-                gradient[j] += weight * row[j] * residuals[i, side]
-                for k in range(6):
-                    normal[j, k] += weight * row[j] * row[k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _rotation(x, y, z, turn):
-    """Fill in the rotation (3, 3) of a rotation vector (x, y, z) rad, by Rodrigues."""
-    square = x * x + y * y + z * z
-    angle = np.sqrt(square)
-    sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
-    if angle > 1e-4:
-        sine, cosine = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
-    turn[0, 0] = 1.0 - cosine * (y * y + z * z)
-    turn[1, 1] = 1.0 - cosine * (x * x + z * z)
-    turn[2, 2] = 1.0 - cosine * (x * x + y * y)
-    turn[0, 1], turn[1, 0] = cosine * x * y - sine * z, cosine * x * y + sine * z
-    turn[0, 2], turn[2, 0] = cosine * x * z + sine * y, cosine * x * z - sine * y
-    turn[1, 2], turn[2, 1] = cosine * y * z - sine * x, cosine * y * z + sine * x
-
-
-# No linear algebra library is called, which would take long to compile.
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve_definite(matrix, right):
-    """Replace ``right`` (n,) by the solution, with Cholesky's factor of the matrix's (n, n) lower
-    triangle, which is overwritten; False, with ``right`` spoilt, where it is not definite.
-    """
-    size = len(right)
-    for i in range(size):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                matrix[i, i] = math.sqrt(total)
-            else:
-                matrix[i, j] = total / matrix[j, j]
-    for i in range(size):
-        for j in range(i):
-            right[i] -= matrix[i, j] * right[j]
-        right[i] /= matrix[i, i]
-    for i in range(size - 1, -1, -1):
-        for j in range(i + 1, size):
-            right[i] -= matrix[j, i] * right[j]
-        right[i] /= matrix[i, i]
-    return True
+        position = matrix[:3, 3] + step[:3]
+        rotation = np.asarray(cv2.Rodrigues(step[3:])[0]) @ matrix[:3, :3]
+    if not np.isfinite(misfit):
+        return None
+    squares = float((residuals**2).sum())
+    freedom = max(1, residuals.size - 6)
+    noise = max(deviation, float(np.sqrt(min(squares, misfit * deviation**2) / freedom)))
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
+    if not values[0] > _DETERMINED:
+        return None
+    half = scale[:, None] * vectors / np.sqrt(values)
+    covariance = half @ half.T * (noise / deviation) ** 2
+    return BodyPose(
+        Pose.from_matrix(matrix),
+        0.5 * (covariance + covariance.T),
+        float(np.sqrt(squares / len(points))),
+        noise,
+        residuals,
+        misfit,
+    )

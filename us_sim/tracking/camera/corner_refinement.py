@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.tracking.camera.body_pose import solve_definite
 
 _WIDEST = 4.0  # pixels on either side of an edge that are looked at
 _NARROWEST = 1.2  # pixels
@@ -255,7 +254,7 @@ def _fit_profile(place, length, reach, edge, widths, k):
         right[5] -= width_weight * (width - 1.0)
         for a in range(6):
             normal[a, a] *= 1.0 + 1e-6
-        if not solve_definite(normal, right):
+        if not _solve_definite(normal, right):
             return False
         turn = min(1.0, 1.0 / max(1e-9, abs(right[0]), abs(right[1])))
         for a in range(3):
@@ -272,6 +271,37 @@ def _fit_profile(place, length, reach, edge, widths, k):
     for i in range(len(place)):
         left += slopes[i, 6] * slopes[i, 6]
     return left < len(place) * (_LIKENESS * (white - black)) ** 2
+
+
+# No linear algebra library is called, which would take long to compile.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve_definite(matrix, right):
+    """Replace ``right`` (n,) by the solution, with Cholesky's factor of the matrix's (n, n) lower
+    triangle, which is overwritten; False, with ``right`` spoilt, where it is not definite.
+    """
+    size = len(right)
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                matrix[i, i] = math.sqrt(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+    for i in range(size):
+        for j in range(i):
+            right[i] -= matrix[i, j] * right[j]
+        right[i] /= matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        for j in range(i + 1, size):
+            right[i] -= matrix[j, i] * right[j]
+        right[i] /= matrix[i, i]
+    return True
 
 
 _CROSSING_STEPS = 12
@@ -378,7 +408,7 @@ def _refine_crossing(image, corner, directions, side, gap):
             right[4] -= (0.05 * contrast) ** 2 * (width - 0.8)
         for a in range(5):
             normal[a, a] *= 1.0 + 1e-6
-        if not solve_definite(normal, right):
+        if not _solve_definite(normal, right):
             return False
         length = math.sqrt(right[0] * right[0] + right[1] * right[1])
         scale = min(1.0, 1.0 / max(length, 1e-9))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import struct
 from typing import Any
 
 import cv2
@@ -13,108 +11,125 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError, VolumeError
 from us_sim.recording.decoding import rows_from
 
-# Bytes a pixel, and OpenCV's name of the colours where it is no grey. A Bayer pattern is named by
-# ROS after its first row's first two pixels, and by OpenCV after its second row's second two.
+_GREY, _BGR, _YUYV = "", "BGR2{}", "YUV2{}_YUY2"
+# A Bayer pattern is named by ROS after its first row's first two pixels, and by OpenCV after its
+# second row's second two.
+_BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
+# Bytes a pixel, and OpenCV's name of the colours where it is no grey.
 _ENCODINGS: dict[str, tuple[int, str]] = {
-    "mono8": (1, ""),
-    "8UC1": (1, ""),
-    "mono16": (2, ""),
-    "16UC1": (2, ""),
-    "bgr8": (3, "BGR2{}"),
-    "8UC3": (3, "BGR2{}"),
+    **dict.fromkeys(("mono8", "8UC1"), (1, _GREY)),
+    **dict.fromkeys(("mono16", "16UC1"), (2, _GREY)),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, _BGR)),
     "rgb8": (3, "RGB2{}"),
-    "bgra8": (4, "BGRA2{}"),
-    "8UC4": (4, "BGRA2{}"),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, "BGRA2{}")),
     "rgba8": (4, "RGBA2{}"),
-    "yuv422_yuy2": (2, "YUV2{}_YUY2"),
-    "yuyv": (2, "YUV2{}_YUY2"),
-    "yuv422": (2, "YUV2{}_UYVY"),
-    "uyvy": (2, "YUV2{}_UYVY"),
-    "bayer_rggb8": (1, "BayerBG2{}"),
-    "bayer_bggr8": (1, "BayerRG2{}"),
-    "bayer_gbrg8": (1, "BayerGR2{}"),
-    "bayer_grbg8": (1, "BayerGB2{}"),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, _YUYV)),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, "YUV2{}_UYVY")),
+    "nv12": (1, "YUV2{}_NV12"),
+    "nv21": (1, "YUV2{}_NV21"),
+    **{f"bayer_{name}8": (1, f"Bayer{code}2{{}}") for name, code in _BAYER.items()},
+    **{f"bayer_{name}16": (2, f"Bayer{code}2{{}}") for name, code in _BAYER.items()},
 }
-
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-_MOST_SEGMENTS = 1000  # of a JPEG before its picture
-_MOST_PIXELS = 1 << 26  # of a compressed image: as many as 8192 × 8192
+_DEPTHS = (8, 10, 12, 14, 16)  # bits of a sensor
+_NOISE = 8.0  # levels
 
 
 def decode_image(message: Any, colours: str) -> NDArray[np.uint8]:
     """Return the pixels of a sensor_msgs/Image.
+
+    Of 16 bits those are taken that its brightest pixel needs: sensors fill the lower 10, 12 or 14.
 
     Args:
         message: the image.
         colours: ``GRAY`` for (rows, columns), ``RGB`` for (rows, columns, 3).
 
     Raises:
-        TrackingError: the encoding is not known, or there are fewer bytes than the size says.
+        TrackingError: the encoding is not known or not that of the bytes, or there are fewer bytes
+            than the size says.
     """
-    if message.encoding not in _ENCODINGS:
+    encoding = message.encoding
+    if encoding not in _ENCODINGS:
         raise TrackingError(
-            f"the image's encoding is '{message.encoding}'; known are {', '.join(_ENCODINGS)}"
+            f"the image's encoding is '{encoding}'; known are {', '.join(_ENCODINGS)}"
         )
-    size, conversion = _ENCODINGS[message.encoding]
+    size, conversion = _ENCODINGS[encoding]
     code = getattr(cv2, f"COLOR_{conversion.format(colours)}", None)  # none of RGB to itself
     try:
-        rows = rows_from(message, size)
+        pixels = np.ascontiguousarray(_rows(message, size))
     except VolumeError as error:
         raise TrackingError(str(error)) from None
-    if message.encoding in ("mono16", "16UC1"):
-        high = 0 if message.is_bigendian else 1  # the more significant byte is enough
-        return np.ascontiguousarray(rows[:, high::2])
-    if not conversion:
-        return np.ascontiguousarray(rows)
-    pixels = rows if size == 1 else rows.reshape(message.height, message.width, size)
+    if encoding == "yuv422":
+        _require_uyvy(pixels)
+    if encoding.endswith(("16", "16UC1")):
+        pixels = _to_8_bits(pixels.view(">u2" if message.is_bigendian else "<u2"))
+    elif size > 1:
+        pixels = pixels.reshape(message.height, message.width, size)
     if code is None:
-        return np.ascontiguousarray(pixels)
+        return pixels
     try:
-        converted = cv2.cvtColor(np.ascontiguousarray(pixels), code)
+        return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
     except cv2.error as error:  # an odd width of pairs, say, or a Bayer pattern of one pixel
         raise TrackingError(
-            f"an image of {message.width} × {message.height} pixels cannot be {message.encoding}"
+            f"an image of {message.width} × {message.height} pixels cannot be {encoding}"
         ) from error
-    return np.asarray(converted, dtype=np.uint8)
+
+
+def _rows(message: Any, size: int) -> NDArray[np.uint8]:
+    """The bytes row by row, those of colours after those of grey."""
+    rows = rows_from(message, size)
+    if not message.encoding.startswith("nv"):
+        return rows
+    step = int(message.step) or int(message.width)
+    count = int(message.height) * 3 // 2
+    if len(message.data) < count * step:
+        raise VolumeError(
+            f"the image holds {len(message.data)} bytes, but {message.encoding} of its size has "
+            f"{count * step}"
+        )
+    flat = np.frombuffer(message.data, dtype=np.uint8, count=count * step)
+    return flat.reshape(count, step)[:, : message.width]
+
+
+def _to_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """The most significant bits of the least depth that holds all pixels."""
+    brightest = int(pixels.max())
+    depth = next(bits for bits in _DEPTHS if brightest < 1 << bits)
+    return (pixels >> (depth - 8)).astype(np.uint8)
+
+
+def _require_uyvy(rows: NDArray[np.uint8]) -> None:
+    """Refuse YUYV, which some drivers call yuv422: its colours would be taken for its grey.
+
+    Raises:
+        TrackingError: what should be the grey alternates as U and V do, or varies far less than
+            what should be the colours.
+    """
+    colours, grey = rows[:, ::2].astype(np.int16), rows[:, 1::2].astype(np.int16)
+    beside, second = (np.abs(grey[:, step:] - grey[:, :-step]).mean() for step in (1, 2))
+    if beside > 1.5 * second + _NOISE or colours.std() > 2.0 * grey.std() + _NOISE:
+        raise TrackingError(
+            "the image is called yuv422, whose bytes are U Y V Y, and they are Y U Y V: let its "
+            "driver call it yuv422_yuy2"
+        )
 
 
 def decompress_image(message: Any, colours: str) -> NDArray[np.uint8]:
     """Return the pixels of a sensor_msgs/CompressedImage, a JPEG or PNG, as `decode_image` does.
 
     Raises:
-        TrackingError: it cannot be decoded, or is larger than any camera's.
+        TrackingError: it cannot be decoded.
     """
     data = np.frombuffer(message.data, dtype=np.uint8)
-    columns, rows = _stated_size(data.tobytes())
-    pixels = None
-    if columns * rows <= _MOST_PIXELS:
-        with contextlib.suppress(cv2.error):
-            flag = cv2.IMREAD_GRAYSCALE if colours == "GRAY" else cv2.IMREAD_COLOR
-            pixels = cv2.imdecode(data, flag) if columns and rows else None
-    if pixels is None:
+    flags = cv2.IMREAD_GRAYSCALE if colours == "GRAY" else cv2.IMREAD_COLOR
+    flags |= cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        pixels: Any = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error:  # larger than OpenCV takes
+        pixels = None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise TrackingError(
-            f"the compressed image ('{message.format}', {data.size} bytes for {columns} × {rows} "
-            f"pixels) cannot be decoded: it must be a JPEG or PNG of {_MOST_PIXELS} pixels at most"
+            f"the compressed image ('{message.format}', {data.size} bytes) cannot be decoded: it "
+            f"must be a JPEG or PNG"
         )
-    found = np.asarray(pixels, dtype=np.uint8)
+    found = pixels if pixels.dtype == np.uint8 else _to_8_bits(pixels)
     return found if found.ndim == 2 else np.ascontiguousarray(found[..., ::-1])  # of BGR
-
-
-def _stated_size(data: bytes) -> tuple[int, int]:
-    """Columns and rows by a PNG's or JPEG's header; 0 and 0 where it is neither.
-
-    A few bytes may say that they are gigabytes, and are taken at their word when decoded.
-    """
-    if data.startswith(_PNG) and len(data) >= 24:
-        columns, rows = struct.unpack_from(">II", data, 16)
-        return columns, rows
-    place = 2
-    for _ in range(_MOST_SEGMENTS):
-        if not data.startswith(_JPEG) or place + 9 > len(data) or data[place] != 0xFF:
-            break
-        marker, length = data[place + 1], struct.unpack_from(">H", data, place + 2)[0]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            rows, columns = struct.unpack_from(">HH", data, place + 5)
-            return columns, rows
-        place += 1 if marker == 0xFF else 2 + length
-    return 0, 0

@@ -13,23 +13,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.kernels import njit
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
 
-DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-"""ROS's names of the lens models, and how many coefficients each has."""
+_OPENCVS = (4, 5, 8, 12, 14)  # k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]
+DISTORTION_MODELS = {
+    "plumb_bob": _OPENCVS,  # whose name drivers give to coefficients of the longer models, too
+    "rational_polynomial": _OPENCVS,
+    "equidistant": (4,),
+}
+"""ROS's names of the lens models, and how many coefficients each may have."""
 
+_LARGEST = 1e9  # pixels, or a coefficient
 _LARGEST_IMAGE = 32768
-_ITERATIONS = 30
+_UNDISTORTING = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-13)
+_STILL = np.zeros(3)
+_ARRIVED = 1e-6  # pixels, between a pixel and where its ray is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +54,7 @@ class CameraModel:
     height: int  # pixels
     matrix: NDArray[np.float64]  # (3, 3) pixels: focal lengths and principal point
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))  # (n,)
-    distortion_model: str = "plumb_bob"  # of OpenCV's coefficients, in its order
+    distortion_model: str = "plumb_bob"  # of OpenCV's coefficients, in its order; its fisheye's
 
     def __post_init__(self) -> None:
         matrix: NDArray[np.float64] = _numbers(self.matrix, "the camera matrix").ravel()
@@ -66,14 +73,15 @@ class CameraModel:
                     f"the camera's image {name} is {size}: it must be 1 to {_LARGEST_IMAGE} pixels"
                 )
             object.__setattr__(self, name, int(size))
-        if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0.0, 0.0, 0.0, 1.0]):
+        if not np.array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
             raise TrackingError(
-                f"the camera matrix {matrix.tolist()} must be [[fx, skew, cx], [0, fy, cy], "
-                f"[0, 0, 1]]"
+                f"the camera matrix {matrix.tolist()} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
-        model = self.distortion_model
-        if distortion.size == 0 and model in ("", "plumb_bob"):
-            model, distortion = "plumb_bob", np.zeros(5)
+        model = self.distortion_model or "plumb_bob"
+        if model == "fisheye":  # as some drivers call it
+            model = "equidistant"
+        if distortion.size == 0 and model == "plumb_bob":
+            distortion = np.zeros(5)
         if model not in DISTORTION_MODELS:
             raise TrackingError(
                 f"the camera's distortion model '{model}' is not known; it must be "
@@ -90,39 +98,60 @@ class CameraModel:
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
 
-    @cached_property
-    def lens(self) -> tuple[NDArray[np.float64], bool]:
-        """For `project_points`: (13,) fx, fy, cx, cy, skew and eight coefficients; whether they are
-        a fisheye's.
-        """
-        numbers = np.zeros(13)
-        matrix = self.matrix
-        numbers[:5] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], matrix[0, 1]
-        numbers[5 : 5 + self.distortion.size] = self.distortion
-        return numbers, self.distortion_model == "equidistant"
-
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels (N, 2) of points (N, 3) m; NaN for points that are not before the camera."""
-        return self.linearise(points)[0]
+        return self.linearise(points, _STILL)[0]
 
     def linearise(
-        self, points: NDArray[np.float64]
+        self, points: NDArray[np.float64], shift: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels (N, 2) of points (N, 3) m, and their derivative (N, 2, 3) pixels/m."""
-        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-        pixels = np.empty((len(points), 2))
-        slopes = np.empty((len(points), 2, 3))
-        project_points(points, *self.lens, pixels, slopes)
+        """Project shifted points, and differentiate by the shift and a rotation before it.
+
+        Args:
+            points: (N, 3) m, about the origin of the rotation.
+            shift: (3,) m.
+
+        Returns:
+            Pixels (N, 2), NaN for points that are not before the camera, and their derivatives
+            (2 N, 6): pixels/m by the shift, pixels/rad by the rotation about the camera's axes.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        if not len(points):
+            return np.empty((0, 2)), np.empty((0, 6))
+        camera: Any = points[:, None], _STILL, shift, self.matrix, self.distortion
+        jacobian: Any
+        if self._is_fisheye:
+            found, jacobian = cv2.fisheye.projectPoints(*camera)
+            slopes = jacobian[:, [11, 12, 13, 8, 9, 10]]  # after those to the camera's numbers
+        else:
+            found, jacobian = cv2.projectPoints(*camera)
+            slopes = jacobian[:, [3, 4, 5, 0, 1, 2]]
+        pixels: NDArray[np.float64] = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+        pixels[~(points[:, 2] + shift[2] > 1e-9)] = np.nan
         return pixels, slopes
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Rays x / z and y / z (N, 2) through pixels (N, 2); NaN where the lens model has
         no such point.
         """
-        pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
-        rays = np.empty((len(pixels), 2))
-        _undistort(pixels, *self.lens, rays)
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+        if not len(pixels):
+            return np.empty((0, 2))
+        undistort: Any = cv2.undistortPoints
+        if self._is_fisheye:
+            undistort = cv2.fisheye.undistortPoints
+        elif hasattr(cv2, "undistortPointsIter"):  # of OpenCV 4, whose other one has no criteria
+            undistort = cv2.undistortPointsIter
+        more = {"R": None, "P": None, "criteria": _UNDISTORTING}
+        found = undistort(pixels, self.matrix, self.distortion, **more)
+        rays: NDArray[np.float64] = np.array(found, dtype=np.float64).reshape(-1, 2)
+        again = self.project(np.column_stack([rays, np.ones(len(rays))]))
+        rays[~(np.abs(again - pixels[:, 0]).max(axis=1) < _ARRIVED)] = np.nan
         return rays
+
+    @property
+    def _is_fisheye(self) -> bool:
+        return self.distortion_model == "equidistant"
 
     def require_image(self, image: NDArray[Any]) -> NDArray[np.uint8]:
         """The image, which is one of this camera.
@@ -148,122 +177,9 @@ def _numbers(values: Any, what: str) -> NDArray[np.float64]:
         numbers = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise TrackingError(f"{what} must be numbers, not {values!r}") from None
-    if not np.isfinite(numbers).all():
-        raise TrackingError(f"{what} is not finite: {numbers.tolist()}")
+    if not (np.abs(numbers) <= _LARGEST).all():
+        raise TrackingError(f"{what} is not finite, or far too large: {numbers.tolist()}")
     return numbers
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _distort(x, y, lens, fisheye):
-    """Where the lens shows x / z, y / z, and the four derivatives of that.
-
-    OpenCV's models: radial rational with tangential terms, and the fisheye's polynomial of the
-    angle (Kannala and Brandt 2006).
-    """
-    k1, k2, k3, k4 = lens[5], lens[6], lens[7], lens[8]
-    square = x * x + y * y
-    if fisheye:
-        radius = np.sqrt(square)
-        if radius < 1e-9:
-            return x, y, 1.0, 0.0, 0.0, 1.0
-        angle = np.arctan(radius)
-        a = angle * angle
-        bent = angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
-        slope = 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
-        scale = bent / radius
-        # d(scale)/d(radius) / radius
-        change = (slope / (1 + square) - scale) / square
-        return (
-            scale * x,
-            scale * y,
-            scale + change * x * x,
-            change * x * y,
-            change * x * y,
-            scale + change * y * y,
-        )
-    # Of plumb_bob and rational: k1, k2, p1, p2, k3, and the denominator's three.
-    p1, p2, k3, k4, k5, k6 = lens[7], lens[8], lens[9], lens[10], lens[11], lens[12]
-    over = 1 + square * (k1 + square * (k2 + square * k3))
-    under = 1 + square * (k4 + square * (k5 + square * k6))
-    scale = over / under
-    slope = k1 + square * (2 * k2 + square * 3 * k3)
-    slope -= scale * (k4 + square * (2 * k5 + square * 3 * k6))
-    slope *= 2 / under
-    return (
-        scale * x + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-        scale * y + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
-        scale + slope * x * x + 2 * p1 * y + 6 * p2 * x,
-        slope * x * y + 2 * p1 * x + 2 * p2 * y,
-        slope * x * y + 2 * p1 * x + 2 * p2 * y,
-        scale + slope * y * y + 6 * p1 * y + 2 * p2 * x,
-    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def project_points(points, lens, fisheye, pixels, slopes):
-    """Fill in pixels (N, 2) and their derivatives (N, 2, 3) of points (N, 3).
-
-    Args:
-        points: m, in front of the camera; pixels of others are NaN.
-        lens, fisheye: `CameraModel.lens`.
-        pixels, slopes: what is filled in.
-    """
-    fx, fy, cx, cy, skew = lens[0], lens[1], lens[2], lens[3], lens[4]
-    for i in range(len(points)):
-        depth = points[i, 2]
-        if not depth > 1e-9:
-            pixels[i] = np.nan
-            slopes[i] = np.nan
-            continue
-        x, y = points[i, 0] / depth, points[i, 1] / depth
-        u, v, ux, uy, vx, vy = _distort(x, y, lens, fisheye)
-        pixels[i, 0] = fx * u + skew * v + cx
-        pixels[i, 1] = fy * v + cy
-        slopes[i, 0, 0] = (fx * ux + skew * vx) / depth
-        slopes[i, 0, 1] = (fx * uy + skew * vy) / depth
-        slopes[i, 1, 0] = fy * vx / depth
-        slopes[i, 1, 1] = fy * vy / depth
-        slopes[i, 0, 2] = -x * slopes[i, 0, 0] - y * slopes[i, 0, 1]
-        slopes[i, 1, 2] = -x * slopes[i, 1, 0] - y * slopes[i, 1, 1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _undistort(pixels, lens, fisheye, rays):
-    """Inverts `project_points` by Newton's method; NaN where it does not arrive."""
-    fx, fy, cx, cy, skew = lens[0], lens[1], lens[2], lens[3], lens[4]
-    for i in range(len(pixels)):
-        v = (pixels[i, 1] - cy) / fy
-        u = (pixels[i, 0] - cx - skew * v) / fx
-        x, y = u, v
-        if fisheye:
-            # A fisheye's pixel may lie well beyond a pinhole's: start at the plain angle.
-            angle = np.sqrt(u * u + v * v)
-            if angle > 1e-9:
-                stretch = np.tan(min(angle, 1.5)) / angle
-                x, y = u * stretch, v * stretch
-        rays[i] = np.nan
-        for _ in range(_ITERATIONS):
-            a, b, ux, uy, vx, vy = _distort(x, y, lens, fisheye)
-            a -= u
-            b -= v
-            determinant = ux * vy - uy * vx
-            # A lens model folds back where its derivative is no longer positive: nothing there
-            # is in the image.
-            if not (determinant > 1e-9 and ux + vy > 0):
-                break
-            if a * a + b * b < 1e-24:
-                rays[i, 0] = x
-                rays[i, 1] = y
-                break
-            dx = (vy * a - uy * b) / determinant
-            dy = (ux * b - vx * a) / determinant
-            length = np.sqrt(dx * dx + dy * dy)
-            limit = 0.5 * (1 + np.sqrt(x * x + y * y))
-            if length > limit:
-                dx *= limit / length
-                dy *= limit / length
-            x -= dx
-            y -= dy
 
 
 def read_camera_info(path: Path | str) -> CameraModel:
