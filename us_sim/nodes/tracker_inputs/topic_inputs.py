@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from geometry_msgs.msg import PoseArray, PoseStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, Header
 
 from us_sim.errors import PoseError, SceneError
-from us_sim.geometry.pose import FrameTree
+from us_sim.geometry.pose import Pose
 from us_sim.nodes.tf import TFMessage, require_tf
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.recording.decoding import transform_from
 from us_sim.settings.spelling import counted
+from us_sim.tracking.frame_chain import FrameChain
 from us_sim.tracking.haptic import HapticDevice
 from us_sim.tracking.measurement import PATIENT, Measurement
 from us_sim.tracking.mouse import SixDofMouse
@@ -130,10 +132,13 @@ MOVING = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-class TfInput(TrackerInput):
-    """The frame ``tracker.body`` in the frame ``tracker.frame``, each time a frame between moves.
+STALE_S = 2.0  # by which a link of the chain may be older than another; some are stamped ahead
 
-    Its stamp is that of the transform that came: frames between are taken where they last were.
+
+class TfInput(TrackerInput):
+    """The frame ``tracker.body`` in the frame ``tracker.frame``, each time that all between moved.
+
+    Its stamp is the latest at which every frame between is known, see `FrameChain`.
     """
 
     def __init__(self, device: Device, settings: Any) -> None:
@@ -150,51 +155,53 @@ class TfInput(TrackerInput):
                 f"publishes itself; name the frame that the tracker gives the probe"
             )
         self._frame, self._body = tracker.frame, tracker.body
-        self._tree = FrameTree()
-        self._fixed: set[str] = set()
+        self._chain = FrameChain(self._body, self._frame)
         device.listen_to_device(TFMessage, "tf", self._take, MOVING)
         device.listen(TFMessage, "tf_static", self._take_static, STATIC)
 
+    def reset(self) -> None:
+        """Forget what moved; what is fixed is told once."""
+        self._chain.restart()
+
     def _take_static(self, message: TFMessage) -> None:
         """Keep static transforms; a chain of these alone makes no poses."""
-        self._fixed |= self._keep(message)
-        chain = self._tree.chain(self._body, self._frame)
-        if chain is not None and self._fixed.issuperset(chain):
+        for child, parent, pose, _ in self._transforms(message):
+            self._chain.fix(child, parent, pose)
+        if self._chain.is_fixed:
             self._device.refuse(
                 "frame",
                 f"nothing moves in tf between '{self._frame}' and '{self._body}': all of it is in "
                 f"tf_static, so no pose comes",
             )
 
-    def _keep(self, message: TFMessage) -> set[str]:
-        """Remember the transforms of a message; the frames that have moved."""
-        moved = set()
+    def _transforms(self, message: TFMessage) -> Iterator[tuple[str, str, Pose, Header]]:
+        """Child, parent, pose and header of each that is a pose."""
         for transform in message.transforms:
-            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id
+            child = transform.child_frame_id.lstrip("/")
+            parent = transform.header.frame_id.lstrip("/")
             try:
-                pose = transform_from(transform)
+                yield child, parent, transform_from(transform), transform.header
             except PoseError as error:
                 self._device.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
-                continue
-            if self._tree.set_pose(child, parent.lstrip("/"), pose):
-                moved.add(child)
-        return moved
 
     def _take(self, message: TFMessage) -> None:
-        moved = self._keep(message)
-        self._fixed -= moved
-        chain = self._tree.chain(self._body, self._frame)
-        if chain is None:
+        for child, parent, pose, header in self._transforms(message):
+            stamp = self._device.stamp_of(header, "tf")
+            made = self._chain.move(child, parent, stamp, pose)
+            if made is not None:
+                self._device.take(Measurement(*made))
+        if self._chain.links() is None:
             self._device.refuse(
                 "frame",
                 f"tf has no way from '{self._body}' up to '{self._frame}' yet: see tracker.body "
                 f"and tracker.frame in the scene",
             )
             return
-        stamps = [
-            self._device.stamp_of(transform.header, "tf")
-            for transform in message.transforms
-            if transform.child_frame_id.lstrip("/") in moved & set(chain)
-        ]
-        if stamps:
-            self._device.take(Measurement(max(stamps), self._tree.pose(chain)))
+        link, lag = self._chain.lag()
+        if lag > STALE_S:
+            self._device.refuse(
+                "time",
+                f"the newest transform of '{link}' in tf is {lag:.1f} s older than others on the "
+                f"way to '{self._frame}', and a pose needs all at one time: publish it as often as "
+                f"it moves, or in tf_static",
+            )
