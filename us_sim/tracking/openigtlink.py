@@ -1,7 +1,7 @@
 """OpenIGTLink: messages as bytes, a client of a tracker's server, and a server of images and poses.
 
-Messages are those of openigtlink.org, versions 1 to 3: big-endian and in millimetres. A checksum
-is written but, over TCP, not verified.
+Messages are those of openigtlink.org, versions 1 to 3: big-endian and in millimetres. A message
+whose checksum is wrong is refused; senders that make none write 0.
 
 >>> from us_sim.tracking.openigtlink import HEADER, header_of, poses_in, transform_message
 >>> matrix = np.eye(4)
@@ -16,13 +16,12 @@ is written but, over TCP, not verified.
 from __future__ import annotations
 
 import contextlib
-import selectors
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +63,7 @@ class Header:
     device: str
     stamp: int  # ns, 0 where the sender does not say
     size: int  # bytes of the body
+    checksum: int = 0  # of the body; 0 where the sender makes none
 
 
 def header_of(data: bytes) -> Header:
@@ -72,7 +72,7 @@ def header_of(data: bytes) -> Header:
     Raises:
         TrackingError: they are none.
     """
-    version, kind, device, seconds, fraction, size, _ = HEADER.unpack(data)
+    version, kind, device, seconds, fraction, size, checksum = HEADER.unpack(data)
     try:
         name = kind.rstrip(b"\0 ").decode("ascii")
     except UnicodeDecodeError:
@@ -80,18 +80,21 @@ def header_of(data: bytes) -> Header:
     if version not in _VERSIONS or not name.replace("_", "").isalnum():
         raise TrackingError("what came is no OpenIGTLink message")
     stamp = seconds * 10**9 + (fraction * 10**9 + 2**31 >> 32)
-    return Header(version, name, _text(device), stamp, size)
+    return Header(version, name, _text(device), stamp, size, checksum)
 
 
 def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]]]:
     """Names and matrices (4, 4) m of the bodies in a message of one of `POSE_KINDS`.
 
-    The matrices are as they were sent: maybe not rigid, or not finite.
+    The matrices are as they were sent: maybe not rigid, or not finite. A POSITION may be without
+    orientation, and then is not turned, or have three of the quaternion's numbers.
 
     Raises:
-        TrackingError: the body is cut or of another layout, or the sender says that the pose is
-            not valid.
+        TrackingError: the body is damaged, cut or of another layout, or the sender says that the
+            pose is not valid.
     """
+    if header.checksum not in (0, _checksum(body)):
+        raise TrackingError(f"the checksum of a {header.kind} of {header.device!r} is wrong")
     content = body
     if header.version > 1:
         content, metadata = _without_extension(header, body)
@@ -106,7 +109,7 @@ def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]
             raise _wrong_size(header, len(content))
         rows = np.frombuffer(content, dtype=element)
         return [(_text(row["name"]), make(row["numbers"].astype(np.float64))) for row in rows]
-    if len(content) != 4 * (12 if is_matrix else 7):
+    if len(content) not in ((48,) if is_matrix else (12, 24, 28)):
         raise _wrong_size(header, len(content))
     return [(header.device, make(np.frombuffer(content, dtype=">f4").astype(np.float64)))]
 
@@ -160,8 +163,8 @@ def _packed(kind: str, device: str, stamp: int, body: bytes) -> bytes:
     seconds, rest = divmod(stamp, 10**9)
     fraction = min((rest * 2**32 + 5 * 10**8) // 10**9, 2**32 - 1)
     name = device.encode("ascii", "replace")[:NAME_LENGTH]
-    checksum = int(_crc64(np.frombuffer(body, dtype=np.uint8), _CRC_TABLE))
-    return HEADER.pack(1, kind.encode(), name, seconds, fraction, len(body), checksum) + body
+    numbers = seconds, fraction, len(body), _checksum(body)
+    return HEADER.pack(1, kind.encode(), name, *numbers) + body
 
 
 def _text(name: bytes) -> str:
@@ -202,11 +205,21 @@ def _of_columns(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_quaternion(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x, y, z mm and the quaternion x, y, z, w; nan where that is none."""
+    """x, y, z mm and the quaternion x, y, z, w, of which w or all may be missing; nan where that is
+    none.
+    """
+    quaternion = numbers[3:] if len(numbers) > 3 else np.zeros(3)
+    if len(quaternion) == 3:
+        w = np.sqrt(max(0.0, 1.0 - float(quaternion @ quaternion)))
+        quaternion = np.append(quaternion, w)
     try:
-        return Pose(_METRES * numbers[:3], numbers[3:]).matrix
+        return Pose(_METRES * numbers[:3], quaternion).matrix
     except PoseError:
         return np.full((4, 4), np.nan)
+
+
+def _checksum(body: bytes) -> int:
+    return int(_crc64(np.frombuffer(body, dtype=np.uint8), _CRC_TABLE))
 
 
 def _crc_table() -> NDArray[np.uint64]:
@@ -236,10 +249,9 @@ LPS_FROM_RAS = Pose(orientation=np.array([0.0, 0.0, 1.0, 0.0]))
 
 _RETRY_S = 1.0
 _CONNECT_S = 2.0
-_LONGEST_POSES = 1 << 20  # bytes: a message with more than that is no list of poses
+_LONGEST_POSES = 1 << 20  # bytes: what claims more is another protocol
 _SKIPPED_AT_ONCE = 1 << 16
 _SAY_EVERY_S = 1.0
-_MOST_NAMES = 100  # of a server's bodies, to be told
 
 
 class OpenIGTLinkClient:
@@ -269,7 +281,7 @@ class OpenIGTLinkClient:
         self.place = f"{settings.host}:{settings.port}"
         self._names: dict[str, None] = {}
         self._heard = time.monotonic()
-        self._stamp = 0  # ns, of the newest pose handed on
+        self._newest: tuple[int, bytes] = (0, b"")  # stamp, ns, and matrix of the newest pose
         self._closing = threading.Event()
         self._socket: socket.socket | None = None
         self._thread = threading.Thread(target=self._run, name="openigtlink", daemon=True)
@@ -280,8 +292,7 @@ class OpenIGTLinkClient:
         self._closing.set()
         connection = self._socket
         if connection is not None:
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+            _shut(connection)
         self._thread.join(_CONNECT_S + _RETRY_S)
 
     def _run(self) -> None:
@@ -339,17 +350,25 @@ class OpenIGTLinkClient:
             except PoseError as error:
                 self._problem("pose", f"{self.place}: {name}: {error}; it is not used")
                 continue
-            if header.stamp and header.stamp == self._stamp:
-                # Some servers repeat the last pose of a body that they do not see.
-                self._problem("repeated", f"{self.place}: {name} is only a repeat; it is not used")
-                continue
-            self._stamp = header.stamp
+            before, self._newest = self._newest, (header.stamp, matrix.tobytes())
+            if header.stamp and header.stamp == before[0]:
+                if self._newest == before:
+                    # Some servers repeat the last pose of a body that they do not see.
+                    said = f"{name} is only a repeat; it is not used"
+                    self._problem("repeated", f"{self.place}: {said}")
+                    continue
+                if self._settings.clock == "server":
+                    self._problem(
+                        "clock",
+                        f"{self.place}: {name} moves while its stamp stands still; it is not used: "
+                        f"set tracker.openigtlink.clock in the scene to arrival",
+                    )
+                    continue
             self._take(Measurement(header.stamp, pose))
 
     def _is_wanted(self, name: str) -> bool:
         """Whether a name is the body's; reports now and then when only others come."""
-        if len(self._names) < _MOST_NAMES:
-            self._names[name] = None
+        self._names[name] = None
         if self._body is None:
             if len(self._names) == 1:
                 return True
@@ -402,21 +421,12 @@ def _skip(connection: socket.socket, size: int) -> None:
         size -= len(_read(connection, min(size, _SKIPPED_AT_ONCE)))
 
 
-_MOST_CLIENTS = 16
 _READ_AT_ONCE = 1 << 16
-
-
-@dataclass(eq=False)
-class _Client:
-    """A connection, the message being sent, and the newest of each name that wait."""
-
-    connection: socket.socket
-    underway: memoryview = field(default_factory=lambda: memoryview(b""))
-    waiting: dict[str, bytes] = field(default_factory=dict)
+_ACCEPT_S = 0.2  # after which it is seen that the server is to close
 
 
 class OpenIGTLinkServer:
-    """A thread that sends the newest message of each name to every client.
+    """Threads that send the newest message of each name to every client.
 
     A client that is too slow for all messages gets the newest ones; what a client sends is not
     listened to.
@@ -438,104 +448,74 @@ class OpenIGTLinkServer:
                 f"({error.strerror or error}): end what uses the port, or choose another"
             ) from error
         self.port = int(self._listener.getsockname()[1])
-        self._clients: dict[socket.socket, _Client] = {}
-        self._lock = threading.Lock()
+        self._waiting: dict[socket.socket, dict[str, bytes]] = {}  # of each client, by name
+        self._changed = threading.Condition()
         self._closing = False
-        self._selector = selectors.DefaultSelector()
-        self._bell, self._ear = socket.socketpair()
-        for listening in (self._listener, self._ear, self._bell):
-            listening.setblocking(False)
-        self._selector.register(self._listener, selectors.EVENT_READ)
-        self._selector.register(self._ear, selectors.EVENT_READ)
-        self._thread = threading.Thread(target=self._run, name="openigtlink", daemon=True)
+        self._thread = threading.Thread(target=self._accept, name="openigtlink", daemon=True)
         self._thread.start()
 
     @property
     def clients(self) -> int:
         """Number of clients connected."""
-        return len(self._clients)
+        return len(self._waiting)
 
     def send(self, name: str, message: bytes) -> None:
         """Send a message to all clients; one of the same name that has not left yet is dropped."""
-        with self._lock:
-            for client in self._clients.values():
-                client.waiting[name] = message
-        self._ring()
+        with self._changed:
+            for waiting in self._waiting.values():
+                waiting[name] = message
+            self._changed.notify_all()
 
     def close(self) -> None:
-        """Disconnect all, and wait for the thread to end."""
+        """Disconnect all, and wait for the threads to end."""
         self._closing = True
-        self._ring()
         self._thread.join()
-        for end in (self._ear, self._bell):  # not by the thread, which may be done before the ring
-            end.close()
-
-    def _ring(self) -> None:
-        with contextlib.suppress(BlockingIOError):  # it has been rung often enough already
-            self._bell.send(b"\0")
-
-    def _run(self) -> None:
-        while not self._closing:
-            for key, events in self._selector.select():
-                if key.fileobj is self._ear:
-                    self._ear.recv(_READ_AT_ONCE)
-                elif key.fileobj is self._listener:
-                    self._accept()
-                else:
-                    self._serve(key.data, events)
-            for client in list(self._clients.values()):
-                if client.waiting and not client.underway:
-                    self._serve(client, selectors.EVENT_WRITE)
-        for client in list(self._clients.values()):
-            self._drop(client)
-        self._selector.close()
         self._listener.close()
+        with self._changed:
+            for connection in self._waiting:
+                _shut(connection)
+            self._changed.wait_for(lambda: not self._waiting, _CONNECT_S)
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # gone again already
-            connection, _ = self._listener.accept()
-            if len(self._clients) >= _MOST_CLIENTS:
-                connection.close()
-                return
-            connection.setblocking(False)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            client = _Client(connection)
-            self._selector.register(connection, selectors.EVENT_READ, client)
-            with self._lock:
-                self._clients[connection] = client
+        self._listener.settimeout(_ACCEPT_S)
+        while not self._closing:
+            with contextlib.suppress(OSError):  # nobody came, or is gone again already
+                connection, _ = self._listener.accept()
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                with self._changed:
+                    self._waiting[connection] = {}
+                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
 
-    def _serve(self, client: _Client, events: int) -> None:
-        """Discard incoming data, and send as much as the connection takes."""
-        if client.connection not in self._clients:
-            return
+    def _serve(self, connection: socket.socket) -> None:
+        """Discard what a client sends, until it is gone."""
+        feeder = threading.Thread(target=self._feed, args=(connection,), daemon=True)
+        feeder.start()
+        with contextlib.suppress(OSError):
+            while connection.recv(_READ_AT_ONCE):
+                pass
+        with self._changed:
+            del self._waiting[connection]
+            self._changed.notify_all()
+        _shut(connection)
+        feeder.join()
+        connection.close()
+
+    def _feed(self, connection: socket.socket) -> None:
+        """Send a client what waits for it, until it is gone."""
         try:
-            if events & selectors.EVENT_READ and not client.connection.recv(_READ_AT_ONCE):
-                self._drop(client)
-                return
-            if events & selectors.EVENT_WRITE:
-                self._write(client)
-        except BlockingIOError:
-            pass
-        except OSError:
-            self._drop(client)
-            return
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.underway else 0)
-        self._selector.modify(client.connection, wanted, client)
-
-    def _write(self, client: _Client) -> None:
-        """Raises BlockingIOError when the connection takes no more."""
-        while True:
-            if not client.underway:
-                with self._lock:
-                    if not client.waiting:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._waiting.get(connection) != {})
+                    if connection not in self._waiting:
                         return
-                    name = next(iter(client.waiting))
-                    client.underway = memoryview(client.waiting.pop(name))
-            sent = client.connection.send(client.underway)
-            client.underway = client.underway[sent:]
+                    waiting = self._waiting[connection]
+                    message = waiting.pop(next(iter(waiting)))
+                connection.sendall(message)
+        except OSError:
+            _shut(connection)
 
-    def _drop(self, client: _Client) -> None:
-        with self._lock:
-            del self._clients[client.connection]
-        self._selector.unregister(client.connection)
-        client.connection.close()
+
+def _shut(connection: socket.socket) -> None:
+    """End both directions, so that nobody waits for it any more."""
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
