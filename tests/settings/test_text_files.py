@@ -11,7 +11,7 @@ import pytest
 from us_sim.errors import CalibrationError, SceneError, TrackingError
 from us_sim.scene.reading import read_document
 from us_sim.settings.text_files import LARGEST_YAML, MOST_NODES, YamlError, load_yaml, read_text
-from us_sim.tracking.calibration.landmarks import read_landmarks, read_wires
+from us_sim.tracking.calibration.landmarks import read_landmarks
 from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.tracking.camera.model import read_camera_info
 from us_sim.tracking.camera.rigid_body import read_rigid_body
@@ -30,7 +30,6 @@ def test_a_pipe_is_read(tmp_path):
     ("read", "error"),
     [
         (read_landmarks, CalibrationError),
-        (read_wires, CalibrationError),
         (read_transform, CalibrationError),
         (read_camera_info, TrackingError),
         (read_rigid_body, TrackingError),

@@ -20,31 +20,25 @@ from us_sim.command.calibration_settings import (
     ClockSettings,
     LandmarkSettings,
     PivotSettings,
-    ProbeSettings,
     Progress,
 )
-from us_sim.errors import CalibrationError, PoseError
+from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import interpolate
 from us_sim.recording.path import ProbePath, is_tracker_recording, read_path
 from us_sim.recording.plus_recording import read_tracker_recording
 from us_sim.settings.spelling import counted
-from us_sim.settings.text_files import read_text
 from us_sim.tracking.calibration.camera import (
     INTRINSICS,
-    Board,
     BoardView,
     CameraCalibration,
     calibrate_camera,
+    find_board,
 )
 from us_sim.tracking.calibration.landmarks import (
     read_landmarks,
-    read_table,
-    read_wires,
     register_landmarks,
 )
-from us_sim.tracking.calibration.pivot import ENOUGH_FEATURES, calibrate_pivot, find_dwells
-from us_sim.tracking.calibration.probe import PixelSighting, ProbeCalibration, calibrate_probe
+from us_sim.tracking.calibration.pivot import calibrate_pivot, find_dwells
 from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
     find_time_offset,
@@ -57,7 +51,7 @@ from us_sim.tracking.calibration.transform_file import (
     write_transform,
 )
 from us_sim.tracking.camera.model import write_camera_info
-from us_sim.tracking.settings import columns_and_rows
+from us_sim.tracking.camera.rigid_body import RigidBody, printed_board
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
 from us_sim.volume.sequences.sweep import Sweep, read_sweep
 from us_sim.volume.sequences.transforms import split_transform_name
@@ -155,10 +149,15 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
             write exists.
     """
     out, picture = settings.out, settings.picture
-    lengths = (settings.square, settings.marker, settings.separation)
-    markers = settings.dictionary or ("" if settings.board == "chessboard" else "4X4_50")
-    shape = columns_and_rows(settings.size)
-    board = Board(settings.board, *shape, *lengths, markers, settings.legacy)
+    board = printed_board(
+        settings.board,
+        settings.size,
+        settings.dictionary,
+        marker=settings.marker,
+        square=settings.square,
+        separation=settings.separation,
+        legacy=settings.legacy,
+    )
     photos = find_photos(settings.photos)
     names, views, blank, size = _views(photos, board, progress)
     if not views:
@@ -169,7 +168,7 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
     found = calibrate_camera(views, *size)
     far_off = list(compress(names, ~found.used))
     names, views = list(compress(names, found.used)), list(compress(views, found.used))
-    notes = _notes(found, board, names, views)
+    notes = _notes(found, f"{settings.board} board {settings.size}", names, views)
     notes |= {"photos_without_board": blank, "photos_left_out": far_off}
     write_camera_info(out, found.camera, settings.name, notes)
     draw_coverage(picture, found, views, names)
@@ -216,7 +215,7 @@ def _natural(path: Path) -> list[tuple[bool, int, str]]:
 
 
 def _views(
-    photos: Sequence[Path], board: Board, progress: Progress | None
+    photos: Sequence[Path], board: RigidBody, progress: Progress | None
 ) -> tuple[list[str], list[BoardView], list[str], tuple[int, int]]:
     """Names and views of the photos that show the board, names of those that do not, the size."""
     names, views, blank = [], [], []
@@ -230,7 +229,7 @@ def _views(
                 f"before it {size[0]} × {size[1]}: all must come from one camera at one size"
             )
         size = columns_rows
-        view = board.find(image)
+        view = find_board(image, board)
         if view is None:
             blank.append(photo.name)
         else:
@@ -254,11 +253,11 @@ def _read(photo: Path) -> NDArray[np.uint8]:
 
 
 def _notes(
-    found: CameraCalibration, board: Board, names: Sequence[str], views: Sequence[BoardView]
+    found: CameraCalibration, board: str, names: Sequence[str], views: Sequence[BoardView]
 ) -> dict[str, object]:
     """Further keys of the camera info, which ROS' readers ignore."""
     return {
-        "method": f"{board.kind} board {board.columns}x{board.rows}, Zhang",
+        "method": f"{board}, Zhang",
         "residuals": {
             "rms": found.rms,  # pixels
             "photos": dict(zip(names, found.residuals.tolist(), strict=True)),  # RMS, pixels
@@ -268,175 +267,6 @@ def _notes(
         "largest_tilt": found.tilt,  # rad, between two boards
         "reach": found.reach,  # fraction of the distance from the image's middle to its corners
         "note": found.note,
-    }
-
-
-_SIGHTED_PIXEL = {"column": "number", "row": "number"}
-_SIGHTED_POSE = dict.fromkeys(("x", "y", "z"), "length") | dict.fromkeys(
-    ("qx", "qy", "qz", "qw"), "number"
-)
-_LONGEST_GAP = 0.2  # s, between poses that are interpolated
-_ROUNDED = 1e-3  # s, by which a time may differ from the stamp that it means
-_LITTLE_TURN = math.radians(20.0)
-_UNCERTAIN = 0.5e-3  # m, of the image's edge
-_FEATURE, _PART = "feature", "part of a feature's sightings"
-
-
-def calibrate_image(settings: ProbeSettings, _: Progress | None = None) -> str:
-    """Find where the image lies on the probe and write it; returns a sentence with the result.
-
-    Raises:
-        UsSimError: the files cannot be read or do not determine the image's place.
-    """
-    out = settings.out
-    to_phantom = read_transform(settings.registration) if settings.registration else Pose()
-    if settings.recording is None:
-        seen = _with_poses(settings.sightings, to_phantom)
-    else:
-        seen = _with_times(settings.sightings, settings.recording, settings.pose, to_phantom)
-    phantom = _features(settings.phantom) if settings.phantom else {}
-    unknown = sorted({sighting.feature for sighting in seen} - set(phantom))
-    if phantom and unknown:
-        raise CalibrationError(
-            f"{settings.phantom}: has no {unknown[0]}, which {settings.sightings} shows; its "
-            f"features are {', '.join(phantom)}"
-        )
-    found = calibrate_probe(
-        seen, phantom, spacing=None if settings.pixel is None else np.array(settings.pixel)
-    )
-    deviations = np.sqrt(np.diag(found.covariance))
-    rejected = int((~found.inliers).sum())
-    clusters = len(np.unique(found.clusters[found.inliers]))
-    features = len({sighting.feature for sighting in seen})
-    write_transform(
-        out,
-        found.probe_pose(*settings.origin),
-        from_frame="probe",
-        to_frame="body",
-        method=f"probe calibration, {settings.sightings.name}",
-        residuals={
-            "rms": found.rms,  # m
-            "features": _by_feature(seen, found.residuals, found.inliers),  # m, RMS of each
-            "sightings": len(seen),
-            "rejected": rejected,
-            "turned": found.turned,  # rad, by which the body turned
-        },
-        more={
-            "pixel_spacing": found.spacing,  # m, between columns and between rows
-            "origin_pixel": list(settings.origin),  # column, row
-            "image_to_body": found.image_to_body,  # m, from (column, row, 0, 1)
-            "standard_deviations": {
-                "position": deviations[:3],  # m, of pixel (0, 0)
-                "rotation": deviations[3:6],  # rad, about the body's axes
-                "pixel_spacing": deviations[6:],  # m
-                "edge": found.edge_deviation,  # m, of the outermost sightings' place
-                # Errors are taken to be independent between these, and related within each.
-                "clusters": clusters,
-                "cluster": _FEATURE if features >= ENOUGH_FEATURES else _PART,
-            },
-            **({"points": found.points} if found.points else {}),  # m
-        },
-    )
-    return (
-        f"{out}: pixels of {1e3 * found.spacing[0]:.4f} × {1e3 * found.spacing[1]:.4f} mm, RMS "
-        f"{1e3 * found.rms:.2f} mm over {counted(len(seen) - rejected, 'sighting')}, "
-        f"{rejected} left out, "
-        f"± {1e3 * float(np.linalg.norm(deviations[:3])):.2f} mm and "
-        f"{np.degrees(float(np.linalg.norm(deviations[3:6]))):.2f}°{_remarks(found, features)}"
-    )
-
-
-def _remarks(found: ProbeCalibration, features: int) -> str:
-    """Remarks on data that leave the result uncertain."""
-    said = ""
-    if found.turned < _LITTLE_TURN:
-        said += (
-            f"; the probe turned by only {math.degrees(found.turned):.0f}°, which determines "
-            f"little: turn it by 30° or more about all axes"
-        )
-    if found.edge_deviation > _UNCERTAIN:
-        said += (
-            f"; the image's edge is known to ± {1e3 * found.edge_deviation:.1f} mm and its turn "
-            f"about one axis to ± {math.degrees(found.turn_deviation):.1f}° only: sight it under "
-            f"more angles, or points beside wires"
-        )
-    if len(found.points) < features < ENOUGH_FEATURES:
-        said += (
-            f"; {features} {'feature is' if features == 1 else 'features are'} too few to tell "
-            f"what a misplaced one does to the result: the deviations leave that out"
-        )
-    return said
-
-
-def _features(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Wires (2, 3) m, or where the file has none points (1, 3) m, by name."""
-    if path.suffix.lower() == ".xml" or _has_ends(path):
-        return read_wires(path)
-    return {name: point[None] for name, point in read_landmarks(path).items()}
-
-
-def _has_ends(path: Path) -> bool:
-    try:
-        return "x2" in read_text(path).partition("\n")[0]
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read: {error}") from error
-
-
-def _with_poses(path: Path, to_phantom: Pose) -> list[PixelSighting]:
-    seen: list[PixelSighting] = []
-    for feature, numbers in read_table(path, _SIGHTED_PIXEL | _SIGHTED_POSE, label="feature"):
-        try:
-            pose = to_phantom @ Pose(np.array(numbers[2:5]), np.array(numbers[5:]))
-        except PoseError as error:
-            raise CalibrationError(f"{path}: sighting {len(seen) + 1}: {error}") from error
-        seen.append(PixelSighting(feature, numbers[0], numbers[1], pose))
-    return seen
-
-
-def _with_times(
-    path: Path, recording: Path, name: str | None, to_phantom: Pose
-) -> list[PixelSighting]:
-    motion = read_motion(recording, name)
-    stamps, first = np.unique(seconds_of(motion), return_index=True)
-    seen: list[PixelSighting] = []
-    for feature, (column, row, time) in read_table(
-        path, _SIGHTED_PIXEL | {"time": "time"}, label="feature"
-    ):
-        before, after, fraction = _around(stamps, time)
-        if stamps[after] - stamps[before] > _LONGEST_GAP or not 0.0 <= fraction <= 1.0:
-            raise CalibrationError(
-                f"{path}: sighting {len(seen) + 1}: {recording.name} has no pose around "
-                f"{time:.3f} s; it goes from {stamps[0]:.3f} to {stamps[-1]:.3f} s"
-            )
-        pose = interpolate(motion.pose(first[before]), motion.pose(first[after]), fraction)
-        pose = to_phantom @ pose
-        seen.append(PixelSighting(feature, column, row, pose))
-    return seen
-
-
-def _around(stamps: NDArray[np.float64], time: float) -> tuple[int, int, float]:
-    """The stamps before and after a time, and the fraction of the way from one to the other.
-
-    Where a stamp is the time but for rounding, it is both. Before the first and after the last
-    stamp the fraction is not from 0 to 1.
-    """
-    after = int(np.clip(np.searchsorted(stamps, time), 1, max(len(stamps) - 1, 1)))
-    for k in (after - 1, min(after, len(stamps) - 1)):
-        if abs(stamps[k] - time) <= _ROUNDED:
-            return k, k, 0.0
-    if after == len(stamps):
-        return 0, 0, math.nan
-    before = after - 1
-    return before, after, float((time - stamps[before]) / (stamps[after] - stamps[before]))
-
-
-def _by_feature(
-    seen: Sequence[PixelSighting], residuals: NDArray[np.float64], used: NDArray[np.bool_]
-) -> dict[str, float]:
-    names = np.array([sighting.feature for sighting in seen])
-    return {
-        str(name): float(np.sqrt((residuals[(names == name) & used] ** 2).mean()))
-        for name in np.unique(names[used])
     }
 
 

@@ -14,13 +14,11 @@ from pathlib import Path
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.tracking.settings import BOARD_LENGTH, BOARDS
+from us_sim.tracking.settings import BOARDS, MARKER_SIZE
 
 Progress = Callable[[float, str], None]
 """A callback that is told the fraction done, and what is being done."""
 
-_PIXEL = Quantity("length", 1e-6, 0.01)
-_PLACE = Quantity("image distance", -1e5, 1e5)
 _POSE = (
     "topic of a bag, or transform of Plus such as StylusToReference; may be left out where "
     "there is one only"
@@ -72,12 +70,10 @@ class CameraSettings(CalibrationSettings):
     )
     size: str = setting(description="squares or markers across and down: 5x7", kw_only=True)
     board: str = setting(description="its kind", choices=BOARDS, default="charuco")
-    square: float = setting(BOARD_LENGTH, "side of a square", default=0.0)
-    marker: float = setting(BOARD_LENGTH, "side of a marker", default=0.0)
-    separation: float = setting(BOARD_LENGTH, "between the markers of a grid", default=0.0)
-    dictionary: str | None = setting(
-        description="of the markers, where there are some; not given: 4X4_50", default=None
-    )
+    square: float | None = setting(MARKER_SIZE, "side of a ChArUco board's square", default=None)
+    marker: float | None = setting(MARKER_SIZE, "side of a marker", default=None)
+    separation: float | None = setting(MARKER_SIZE, "between the markers of a grid", default=None)
+    dictionary: str = setting(description="of the markers", default="4X4_50")
     legacy: bool = setting(
         description="the ChArUco board is as OpenCV before 4.6 drew it", default=False
     )
@@ -114,33 +110,6 @@ class LandmarkSettings(CalibrationSettings):
     )
     pose: str | None = setting(description=_POSE, default=None)
     out: Path = _out(": the registration", "registration.yaml")
-
-
-@dataclass(frozen=True)
-class ProbeSettings(CalibrationSettings):
-    """Where the image lies on the probe, from a phantom."""
-
-    sightings: Path = setting(
-        description="CSV: feature,column,row,x,y,z,qx,qy,qz,qw with the body's poses, or "
-        "feature,column,row,time with --recording"
-    )
-    origin: tuple[float, float] = setting(
-        _PLACE, "column and row of the pixel at the middle of the transducer's face", kw_only=True
-    )
-    phantom: Path | None = setting(
-        description="CSV name,x,y,z of points or name,x1,y1,z1,x2,y2,z2 of wires, or Plus' XML; "
-        "without it features are points at unknown places",
-        default=None,
-    )
-    recording: Path | None = setting(description="the body's poses over time", default=None)
-    registration: Path | None = setting(
-        description="from the poses' frame to the phantom's", default=None
-    )
-    pixel: tuple[float, float] | None = setting(
-        _PIXEL, "width and height of a pixel, where known: '0.2 mm' '0.2 mm'", default=None
-    )
-    pose: str | None = setting(description=_POSE, default=None)
-    out: Path = _out(": the calibration", "calibration.yaml")
 
 
 @dataclass(frozen=True)

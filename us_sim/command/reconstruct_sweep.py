@@ -51,8 +51,7 @@ class SweepSettings(Settings):
         kw_only=True,
     )
     calibration: Path | None = setting(
-        description="where the image lies on the probe: Plus' XML, or YAML of `us-sim calibrate "
-        "probe`",
+        description="where the image lies on the probe: Plus' XML, or YAML with image_to_body",
         default=None,
     )
     image: str = setting(description="name of the images' frame", default="Image")

@@ -164,6 +164,5 @@ CALIBRATIONS = Choice(
     landmarks=Option(
         f"{_CALIBRATION}:calibrate_registration", f"{_CALIBRATION}_settings:LandmarkSettings"
     ),
-    probe=Option(f"{_CALIBRATION}:calibrate_image", f"{_CALIBRATION}_settings:ProbeSettings"),
     time=Option(f"{_CALIBRATION}:calibrate_clock", f"{_CALIBRATION}_settings:ClockSettings"),
 )

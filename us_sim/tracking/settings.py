@@ -21,12 +21,7 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-BOARDS_OF_MARKERS = ("charuco", "grid")  # kinds of flat boards that carry markers
-BOARDS = (*BOARDS_OF_MARKERS, "chessboard")  # the kinds of boards for calibrating a camera
-BOARD_LENGTH = Quantity("length", 0.0, 10.0)
-"""Sides and distances on a board; 0 where the board has none such."""
-
-
+BOARDS = ("charuco", "grid")  # the kinds of flat boards
 DICTIONARIES = (
     *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "ARUCO_ORIGINAL",
@@ -78,18 +73,6 @@ class CameraSettings(Settings):
         "time from the middle of the exposure to the image's stamp",
         default=0.0,
     )
-
-
-def columns_and_rows(size: str) -> tuple[int, int]:
-    """The numbers in a board's size, which a person writes as ``5x7``.
-
-    Raises:
-        TrackingError: it is written otherwise.
-    """
-    columns, _, rows = size.lower().partition("x")
-    if not (columns.isdigit() and rows.isdigit()):
-        raise TrackingError(f"--size {size}: write columns and rows, e.g. 5x7")
-    return int(columns), int(rows)
 
 
 _CUTOFF = Quantity("frequency", 1e-3, 1e3)

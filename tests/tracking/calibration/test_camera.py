@@ -6,8 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
-from us_sim.tracking.calibration.camera import Board, BoardView, calibrate_camera
+from us_sim.tracking.calibration.camera import BoardView, calibrate_camera, find_board
 from us_sim.tracking.camera.model import CameraModel
+from us_sim.tracking.camera.rigid_body import RigidBody
 
 CAMERA = CameraModel(
     640, 480, [[610.0, 0, 325], [0, 612, 236], [0, 0, 1]], [-0.21, 0.06, 1e-3, -5e-4, 0.0]
@@ -60,13 +61,13 @@ def test_errors_are_as_large_as_the_deviations_say():
 
 
 def test_the_grid_boards_photos_give_a_smaller_residual_than_was_known(shared_data):
-    board = Board("grid", 4, 5, marker=0.0375, separation=0.005, dictionary="DICT_6X6_1000")
+    board = RigidBody.grid("DICT_6X6_1000", 4, 5, 0.0375, 0.005)
     files = [shared_data / "marker-aruco-gridboard" / f"{k}.jpg" for k in range(42)]
-    views = [board.find(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) for file in files]
+    views = [find_board(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), board) for file in files]
     # At least 19 of the 20 markers in each photo, as other programs find.
     assert min(len(view) for view in views) >= 4 * 19
     found = calibrate_camera(views, 640, 480)
-    assert found.rms < 0.5  # 0.918 pixels without sub-pixel corners
+    assert found.rms < 0.3  # 0.918 pixels without sub-pixel corners, 0.46 with OpenCV's
     # OpenCV's own result there: 813.3, 812.8, 319.0, 239.5; five deviations of it apart.
     focal_and_centre = found.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     np.testing.assert_allclose(focal_and_centre, [813.3, 812.8, 319.0, 239.5], atol=5.0)
@@ -74,17 +75,17 @@ def test_the_grid_boards_photos_give_a_smaller_residual_than_was_known(shared_da
 
 
 def test_the_charuco_photos_give_the_published_camera(shared_data):
-    board = Board("charuco", 5, 7, 0.04, 0.02, dictionary="6X6_250")
+    board = RigidBody.charuco("6X6_250", 5, 7, 0.04, 0.02)
     files = [shared_data / "marker-opencv-charuco" / f"img_0{k}.jpg" for k in range(4)]
-    views = [board.find(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) for file in files]
+    views = [find_board(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), board) for file in files]
     assert [len(view) for view in views] == [24, 24, 24, 24]
     found = calibrate_camera(views, 640, 480)
-    assert found.rms <= 0.20
-    # tutorial_camera_charuco.yml of OpenCV, within the deviations that four alike views leave.
+    assert found.rms <= 0.15  # OpenCV's corners give 0.19
+    # tutorial_camera_charuco.yml of OpenCV, within the errors that four alike views leave to both.
     published = np.array([452.511, 456.767, 317.703, 277.752])
     error = found.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]] - published
-    assert (np.abs(error) < found.deviations[:4]).all()
-    assert "the focal length is known to 3." in found.note
+    assert (np.abs(error) < 2.5 * found.deviations[:4]).all()
+    assert "the focal length is known to 2." in found.note
     assert "beyond 44 % of the way" in found.note
 
 
@@ -130,61 +131,28 @@ def test_views_that_do_not_determine_the_camera_are_refused(views, problem):
         calibrate_camera(views(np.random.default_rng(1)), 640, 480)
 
 
-def test_half_a_chessboard_is_not_a_board_but_half_a_charuco_is():
-    board = Board("charuco", 6, 5, 0.03, 0.02, dictionary="4X4_50")
-    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    drawn = cv2.aruco.CharucoBoard((6, 5), 0.03, 0.02, markers).generateImage((600, 500))
-    photo = cv2.copyMakeBorder(drawn, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
-    whole, half = board.find(photo), board.find(photo[:, :400])
+def drawn(board):
+    """A photo straight from above, 100 pixels a square."""
+    columns, rows = board.chessboard.columns, board.chessboard.rows
+    image = board.chessboard.board.generateImage((100 * columns, 100 * rows))
+    return cv2.copyMakeBorder(image, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+
+
+def test_half_a_board_is_enough_and_a_row_or_none_of_it_is_not():
+    board = RigidBody.charuco("4X4_50", 6, 5, 0.03, 0.02)
+    photo = drawn(board)
+    whole, half = find_board(photo, board), find_board(photo[:, :400], board)
     assert len(whole) == 20
     assert 6 <= len(half) < 20
     # The squares are 100 pixels and 30 mm wide.
     scale = np.polyfit(half.points[:, 0], half.pixels[:, 0], 1)[0]
     assert scale == pytest.approx(100 / 0.03, rel=2e-3)
-    squares = np.add.outer(np.arange(5), np.arange(6)) % 2 * 255
-    chessboard = np.kron(squares, np.ones((60, 60))).astype(np.uint8)
-    chessboard = cv2.copyMakeBorder(chessboard, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
-    plain = Board("chessboard", 6, 5, 0.03)
-    assert len(plain.find(chessboard)) == 20
-    assert plain.find(chessboard[:, :250]) is None
-    assert plain.find(np.zeros((100, 100), np.uint8)) is None
+    assert find_board(photo[:, :200], board) is None
+    assert find_board(np.zeros((100, 100), np.uint8), board) is None
 
 
 def test_old_charuco_boards_need_to_be_called_that():
-    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    old = cv2.aruco.CharucoBoard((5, 6), 0.03, 0.02, markers)
-    old.setLegacyPattern(True)
-    photo = cv2.copyMakeBorder(old.generateImage((400, 480)), 60, 60, 60, 60, 0, value=255)
-    arguments = ("charuco", 5, 6, 0.03, 0.02, 0.0, "4X4_50")
-    assert Board(*arguments).find(photo) is None
-    assert len(Board(*arguments, legacy=True).find(photo)) == 20
-
-
-def test_a_large_chessboard_is_found_as_exactly_as_a_small_one():
-    squares = np.add.outer(np.arange(7), np.arange(9)) % 2 * 255
-    photo = np.kron(squares, np.ones((240, 240))).astype(np.uint8)
-    photo = cv2.copyMakeBorder(photo, 400, 400, 400, 400, 0, value=200)
-    found = Board("chessboard", 9, 7, 0.02).find(photo)
-    # Corners lie between pixels; their middle is the board's.
-    np.testing.assert_allclose(
-        found.pixels.mean(axis=0), [399.5 + 4.5 * 240, 399.5 + 3.5 * 240], atol=0.05
-    )
-    steps = np.linalg.norm(np.diff(found.pixels.reshape(6, 8, 2), axis=1), axis=2)
-    np.testing.assert_allclose(steps, 240.0, atol=0.2)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (("circles", 5, 7, 0.04), "there is no board 'circles'"),
-        (("charuco", 2, 7, 0.04, 0.02, 0.0, "6X6_250"), "too few corners"),
-        (("charuco", 5, 7, 0.04), "needs its marker"),
-        (("charuco", 5, 7, 0.04, 0.02), "needs the dictionary of its markers"),
-        (("charuco", 5, 7, 0.04, 0.05, 0.0, "6X6_250"), "must be smaller than its square"),
-        (("grid", 5, 7, 0.0, 0.03, 0.005, "7X3_1"), "no marker dictionary '7X3_1'"),
-        (("chessboard", 5, 7, 40.0), "needs its square in metres"),
-    ],
-)
-def test_boards_that_cannot_be_are_refused(arguments, problem):
-    with pytest.raises(CalibrationError, match=problem):
-        Board(*arguments)
+    shape = ("4X4_50", 5, 6, 0.03, 0.02)
+    photo = drawn(RigidBody.charuco(*shape, legacy=True))
+    assert find_board(photo, RigidBody.charuco(*shape)) is None
+    assert len(find_board(photo, RigidBody.charuco(*shape, legacy=True))) == 20

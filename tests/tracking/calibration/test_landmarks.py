@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from us_sim.command.calibration import read_motion, seconds_of
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.calibration.landmarks import read_landmarks, read_wires, register_landmarks
+from us_sim.tracking.calibration.landmarks import read_landmarks, register_landmarks
 from us_sim.tracking.calibration.pivot import find_dwells
 
 CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.06, 0], [0, 0.06, 0.03], [0.05, 0, 0.04]])
@@ -119,7 +119,6 @@ def test_what_cannot_determine_a_registration_is_refused(measured, known, proble
 
 
 PLUS = """<PlusConfiguration><PhantomDefinition><Geometry>
-<Pattern Type="NWire"><Wire Name="G1" EndPointFront="30 0 20" EndPointBack="30 40 20"/></Pattern>
 <Landmarks><Landmark Name="#1" Position="104.3 5.0 20.0"/></Landmarks>
 </Geometry></PhantomDefinition></PlusConfiguration>"""
 
@@ -139,43 +138,31 @@ def test_a_csv_of_metres_and_of_written_units_is_read(tmp_path):
     np.testing.assert_allclose(points["b"], [0.01, 0.0, 0.0])
 
 
-def test_wires_have_two_ends(tmp_path):
-    wires = read_wires(written(tmp_path, "name,x1,y1,z1,x2,y2,z2\nG1,0,0,0,0,40 mm,0\n"))
-    np.testing.assert_allclose(wires["G1"], [[0, 0, 0], [0, 0.04, 0]])
-
-
 def test_a_phantom_of_plus_is_in_millimetres(tmp_path):
     file = written(tmp_path, PLUS, "phantom.xml")
     np.testing.assert_allclose(read_landmarks(file)["#1"], [0.1043, 0.005, 0.02])
-    np.testing.assert_allclose(read_wires(file)["G1"], [[0.03, 0, 0.02], [0.03, 0.04, 0.02]])
 
 
 @pytest.mark.parametrize(
     ("text", "name", "problem"),
     [
-        ("", "points.csv", "name,x,y,z"),
-        ("name,x,y\n", "points.csv", "has no column z"),
-        ("name,x,y,z\n", "points.csv", "holds no landmark"),
-        ("name,x,y,z\na,1,2\n", "points.csv", "line 2: z: '' is not a length"),
-        ("name,x,y,z\na,1,2,nan\n", "points.csv", "line 2: z: 'nan' is not a length"),
-        ("name,x,y,z\na,0,0,0\na,1,0,0\n", "points.csv", "landmark a is there twice"),
-        ("name,x,y,z\n,0,0,0\n", "points.csv", "a landmark has no name"),
-        ("<a>", "points.xml", "is not XML"),
-        ("<a/>", "points.xml", "holds no landmark"),
-        ('<a><Landmark Name="p" Position="1 2"/></a>', "points.xml", "Position must be 3 numbers"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><a/>', "points.xml", "defines entities"),
+        ("", "points.csv", "column"),
+        ("name,x,y\n", "points.csv", "column z"),
+        ("name,x,y,z\n", "points.csv", "no landmark"),
+        ("name,x,y,z\na,1,2\n", "points.csv", "line 2"),
+        ("name,x,y,z\na,1,2,nan\n", "points.csv", "line 2"),
+        ("name,x,y,z\na,0,0,0\na,1,0,0\n", "points.csv", "twice"),
+        ("name,x,y,z\n,0,0,0\n", "points.csv", "no name"),
+        ("<a>", "points.xml", "XML"),
+        ("<a/>", "points.xml", "landmark"),
+        ('<a><Landmark Name="p" Position="1 2"/></a>', "points.xml", "3 numbers"),
+        (None, "points.csv", "read"),
     ],
 )
-def test_what_is_no_list_of_landmarks_is_refused_with_a_sentence(tmp_path, text, name, problem):
-    with pytest.raises(CalibrationError, match=problem) as refused:
-        read_landmarks(written(tmp_path, text, name))
-    assert name in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(CalibrationError, match=r"nowhere\.csv: "):
-        read_landmarks(tmp_path / "nowhere.csv")
+def test_what_is_no_list_of_landmarks_is_refused(tmp_path, text, name, problem):
+    file = tmp_path / name if text is None else written(tmp_path, text, name)
+    with pytest.raises(CalibrationError, match=f"{name}: .*{problem}"):
+        read_landmarks(file)
 
 
 def touching(places, rng, rate=20.0, noise=1e-4):

@@ -1,4 +1,4 @@
-"""A probe calibrated by three N-wires, and a volume of such wires, beside those of Plus.
+"""Plus' calibration of a probe by three N-wires as it is read, and a volume of such wires.
 
 Plus found nine wires in each image. Of each N, the middle wire's point divides the line between
 those of its parallel ones, which says where on the wire it lies (R. M. Comeau, A. Fenster and T. M.
@@ -9,7 +9,7 @@ Peters, Integrated MR and ultrasound imaging for improved image guidance in neur
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,12 +20,6 @@ from numpy.typing import NDArray
 from us_sim.errors import UsSimError
 from us_sim.evaluation.measured.study import Finding, Section, Study
 from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
-from us_sim.geometry.pose import Pose
-from us_sim.tracking.calibration.probe import (
-    PixelSighting,
-    ProbeCalibration,
-    calibrate_probe,
-)
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.reconstruction.reconstruction import plan, reconstruct
@@ -53,15 +47,6 @@ class Recording:
     wires: Array  # (9, 2, 3) m, both ends in the phantom's frame
     pixels: Array  # (F, 9, 2), column and row
     poses: Array  # (F, 4, 4) m, of the probe's body in the phantom's frame
-
-    def to_wires(self, image_to_body: Array) -> Array:
-        """(F, 9) m from the points, placed by a calibration, to their wires."""
-        start = self.wires[:, 0]
-        along = self.wires[:, 1] - start
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        off = self._placed(image_to_body) - start
-        off -= np.einsum("fwi,wi->fw", off, along)[..., None] * along
-        return np.asarray(np.linalg.norm(off, axis=2))
 
     def to_middles(self, image_to_body: Array) -> Array:
         """(F, 3) m from the middle wires' points to where the ratio says that they lie."""
@@ -148,111 +133,41 @@ def _numbers(text: str) -> list[float]:
     return [float(word) for word in text.split()]
 
 
-def calibrated(recording: Recording, targets: str) -> ProbeCalibration:
-    """The project's calibration on ``wires``, on the ``middle points`` of the Ns, or on ``both``.
-
-    On both, the parallel wires are wires, and the middle ones points.
-    """
-    phantom: dict[str, Array] = {}
-    sightings = []
-    middles = recording.middles()
-    for k, (pixels, matrix) in enumerate(zip(recording.pixels, recording.poses, strict=True)):
-        pose = Pose.from_matrix(matrix)
-        for w, (column, row) in enumerate(pixels.tolist()):
-            is_point = w % 3 == 1 and targets != "wires"
-            if w % 3 != 1 and targets == "middle points":
-                continue
-            name = f"{k}, {w}" if is_point else str(w)
-            phantom[name] = middles[k, w // 3][None] if is_point else recording.wires[w]
-            sightings.append(PixelSighting(name, column, row, pose))
-    return calibrate_probe(sightings, phantom)
-
-
 def measure_nwires(folder: Path, report: ReportFolder) -> Section:
-    """Calibrate and reconstruct from the recordings in ``folder``, and draw them.
+    """Take Plus' errors again, reconstruct from the recordings in ``folder``, and draw both.
 
     Raises:
         UsSimError: a file is missing or cannot be read.
     """
     recordings = {which: read_recording(folder, which) for which in _RECORDINGS}
-    published = read_calibration(folder / _RESULT, "Probe").transforms["ImageToProbe"]
-    matrices, seconds = {"Plus": published}, {}
-    found = {}
-    for targets in ("wires", "middle points", "both"):
-        begun = time.process_time()
-        found[targets] = calibrated(recordings["calibration"], targets)
-        seconds[targets] = time.process_time() - begun
-        matrices[targets] = found[targets].image_to_body
+    matrix = read_calibration(folder / _RESULT, "Probe").transforms["ImageToProbe"]
     said = _xml(folder / _RESULT).find(".//ReprojectionError3DStatistics")
-    stated = {
-        which: float("nan") if said is None else float(said.get(f"{which.capitalize()}MeanMm", ""))
-        for which in recordings
-    }
-    rows = []
-    findings = []
-    for name, matrix in matrices.items():
-        wire = [1e3 * float(recordings[w].to_wires(matrix).mean()) for w in recordings]
-        middle = [1e3 * plus_mean(recordings[w].to_middles(matrix)) for w in recordings]
-        apart = np.linalg.norm(_corners(matrix) - _corners(published), axis=1)
-        farthest = 1e3 * float(apart.max())
-        cells = [f"{mm:.3f}" for mm in (*wire, *middle)]
-        cells += ["", ""] if name == "Plus" else [f"{farthest:.2f}", f"{seconds[name]:.2f}"]
-        rows.append((name, *cells))
-        if name == "Plus":
-            floor = wire[1]
-            findings.append(
-                Finding("nwires", "matrix of Plus", "3-D error, validation", "mm",
-                        stated["validation"], middle[1], middle[1] - stated["validation"])
-            )  # fmt: skip
-            continue
-        fit = f"calibration recording, {name}"
-        for quantity, error, best in (
-            ("point to wire, validation", wire[1], floor),
-            ("3-D error, validation", middle[1], stated["validation"]),
-            ("corner of the image, from that of Plus", farthest, float("nan")),
-        ):
-            findings.append(
-                Finding(
-                    "nwires",
-                    name,
-                    quantity,
-                    "mm",
-                    error=error,
-                    floor=best,
-                    fitted_on=fit,
-                    headline=quantity.startswith("3-D"),
-                )
-            )
+    rows, findings = [], []
+    for which, recording in recordings.items():
+        stated = (
+            float("nan") if said is None else float(said.get(f"{which.capitalize()}MeanMm", ""))
+        )
+        found = 1e3 * plus_mean(recording.to_middles(matrix))
+        rows.append((which, f"{stated:.4f}", f"{found:.4f}"))
+        findings.append(
+            Finding("nwires", "matrix of Plus", f"3-D error, {which}", "mm",
+                    stated, found, found - stated, headline=which == "validation")
+        )  # fmt: skip
     volume = _volume(folder)
     findings += [
         Finding("nwires", "volume", "offset from that of Plus", "mm", error=volume.offset),
         Finding("nwires", "volume", "equal voxels", "%", 100.0, volume.equal, volume.equal - 100.0),
     ]
     file = report.picture("nwires")
-    _draw(file, recordings["validation"], matrices, volume)
+    _draw(file, recordings["validation"].to_middles(matrix), volume)
     text = filled(
         "measured",
         "nwires",
-        table=markdown_table(
-            ["matrix", "to wire, calibration", "to wire, validation", "3-D, calibration",
-             "3-D, validation", "corner", "time, s"],
-            rows,
-        ),
-        stated=", ".join(f"{mm:.3f}" for mm in stated.values()),
-        turned=f"{np.degrees(found['wires'].turned):.0f}",
-        edge=f"{1e3 * found['wires'].edge_deviation:.1f}",
-        uncertain=f"{np.degrees(found['wires'].turn_deviation):.1f}",
-        certain=f"{np.degrees(found['middle points'].turn_deviation):.1f}",
+        table=markdown_table(["recording", "stated by Plus", "found"], rows),
         volume=volume.words(),
         picture=file.name,
-    )  # fmt: skip
+    )
     return Section("N-wires and Plus", text, findings)
-
-
-def _corners(image_to_body: Array) -> Array:
-    """(4, 3) m, of the image of 820 × 616 pixels."""
-    pixels = np.array([[c, r, 0.0, 1.0] for c in (0.0, 819.0) for r in (0.0, 615.0)])
-    return np.asarray((pixels @ image_to_body.T)[:, :3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,22 +232,17 @@ def _volume(folder: Path) -> _Volumes:
     return _Volumes(running, mean, plus, (ours.shape, theirs.shape), seconds)
 
 
-def _draw(
-    file: Path, recording: Recording, matrices: Mapping[str, Array], volumes: _Volumes
-) -> None:
+def _draw(file: Path, errors: Array, volumes: _Volumes) -> None:
     with picture(
         file,
         11.0,
         3.6,
-        "N-wires: errors of calibrations on the validation recording; volumes, brightest voxels",
+        "N-wires: errors of Plus' matrix on the validation recording; volumes, brightest voxels",
     ) as f:
-        errors, ours, plus = f.subplots(1, 3)
-        for name, matrix in matrices.items():
-            mm = 1e3 * np.sort(recording.to_middles(matrix), axis=None)
-            errors.plot(mm, np.linspace(0, 100, mm.size), label=name)
-        errors.set(xlabel="3-D error, mm", ylabel="% of the middle wires' points", xlim=(0, 2))
-        errors.legend(fontsize=8, frameon=False)
-        plain(errors)
+        axes, ours, plus = f.subplots(1, 3)
+        axes.plot(1e3 * np.sort(errors, axis=None), np.linspace(0, 100, errors.size))
+        axes.set(xlabel="3-D error, mm", ylabel="% of the middle wires' points", xlim=(0, 2))
+        plain(axes)
         for panel, grey, title in (
             (ours, volumes.ours, "the project's volume"),
             (plus, volumes.plus, "Plus' volume"),

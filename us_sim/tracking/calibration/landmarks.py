@@ -17,10 +17,9 @@ import csv
 import io
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,10 +162,10 @@ def _cross(vector: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-_MILLIMETRES = 1e-3  # Plus' unit
+_LENGTH = Quantity("length")
 
 
-def read_landmarks(path: str | Path) -> dict[str, NDArray[np.float64]]:
+def read_landmarks(path: str | Path) -> dict[str, Array]:
     """Points (3,) m by name, in the file's order.
 
     Args:
@@ -176,114 +175,58 @@ def read_landmarks(path: str | Path) -> dict[str, NDArray[np.float64]]:
     Raises:
         CalibrationError: the file cannot be read, names a landmark twice or has none.
     """
-    points = _read(Path(path), "landmark", ("Position",), ("x", "y", "z"))
-    return {name: numbers[0] for name, numbers in points.items()}
-
-
-def read_wires(path: str | Path) -> dict[str, NDArray[np.float64]]:
-    """Wires (2, 3) m, both ends, by name.
-
-    Args:
-        path: a CSV with the columns name, x1, y1, z1, x2, y2, z2, or a Plus configuration with the
-            Wire elements of a phantom.
-
-    Raises:
-        CalibrationError: the file cannot be read, names a wire twice or has none.
-    """
-    columns = ("x1", "y1", "z1", "x2", "y2", "z2")
-    return _read(Path(path), "wire", ("EndPointFront", "EndPointBack"), columns)
-
-
-def read_table(
-    path: str | Path, columns: Mapping[str, str], *, label: str
-) -> list[tuple[str, list[float]]]:
-    """Rows of a CSV whose header names at least these columns: the label's text, and numbers.
-
-    Args:
-        path: of the file.
-        columns: their names, and what they hold (length, number, time).
-        label: name of the column with a text.
-
-    Raises:
-        CalibrationError: it cannot be read, or lacks a column, or a cell is no such quantity.
-    """
     path = Path(path)
-    quantities = {name: Quantity(dimension) for name, dimension in columns.items()}
+    named: dict[str, Array] = {}
+    for name, point in _phantom(path) if path.suffix.lower() == ".xml" else _table(path):
+        if not name:
+            raise CalibrationError(f"{path}: a landmark has no name; name all of them")
+        if name in named:
+            raise CalibrationError(f"{path}: landmark {name} is there twice; name each only once")
+        named[name] = point
+    if not named:
+        raise CalibrationError(f"{path}: holds no landmark")
+    return named
+
+
+def _table(path: Path) -> Iterator[tuple[str, Array]]:
+    """Names and points (3,) m of a CSV."""
     try:
         reader = csv.DictReader(io.StringIO(read_text(path, "utf-8-sig")), skipinitialspace=True)
-        header = [name.strip() for name in reader.fieldnames or ()]
-        reader.fieldnames = header
-        missing = [name for name in (label, *columns) if name not in header]
+        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+        missing = [name for name in ("name", *"xyz") if name not in reader.fieldnames]
         if missing:
             raise CalibrationError(
-                f"{path}: has no column {missing[0]}; its first line must be "
-                f"{','.join([label, *columns])}"
+                f"{path}: has no column {missing[0]}; its first line must be name,x,y,z"
             )
-        rows = []
         for row in reader:
-            values = []
-            for name, quantity in quantities.items():
-                try:
-                    values.append(quantity.parse(row[name] or ""))
-                except ValueError as error:
-                    raise CalibrationError(
-                        f"{path}: line {reader.line_num}: {name}: {error}"
-                    ) from error
-            rows.append(((row[label] or "").strip(), values))
+            try:
+                point = np.array([_LENGTH.parse(row[axis] or "") for axis in "xyz"])
+            except ValueError as error:
+                raise CalibrationError(f"{path}: line {reader.line_num}: {error}") from error
+            yield (row["name"] or "").strip(), point
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(f"{path}: is no CSV: {error}") from error
-    return rows
 
 
-def _read(
-    path: Path, what: str, attributes: Sequence[str], columns: Sequence[str]
-) -> dict[str, NDArray[np.float64]]:
-    """(K, 3) m by name, from a Plus configuration's attributes or a CSV's columns."""
-    found: list[tuple[str, Any]]
-    if path.suffix.lower() == ".xml":
-        found = [
-            (element.get("Name", ""), [_vector(path, element, key) for key in attributes])
-            for element in _document(path).iter(what.capitalize())
-        ]
-    else:
-        found = read_table(path, dict.fromkeys(columns, "length"), label="name")
-    named: dict[str, NDArray[np.float64]] = {}
-    for name, value in found:
-        if not name:
-            raise CalibrationError(f"{path}: a {what} has no name; name all of them")
-        if name in named:
-            raise CalibrationError(f"{path}: {what} {name} is there twice; name each only once")
-        named[name] = np.array(value).reshape(-1, 3)
-    if not named:
-        raise CalibrationError(f"{path}: holds no {what}")
-    return named
-
-
-def _document(path: Path) -> ElementTree.Element:
+def _phantom(path: Path) -> Iterator[tuple[str, Array]]:
+    """Names and points (3,) m of a configuration of Plus, which has them in mm."""
     try:
-        text = read_bytes(path)
-        # Entities that expand without end are a known attack; no phantom needs any.
-        if b"<!ENTITY" in text:
-            raise CalibrationError(f"{path}: defines entities, which is not allowed; remove them")
-        return ElementTree.fromstring(text)
+        root = ElementTree.fromstring(read_bytes(path))
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:
         raise CalibrationError(f"{path}: is not XML: {error}") from error
-
-
-def _vector(path: Path, element: ElementTree.Element, key: str) -> NDArray[np.float64]:
-    """(3,) m of an attribute in millimetres."""
-    text = element.get(key, "")
-    try:
-        vector = np.array([float(number) for number in text.split()])
-    except ValueError:
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise CalibrationError(
-            f"{path}: {element.tag} {element.get('Name', '')}: {key} must be 3 numbers in "
-            f"millimetres, not {text!r}"
-        )
-    return vector * _MILLIMETRES
+    for element in root.iter("Landmark"):
+        name, text = element.get("Name", ""), element.get("Position", "")
+        try:
+            x, y, z = map(float, text.split())
+        except ValueError:
+            x = y = z = math.nan
+        point = 1e-3 * np.array([x, y, z])
+        if not np.isfinite(point).all():
+            raise CalibrationError(
+                f"{path}: landmark {name}: Position must be 3 numbers in millimetres, not {text!r}"
+            )
+        yield name, point

@@ -1,4 +1,4 @@
-"""Pivot calibration of a stylus, the landmarks it touches, and the covariance of clustered errors.
+"""Pivot calibration of a stylus, and the landmarks that it touches.
 
 A pose (R, p) of the body puts the tip t at R t + p, which is the same point c for all of them:
 [R  -I] [t; c] = -p, solved at once ("algebraic one-step", Yaniv 2015, Which pivot calibration?).
@@ -23,66 +23,7 @@ from numpy.typing import NDArray
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
 
-ENOUGH_FEATURES = 6
-"""Fewer features are too few clusters: each is divided into parts of the recording."""
-
-_PARTS = 12  # clusters at least, where features are divided
-_OWN = 1e-6
-"""The rest of an error in a direction that a cluster alone determines; its residual is zero."""
-
-
-def cluster_numbers(features: Sequence[str]) -> NDArray[np.intp]:
-    """Which cluster each sighting belongs to (N,): that of its feature, if there are enough.
-
-    Otherwise each feature's sightings are divided, in the order in which they are given, into
-    parts as long as possible: of neighbouring frames one part errs alike.
-    """
-    _, numbers = np.unique(np.array(features), return_inverse=True)
-    count = int(numbers.max()) + 1
-    if count >= ENOUGH_FEATURES:
-        return numbers.astype(np.intp)
-    clusters = np.zeros(len(numbers), np.intp)
-    first = 0
-    for number in range(count):
-        own = np.flatnonzero(numbers == number)
-        parts = np.array_split(own, min(-(-_PARTS // count), len(own)))
-        for k, part in enumerate(parts):
-            clusters[part] = first + k
-        first += len(parts)
-    return clusters
-
-
-def clustered_covariance(
-    jacobian: NDArray[np.float64], residuals: NDArray[np.float64], clusters: NDArray[np.intp]
-) -> NDArray[np.float64]:
-    """Covariance (P, P) of parameters fitted by least squares, errors correlated within clusters.
-
-    The sandwich of Liang and Zeger (1986) with the correction for few clusters of Bell and
-    McCaffrey (2002), CR2 (Pustejovsky and Tipton 2018, equation 11). A wire is not quite where the
-    phantom's drawing says, and neighbouring frames err alike: a thousand sightings tell far less
-    than a thousand independent ones.
-
-    Args:
-        jacobian: (N, D, P) derivatives of each observation's D residuals to the parameters, which
-            they determine.
-        residuals: (N, D) at the minimum.
-        clusters: (N,) from 0, which cluster each observation belongs to.
-    """
-    size = jacobian.shape[2]
-    inverse = np.linalg.inv(np.einsum("nij,nik->jk", jacobian, jacobian))
-    root = np.linalg.cholesky(inverse)
-    pulls = np.empty((int(clusters.max()) + 1, size))
-    for number, pull in enumerate(pulls):
-        own = clusters == number
-        slopes = jacobian[own].reshape(-1, size)
-        left = residuals[own].ravel()
-        # Of the hat matrix's block of this cluster: directions, and the leverage of each.
-        directions, lengths, _ = np.linalg.svd(slopes @ root, full_matrices=False)
-        larger = 1.0 / np.sqrt(np.maximum(1.0 - lengths**2, _OWN)) - 1.0
-        pull[:] = slopes.T @ (left + directions @ (larger * (directions.T @ left)))
-    spread: NDArray[np.float64] = inverse @ (pulls.T @ pulls) @ inverse
-    return spread
-
+Array = NDArray[np.float64]
 
 _WINDOW = 0.2  # s, over which the tip is averaged
 
@@ -91,15 +32,15 @@ _WINDOW = 0.2  # s, over which the tip is averaged
 class Dwell:
     """A place where the tip stayed."""
 
-    position: NDArray[np.float64]  # (3,) m, mean of the first steady second
-    deviations: NDArray[np.float64]  # (3,) m, of its samples
+    position: Array  # (3,) m, mean of the first steady second
+    deviations: Array  # (3,) m, of its samples
     start: float  # s
 
 
 def find_dwells(
-    times: NDArray[np.float64],
-    tips: NDArray[np.float64],
-    rotations: NDArray[np.float64],
+    times: Array,
+    tips: Array,
+    rotations: Array,
     *,
     stillness: float = 1.5e-3,
     swing: float = 0.3,
@@ -138,16 +79,14 @@ def find_dwells(
     return dwells
 
 
-def _diagonal(points: NDArray[np.float64]) -> float:
+def _diagonal(points: Array) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
 
 
-def _swing(rotations: NDArray[np.float64]) -> float:
+def _swing(rotations: Array) -> float:
     """How far the axis swings that swings most, about in rad."""
     return float(np.linalg.norm(np.ptp(rotations, axis=0), axis=0).max())
 
-
-Array = NDArray[np.float64]
 
 _FEWEST = 10  # poses
 _SMALLEST_SWING = math.radians(5.0)  # of the direction that moves least, root mean square

@@ -308,6 +308,42 @@ class CharucoBoard(Settings):
         return RigidBody.charuco(dictionary, **asdict(self))
 
 
+def printed_board(
+    kind: str,
+    size: str | None,
+    dictionary: str,
+    *,
+    marker: float | None,
+    square: float | None,
+    separation: float | None,
+    legacy: bool = False,
+) -> RigidBody:
+    """A board as options of a command describe it.
+
+    Args:
+        kind: charuco or grid.
+        size: columns and rows, as a person writes them: 5x7.
+        dictionary: of the markers.
+        marker, square, separation: m.
+        legacy: a ChArUco board is as OpenCV before 4.6 drew it.
+
+    Raises:
+        TrackingError: an option is missing, or the board is impossible.
+    """
+    lengths = {"marker": marker, "square": square, "separation": separation}
+    needed = ("marker", "square" if kind == "charuco" else "separation")
+    for name, value in (("size", size), *((name, lengths[name]) for name in needed)):
+        if value is None:
+            raise TrackingError(f"--board {kind} needs --{name}")
+    columns, _, rows = str(size).lower().partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise TrackingError(f"--size {size}: write columns and rows, e.g. 5x7")
+    shape, edge = (int(columns), int(rows)), marker or 0.0
+    if kind == "charuco":
+        return RigidBody.charuco(dictionary, *shape, square or 0.0, edge, legacy)
+    return RigidBody.grid(dictionary, *shape, edge, separation or 0.0)
+
+
 _BOARDS = Choice(
     "board",
     key="kind",

@@ -1,4 +1,4 @@
-"""Where the image lies on the probe, from a file: Plus' configuration, or `us-sim calibrate probe`.
+"""Where the image lies on the probe, from a file: Plus' configuration, or YAML.
 
 Plus' XML may hold several transforms (``<Transform From="Image" To="Probe" Matrix=.../>``, mm),
 and the part of an image that is tissue (``<VolumeReconstruction ClipRectangleOrigin=... />``).
@@ -32,7 +32,7 @@ def read_calibration(path: Path, probe: str) -> SweepCalibration:
     """The fixed transforms of a sweep.
 
     Args:
-        path: a configuration of Plus (.xml), or a result of `us-sim calibrate probe` (.yaml).
+        path: a configuration of Plus (.xml), or a matrix ``image_to_body`` (.yaml).
         probe: the frame of the tracked body that the image lies on, for the latter, which does
             not say its name.
 
@@ -121,5 +121,5 @@ def _image_to_body(path: Path, data: bytes) -> NDArray[np.float64]:
     except (TypeError, ValueError) as error:
         raise VolumeError(
             f"{path}: holds no image_to_body, a 4 × 4 matrix from pixels to metres on the tracked "
-            f"body, as `us-sim calibrate probe` writes it"
+            f"body"
         ) from error
