@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.command.calibration_pictures import draw_coverage, draw_offset
 from us_sim.command.calibration_settings import (
     CameraSettings,
     ClockSettings,
@@ -138,7 +137,7 @@ _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".
 
 
 def calibrate_photos(settings: CameraSettings, progress: Progress | None = None) -> str:
-    """Calibrate a camera and write its info and a picture; returns a sentence with the result.
+    """Calibrate a camera and write its info; returns a sentence with the result.
 
     Args:
         settings: the photos, what they show, the camera's name, and the file to write.
@@ -148,7 +147,7 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
         CalibrationError: the photos cannot be read or do not determine the camera, or a file to
             write exists.
     """
-    out, picture = settings.out, settings.picture
+    out = settings.out
     board = printed_board(
         settings.board,
         settings.size,
@@ -171,13 +170,12 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
     notes = _notes(found, f"{settings.board} board {settings.size}", names, views)
     notes |= {"photos_without_board": blank, "photos_left_out": far_off}
     write_camera_info(out, found.camera, settings.name, notes)
-    draw_coverage(picture, found, views, names)
     focal = " and ".join(
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
         for k, intrinsic in enumerate(INTRINSICS[:2])
     )
     said = f"{out}: {focal} pixels, RMS {found.rms:.3f} pixels in {counted(len(views), 'photo')}, "
-    said += f"coverage in {picture}"
+    said += f"corners up to {100 * found.reach:.0f} % of the way to the image's"
     if blank:
         said += f"; {len(blank)} without the board: {', '.join(blank)}"
     if far_off:
@@ -360,12 +358,10 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
 def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
-    A picture of both signals goes beside the file.
-
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
     """
-    out, picture = settings.out, settings.picture
+    out = settings.out
     moving = read_signal(settings.moving, settings.pose, progress=progress)
     name = settings.fixed_pose or settings.pose
     fixed = read_signal(settings.fixed, name, images=settings.images, progress=progress)
@@ -384,10 +380,9 @@ def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -
             },
         },
     )
-    draw_offset(picture, found, moving, fixed)
     return (
         f"{out}: time_offset {1e3 * found.offset:z.1f} ms ± {1e3 * found.deviation:.1f} ms, "
-        f"correlation {found.correlation:.3f} over {found.seconds:.0f} s, signals in {picture}"
+        f"correlation {found.correlation:.3f} over {found.seconds:.0f} s"
     )
 
 

@@ -48,18 +48,6 @@ class CalibrationSettings(Settings):
         if not self.out.absolute().parent.is_dir():
             raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
 
-    @property
-    def picture(self) -> Path:
-        """The picture that goes beside the file.
-
-        Raises:
-            CalibrationError: it exists already.
-        """
-        picture = self.out.with_suffix(".png")
-        if picture.exists():
-            raise CalibrationError(f"{picture}: exists already; choose another name for --out")
-        return picture
-
 
 @dataclass(frozen=True)
 class CameraSettings(CalibrationSettings):
@@ -78,7 +66,7 @@ class CameraSettings(CalibrationSettings):
         description="the ChArUco board is as OpenCV before 4.6 drew it", default=False
     )
     name: str = setting(description="the camera's name in the file", default="camera")
-    out: Path = _out(": camera info; a picture of the coverage goes beside it", "camera.yaml")
+    out: Path = _out(": camera info", "camera.yaml")
 
 
 @dataclass(frozen=True)
@@ -126,4 +114,4 @@ class ClockSettings(CalibrationSettings):
     fixed_pose: str | None = setting(
         description="the same of the fixed recording, where it differs", default=None
     )
-    out: Path = _out(": the offset; a picture of both signals goes beside it", "time.yaml")
+    out: Path = _out(": the offset", "time.yaml")

@@ -27,7 +27,6 @@ from collections import Counter, deque
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import adjoint, product
 from us_sim.tracking.filters import PoseFilter
@@ -42,9 +41,6 @@ _LEAST_JUMP = 0.005
 _BACK, _WINDOW, _JUMPS = 4, 12, 4
 """Poses among which a pose comes back; and of so many in a row, how many have to."""
 
-LARGEST_DEVIATION = 1e3
-"""m or rad: drivers write any large number where they know nothing, and filters lose digits."""
-
 
 class ProbeTracking:
     """Takes a device's measurements and gives the probe's, each once and with its own stamp.
@@ -57,9 +53,6 @@ class ProbeTracking:
         time_offset: s that are added to the device's stamps.
         coast_for: s without a pose after which the state is *coasting*.
         lost_after: s without a pose after which it is *lost*, and the next one starts anew.
-
-    Raises:
-        TrackingError: the times make no sense.
     """
 
     def __init__(
@@ -73,8 +66,6 @@ class ProbeTracking:
         coast_for: float = 0.3,
         lost_after: float = 1.0,
     ) -> None:
-        if not np.isfinite(time_offset):
-            raise TrackingError(f"the time offset of a tracker is {time_offset} s: not finite")
         self._registration, self._calibration = registration, calibration
         self._to_patient = registration.rotation
         self.filter, self._gate = filter, gate
@@ -114,7 +105,7 @@ class ProbeTracking:
         """The probe in ``patient``, or None where the measurement is refused.
 
         Why is then in `last_problem`, and `last_refused` is what it is counted as in `refused`:
-        "order" (not newer than one before), "covariance" (of no distribution) or "gate".
+        "order" (not newer than one before) or "gate".
 
         Args:
             measurement: the tracked body in the device's frame, or the probe in ``patient``.
@@ -122,10 +113,6 @@ class ProbeTracking:
         """
         if not self._in_order(measurement.stamp):
             self.refuse("order", "the pose is not newer than the one before it")
-            return None
-        covariance = measurement.covariance
-        if covariance is not None and not _is_of_a_distribution(covariance):
-            self.refuse("covariance", "the pose's covariance has a negative variance")
             return None
         probe = self._of_probe(measurement)
         self._note_jump(probe.pose.position)
@@ -189,7 +176,6 @@ class ProbeTracking:
         if covariance is not None and not covariance.any():
             covariance = None  # ROS's way to say that nothing is known
         if covariance is not None:
-            covariance = _held_within_sense(covariance)
             # From the body's origin to the probe's, and from the device's axes to the patient's.
             moved = adjoint(Pose(-(self._to_patient @ lever), self._registration.orientation))
             covariance = moved @ covariance @ moved.T
@@ -200,22 +186,3 @@ class ProbeTracking:
             pose=pose,
             covariance=covariance,
         )
-
-
-def _is_of_a_distribution(covariance: NDArray[np.float64]) -> bool:
-    """Whether a symmetric matrix has no negative eigenvalue but for rounding."""
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        variances = np.linalg.eigvalsh(covariance)
-        return bool(variances[0] >= -1e-9 * abs(variances[-1]))
-    return True
-
-
-def _held_within_sense(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The covariance with its larger deviations brought to the largest; correlations stay."""
-    deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    if deviations.max() <= LARGEST_DEVIATION:
-        return covariance
-    scale = np.minimum(1.0, LARGEST_DEVIATION / np.maximum(deviations, 1e-300))
-    return covariance * np.outer(scale, scale)

@@ -32,32 +32,36 @@ def test_dictionaries_are_known_by_opencvs_names():
     assert family("APRILTAG_36h11") == "APRILTAG_36h11"
     small, large = dictionary("5X5_50").bytesList, dictionary("5X5_1000").bytesList
     assert np.array_equal(small, large[:50])
-    with pytest.raises(TrackingError, match=r"8X8_50.* 4X4_50"):
-        RigidBody.single("8X8_50", 0, 0.04)
+
+
+def body_of(*corners, ids=(1,)):
+    return RigidBody("4X4_50", np.array(ids), *corners)
 
 
 @pytest.mark.parametrize(
-    ("body", "sentence"),
+    ("make", "arguments", "word"),
     [
-        (lambda: RigidBody.single("4X4_50", 50, 0.04), "only markers 0 to 49"),
-        (lambda: RigidBody.single("4X4_50", 0, 40), r"did you mean '40 mm'"),
-        (lambda: RigidBody.grid("4X4_50", 8, 7, 0.04, 0.01), "marker 50: dictionary"),
-        (lambda: RigidBody.grid("4X4_50", 0, 7, 0.04, 0.01), "columns are 0"),
-        (lambda: RigidBody.grid("4X4_50", 2, 2, 0.04, -1), "separation of a board's markers is -1"),
-        (lambda: RigidBody.charuco("4X4_50", 5, 7, 0.02, 0.04), "must be smaller than its squares"),
-        (lambda: RigidBody("4X4_50", np.array([1]), np.zeros((1, 4, 3))), "length of an edge"),
-        (lambda: RigidBody("4X4_50", np.array([1]), np.zeros((4, 3))), "4 corners of 3"),
-        (
-            lambda: RigidBody("4X4_50", np.array([1]), CORNERS[:, [0, 2, 1, 3]]),
-            r"marker 1: .*convex",
-        ),
-        (lambda: RigidBody("4X4_50", np.array([1]), CORNERS + BEND), "not in one plane"),
-        (lambda: RigidBody("4X4_50", np.array([1, 1]), CORNERS.repeat(2, 0)), "marker 1 .*twice"),
+        (RigidBody.single, ("4X4_50", 50, 0.04), "0 to 49"),
+        (RigidBody.single, ("4X4_50", 0, 40), "40 mm"),
+        (RigidBody.single, ("8X8_50", 0, 0.04), "4X4_50"),
+        (RigidBody.grid, ("4X4_50", 8, 7, 0.04, 0.01), "50"),
+        (RigidBody.grid, ("4X4_50", 0, 7, 0.04, 0.01), "columns"),
+        (RigidBody.grid, ("4X4_50", 2, 2, 0.04, -1), "separation"),
+        (RigidBody.charuco, ("4X4_50", 5, 7, 0.02, 0.04), "smaller"),
+        (body_of, (np.zeros((1, 4, 3)),), "edge"),
+        (body_of, (np.zeros((4, 3)),), "corners"),
+        (body_of, (CORNERS[:, [0, 2, 1, 3]],), "convex"),
+        (body_of, (CORNERS + BEND,), "plane"),
     ],
 )
-def test_an_impossible_body_is_refused(body, sentence):
-    with pytest.raises(TrackingError, match=sentence):
-        body()
+def test_an_impossible_body_is_refused(make, arguments, word):
+    with pytest.raises(TrackingError, match=word):
+        make(*arguments)
+
+
+def test_a_marker_is_in_a_body_once():
+    with pytest.raises(TrackingError, match="twice"):
+        body_of(CORNERS.repeat(2, 0), ids=(1, 1))
 
 
 def test_a_table_of_millimetres_is_read(tmp_path):
@@ -88,13 +92,6 @@ aruco_bc_markers:
     body = read_rigid_body(path)
     assert (body.dictionary, body.ids.tolist()) == ("ARUCO_MIP_36h12", [81])
     assert np.allclose(body.corners, RigidBody.single("ARUCO_MIP_36h12", 81, 0.04).corners)
-    known = path.read_text()
-    path.write_text(known.replace("id: 81", f"id: {2**70}"))
-    with pytest.raises(TrackingError, match=f"marker {2**70}"):
-        read_rigid_body(path)
-    path.write_text(known.replace("InfoType: 1", "InfoType: 0"))
-    with pytest.raises(TrackingError, match="in pixels"):
-        read_rigid_body(path)
 
 
 def test_markers_are_placed_by_their_poses(tmp_path):
@@ -126,35 +123,33 @@ def test_boards_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "sentence"),
+    ("name", "text", "word"),
     [
-        ("a.txt", "", "there is no marker in it"),
-        ("a.txt", "1 2 3", "line 1: a marker has 16 numbers"),
-        ("a.txt", f"inf{' 0' * 15}", "line 1: a marker has 16 numbers"),
-        ("a.txt", f"1e30{' 0' * 15}", "markers 0 to 1023"),
-        ("a.txt", "# markers\none 2 3", "line 2: 'one 2 3'"),
-        ("a.yaml", "[1]", "must be a mapping"),
-        ("a.yaml", "{a: [", "not a YAML file"),
-        ("a.yaml", "dictionary: 4X4_50", "give a list of markers, or a board"),
-        ("a.yaml", "{markers: [], sizes: 3}", "sizes: unknown key"),
-        ("a.yaml", "markers: []", "give a list of markers"),
-        ("a.yaml", "markers: [{size: 30 mm}]", r"markers\[0\].id: is missing"),
-        ("a.yaml", "markers: [{id: 1, size: 30}]", r"markers\[0\].size: .*did you mean '30 mm'"),
-        ("a.yaml", "markers: [{id: 1, size: 0.03, position: 3}]", "position: must be a list"),
-        ("a.yaml", "markers: [{id: 1, size: 0.03, orientation: [0, 0, 0, 0]}]", "is zero"),
-        ("a.yaml", "markers: [{id: 1, corners: [[0, 0, 0]]}]", "corners: needs 4 values, not 1"),
-        ("a.yaml", "board: {kind: chess}", "'chess' is not one of grid, charuco"),
-        ("a.yaml", "board: {kind: grid, columns: 2}", "board.rows: is missing"),
-        (
-            "a.yaml",
-            "board: {kind: grid, columns: 2.5, rows: 2, size: 0.03, separation: 0.01}",
-            "2.5 is not a whole number",
-        ),
-        ("a.yaml", "{dictionary: 9X9, markers: [{id: 1, size: 0.03}]}", "dictionary '9X9'"),
+        ("a.txt", "", "16 numbers"),
+        ("a.txt", f"1{' 0' * 7}\n" * 2, "16 numbers"),
+        ("a.txt", "1 2 3", "16 numbers"),
+        ("a.txt", f"inf{' 0' * 15}", "16 numbers"),
+        ("a.txt", f"1e15{' 0' * 15}", "0 to 1023"),
+        ("a.txt", "# markers\none 2 3", "one"),
+        ("a.yaml", "[1]", "mapping"),
+        ("a.yaml", "{a: [", "YAML"),
+        ("a.yaml", "dictionary: 4X4_50", "markers"),
+        ("a.yaml", "{markers: [], sizes: 3}", "sizes"),
+        ("a.yaml", "markers: []", "markers"),
+        ("a.yaml", "markers: [{size: 30 mm}]", r"markers\[0\].id"),
+        ("a.yaml", "markers: [{id: 1, size: 30}]", "30 mm"),
+        ("a.yaml", "markers: [{id: 1, size: 0.03, position: 3}]", "position"),
+        ("a.yaml", "markers: [{id: 1, size: 0.03, orientation: [0, 0, 0, 0]}]", "orientation"),
+        ("a.yaml", "markers: [{id: 1, corners: [[0, 0, 0]]}]", "corners"),
+        ("a.yaml", "board: {kind: chess}", "chess"),
+        ("a.yaml", "board: {kind: grid, columns: 2}", "board.rows"),
+        ("a.yaml", "{dictionary: 9X9, markers: [{id: 1, size: 0.03}]}", "9X9"),
+        ("a.yaml", "{aruco_bc_mInfoType: 0, aruco_bc_markers: []}", "pixels"),
+        ("a.yaml", "{aruco_bc_mInfoType: 1, aruco_bc_markers: [{id: 1}]}", "corners"),
     ],
 )
-def test_a_bad_file_is_refused(name, text, sentence, tmp_path):
+def test_a_bad_file_is_refused(name, text, word, tmp_path):
     path = tmp_path / name
     path.write_text(text)
-    with pytest.raises(TrackingError, match=f"{name}: .*{sentence}"):
+    with pytest.raises(TrackingError, match=f"{name}: .*{word}"):
         read_rigid_body(path)

@@ -148,8 +148,6 @@ class TimeOffset:
     correlation: float  # there; its sign says whether the two count in the same direction
     residual: float  # of the fixed signal's standard deviation, what the moving leaves unexplained
     seconds: float  # how long both were compared
-    tried: NDArray[np.float64]  # (N,) s
-    correlations: NDArray[np.float64]  # (N,) at these
 
 
 def find_time_offset(
@@ -191,8 +189,7 @@ def find_time_offset(
     spread = np.asarray(without) - np.mean(without)
     deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * (spread**2).sum()))
     residual = float(np.sqrt(max(1.0 - correlation**2, 0.0)))
-    fit = (sign * shift, deviation, correlation, residual)
-    return TimeOffset(*fit, float(np.ptp(times)), sign * tried, correlations)
+    return TimeOffset(sign * shift, deviation, correlation, residual, float(np.ptp(times)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -421,27 +421,17 @@ def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> Rig
 
 
 def _table(text: str, dictionary: str) -> RigidBody:
-    ids, corners = [], []
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.replace(",", " ").split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            raise TrackingError(
-                f"line {number}: {line.strip()!r} is not a row of numbers"
-            ) from None
-        if len(values) != 16 or not values[0].is_integer():
-            raise TrackingError(
-                f"line {number}: a marker has 16 numbers (its number, the middle and four corners "
-                f"in mm), not {len(values)}"
-            )
-        ids.append(int(values[0]))
-        corners.append(np.reshape(values[4:], (4, 3)) * 1e-3)
-    if not ids:
-        raise TrackingError("there is no marker in it")
-    return RigidBody(dictionary, np.array(ids), np.array(corners))
+    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    try:
+        rows = np.array([line for line in lines if line], dtype=np.float64)
+        if rows.shape[1:] != (16,):
+            raise ValueError(f"not {rows.shape[-1]}")
+        ids = np.array([int(number) for number in rows[:, 0]])
+    except (ValueError, OverflowError) as error:
+        raise TrackingError(
+            f"a marker is a line of 16 numbers, its own, the middle and four corners in mm: {error}"
+        ) from error
+    return RigidBody(dictionary, ids, rows[:, 4:].reshape(-1, 4, 3) * 1e-3)
 
 
 def _yaml(text: str) -> Mapping[str, Any]:
@@ -466,10 +456,14 @@ def _marker_map(content: Mapping[str, Any], dictionary: str) -> RigidBody:
     named = content.get("aruco_bc_dict")
     if named is not None:
         dictionary = _PLUS_DICTIONARIES.get(str(named).upper(), str(named))
-    markers = _list(content, "aruco_bc_markers")
-    ids = [_number(marker, f"aruco_bc_markers[{i}]") for i, marker in enumerate(markers)]
-    corners = [_corners(marker, f"aruco_bc_markers[{i}]") for i, marker in enumerate(markers)]
-    return RigidBody(dictionary, np.array(ids), np.array(corners))
+    try:
+        ids = [marker["id"] for marker in content["aruco_bc_markers"]]
+        corners = np.array([marker["corners"] for marker in content["aruco_bc_markers"]], float)
+    except (TypeError, KeyError, ValueError) as error:
+        raise TrackingError(
+            f"aruco_bc_markers must be a list, of id and 4 × 3 corners in metres each ({error})"
+        ) from error
+    return RigidBody(dictionary, np.array(ids), corners)
 
 
 def _body(path: Path, content: Mapping[str, Any], dictionary: str) -> RigidBody:
@@ -480,27 +474,3 @@ def _body(path: Path, content: Mapping[str, Any], dictionary: str) -> RigidBody:
         return board.body(dictionary)
     corners = np.array([marker.points for marker in body.markers])
     return RigidBody(dictionary, np.array([marker.id for marker in body.markers]), corners)
-
-
-def _list(content: Mapping[str, Any], key: str) -> list[Any]:
-    items = content[key]
-    if not isinstance(items, list) or not items:
-        raise TrackingError(f"{key}: it must be a list of markers")
-    return items
-
-
-def _number(marker: Any, where: str) -> int:
-    number = marker.get("id") if isinstance(marker, Mapping) else None
-    if not isinstance(number, int) or isinstance(number, bool):
-        raise TrackingError(f"{where}.id: {number!r} is not a marker's number")
-    return number
-
-
-def _corners(marker: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    try:
-        corners = np.array(marker.get("corners"), dtype=np.float64)
-    except (TypeError, ValueError):
-        corners = np.empty(0)
-    if corners.shape != (4, 3):
-        raise TrackingError(f"{where}.corners: they must be 4 × 3 numbers in metres")
-    return corners
