@@ -223,12 +223,10 @@ def test_a_model_survives_its_message():
     np.testing.assert_allclose(back.pose.matrix, pose.matrix, atol=1e-15)
     np.testing.assert_array_equal(back.wrench, model.wrench)
     np.testing.assert_array_equal(back.stiffness, model.stiffness)
-    message.data[20] = float("nan")
-    with pytest.raises(TrackingError, match="51 finite numbers"):
-        contact_model_from(message)
-    message.data[20] = 7.0
-    with pytest.raises(TrackingError, match="not symmetric"):
-        contact_model_from(message)
+    for wrong in (float("nan"), 1e300):
+        message.data[20] = wrong
+        with pytest.raises(TrackingError, match="51 numbers"):
+            contact_model_from(message)
 
 
 @pytest.mark.parametrize("frame", ["", "arm", "base_link", "a_longer_name_of_a_frame"])

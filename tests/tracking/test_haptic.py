@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tissue_block import block
 
-from us_sim.errors import TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.solvers.solver import create_solver
@@ -111,29 +110,6 @@ def test_a_light_touch_ends_without_a_kick(seed):
         deeper = max(0.0, -float(slope @ light.displacement(here)))
         along = float(light.wrench_at(here)[:3] @ light.push)
         assert abs(along) <= (2.5 * size + deeper) * (1 + 1e-9)
-
-
-def test_without_contact_nothing_is_felt_anywhere():
-    model = ContactModel(0, Pose(), np.zeros(6), np.zeros((6, 6)))
-    np.testing.assert_array_equal(model.wrench_at(Pose([0.0, 0.0, 1.0])), 0.0)
-    np.testing.assert_array_equal(model.push, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("wrench", "stiffness", "sentence"),
-    [
-        (np.zeros(3), np.zeros((6, 6)), "6 numbers"),
-        (np.zeros(6), np.zeros((3, 3)), "6 by 6"),
-        (np.full(6, np.nan), np.zeros((6, 6)), "not finite"),
-        (np.zeros(6), np.full((6, 6), np.inf), "not finite"),
-        (np.full(6, 1e9), np.zeros((6, 6)), "1e\\+09 N"),
-        (np.zeros(6), 1e12 * np.eye(6), "1e\\+12 N/m"),
-        (np.zeros(6), np.triu(np.ones((6, 6))), "not symmetric"),
-    ],
-)
-def test_a_model_that_cannot_be_is_refused(wrench, stiffness, sentence):
-    with pytest.raises(TrackingError, match=sentence):
-        ContactModel(0, Pose(), wrench, stiffness)
 
 
 def test_a_secant_is_the_springs_along_the_push():

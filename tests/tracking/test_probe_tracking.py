@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.errors import PoseError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import FILTERS
@@ -206,29 +205,6 @@ def test_after_a_reset_it_waits():
     assert take(tracked, at(-500, 4.0))[0].pose.position[0] == 4.0
 
 
-def test_a_plane_without_covariance_is_still_a_distribution():
-    """Drivers that know the position only leave zeros for the rotation."""
-    half_known = np.diag([1e-6] * 3 + [0.0] * 3)
-    tracked = tracking("kalman", GateSettings())
-    answers = take(tracked, *(at(10 * k, covariance=half_known) for k in range(50)))
-    assert all(answers)
-
-
-def test_poses_that_never_were_are_counted_beside_the_others():
-    tracked = tracking()
-    for position, orientation in (
-        ([np.nan, 0, 0], [0, 0, 0, 1]),
-        ([0, 0, 0], [0, 0, 0, 0]),
-        ([0, 0, 0], [0, 0, np.inf, 1]),
-    ):
-        with pytest.raises(PoseError) as error:
-            Pose(position, orientation)
-        tracked.refuse("pose", str(error.value))
-    assert tracked.refused == {"pose": 3}
-    assert "not finite" in tracked.last_problem
-    assert tracked.state(0) is TrackingState.WAITING
-
-
 @pytest.fixture(scope="module")
 def recorded(shared_file):
     """Seconds and (4, 4) matrices, mm, of the transforms of a PLUS recording of 500 samples.
@@ -275,22 +251,3 @@ def test_outliers_of_a_real_tracker_are_refused_and_counted(recorded, method, na
         if answer is not None
     ]
     assert max(off) < 0.02  # m: no filter drags an outlier along
-
-
-def test_a_matrix_of_zeros_is_no_pose(recorded):
-    """A matrix of PLUS where a transform could not be computed, in a real stream of poses."""
-    times, matrices = recorded
-    tracked = tracking("one_euro", GateSettings())
-    for k in range(8, 108):
-        matrix = matrices["ProbeToTrackerTransform"][k].copy()
-        if k % 10 == 0:
-            matrix[:] = 0.0
-        try:
-            pose = Pose.from_matrix(matrix)
-        except PoseError as error:
-            tracked.refuse("pose", str(error))
-            continue
-        pose = Pose(1e-3 * pose.position, pose.orientation)
-        stamp = round(1e9 * times[k])
-        assert tracked.take(Measurement(stamp, pose), stamp) is not None
-    assert tracked.refused == {"pose": 10}

@@ -96,6 +96,7 @@ def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> by
     return CDR_LITTLE_ENDIAN + head + wrench.astype("<f8").tobytes()
 
 
+_LARGEST_OF_CONTACT = 1e10  # N, N/m or s: products of larger ones would end in a hand as infinite
 _CONTACT_PARTS = (("stamp", 2), ("pose", 7), ("wrench", 6), ("stiffness", 36))
 """Numbers of a contact model: seconds and nanoseconds; position and quaternion of the probe;
 force and torque; six rows of six."""
@@ -122,10 +123,11 @@ def contact_model_from(message: Float64MultiArray) -> ContactModel:
     """
     parts = tuple((dimension.label, dimension.size) for dimension in message.layout.dim)
     values = np.array(message.data, dtype=np.float64)
-    if parts != _CONTACT_PARTS or len(values) != 51 or not np.isfinite(values).all():
+    is_sound = len(values) == 51 and bool((np.abs(values) <= _LARGEST_OF_CONTACT).all())
+    if parts != _CONTACT_PARTS or not is_sound:
         raise TrackingError(
             f"a model of the contact needs {', '.join(f'{n} of {k}' for k, n in _CONTACT_PARTS)}, "
-            f"51 finite numbers in all, not {len(values)} in {list(parts)}"
+            f"51 numbers of a sensible size in all, not {len(values)} in {list(parts)}"
         )
     stamp = nanoseconds_since(int(values[0]), int(values[1]))
     try:

@@ -90,16 +90,6 @@ def test_the_same_arguments_give_the_same_bytes(camera, marker):
     assert (first != marker.render(pose, worst, 6, motion)).mean() > 0.5
 
 
-def test_the_light_falls_by_the_gradient(marker):
-    pose = Pose([0.0, 0.0, 0.3], FACING)
-    even = Conditions(defocus=0, read_noise=0, shot_noise=0)
-    full = marker.render(pose, even).astype(float)
-    dimmed = marker.render(pose, Conditions(0, 0, 0, gradient=0.6), seed=2)
-    share = (dimmed / full)[full > 60]
-    assert share.min() == pytest.approx(0.4, abs=0.02)
-    assert share.max() == pytest.approx(1.0, abs=0.02)
-
-
 def test_a_hand_covers_a_share_of_the_marker(camera, marker):
     pose = Pose([0.0, 0.0, 0.25], FACING)
     corners = camera.project(pose.apply(marker.body.corners[0]))

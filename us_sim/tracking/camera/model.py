@@ -137,11 +137,10 @@ class CameraModel:
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         if not len(pixels):
             return np.empty((0, 2))
-        undistort: Any = cv2.undistortPoints
+        # OpenCV 4 has a function of its own for criteria.
+        undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
         if self._is_fisheye:
             undistort = cv2.fisheye.undistortPoints
-        elif hasattr(cv2, "undistortPointsIter"):  # of OpenCV 4, whose other one has no criteria
-            undistort = cv2.undistortPointsIter
         more = {"R": None, "P": None, "criteria": _UNDISTORTING}
         found = undistort(pixels, self.matrix, self.distortion, **more)
         rays: NDArray[np.float64] = np.array(found, dtype=np.float64).reshape(-1, 2)
