@@ -163,34 +163,34 @@ def test_axes_are_put_in_any_order():
 
 
 @pytest.mark.parametrize(
-    ("bad", "sentence"),
+    ("bad", "word"),
     [
         ([0.0] * 5, "5 axes"),
-        ([], "the message has 0 axes"),
-        (axes(y=math.nan), "are not finite"),
-        (axes(rz=-math.inf), "are not finite"),
-        (axes(rx=-1.4), "axis 3 is -1.4"),
+        ([], "0 axes"),
+        (axes(y=math.nan), "finite"),
+        (axes(rz=-math.inf), "finite"),
+        (axes(rx=-1.4), "-1.4"),
     ],
 )
-def test_a_message_that_cannot_be_used_changes_nothing(bad, sentence):
+def test_a_message_that_cannot_be_used_changes_nothing(bad, word):
     device = mouse()
     drive(device, axes(x=1.0), 0.5)
     assert device.axes(bad, [1], 505 * MS) is None
-    assert sentence in device.last_problem
+    assert word in device.last_problem
     probe = device.axes(axes(x=1.0), (), 510 * MS)
     assert probe.pose.position[0] == pytest.approx(0.051)
 
 
 @pytest.mark.parametrize(
-    ("setting", "sentence"),
+    ("setting", "word"),
     [
-        ({"reach": (0.1, 0.1)}, "six_dof_mouse.reach: .*3 values"),
-        ({"axes": (0, 1, 2, 3, 4, 4)}, "six different whole numbers"),
-        ({"clutch_button": 1}, "reset_button: 1 is the clutch already"),
-        ({"home": (1.0, 0.0, 0.0)}, "is outside the workspace"),
-        ({"home_orientation": (0, 0, 0, 0)}, "is no orientation"),
+        ({"reach": (0.1, 0.1)}, "3 values"),
+        ({"axes": (0, 1, 2, 3, 4, 4)}, "different"),
+        ({"clutch_button": 1}, "reset_button"),
+        ({"home": (1.0, 0.0, 0.0)}, "workspace"),
+        ({"home_orientation": (0, 0, 0, 0)}, "orientation"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(setting, sentence):
-    with pytest.raises(TrackingError, match=sentence):
+def test_settings_that_make_no_sense_are_refused(setting, word):
+    with pytest.raises(TrackingError, match=word):
         SixDofMouseSettings(**setting)

@@ -102,15 +102,15 @@ def test_a_fake_trackers_landmarks_give_plus_published_registration():
 @pytest.mark.parametrize(
     ("measured", "known", "problem"),
     [
-        (CORNERS[:2], CORNERS[:2], "at least 3 landmarks, not 2"),
-        (CORNERS[:3], CORNERS, "not 3 and 5"),
-        (CORNERS * [1, 0, 0], CORNERS * [1, 0, 0], "measured landmarks lie on a line"),
-        (CORNERS, CORNERS * [1, 0, 0], "known landmarks lie on a line"),
-        (CORNERS * 0, CORNERS, "lie on a line"),
-        (CORNERS * 1000, CORNERS, "1e\\+03 times as far apart.*metres"),
-        (CORNERS[::-1], CORNERS, "do not fit.*check their order"),
-        (CORNERS * [-1, 1, 1], CORNERS, "do not fit.*mirrored"),
-        (np.where(CORNERS == 0.03, np.nan, CORNERS), CORNERS, "landmark 4: its measured"),
+        (CORNERS[:2], CORNERS[:2], "at least 3"),
+        (CORNERS[:3], CORNERS, "3 and 5"),
+        (CORNERS * [1, 0, 0], CORNERS * [1, 0, 0], "measured .*line"),
+        (CORNERS, CORNERS * [1, 0, 0], "known .*line"),
+        (CORNERS * 0, CORNERS, "line"),
+        (CORNERS * 1000, CORNERS, "metres"),
+        (CORNERS[::-1], CORNERS, "order"),
+        (CORNERS * [-1, 1, 1], CORNERS, "mirrored"),
+        (np.where(CORNERS == 0.03, np.nan, CORNERS), CORNERS, "landmark 4"),
     ],
 )
 def test_what_cannot_determine_a_registration_is_refused(measured, known, problem):

@@ -136,42 +136,33 @@ def test_a_large_image_is_searched_at_its_full_resolution_where_need_be():
         assert np.linalg.norm(seen.pose.position - true.position) < 0.01 * distance
 
 
-def refused(image, sentence, body=MARKER, **settings):
+def refused(image, word, body=MARKER, **settings):
     source = CameraSource(WEBCAM, body, CameraSettings(**settings))
     assert source.measure(image, 0) is None
-    assert sentence in source.last_problem
-    return source
+    assert word in source.last_problem
+    assert source.seen == 0
 
 
 def test_images_without_the_marker_say_what_is_there(image):
-    refused(np.zeros((480, 640), np.uint8), "which is black: uncover the lens or add light")
-    refused(np.full((480, 640), 200, np.uint8), "no marker of the body of 4X4_50 is in the image")
-    refused(image, "only 1 marker that the body lacks (7)", RigidBody.single("4X4_50", 8, 0.04))
+    refused(np.zeros((480, 640), np.uint8), "black")
+    refused(np.full((480, 640), 200, np.uint8), "4X4_50")
+    refused(image, "lacks (7)", RigidBody.single("4X4_50", 8, 0.04))
     source = CameraSource(WEBCAM, RigidBody.single("6X6_250", 7, 0.04))
     for _ in range(3):
         assert source.measure(image, 0) is None
-    assert "but 1 marker of 4X4_1000 (7): check camera.dictionary" in source.last_problem
+    assert "4X4_1000 (7)" in source.last_problem
 
 
-def test_two_copies_of_a_marker_are_refused(image):
-    doubled = image.copy()
-    doubled[:, 320:] = image[:, 240:560]
-    doubled[:, :320] = image[:, 240:560]
-    refused(doubled, "two copies of marker 7: none is used")
-
-
-def test_a_marker_seen_from_the_side_is_refused(scene):
-    side = [
-        Pose([0.0, 0.0, 0.15], (turned([1, 0, 0], np.pi + np.radians(angle))).orientation)
-        for angle in (78.0, 85.0)
-    ]
-    source = refused(
-        scene.render(side[0], ORDINARY), "is seen at 78° from its normal, beyond the 75°"
+def test_what_the_marker_cannot_be_measured_by_is_refused(scene, image):
+    doubled = np.concatenate([image[:, 240:560]] * 2, axis=1)
+    refused(doubled, "two copies")
+    for angle, word in ((78.0, "78°"), (85.0, "")):
+        turn = turned([1, 0, 0], np.pi + np.radians(angle)).orientation
+        refused(scene.render(Pose([0.0, 0.0, 0.15], turn), ORDINARY), word)
+    both = np.concatenate([MARKER.corners, MARKER.corners + 0.1])
+    refused(
+        image, "minimum_markers", RigidBody("4X4_50", np.array([7, 8]), both), minimum_markers=2
     )
-    assert source.seen == 0
-    source = CameraSource(WEBCAM, MARKER)
-    assert source.measure(scene.render(side[1], ORDINARY), 0) is None
-    assert source.last_problem
 
 
 def test_a_wrong_size_of_one_of_three_markers_is_left_out():
@@ -194,18 +185,11 @@ def test_a_body_that_is_not_as_its_file_says_is_refused():
     refused(image, "camera.reprojection_limit", RigidBody("4X4_50", grip.ids, wrong))
 
 
-def test_too_few_markers_are_refused(image):
-    body = RigidBody(
-        "4X4_50", np.array([7, 8]), np.concatenate([MARKER.corners, MARKER.corners + 0.1])
-    )
-    refused(image, "1 marker of the body is seen, fewer than the 2", body, minimum_markers=2)
-
-
 def test_an_image_of_another_camera_is_refused(image):
     source = CameraSource(WEBCAM, MARKER)
-    with pytest.raises(TrackingError, match=r"320 × 240.* 640 × 480"):
+    with pytest.raises(TrackingError, match="320 × 240"):
         source.measure(image[:240, :320], 0)
-    with pytest.raises(TrackingError, match="must be grey uint8"):
+    with pytest.raises(TrackingError, match="grey"):
         source.measure(image.astype(np.float32), 0)
 
 
@@ -221,14 +205,6 @@ def test_corners_are_exact_to_a_tenth_of_a_pixel(scene):
     for true in random_views(10, 0.4, (0.0, 60.0), seed=9):
         points, pixels = detect_corners(scene.render(true, ORDINARY), MARKER)
         assert np.abs(pixels - WEBCAM.project(true.apply(points))).max() < 0.1
-
-
-def test_the_same_images_give_the_same_poses(image):
-    def run():
-        source = CameraSource(WEBCAM, MARKER)
-        return [source.measure(image, k * FRAME).pose.matrix.tobytes() for k in range(3)]
-
-    assert run() == run()
 
 
 @pytest.mark.parametrize(

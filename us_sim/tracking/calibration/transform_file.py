@@ -62,11 +62,6 @@ def read_transform(path: str | Path) -> Pose:
         document = _document(path)
         written = {key: document[key] for key in ("position", "orientation") if key in document}
         place = Reader(str(path), error=CalibrationError).read(_Written, written)
-        residuals = document.get("residuals", {})
-        if not isinstance(residuals, dict):
-            raise CalibrationError(
-                f"{path}: residuals: must be a mapping of names, not {residuals!r}"
-            )
         return Pose(np.array(place.position), np.array(place.orientation))
     except VolumeError as error:
         raise CalibrationError(str(error)) from error
@@ -127,13 +122,9 @@ def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
 def _document(path: Path) -> dict[str, Any]:
     try:
         document = load_yaml(read_text(path))
-    except FileNotFoundError:
-        raise CalibrationError(
-            f"{path}: there is no such file; `us-sim calibrate` writes transforms"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot be read: {error}") from error
-    except YamlError as error:
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, YamlError) as error:
         raise CalibrationError(f"{path}: {error}") from error
     if not isinstance(document, dict):
         raise CalibrationError(
