@@ -132,7 +132,7 @@ _SAME = 1.0 + 2.0 * np.cos(np.radians(1.0))  # trace of the rotation between pos
 _TRIED = 3  # markers from which a pose is guessed
 _REFINED = 3  # guesses that are refined
 _ITERATIONS = 25
-_STEADY = 1e-6  # of the misfit: a gain after which the pose moves by a thousandth of its deviation
+_STEADY = 1e-5  # of the misfit: a gain after which a pose moves by less than a hundredth deviation
 _DETERMINED = 1e-9  # least eigenvalue of the normal matrix with a unit diagonal
 _HUBER = 2.0  # standard deviations beyond which a corner pulls no harder
 
@@ -188,13 +188,14 @@ def body_poses(
         return []
     places = np.concatenate([points @ turn.T + place for turn, place in guesses])
     offsets = camera.project(places).reshape(-1, len(points), 2) - pixels
-    misfits = [_misfit(each, deviation) for each in offsets]
+    misfits = [_misfit(_lengths(each, deviation)) for each in offsets]
     found: list[BodyPose] = []
     for i in np.argsort(misfits, kind="stable")[: _REFINED + 1].tolist():
         if not np.isfinite(misfits[i]):
             break
         turn, place = guesses[i]
-        pose = _refined(camera, points, pixels, turn, place, deviation, found)
+        known = [each.pose.rotation for each in found]
+        pose = _refined(camera, points, pixels, turn, place, deviation, known)
         if pose is not None:
             found.append(pose)
     return sorted(found, key=lambda each: each.misfit)[:2]
@@ -227,12 +228,15 @@ def _guesses(
     return [each for group in groups[:_TRIED] for each in plane_poses(points[group], rays[group])]
 
 
-def _misfit(residuals: NDArray[np.float64], deviation: float) -> float:
-    """Huber's loss, in deviations; infinite where a point is not before the camera."""
-    squares = np.einsum("ij,ij->i", residuals, residuals) / deviation**2
-    lengths = np.sqrt(squares)
-    loss = np.where(lengths <= _HUBER, squares, 2 * _HUBER * lengths - _HUBER**2)
-    total = float(loss.sum())
+def _lengths(residuals: NDArray[np.float64], deviation: float) -> NDArray[np.float64]:
+    """(N,) of residuals (N, 2), in deviations."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", residuals, residuals)) / deviation)
+
+
+def _misfit(lengths: NDArray[np.float64]) -> float:
+    """Huber's loss; infinite where a point is not before the camera."""
+    near = np.minimum(lengths, _HUBER)
+    total = float((near * (2.0 * lengths - near)).sum())
     return total if np.isfinite(total) else np.inf
 
 
@@ -243,7 +247,7 @@ def _refined(
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
     deviation: float,
-    known: list[BodyPose],
+    known: list[NDArray[np.float64]],
 ) -> BodyPose | None:
     """Descend to the pose of least misfit: Levenberg-Marquardt on SE(3) with Huber's weights.
 
@@ -251,22 +255,22 @@ def _refined(
     the inverse of the normal matrix is the covariance as ROS has it.
 
     Returns:
-        None where that leads to a known pose or behind the camera, or the points do not determine
-        a pose.
+        None where that leads to a known rotation or behind the camera, or the points do not
+        determine a pose.
     """
     misfit, damping = np.inf, 1e-4
     for _ in range(_ITERATIONS + 1):
-        if any(np.vdot(rotation, other.pose.rotation) > _SAME for other in known):
+        if any(np.vdot(rotation, other) > _SAME for other in known):
             return None
         seen, slopes = camera.linearise(points @ rotation.T, position)
         offsets = seen - pixels
-        loss = _misfit(offsets, deviation)
+        lengths = _lengths(offsets, deviation)
+        loss = _misfit(lengths)
         if loss < misfit:
             gain, misfit, damping = misfit - loss, loss, max(damping * 0.1, 1e-9)
             matrix, residuals = np.eye(4), offsets
             matrix[:3, :3], matrix[:3, 3] = rotation, position
-            lengths = np.sqrt(np.einsum("ij,ij->i", residuals, residuals))
-            weights = np.minimum(1.0, _HUBER * deviation / np.maximum(lengths, 1e-12))
+            weights = np.minimum(1.0, _HUBER / np.maximum(lengths, 1e-12))
             weighted = slopes.T * np.repeat(weights / deviation**2, 2)
             normal, gradient = weighted @ slopes, weighted @ residuals.ravel()
             if gain <= _STEADY * misfit + 1e-12:
