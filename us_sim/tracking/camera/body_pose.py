@@ -11,8 +11,8 @@ images so far chooses one.
 >>> poses = body_poses(camera, square(0.04), camera.project(true.apply(square(0.04))))
 >>> poses[0].pose.position.round(6)
 array([0.02, 0.01, 0.4 ])
->>> [round(each.error, 2) for each in poses]  # pixels, of the pose and of the other one
-[0.0, 0.86]
+>>> [round(each.error, 1) for each in poses]  # pixels, of the pose and of the other one
+[0.0, 0.9]
 """
 
 from __future__ import annotations
