@@ -106,7 +106,6 @@ setup(
         "lerobot": ["lerobot[dataset]>=0.4"],
         "meshes": ["meshio>=5.3"],
         "ray": [GYMNASIUM, "ray>=2.40", UPATH],
-        "rerun": ["rerun-sdk>=0.41"],
         "space_mouse": ["hidapi>=0.14"],
         "surfaces": ["fast-simplification>=0.1.7"],
         "viewer": ["nicegui>=3.6,<4"],

@@ -17,8 +17,6 @@ MODULES = sorted(
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples(name):
-    if name.startswith("us_sim.command.rerun"):
-        pytest.importorskip("rerun", reason="rerun-sdk, the extra `rerun`, is not installed")
     module = importlib.import_module(name)
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
     assert doctest.testmod(module, optionflags=flags).failed == 0

@@ -90,10 +90,6 @@ class BagError(UsSimError):
     """A bag cannot be read, or cannot be written where it was asked to."""
 
 
-class FileTakenError(BagError):
-    """A file that is being written was removed or moved; writing goes on in another one."""
-
-
 class TrackingError(UsSimError):
     """A tracker's data, or the file of its bodies, cannot be used."""
 

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections import Counter
+import time
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,10 @@ from std_srvs.srv import Trigger
 from us_sim.errors import BagError
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
-from us_sim.recording.mcap_output import McapOutput
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import extract
-from us_sim.recording.writer import BagWriter
+from us_sim.recording.writer import BagWriter, PatientFile
 from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
 
@@ -397,21 +396,18 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     assert not read_bag(tmp_path / "session_1.mcap").note
 
 
-def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
+def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch):
     full = [False]
-    end_chunk = McapOutput.end_chunk
+    flush = PatientFile.flush
 
-    def unless_full(output):
+    def flush_unless_full(file):
         if full[0]:
-            counts = Counter({topic: len(entries) for topic, entries in output._index.items()})
-            output._begin_chunk()
-            output._drop(counts)
-            raise OSError(errno.ENOSPC, "No space left on device")
-        end_chunk(output)
+            file.error = OSError(errno.ENOSPC, "No space left on device")
+        else:
+            flush(file)
 
-    monkeypatch.setattr(McapOutput, "end_chunk", unless_full)
+    monkeypatch.setattr(PatientFile, "flush", flush_unless_full)
     monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.1)
-    monkeypatch.setattr("us_sim.recording.writer._ROOM", 2**62)
     recorder, note, _, file = quiet()
     reports = bench.collect(DiagnosticArray, "diagnostics")
     say(bench, recorder, note, "one")
@@ -430,10 +426,21 @@ def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch, tmp_path):
     bench.spin_until(lambda: any("No space left on device" in text for text in told()))
     assert recorder.health.problems("disk") == 1
     full[0] = False
-    monkeypatch.setattr("us_sim.recording.writer._ROOM", 0)
-    bench.spin_until(lambda: (tmp_path / "session_1.mcap").exists())
     bench.spin_until(lambda: not recorder.health.warning)
     say(bench, recorder, note, "three")
     end(bench, recorder)
-    assert texts(tmp_path)[-1] == "three"
-    assert sum(read_bag(tmp_path).lost().values()) > 0
+    assert texts(file) == ["one", "two", "three"]
+    assert not read_bag(file).lost()
+
+
+def test_a_message_is_recorded_with_the_time_at_which_it_came(bench, tmp_path):
+    file = tmp_path / "session.mcap"
+    recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
+    note = bench.publisher(String, "note")
+    say(bench, recorder, note, "one")
+    bench.executor.remove_node(recorder)  # its turn does not come
+    note.publish(String(data="two"))
+    time.sleep(1.0)
+    recorder.destroy_node()
+    _, late = read_bag(file).messages()
+    assert 0 <= late.log_time - late.publish_time < 5 * 10**8

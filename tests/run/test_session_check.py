@@ -1,6 +1,7 @@
 """A recording is whole, or broken in one way, which is told in one sentence."""
 
 import struct
+import threading
 import time
 import zlib
 
@@ -109,15 +110,16 @@ def test_what_a_full_queue_lost_is_told_with_the_recorders_own_count(tmp_path):
     recorder = WriteBehind(bag, 40_000)
     for topic, kind in TYPES.items():
         recorder.add_topic(topic, kind)
-    recorder._changed.acquire()  # the thread that writes cannot
+    may_write = threading.Event()
+    recorder._queue.put(may_write.wait)
     for topic, data, logged, sent, _ in messages:
         recorder.put(topic, data, logged, sent)
-    recorder._changed.release()
+    may_write.set()
     last = (*messages[-1][:2], messages[-1][2] + 1, messages[-1][3])
     while not recorder.put(*last):
         time.sleep(0.01)
     recorder.close()
-    lost = recorder.losses.total
+    lost = recorder.losses.total()
     assert lost > 100
     found, told = findings(tmp_path / "s.mcap")
     assert sum(each.missing or 0 for each in found.topics) <= lost == sum(found.bag.lost().values())

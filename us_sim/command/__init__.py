@@ -1,1 +1,1 @@
-"""The command `us-sim`, and its work on files: calibrations, volumes, recordings for rerun."""
+"""The command `us-sim`, and its work on files: calibrations, volumes, recordings."""

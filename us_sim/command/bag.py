@@ -53,14 +53,6 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
         "--out", type=Path, help="new folder or .mcap file (default: FILE_repaired beside it)"
     )
     repair.set_defaults(command=_repair)
-    rerun = bag_commands.add_parser(
-        "to-rerun", help="a session with its surfaces, forces and images as rerun shows them"
-    )
-    rerun.add_argument("file", type=Path, metavar="SESSION")
-    rerun.add_argument(
-        "--out", type=Path, metavar="FILE", help="file to write (default: SESSION.rrd beside it)"
-    )
-    rerun.set_defaults(command=_to_rerun)
     lerobot = bag_commands.add_parser(
         "to-lerobot", help="sessions as the episodes of a LeRobot data set, resampled to one rate"
     )
@@ -161,18 +153,6 @@ def _repair(args: argparse.Namespace) -> int:
     for fault in made.faults:
         print(fault.text)
     print(f"{counted(made.message_count, 'message is', 'messages are')} in {made.path}")
-    return 0
-
-
-def _to_rerun(args: argparse.Namespace) -> int:
-    from us_sim.command.rerun import to_rerun
-    from us_sim.progress import late_progress
-
-    session: Path = args.file
-    file: Path = args.out or session.with_suffix(".rrd")
-    for sentence in to_rerun(session, file, late_progress(f"bag to-rerun {session.name}")):
-        print(sentence)
-    print(file)
     return 0
 
 

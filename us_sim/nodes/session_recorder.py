@@ -7,6 +7,7 @@ import ctypes
 import functools
 import os
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.nodes.topics import MARKERS, TOPICS
 from us_sim.recording.schemas import normalized_type, type_hash
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Loss, Message, PreRoll, WriteBehind, losses_between
+from us_sim.recording.write_behind import Message, PreRoll, WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
@@ -66,7 +67,7 @@ class SessionRecorder(GuardedNode):
         self._refused: set[tuple[str, str]] = set()  # topics of a type, as has been said
         self._topics: dict[str, RecordedTopic] = {}
         self._types: dict[str, str] = {}
-        self._told: dict[str, Loss] = {}  # losses of which a person was told
+        self._told: Counter[str] = Counter()  # losses of which a person was told
         self._bag: WriteBehind | None = None  # None once it was stopped
         self.health = Health(self, settings.file)
         self._begin()
@@ -193,7 +194,7 @@ class SessionRecorder(GuardedNode):
 
     def _take(self, topic: str, data: bytes, info: Mapping[str, Any]) -> None:
         self.health.received += 1
-        now = self.get_clock().now().nanoseconds
+        now = self._time_of_arrival(info)
         sent = info["source_timestamp"]
         message = Message(topic, data, now, sent if sent > 0 else now)
         if self._bag is None:
@@ -204,6 +205,13 @@ class SessionRecorder(GuardedNode):
             self._kept.add(message, latched=self._topics[topic].is_latched)
         elif self._bag.put(topic, data, now, message.publish_time):
             self.health.published(topic)
+
+    def _time_of_arrival(self, info: Mapping[str, Any]) -> int:
+        """ns: when the middleware had a message; a recorder that starves takes it later."""
+        clock: Any = self.get_clock()
+        received: int = info.get("received_timestamp") or 0
+        is_known = received > 0 and not clock.ros_time_is_active  # which is another clock's
+        return received if is_known else int(clock.now().nanoseconds)
 
     def _mark(self, data: bytes, now: int) -> None:
         """Put a marker beside the messages, too, where it is found at once."""
@@ -217,7 +225,7 @@ class SessionRecorder(GuardedNode):
 
     def _lost(self, topic: str, count: int) -> None:
         if self._bag is not None and not self._settings.paused:
-            self._bag.losses.add(topic, in_transport=count)
+            self._bag.lose(topic, count)
 
     def _follow_publishers(self) -> None:
         for topic in self._topics.values():
@@ -229,16 +237,14 @@ class SessionRecorder(GuardedNode):
             self._tell_losses(self._bag)
 
     def _tell_losses(self, bag: WriteBehind) -> None:
-        lost = bag.losses.by_topic()
-        new = losses_between(lost, self._told)
-        self._told = lost
-        self.health.dropped = bag.losses.total
+        lost = bag.losses
+        new, self._told = lost - self._told, lost
+        self.health.dropped = lost.total()
         while bag.untold:
-            self.health.problem(*bag.untold.popleft())
+            self.health.problem("disk", bag.untold.popleft())
         if new:
-            count = sum(map(sum, new.values()))
             self.health.problem(
-                "lost", f"{counted(count, 'message')} of {', '.join(new)} not recorded"
+                "lost", f"{counted(new.total(), 'message')} of {', '.join(new)} not recorded"
             )
 
     def _tell_state(self) -> None:

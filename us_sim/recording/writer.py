@@ -14,27 +14,89 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from us_sim.errors import BagError, FileTakenError
-from us_sim.recording.mcap_output import McapOutput, Place
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
+from mcap.writer import CompressionType, Writer
+
+from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata, FileEntry, TopicEntry
 from us_sim.recording.schemas import definitions, schema_text
 from us_sim.recording.topic import QosProfile, qos_to_yaml
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
-_CHUNK_SIZE = 768 * 1024  # bytes, rosbag2's default
+_CHUNK_SIZE = 2 * 1024 * 1024  # bytes; the writer keeps an index of each chunk in memory
 _FLUSH = 10**9  # ns of log time after which everything is handed to the operating system
-_ROOM = 16 * 1024 * 1024  # bytes, that must be free again before a full disk is written to
-_COMPRESSIONS = {"none": "", "zstd": "zstd"}
+_NEVER = 2**63 - 1  # ns, later than any time
+_COMPRESSIONS = {"none": CompressionType.NONE, "zstd": CompressionType.ZSTD}
+
+
+class PatientFile:
+    """A new file that takes every byte: what the disk has no room for waits in memory.
+
+    Where a write fails the file is cut back to the last one that succeeded, so that it holds whole
+    records at every moment. Each `flush` tries again.
+
+    Raises:
+        OSError: the file exists or cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.error: OSError | None = None  # why bytes wait
+        self._stream = path.open("xb", buffering=0)
+        self._waiting: deque[bytes] = deque()
+        self._size = 0  # bytes in the file
+        self._end = 0  # likewise, with those that wait
+
+    def tell(self) -> int:
+        """Bytes that were written, with those that wait."""
+        return self._end
+
+    def write(self, data: bytes) -> None:
+        """Append whole records."""
+        self._waiting.append(data)
+        self._end += len(data)
+        self.flush()
+
+    def flush(self) -> None:
+        """Hand what waits to the operating system."""
+        try:
+            while self._waiting:
+                rest = memoryview(self._waiting[0])
+                while rest:
+                    rest = rest[self._stream.write(rest) :]
+                self._size += len(self._waiting.popleft())
+            self.error = None
+        except OSError as error:
+            self.error = error
+            self._cut(self._size)
+
+    def close(self, size: int | None = None) -> None:
+        """Close the file, cut to ``size`` bytes where that is given; what waits is lost."""
+        if size is not None:
+            self._cut(size)
+        self._waiting.clear()
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    @property
+    def is_removed(self) -> bool:
+        """Whether no folder holds the file any more."""
+        return os.fstat(self._stream.fileno()).st_nlink == 0
+
+    def _cut(self, size: int) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.truncate(size)
+            self._stream.seek(size)
 
 
 @dataclass
@@ -45,16 +107,89 @@ class _Topic:
     type_hash: str
 
 
+class _Part:
+    """One file of a bag."""
+
+    def __init__(self, path: Path, compression: CompressionType, chunk_size: int) -> None:
+        self.file = PatientFile(path)
+        self.counts: Counter[str] = Counter()  # messages by topic, of the chunk in progress too
+        self.start, self._end = _NEVER, 0  # ns, of their log times
+        # What no full disk takes away any more: bytes, and the messages in them.
+        self._size = 0
+        self.entry, self.kept = FileEntry(path.name), self.counts.copy()
+        self._schemas: dict[str, int] = {}  # by type
+        self._channels: dict[str, int] = {}  # by topic
+        stream: Any = self.file  # which has what a Writer asks of one
+        self._writer = Writer(stream, chunk_size, compression)
+        self._writer.start("ros2", _library())
+
+    def add_topic(self, name: str, topic: _Topic) -> None:
+        encoding, text = ("", "") if topic.schema is None else ("ros2msg", topic.schema)
+        schema: dict[str, Any] = {"name": topic.type_name, "encoding": encoding}
+        schema["data"] = text.encode()
+        if topic.type_name not in self._schemas:
+            self._schemas[topic.type_name] = self._writer.register_schema(**schema)
+        channel: dict[str, Any] = {"topic": name, "message_encoding": "cdr"}
+        channel["schema_id"] = self._schemas[topic.type_name]
+        channel["metadata"] = {
+            "offered_qos_profiles": qos_to_yaml(topic.qos),
+            "topic_type_hash": topic.type_hash,
+        }
+        self._channels[name] = self._writer.register_channel(**channel)
+        # Twice, here and in the next chunk: one damaged chunk makes no others unreadable.
+        records = RecordBuilder()
+        Schema(id=channel["schema_id"], **schema).write(records)
+        Channel(id=self._channels[name], **channel).write(records)
+        self.file.write(records.end())
+
+    def write(self, topic: str, data: bytes, log_time: int, publish_time: int, number: int) -> None:
+        before = self.file.tell()
+        self._writer.add_message(self._channels[topic], log_time, data, publish_time, number)
+        self.counts[topic] += 1
+        self.start, self._end = min(self.start, log_time), max(self._end, log_time)
+        if self.file.tell() > before:  # a chunk has ended with this message
+            self._note_kept()
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        self._writer.add_metadata(name, values)
+        self.flush()
+
+    def attach(self, name: str, media_type: str, data: bytes, time: int) -> None:
+        self._writer.add_attachment(time, time, name, media_type, data)
+        self.flush()
+
+    def flush(self) -> None:
+        """End the chunk in progress, and hand everything to the operating system."""
+        self._writer.flush()
+        self._note_kept()
+
+    def finish(self) -> Counter[str]:
+        """Write the index and close the file; the messages that did not fit."""
+        self._writer.finish()
+        self.file.flush()
+        fits = self.file.error is None
+        if fits:
+            self._note_kept()
+        self.file.close(None if fits else self._size)
+        return self.counts - self.kept
+
+    def _note_kept(self) -> None:
+        if self.file.error is None:
+            self._size, self.kept = self.file.tell(), self.counts.copy()
+            if self.counts:
+                span = self.start, self._end - self.start
+                self.entry = FileEntry(self.file.path.name, *span, self.counts.total())
+
+
 class BagWriter:
     """Writes one bag: an MCAP file or several, and when it is closed, its ``metadata.yaml``.
 
     A message reaches the operating system at the latest when one comes that is a second younger,
     or with :meth:`flush`, and then survives the end of the process.
 
-    Where the disk is full the file gets its index and is closed, :meth:`resume` goes on in another
-    one when there is room again, and :attr:`lost` counts the messages that did not fit. Where
-    somebody takes the file or a part of it away, that is an error as well, and writing goes on in
-    another one at once.
+    Where the disk is full the file holds what fitted, :attr:`problem` says so, and what was
+    written since waits in memory for room. Where somebody takes the file away, that is an error,
+    and writing goes on in a further file at once. :attr:`lost` counts the messages that are gone.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -62,7 +197,7 @@ class BagWriter:
             files are called ``FILE_1.mcap`` or ``FOLDER_1.mcap`` and so on.
         compression: of the chunks, ``"none"`` or ``"zstd"``.
         chunk_size: bytes after which a chunk is ended.
-        max_size: bytes after which a further file is begun; 0 for never.
+        max_size: bytes in the file after which a further one is begun; 0 for never.
         max_duration: s after which a further file is begun; 0 for never.
         sidecar: False leaves ``metadata.yaml`` away, for folders with several one-file bags.
         further: where ``FILE.mcap`` exists, go on in ``FILE_1.mcap`` or the next that is free. No
@@ -87,25 +222,21 @@ class BagWriter:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
         self.custom_data: dict[str, str] = {}  # free text for the metadata
-        self.lost: Counter[str] = Counter()  # messages that the disk did not take, by topic
-        self._compression, self._chunk_size = _COMPRESSIONS[compression], chunk_size
+        self.lost: Counter[str] = Counter()  # messages that no file holds, by topic
+        self._options = _COMPRESSIONS[compression], chunk_size
         self._max_size, self._max_duration = max_size, round(max_duration * 1e9)
         self._files: list[FileEntry] = []  # that are closed
         self._counts: Counter[str] = Counter()  # messages in those files, by topic
         self._topics: dict[str, _Topic] = {}
         self._attachments: dict[str, tuple[str, bytes, int]] = {}
         self._last_flush: int | None = None
-        self._closed_because = ""
-        self._taken_away: list[str] = []  # sentences that nobody has been told yet
+        self._untold: list[str] = []  # sentences for the next error
         self._ended = False
         try:
             self._name_files(Path(path), sidecar, further)
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._output = self._opened(self.path)
-        except OSError as error:
-            raise BagError(f"{path} cannot be made: {error.strerror}") from None
-        except ValueError as error:  # a name that no file can have
-            raise BagError(f"{path} cannot be made: {error}") from None
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+            raise _cannot_be_made(path, error) from None
+        self._part = self._opened(self.path)
 
     def _name_files(self, path: Path, sidecar: bool, further: bool) -> None:
         """Choose the names of the first file and of ``metadata.yaml``."""
@@ -138,13 +269,20 @@ class BagWriter:
     @property
     def message_count(self) -> int:
         """Number of messages written."""
-        present = 0 if self._output.is_finished else self._output.message_count
-        return self._counts.total() + present
+        return self._counts.total() + (0 if self._ended else self._part.counts.total())
 
     @property
     def topics(self) -> tuple[str, ...]:
         """Names of the topics added."""
         return tuple(self._topics)
+
+    @property
+    def problem(self) -> str:
+        """Why messages wait for room; empty when none do."""
+        file = self._part.file
+        if file.error is None or self._ended:
+            return ""
+        return f"{_cannot_be_written(file)}: what it holds can be read, and the rest waits for room"
 
     def add_topic(
         self,
@@ -170,8 +308,7 @@ class BagWriter:
         Raises:
             BagError: the type is unknown, differs from before, or the bag is closed.
         """
-        if self._ended:
-            raise BagError(self._closed_because)
+        self._require_open()
         if not topic or any(character.isspace() for character in topic):
             raise BagError(f"{topic!r} is not a topic name")
         profiles = tuple(map(QosProfile.of, qos))
@@ -190,16 +327,7 @@ class BagWriter:
             if defined:
                 raise
         self._topics[topic] = _Topic(type_name, schema, profiles, type_hash or "")
-        self._introduce(topic, self._output)
-
-    def _introduce(self, topic: str, output: McapOutput) -> None:
-        """Make a topic known to a file."""
-        known = self._topics[topic]
-        metadata = {
-            "offered_qos_profiles": qos_to_yaml(known.qos),
-            "topic_type_hash": known.type_hash,
-        }
-        output.add_topic(topic, known.type_name, known.schema, metadata)
+        self._part.add_topic(topic, self._topics[topic])
 
     def write(
         self,
@@ -219,14 +347,12 @@ class BagWriter:
             sequence: number of the message on its topic, where one is kept.
 
         Raises:
-            BagError: the topic is unknown, a time is negative, the bag is closed, or the disk is
-                full; earlier messages stay readable.
+            BagError: the topic is unknown, a time is negative, the bag is closed, or earlier
+                messages wait for room on the disk. The message is not written then.
         """
         if topic not in self._topics:
             raise BagError(f"topic {topic} was not added to {self.path}: call add_topic first")
-        if self._closed_because:
-            self.lost[topic] += 1
-            raise BagError(self._closed_because)
+        self._require_open()
         if publish_time_ns is None:
             publish_time_ns = log_time_ns
         if log_time_ns < 0 or publish_time_ns < 0:
@@ -234,15 +360,18 @@ class BagWriter:
                 f"a message on {topic} has a time before 1970: log time {log_time_ns} ns, publish "
                 f"time {publish_time_ns} ns"
             )
-        if self._is_long(log_time_ns):
-            self.split()
-        with self._writing():
-            times = log_time_ns, publish_time_ns
-            self._output.add_message(topic, *times, sequence & 0xFFFFFFFF, bytes(cdr))
+        if self.problem:
+            self.flush()
+        is_late = 0 < self._max_duration < log_time_ns - self._part.start
+        if is_late or 0 < self._max_size <= self._part.file.tell():
+            with contextlib.suppress(BagError):  # the present file takes it, too
+                self._go_on()
+        number = sequence & 0xFFFFFFFF
+        self._part.write(topic, bytes(cdr), log_time_ns, publish_time_ns, number)
         if self._last_flush is None:
             self._last_flush = log_time_ns
         elif log_time_ns - self._last_flush >= _FLUSH:
-            self.flush()
+            self._part.flush()
             self._last_flush = log_time_ns
 
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
@@ -254,9 +383,10 @@ class BagWriter:
         Raises:
             BagError: the bag is closed, or the disk is full.
         """
+        self._require_open()
         self._attachments[name] = media_type, data, time_ns
-        with self._writing():
-            self._output.add_attachment(name, *self._attachments[name])
+        self._part.attach(name, media_type, data, time_ns)
+        self._tell()
 
     def note(self, name: str, values: Mapping[str, str]) -> None:
         """Puts texts by their names into the present file, as a metadata record of MCAP.
@@ -264,75 +394,60 @@ class BagWriter:
         Raises:
             BagError: the bag is closed, or the disk is full.
         """
-        with self._writing():
-            self._output.add_metadata(name, dict(values))
+        self._require_open()
+        self._part.add_metadata(name, dict(values))
+        self._tell()
 
     def flush(self) -> None:
         """Ends the chunk and hands everything to the operating system.
 
         Raises:
-            BagError: the bag is closed, or the disk is full.
-            FileTakenError: the file was removed or moved.
+            BagError: the bag is closed, the disk is full, or the file was removed or moved; then
+                the next messages are written to a further one.
         """
-        with self._writing():
-            self._output.end_chunk()
-            if self._output.place is not Place.HERE:
-                self._go_on()
-        self._tell_taken_away(f"; the recording goes on in {self._output.path}")
+        self._require_open()
+        self._part.flush()
+        if not self._part.file.path.exists():
+            self._go_on()
+        self._tell()
 
     def split(self) -> None:
         """Ends the present file and goes on in a further one.
 
         Raises:
-            BagError: the bag is closed, or the disk is full.
-            FileTakenError: the file was removed or moved.
+            BagError: the bag is closed, or the disk is full; or the file was removed or moved.
         """
-        with self._writing():
-            self._go_on()
-        self._tell_taken_away(f"; the recording goes on in {self._output.path}")
-
-    def resume(self) -> bool:
-        """After the disk was full: whether there is room again, and a further file is begun."""
-        if self._closed_because:
-            with contextlib.suppress(OSError):
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                if shutil.disk_usage(self.path.parent).free >= _ROOM:
-                    self._output = self._opened(self._further_file())
-                    self._closed_because = ""
-        return not self._closed_because
+        self._require_open()
+        self._go_on()
+        self._tell()
 
     def close(self) -> None:
         """Writes the index and ``metadata.yaml``; closing again does nothing.
 
         Raises:
-            BagError: the disk is full; earlier messages stay readable.
-            FileTakenError: the file was removed or moved.
+            BagError: the disk is full, with the number of messages that are lost; or the file was
+                removed or moved.
         """
-        self._ended = True
-        if not self._closed_because:
-            with self._writing():
-                self._add_metadata(self._output)
-                self._finish()
-            self._closed_because = f"{self.path} is closed: nothing can be written to it any more"
-        self._write_metadata_file()
-        self._tell_taken_away()
-
-    def _write_metadata_file(self) -> None:
-        metadata_file, self._metadata_file = self._metadata_file, None
-        if metadata_file is None or not self._files:
+        if self._ended:
             return
+        self._finish(self._part)
+        self._ended = True
+        if self._metadata_file is not None and self._files:
+            self._write_metadata_file(self._metadata_file)
+        self._tell()
+
+    def _write_metadata_file(self, metadata_file: Path) -> None:
         try:
             with metadata_file.open("x", encoding="utf-8") as file:
-                file.write(self._metadata(None).document())
+                file.write(self._metadata(self._files, self._counts).document())
         except OSError as error:
-            with contextlib.suppress(OSError):
-                if not isinstance(error, FileExistsError):
-                    metadata_file.unlink()
-            raise BagError(
+            if not isinstance(error, FileExistsError):
+                metadata_file.unlink(missing_ok=True)
+            self._untold.append(
                 f"{metadata_file} cannot be written ({error.strerror}): the recording can be read "
                 f"without it, and `us-sim bag repair {metadata_file.parent}` makes a bag that has "
                 f"it"
-            ) from None
+            )
 
     def __enter__(self) -> BagWriter:
         return self
@@ -340,107 +455,70 @@ class BagWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _is_long(self, time: int) -> bool:
-        """Whether the file is as large or long as one may be, before a message of that time."""
-        file = self._output
-        if self._max_size and file.size >= self._max_size:
-            return True
-        late = file.start is not None and time - file.start > self._max_duration
-        return bool(self._max_duration and late)
+    def _require_open(self) -> None:
+        if self._ended:
+            raise BagError(f"{self.path} is closed: nothing can be written to it any more")
 
-    def _opened(self, path: Path) -> McapOutput:
+    def _opened(self, path: Path) -> _Part:
         """A new file with all topics so far and the attachments."""
-        output = McapOutput(
-            path, _library(), compression=self._compression, chunk_size=self._chunk_size
-        )
-        for topic in self.topics:
-            self._introduce(topic, output)
         try:
-            # rosbag2 does this too: readers find the distribution even in a file that is cut.
-            self._add_metadata(output)
-            for name, attachment in self._attachments.items():
-                output.add_attachment(name, *attachment)
-        except OSError:
-            with contextlib.suppress(OSError):
-                output.finish()
-            path.unlink()
-            raise
-        return output
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Stop at a failure of the disk, with an error that says how much is kept."""
-        if self._closed_because:
-            raise BagError(self._closed_because)
-        try:
-            yield
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                self._finish()
-            kept = f"the first {counted(self._output.message_count, 'message')} can be read"
-            if self._taken_away:
-                kept = "; ".join(self._taken_away)
-                self._taken_away.clear()
-            self._closed_because = (
-                f"{error.filename or self._output.path} cannot be written ({error.strerror}): "
-                f"the recording stops, and {kept}"
-            )
-            raise BagError(self._closed_because) from None
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = _Part(path, *self._options)
+        except (OSError, ValueError) as error:
+            raise _cannot_be_made(path, error) from None
+        for name, topic in self._topics.items():
+            part.add_topic(name, topic)
+        # rosbag2 does this too: readers find the distribution even in a file that is cut.
+        self._add_metadata(part)
+        for name, attachment in self._attachments.items():
+            part.attach(name, *attachment)
+        if part.file.error is not None:
+            part.file.close()
+            path.unlink(missing_ok=True)
+            raise _cannot_be_made(path, part.file.error)
+        return part
 
     def _go_on(self) -> None:
-        """End the present file, and begin a further one."""
-        closed = self._output
-        self._add_metadata(closed)
-        self._finish()
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._output = self._opened(self._further_file())
+        """Begin a further file, and end the present one, unless the disk is full."""
+        self._part.flush()
+        if self._part.file.error is None:
+            further = self._opened(self._further_file())
+            closed, self._part = self._part, further
+            self._finish(closed)
 
-    def _finish(self) -> None:
-        """Give the present file its index, close it and count its messages."""
-        file = self._output
-        if file.is_finished:
+    def _finish(self, part: _Part) -> None:
+        """Give a file its index, close it and count its messages."""
+        is_taken, is_removed = not part.file.path.exists(), part.file.is_removed
+        part.flush()
+        self._add_metadata(part)
+        lost = part.finish()
+        if is_taken:
+            self.lost += part.counts if is_removed else lost
+            self._untold.append(
+                f"{part.file.path} was {'removed' if is_removed else 'moved away'} while it was "
+                f"recorded, with {counted(part.counts.total(), 'message')}"
+            )
             return
-        place = file.place
-        try:
-            file.finish()
-        finally:
-            self.lost += file.dropped
-            if place in (Place.HERE, Place.CUT):
-                self._files.append(_entry(file))
-                self._counts += file.counts
-            if place is Place.CUT:
-                self._taken_away.append(
-                    f"{file.path} was cut by another process while it was recorded: "
-                    f"{file.dropped.total()} messages are lost, and {file.message_count} are in it"
-                )
-            elif place is Place.MOVED:
-                self._taken_away.append(
-                    f"{file.path} was moved away while it was recorded, with "
-                    f"{counted(file.message_count, 'message')}"
-                )
-            elif place is Place.REMOVED:
-                self.lost += file.counts
-                self._taken_away.append(
-                    f"{file.path} was removed while it was recorded: "
-                    f"{counted(file.message_count, 'message is', 'messages are')} lost with it"
-                )
+        self._files.append(part.entry)
+        self._counts += part.kept
+        self.lost += lost
+        if part.file.error is not None:
+            self._untold.append(
+                f"{_cannot_be_written(part.file)}; {counted(lost.total(), 'message')} and its "
+                f"index are missing, and `us-sim bag repair` makes an index where there is room"
+            )
 
-    def _tell_taken_away(self, then: str = "") -> None:
-        """Raise FileTakenError where a file was taken away, once."""
-        told, self._taken_away = "; ".join(self._taken_away), []
+    def _tell(self) -> None:
+        """Raise an error where something went wrong of which nobody was told."""
+        told, self._untold = [*self._untold, *filter(None, [self.problem])], []
         if told:
-            raise FileTakenError(told + then)
+            raise BagError("; ".join(told))
 
-    def _add_metadata(self, output: McapOutput) -> None:
-        lines = self._metadata(output).lines()
-        output.add_metadata("rosbag2", {"serialized_metadata": "\n".join(lines)})
+    def _add_metadata(self, part: _Part) -> None:
+        information = self._metadata([*self._files, part.entry], self._counts + part.kept)
+        part.add_metadata("rosbag2", {"serialized_metadata": "\n".join(information.lines())})
 
-    def _metadata(self, present: McapOutput | None) -> BagMetadata:
-        """Metadata of the closed files, and of the present one."""
-        files, counts = [*self._files], self._counts
-        if present is not None:
-            files.append(_entry(present))
-            counts = counts + present.counts
+    def _metadata(self, files: Sequence[FileEntry], counts: Mapping[str, int]) -> BagMetadata:
         filled = [file for file in files if file.message_count]
         start = min((file.start for file in filled), default=files[0].start)
         end = max((file.start + file.duration for file in filled), default=start)
@@ -452,17 +530,19 @@ class BagWriter:
             ),
             start=start,
             duration=end - start,
-            message_count=counts.total(),
+            message_count=sum(counts.values()),
             ros_distro=os.environ.get("ROS_DISTRO") or "jazzy",
             custom_data=self.custom_data,
         )
 
 
-def _entry(output: McapOutput) -> FileEntry:
-    if output.start is None or output.end is None:
-        return FileEntry(output.path.name)
-    duration = output.end - output.start
-    return FileEntry(output.path.name, output.start, duration, output.message_count)
+def _cannot_be_made(path: str | Path, error: OSError | ValueError) -> BagError:
+    return BagError(f"{path} cannot be made: {getattr(error, 'strerror', None) or error}")
+
+
+def _cannot_be_written(file: PatientFile) -> str:
+    assert file.error is not None
+    return f"{file.path} cannot be written ({file.error.strerror})"
 
 
 def _library() -> str:
