@@ -299,6 +299,37 @@ def test_a_frame_of_tf_is_followed_up_to_another(tmp_path):
         read_path(file, "/tf:base:tip")
 
 
+def of_tf(child, parent, x, seconds):
+    made = transform(parent, child, x, 0)
+    made.header.stamp.sec = round(seconds * 1e9) // 10**9
+    made.header.stamp.nanosec = round(seconds * 1e9) % 10**9
+    return message(TF, transforms=[made])
+
+
+def test_the_links_of_a_chain_are_taken_at_one_time(tmp_path):
+    """`map` to `odom` is stamped a second ahead, as by Nav2, and moves back as `odom` moves on."""
+    times = 100 + 0.02 * np.arange(300)
+    messages = [(t, of_tf("tip", "odom", t - 100, t)) for t in times]
+    messages += [(t, of_tf("odom", "map", 99 - t, t + 1.0)) for t in times[::5]]
+    file = tmp_path / "bag.mcap"
+    record(file, {"/tf": [each for _, each in sorted(messages, key=lambda pair: pair[0])]})
+    path = read_path(file, "/tf:tip:map")
+    np.testing.assert_allclose(path.positions[:, 0], 0.0, atol=1e-9)
+    assert path.stamps[[0, -1]].tolist() == [101 * 10**9, 105_900_000_000]
+    assert (len(path), path.rejected) == (50, 10)  # stamped after the last of `odom`
+    assert "not known all the way up" in path.note
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [(of_tf("tip", "base", 0.0, 50.0), "back by"), (of_tf("tip", "moon", 0.0, 101.0), "several")],
+)
+def test_a_chain_of_two_times_or_ways_is_refused(tmp_path, second, said):
+    record(tmp_path / "bag.mcap", {"/tf": [of_tf("tip", "base", 0.0, 100.0), second]})
+    with pytest.raises(BagError, match=said):
+        read_path(tmp_path / "bag.mcap", "/tf:tip:base")
+
+
 def test_tf_of_a_real_recorder_holds_the_path_of_its_poses(shared_data):
     bag = shared_data / "ros2-jazzy/bags/probe_path_mcap"
     (body,) = bodies_in(read_bag(bag))[TF]

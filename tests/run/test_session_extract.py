@@ -160,7 +160,39 @@ def test_images_that_are_no_pictures(tmp_path, capsys):
     for message in messages:
         message[1] = message[1].replace(b"mono8", b"bayer")
     assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--images") == 1
-    assert "the image is bayer; it must be mono8" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "/ultrasound/image: 3 images skipped: the image's encoding is 'bayer'" in told.out
+    assert "no image that can be decoded" in told.err
+
+
+@pytest.mark.parametrize(
+    ("case", "options", "lines", "said"),
+    [
+        ("bag-time-back/stamps_back_by_20_s.mcap", "--poses", 1200, "back 1 time, first by 29.983"),
+        ("bag-quaternions/quaternions.mcap", "--poses", 360, "120 poses are not finite or without"),
+        (
+            "bag-every-type/test_bag_mcap",
+            "--images",
+            0,
+            "/test/sensor_msgs/image: 2 images skipped",
+        ),
+        ("bag-stamps-zero/zed_like.mcap", "--images", 0, "60 of 60 stamps are 0"),
+    ],
+)
+def test_what_is_odd_in_real_bags_is_told(
+    shared_data, tmp_path, capsys, case, options, lines, said
+):
+    extracted(shared_data / "cases" / case, tmp_path, options)
+    assert said in capsys.readouterr().out
+    assert sum(len(file.read_text().splitlines()) for file in tmp_path.glob("*.tum")) == lines
+
+
+def test_images_are_taken_in_every_encoding_of_a_camera(shared_data, tmp_path):
+    assert extracted(shared_data / "cases/bag-stamps-zero/zed_like.mcap", tmp_path, "--images") == 0
+    file, *others = sorted((tmp_path / "zed_zed_node_left_image_rect_color").iterdir())
+    assert len(others) == 59
+    with Image.open(file) as picture:
+        assert picture.mode == "RGB"
 
 
 def test_nothing_is_overwritten(scaled, tmp_path, capsys):

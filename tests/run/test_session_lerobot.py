@@ -1,5 +1,7 @@
 """Sessions as episodes of LeRobot: which moments, which image, which number; then real lerobot."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -84,7 +86,8 @@ def test_what_becomes_of_images_is_told(tmp_path):
     _, frames, _, told = frames_of(file, 5)
     assert [f["observation.images.image"][0, 0] for f in frames] == [0, 2, 2, 3, 6]
     shown = "/image: 4 of 7 images shown, 1 frame repeats the one before, which is 0.200 s old"
-    assert told == ["5 frames", f"{shown} at most"]
+    late = "1 message is stamped before one that was recorded earlier"
+    assert told == ["5 frames", f"{shown} at most; {late}"]
 
 
 def test_joints_of_several_publishers_and_compressed_images_go_together(tmp_path):
@@ -115,6 +118,34 @@ def test_poses_that_are_none_are_left_out_and_told(tmp_path):
     depth = np.array([frame["observation.state"][2] for frame in frames])
     assert depth == pytest.approx(1e-3 * (moments - EPOCH) / PERIOD, abs=1e-9)
     assert told[-1].endswith("1 are not finite and left out")
+
+
+@pytest.mark.parametrize(
+    ("case", "by_log_time", "said"),
+    [
+        ("bag-time-back/stamps_back_by_20_s.mcap", False, "back by 30.0 s"),
+        ("bag-time-back/looped_sim_time.mcap", False, "back by 10.0 s"),
+        ("bag-time-back/stamps_back_by_20_s.mcap", True, "1200 messages, 0.117 s apart at most"),
+        ("bag-time-back/log_time_back_too.mcap", True, "601 frames lie between messages more than"),
+        ("bag-quaternions/quaternions.mcap", False, "360 messages.*120 are not finite"),
+        ("bag-stamps-zero/zed_like.mcap", False, "60 messages have no stamp"),
+        ("bag-every-type/test_bag_mcap", False, "image is left out: the image holds 30 bytes"),
+    ],
+)
+def test_nothing_is_dropped_invented_or_reordered_unsaid(shared_data, case, by_log_time, said):
+    try:
+        told = "\n".join(frames_of(shared_data / "cases" / case, by_log_time=by_log_time)[-1])
+    except BagError as error:
+        told = str(error)
+    assert re.search(said, told)
+
+
+def test_poses_of_one_stamp_are_counted(tmp_path):
+    messages = [("/p", pose(EPOCH + k // 2 * PERIOD, z=1e-3 * k), EPOCH + k) for k in range(6)]
+    file = write(tmp_path / "twice.mcap", messages, {"/p": TYPES["/probe/pose"]})
+    _, frames, _, told = frames_of(file, 60)
+    assert [frame["observation.state"][2] for frame in frames] == pytest.approx([0.0, 2e-3, 4e-3])
+    assert "3 have the time of one before and are left out" in told[-1]
 
 
 def test_clocks_that_differ_are_told_and_log_times_help(tmp_path):

@@ -16,7 +16,6 @@ array([-0.01 , -0.009])
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -25,10 +24,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from us_sim.errors import BagError, PoseError, TrackingError
-from us_sim.geometry.pose import FrameTree, Pose
+from us_sim.errors import BagError, TrackingError
+from us_sim.geometry.pose import Pose
 from us_sim.recording.reader import Bag, read_bag
+from us_sim.recording.resampling import Times, slerp
 from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.topic import BagTopic, QosProfile
@@ -40,6 +41,8 @@ POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 _TF = "tf2_msgs/msg/TFMessage"
 _NOWHERE = (math.nan,) * 7
+_LATE = 1_000_000_000  # ns that a stamp may be older than one before; more is another time
+_LONGEST_GAP = 10_000_000_000  # ns between two transforms that belong together, as tf2 keeps them
 
 _Found = tuple[str, Any, Any, Any]  # a body's name, header, position, orientation
 
@@ -138,37 +141,83 @@ def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[Row, _Found]]:
 
 
 def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]:
-    """The poses of a frame of tf in one further up, each time that a frame between moves.
+    """The poses of a frame of tf in one further up, all links of the way at one time.
 
-    Frames between are taken where they last were, as the tracker source ``tf`` does.
+    They are made at the stamps of the link that moves least often, and the others interpolated
+    there; without a pose where one of them is not known then.
     """
-    tree = FrameTree()
+    links: dict[str, list[Row]] = {}
+    fixed: set[str] = set()
     static = f"{topic.name}_static"
     if any(each.name == static for each in bag.topics):
         for row, (frame, *_) in _each(bag, bag.topic(static)):
-            with contextlib.suppress(PoseError):  # a way through it is then none
-                tree.set_pose(frame, row.frame_id.lstrip("/"), _pose(row))
-    is_there = False
+            links[frame] = [row]
+            fixed.add(frame)
     for row, (frame, *_) in _each(bag, topic):
-        try:
-            tree.set_pose(frame, row.frame_id.lstrip("/"), _pose(row))
-        except PoseError:
-            yield row._replace(frame_id=parent, pose=_NOWHERE)
-            continue
-        chain = tree.chain(body, parent)
-        if chain is not None and frame in chain:
-            is_there = True
-            pose = tree.pose(chain)
-            values = tuple(map(float, (*pose.position, *pose.orientation)))
-            yield Row(row.log_time, row.stamp, parent, values)
-    if not is_there:
+        links[frame] = [row] if frame in fixed or frame not in links else [*links[frame], row]
+        fixed.discard(frame)
+    way: list[str] = []
+    while (frame := links[way[-1]][0].frame_id.lstrip("/") if way else body) != parent:
+        if frame not in links or frame in way:
+            way = []
+            break
+        way.append(frame)
+    moving = [frame for frame in way if frame not in fixed]
+    if not moving:
         raise BagError(
             f"{bag.path} holds no way in {topic.name} from '{body}' up to '{parent}' that moves"
         )
+    tracks = {frame: _track(bag, frame, links[frame]) for frame in way}
+    slowest = min(moving, key=lambda frame: len(links[frame]))
+    stamps = np.unique([row.stamp for row in links[slowest]])
+    turn, place = Rotation.identity(len(stamps)), np.zeros((len(stamps), 3))
+    for frame in way:
+        poses = _at(tracks[frame], stamps, is_fixed=frame in fixed)
+        is_known = np.isfinite(poses).all(axis=1)
+        place[~is_known] = np.nan
+        poses[~is_known] = 0, 0, 0, 0, 0, 0, 1
+        link = Rotation.from_quat(poses[:, 3:])
+        turn, place = link * turn, link.apply(place) + poses[:, :3]
+    base = stamps[0]
+    seen = np.array([(row.stamp - base, row.log_time - base) for row in links[moving[0]]])
+    seen = seen[np.argsort(seen[:, 0], kind="stable")]
+    times = np.interp(stamps - base, *seen.T).round().astype(np.int64) + base
+    for time, stamp, at, q in zip(times, stamps, place, turn.as_quat(), strict=True):
+        pose = (*at.tolist(), *q.tolist()) if np.isfinite(at).all() else _NOWHERE
+        yield Row(int(time), int(stamp), parent, pose)
 
 
-def _pose(row: Row) -> Pose:
-    return Pose(np.array(row.pose[:3]), np.array(row.pose[3:]))
+def _track(bag: Bag, frame: str, rows: list[Row]) -> tuple[Times, NDArray[np.float64]]:
+    """The poses (K, 7) of a frame of tf by its stamps, each stamp once."""
+    if len({row.frame_id for row in rows}) > 1:
+        raise BagError(f"{bag.path} holds '{frame}' of tf in several frames: no way up is known")
+    stamps = np.array([row.stamp for row in rows], np.int64)
+    back = (np.maximum.accumulate(stamps) - stamps).max()
+    if back > _LATE:
+        raise BagError(
+            f"{bag.path}: stamps of '{frame}' in tf go back by {back / 1e9:.1f} s, so nobody knows "
+            f"which transforms go together: cut the recording there"
+        )
+    stamps, first = np.unique(stamps, return_index=True)
+    return stamps, np.array([row.pose for row in rows])[first]
+
+
+def _at(track: tuple[Times, NDArray[np.float64]], stamps: Times, *, is_fixed: bool) -> Any:
+    """Poses (M, 7) of a link at stamps; nan where there is none, or a neighbour is far."""
+    times, poses = track
+    usable = is_pose(poses)
+    if is_fixed:
+        return np.tile(poses[0] if usable[0] else _NOWHERE, (len(stamps), 1))
+    found = np.full((len(stamps), 7), np.nan)
+    after = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
+    before = np.clip(np.searchsorted(times, stamps, side="right") - 1, 0, None)
+    known = (times[before] <= stamps) & (stamps <= times[after])
+    known &= usable[before] & usable[after] & (times[after] - times[before] <= _LONGEST_GAP)
+    if usable.sum() > 1 and known.any():
+        found[known] = slerp(times[usable], poses[usable], stamps[known])
+    elif known.any():
+        found[known] = poses[usable]
+    return found
 
 
 _PATHS = (
@@ -323,6 +372,16 @@ def _only_body(bag: Bag, option: str) -> str:
     )
 
 
+def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(K,) whether each of (K, 7) is finite and has an orientation, as `Pose` asks for.
+
+    Trackers send a zero quaternion for a lost marker.
+    """
+    with np.errstate(invalid="ignore"):
+        has_orientation = np.linalg.norm(poses[:, 3:], axis=1) >= 1e-6
+    return np.isfinite(poses).all(axis=1) & has_orientation
+
+
 @dataclass(frozen=True, eq=False)
 class _Read:
     """All recorded poses of a body."""
@@ -359,16 +418,15 @@ def _usable(bag: Bag, read: _Read) -> ProbePath:
             f"{bag.path} holds poses on {read.name} in the frames {', '.join(read.frames)}: a path "
             f"has one frame"
         )
-    # As geometry.pose.Pose refuses it; trackers send a zero quaternion for a lost marker.
-    with np.errstate(invalid="ignore"):
-        has_orientation = np.linalg.norm(poses[:, 3:], axis=1) >= 1e-6
-    usable = np.isfinite(poses).all(axis=1) & has_orientation
+    usable = is_pose(poses)
     rejected = count - int(usable.sum())
     notes = [bag.note] if bag.note else []
     if rejected:
         notes.append(
-            f"{rejected} of the {count} poses on {read.name} are not finite or have no "
-            f"orientation and are left out, the first being number {int(np.argmin(usable)) + 1}"
+            f"{rejected} of the {count} poses on {read.name} are not finite"
+            + (", or not known all the way up," if read.name.count(":") > 1 else "")
+            + " or have no orientation and are left out, the first being number "
+            + str(int(np.argmin(usable)) + 1)
         )
     if rejected == count:
         raise BagError(f"{bag.path} holds no usable pose: {'; '.join(notes)}")

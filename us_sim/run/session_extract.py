@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,29 +14,34 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from us_sim.errors import BagError
-from us_sim.recording.decoding import colour_pixels_from, pixels_from
-from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
+from us_sim.errors import BagError, TrackingError
+from us_sim.recording.path import POSE_STAMPED, bodies_in, is_pose, pose_rows
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagTopic
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
 from us_sim.run.resimulation import scene_of
 from us_sim.run.session_summary import read_session
+from us_sim.settings.spelling import counted
+from us_sim.tracking.camera.encodings import decode_image, decompress_image
 
 AREAS = 200  # images of which areas are measured, evenly over the session
-_IMAGE = "sensor_msgs/msg/Image"
+_DECODE: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
+    "sensor_msgs/msg/Image": decode_image,
+    "sensor_msgs/msg/CompressedImage": decompress_image,
+}
 _LONGEST_PAUSE = 1.0  # s, that a video stands still
 _RATES = (1.0, 240.0)  # images a second of a video
 _MILLIMETRE = 1e-3
 Progress = Callable[[float, str], None]
 
 
-def write_poses(bag: Bag, folder: Path) -> Iterator[Path]:
+def write_poses(bag: Bag, folder: Path) -> Iterator[Path | str]:
     """Every PoseStamped topic, or else every body of others, as CSV and in TUM's format.
 
-    TUM's (``timestamp tx ty tz qx qy qz qw``, s and m) has no poses that are not finite; the CSV
-    has all, with the time at which they were recorded, and their frame.
+    TUM's (``timestamp tx ty tz qx qy qz qw``, s and m) has no poses that are not finite or have no
+    orientation; the CSV has all, with the time at which they were recorded, and their frame. What
+    TUM's has not, and stamps that go back, are said in sentences among the files.
 
     Raises:
         BagError: there are no poses, a file exists, or cannot be written.
@@ -51,12 +55,28 @@ def write_poses(bag: Bag, folder: Path) -> Iterator[Path]:
         head = ("stamp_s", "recorded_s", "frame", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
         table = [(_s(row.stamp), _s(row.log_time), row.frame_id, *row.pose) for row in rows]
         yield _write_csv(folder / f"{_file_name(name)}.csv", head, table)
-        lines = [
-            " ".join([_s(row.stamp), *map(repr, row.pose)])
-            for row in rows
-            if all(map(math.isfinite, row.pose))
-        ]
-        yield _written(folder / f"{_file_name(name)}.tum", "".join(f"{line}\n" for line in lines))
+        usable = is_pose(np.array([row.pose for row in rows]).reshape(-1, 7))
+        kept = [row for row, is_one in zip(rows, usable, strict=True) if is_one]
+        lines = [" ".join([_s(row.stamp), *map(repr, row.pose)]) for row in kept]
+        file = folder / f"{_file_name(name)}.tum"
+        yield _written(file, "".join(f"{line}\n" for line in lines))
+        if rejected := len(rows) - len(kept):
+            are = counted(rejected, "pose is", "poses are")
+            yield f"{name}: {are} not finite or without an orientation, and not in {file.name}"
+        yield from _times_told(name, [row.stamp for row in kept], file.name)
+
+
+def _times_told(name: str, stamps: list[int], where: str, remedy: str = "") -> Iterator[str]:
+    """Sentences on stamps that are 0 or go back."""
+    if missing := stamps.count(0):
+        yield f"{name}: {missing} of {counted(len(stamps), 'stamp')} are 0{remedy}"
+    back = [k for k in range(1, len(stamps)) if stamps[k] < stamps[k - 1]]
+    if back:
+        k = back[0]
+        yield (
+            f"{name}: stamps go back {counted(len(back), 'time')}, first by "
+            f"{(stamps[k - 1] - stamps[k]) / 1e9:.3f} s at line {k + 1} of {where}"
+        )
 
 
 def write_wrenches(bag: Bag, folder: Path) -> Iterator[Path]:
@@ -78,55 +98,78 @@ def write_wrenches(bag: Bag, folder: Path) -> Iterator[Path]:
 
 def write_images(
     bag: Bag, folder: Path, progress: Progress, *, pictures: bool, video: bool
-) -> Iterator[Path]:
+) -> Iterator[Path | str]:
     """Every topic of images as PNG files, as MP4, or both; and a CSV with stamp and scale of each.
 
     PNG files hold their scale as resolution, and it, stamp, topic and frame as texts. A video has a
     constant rate, the usual one of the images: they are shown when they were stamped, but none for
-    longer than a second.
+    longer than a second. Images without a stamp have the time of their recording. What cannot be
+    decoded is said in sentences among the files.
 
     Args:
-        bag: with images of ``mono8`` or ``rgb8``.
+        bag: with images, raw or compressed, as `tracking.camera.encodings` knows them.
         folder: gets a folder for each topic, and a video.
         progress: takes the fraction done, and the topic.
         pictures: write PNG files.
         video: write an MP4.
 
     Raises:
-        BagError: there is no image, its encoding is another, a file exists, or cannot be written.
+        BagError: there is no image that can be decoded, a file exists, or cannot be written.
     """
-    topics = [topic for topic in bag.topics if topic.type_name == _IMAGE and topic.message_count]
+    topics = [topic for topic in bag.topics if topic.type_name in _DECODE and topic.message_count]
     if not topics:
         raise BagError(f"{bag.path} holds no image; leave out --images and --video")
+    is_written = False
     for topic in topics:
-        stem = folder / _file_name(topic.name)
-        scale = _scale(bag, topic)
-        stamps = _stamps(bag, topic)
-        beats, rate = _beats(stamps)
-        spacing = [f"{each / _MILLIMETRE:.6g}" for each in scale or ()]
-        facts = [f"topic {topic.name}"]
-        if scale:
-            facts.append("pixel spacing {} mm across, {} mm down".format(*spacing))
-        film = _Film(stem.with_suffix(".mp4"), rate) if video else None
-        rows = []
-        for number, message in enumerate(bag.messages([topic.name])):
-            progress(min(number / topic.message_count, 0.999), topic.name)
-            decoded: Any = bag.deserialize(message)
-            pixels = _pixels(decoded)
-            name = f"{number:06d}.png"
-            rows.append((name if pictures else number, _s(stamps[number]), *(spacing or ("", ""))))
-            if pictures:
-                told = [f"stamp {_s(stamps[number])} s", f"frame {decoded.header.frame_id}", *facts]
-                _write_png(stem / name, pixels, scale, told)
-            if film is not None:
-                film.show(pixels, beats[number])
-        head = ("image", "stamp_s", "column_spacing_mm", "row_spacing_mm")
-        yield _write_csv(stem.with_suffix(".csv"), head, rows)
-        if pictures:
-            yield stem
-        if film is not None:
-            yield film.finish()
+        for made in _write_topic(bag, topic, folder, progress, pictures, video):
+            is_written = is_written or isinstance(made, Path)
+            yield made
     progress(1.0, "")
+    if not is_written:
+        raise BagError(f"{bag.path} holds no image that can be decoded")
+
+
+def _write_topic(
+    bag: Bag, topic: BagTopic, folder: Path, progress: Progress, pictures: bool, video: bool
+) -> Iterator[Path | str]:
+    stem = folder / _file_name(topic.name)
+    scale = _scale(bag, topic)
+    stamps, times = _stamps(bag, topic)
+    beats, rate = _beats(times)
+    spacing = [f"{each / _MILLIMETRE:.6g}" for each in scale or ()]
+    facts = [f"topic {topic.name}"]
+    if scale:
+        facts.append("pixel spacing {} mm across, {} mm down".format(*spacing))
+    film = _Film(stem.with_suffix(".mp4"), rate) if video else None
+    rows: list[Sequence[object]] = []
+    odd: list[str] = []
+    for number, message in enumerate(bag.messages([topic.name])):
+        progress(min(number / topic.message_count, 0.999), topic.name)
+        try:
+            decoded: Any = bag.deserialize(message)
+            pixels = _DECODE[topic.type_name](decoded, "RGB")
+        except (BagError, TrackingError) as error:
+            odd.append(str(error))
+            continue
+        name = f"{number:06d}.png"
+        rows.append((name if pictures else number, _s(times[number]), *(spacing or ("", ""))))
+        if pictures:
+            told = [f"stamp {_s(times[number])} s", f"frame {decoded.header.frame_id}", *facts]
+            _write_png(stem / name, pixels, scale, told)
+        if film is not None:
+            film.show(pixels, beats[number])
+    if odd:
+        yield f"{topic.name}: {counted(len(odd), 'image')} skipped: {odd[0]}"
+    if not rows:
+        return
+    head = ("image", "stamp_s", "column_spacing_mm", "row_spacing_mm")
+    yield _write_csv(stem.with_suffix(".csv"), head, rows)
+    remedy = ": the times are those of the recording"
+    yield from _times_told(topic.name, stamps, stem.with_suffix(".csv").name, remedy)
+    if pictures:
+        yield stem
+    if film is not None:
+        yield film.finish()
 
 
 def write_areas(bag: Bag, folder: Path, progress: Progress) -> Iterator[Path]:
@@ -199,14 +242,16 @@ def _scale(bag: Bag, topic: BagTopic) -> tuple[float, float] | None:
     return None
 
 
-def _stamps(bag: Bag, topic: BagTopic) -> list[int]:
+def _stamps(bag: Bag, topic: BagTopic) -> tuple[list[int], list[int]]:
+    """ns of each message: its stamp; and likewise, or where it is 0, when it was recorded."""
     read = stamp_reader(bag, topic)
     if read is None:
         raise BagError(f"{bag.path} defines {topic.type_name} as ROS 2 does not: it has no header")
     try:
-        return [read(message.data) or 0 for message in bag.messages([topic.name])]
+        both = [(read(m.data) or 0, m.log_time) for m in bag.messages([topic.name])]
     except (struct.error, IndexError):
         raise BagError(f"{bag.path} holds a message on {topic.name} that is no image") from None
+    return [stamp for stamp, _ in both], [stamp or log_time for stamp, log_time in both]
 
 
 def _beats(stamps: list[int]) -> tuple[list[int], float]:
@@ -214,13 +259,10 @@ def _beats(stamps: list[int]) -> tuple[list[int], float]:
     steps = np.diff(np.array(stamps, np.float64)) * 1e-9
     usual = float(np.median(steps)) if len(steps) else 0.0
     rate = float(np.clip(1.0 / usual, *_RATES)) if usual > 0 else 25.0
+    steps[steps < 0] = 1.0 / rate  # after a clock was set back
     ends = np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE)) * rate
     shown = np.diff(np.round(ends), prepend=0.0).astype(int)
     return [*shown.tolist(), 1], rate
-
-
-def _pixels(message: Any) -> NDArray[np.uint8]:
-    return colour_pixels_from(message) if message.encoding == "rgb8" else pixels_from(message)
 
 
 def _write_png(

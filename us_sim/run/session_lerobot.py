@@ -35,6 +35,8 @@ _SECOND = 1_000_000_000
 _HIGHEST_RATE = 1000  # Hz
 _MOST_FRAMES = 10_000_000
 """Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""
+_LATE = _SECOND  # ns that a stamp may be older than one before; more is another time
+_LONG = 0.5  # s between two messages, between which frames are told to be interpolated
 _PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
     "sensor_msgs/msg/Image": decode_image,
     "sensor_msgs/msg/CompressedImage": decompress_image,
@@ -49,6 +51,7 @@ _NUMBERS: Mapping[str, Callable[[Any], Iterator[tuple[str, float]]]] = {
     "sensor_msgs/msg/JointState": lambda m: zip(m.name, m.position, strict=False),
 }
 """Numbers of messages that have a header, with their names."""
+_Timed = tuple[int, int, dict[str, float]]  # stamp and log time, ns, and numbers by their names
 Progress = Callable[[float, str], None]
 
 
@@ -122,6 +125,7 @@ class Images:
     times: Times
     numbers: NDArray[np.int64]  # (K,) of the messages, in the order of the recording
     count: int  # of messages
+    notes: list[str]  # on messages that are not as they should be
     damaged: int = field(default=0, init=False)  # of those that were to be shown
 
     @property
@@ -156,6 +160,7 @@ class Images:
             f"{counted(len(moments) - count, 'frame repeats', 'frames repeat')} the one before, "
             f"which is {oldest:.3f} s old at most"
             + (f"; {self.damaged} cannot be decoded" if self.damaged else "")
+            + "".join(f"; {note}" for note in self.notes)
         )
 
 
@@ -168,7 +173,7 @@ class Numbers:
     values: NDArray[np.float64]  # (K, N), NaN where a message has them not
     parts: list[str]  # names of the N
     is_pose: bool
-    rejected: int  # messages without a finite number, or poses without an orientation
+    notes: list[str]  # on messages that are not as they should be
 
     @property
     def span(self) -> tuple[int, int]:
@@ -184,13 +189,15 @@ class Numbers:
 
     def told(self, moments: Times) -> str:
         """The messages in numbers."""
-        begin, end = np.searchsorted(self.times, moments[[0, -1]])
-        gap = np.diff(self.times[max(begin - 1, 0) : end + 1]).max() / _SECOND
-        return (
-            f"{self.name}: {'slerp' if self.is_pose else 'linear'} between "
-            f"{counted(len(self.times), 'message')}, {gap:.3f} s apart at most"
-            + (f"; {self.rejected} are not finite and left out" if self.rejected else "")
-        )
+        after = np.clip(np.searchsorted(self.times, moments), 1, len(self.times) - 1)
+        gaps = (self.times[after] - self.times[after - 1]) / _SECOND
+        between = "slerp" if self.is_pose else "linear"
+        messages = counted(len(self.times), "message")
+        told = [f"{self.name}: {between} between {messages}, {gaps.max():.3f} s apart at most"]
+        if count := int((gaps > _LONG).sum()):
+            lie = counted(count, "frame lies", "frames lie")
+            told.append(f"{lie} between messages more than {_LONG} s apart")
+        return "; ".join(told + self.notes)
 
 
 class Episode:
@@ -293,11 +300,11 @@ class Episode:
         if topic.type_name in _PIXELS:
             if name == self._action:
                 raise BagError("is a topic of images, which are no action")
-            stamp = (not self._wanted.by_log_time and stamp_reader(bag, topic)) or (lambda _: None)
-            times, kept, count = [-1], [], 0
+            stamp = stamp_reader(bag, topic) or (lambda _: None)
+            times, kept, count, clock = [-1], [], 0, self._clock()
             for raw in bag.messages([topic.name]):
                 with _telling(topic):
-                    time = stamp(raw.data) or raw.log_time
+                    time = clock.time(stamp(raw.data) or 0, raw.log_time)
                 if not count:
                     _pixels(bag, raw)  # refused at once where nothing of it can be decoded
                 if time > times[-1]:  # else it came too late to be shown
@@ -306,47 +313,92 @@ class Episode:
                 count += 1
             self._require_several(kept)
             arrays = _times(times[1:]), np.array(kept, np.int64)
-            self._images.append(Images(bag, name, *arrays, count))
+            self._images.append(Images(bag, name, *arrays, count, clock.notes()))
             return
         is_pose = topic.type_name not in _NUMBERS
         table: dict[int, dict[str, float]] = {}  # numbers of the same time go together
-        rejected, frames = 0, dict[str, None]()
+        rejected, repeated, frames, clock = 0, 0, dict[str, None](), self._clock()
         rows = self._poses(name, frames) if is_pose else self._vectors(topic)
-        for time, numbers in rows:
+        for stamped, log_time, numbers in rows:
+            time = clock.time(stamped, log_time)
             finite = {part: value for part, value in numbers.items() if np.isfinite(value)}
             if is_pose and (
                 len(finite) < 7 or np.linalg.norm([finite[q] for q in POSE_PARTS[3:]]) < 1e-6
             ):
                 finite = {}
             rejected += not finite
-            if finite:
-                table.setdefault(time, {}).update(finite)
+            known = table.setdefault(time, {}) if finite else {}
+            repeated += not known.keys().isdisjoint(finite)
+            known |= {part: value for part, value in finite.items() if part not in known}
         if len(frames) > 1:
             raise BagError(f"has poses in the frames {', '.join(frames)}, and a path has one")
         self._require_several(table)
         parts = list(dict.fromkeys(part for row in table.values() for part in row))
         times = sorted(table)
         values = np.array([[table[t].get(part, np.nan) for part in parts] for t in times])
-        self._numbers.append(Numbers(name, _times(times), values, parts, is_pose, rejected))
+        notes = clock.notes()
+        if repeated:
+            notes.append(f"{repeated} have the time of one before and are left out")
+        if rejected:
+            notes.append(f"{rejected} are not finite and left out")
+        self._numbers.append(Numbers(name, _times(times), values, parts, is_pose, notes))
 
-    def _poses(self, name: str, frames: dict[str, None]) -> Iterator[tuple[int, dict[str, float]]]:
+    def _clock(self) -> _Clock:
+        return _Clock(self._wanted.by_log_time)
+
+    def _poses(self, name: str, frames: dict[str, None]) -> Iterator[_Timed]:
         for row in pose_rows(self._bag, name):
             frames[row.frame_id] = None
-            time = row.log_time if self._wanted.by_log_time else row.stamp or row.log_time
-            yield time, dict(zip(POSE_PARTS, row.pose, strict=True))
+            yield row.stamp, row.log_time, dict(zip(POSE_PARTS, row.pose, strict=True))
 
-    def _vectors(self, topic: BagTopic) -> Iterator[tuple[int, dict[str, float]]]:
+    def _vectors(self, topic: BagTopic) -> Iterator[_Timed]:
         for raw in self._bag.messages([topic.name]):
             message = self._bag.deserialize(raw)
             with _telling(topic):
                 stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
                 numbers = {str(part): float(x) for part, x in _NUMBERS[topic.type_name](message)}
-            yield raw.log_time if self._wanted.by_log_time else stamp or raw.log_time, numbers
+            yield stamp, raw.log_time, numbers
 
     @staticmethod
     def _require_several(messages: Any) -> None:
         if len(messages) < 2:
             raise BagError(f"has {counted(len(messages), 'message')} of use, and two are needed")
+
+
+class _Clock:
+    """The times of a topic's messages, ns: their stamps, or when they were recorded."""
+
+    def __init__(self, by_log_time: bool) -> None:
+        self._by_log_time = by_log_time
+        self._newest: int | None = None
+        self._late = self._unstamped = 0
+
+    def time(self, stamp: int, log_time: int) -> int:
+        """The time of the next message in the recording.
+
+        Raises:
+            BagError: it is of another time, as after a clock was set back.
+        """
+        self._unstamped += not stamp and not self._by_log_time
+        time = log_time if self._by_log_time else stamp or log_time
+        back = 0 if self._newest is None else self._newest - time
+        if back > _LATE:
+            raise BagError(
+                f"its stamps go back by {back / _SECOND:.1f} s, so nobody knows which messages go "
+                f"together: give --by-log-time"
+            )
+        self._late += back > 0
+        self._newest = time if back < 0 or self._newest is None else self._newest
+        return time
+
+    def notes(self) -> list[str]:
+        """What of the times so far is not as it should be."""
+        unstamped = counted(self._unstamped, "message has", "messages have")
+        late = counted(self._late, "message is", "messages are")
+        return [
+            *[f"{unstamped} no stamp, but the time of recording"][: self._unstamped],
+            *[f"{late} stamped before one that was recorded earlier"][: self._late],
+        ]
 
 
 def _whole_name(bag: Bag, name: str) -> str:
