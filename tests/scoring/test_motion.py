@@ -1,7 +1,10 @@
 """PerkTutor's published tables, met on its own recordings; movements whose metrics are known."""
 
 import csv
+import tempfile
 import xml.etree.ElementTree as ElementTree
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.scoring.metrics import Scan, metrics_of
 from us_sim.scoring.motion import Motion
-from us_sim.volume.sequences.slicer_transforms import read_slicer_sequences
+from us_sim.volume.sequences.itk_transform import read_slicer_transform
 
 NEEDLE = 0.3  # m, TissueDamage.NEEDLE_LENGTH; it points along +z, as its evaluator has by default
 MM, MM2 = 1e3, 1e6
@@ -68,8 +71,20 @@ def lumbar(folder):
 
 
 def in_plane(folder):
-    times, found = read_slicer_sequences(folder / "Scene_InPlane.mrml")
-    devices = {name: each.matrices for name, each in found.items()}
+    scene = ElementTree.parse(folder / "Scene_InPlane.mrml").iter("Sequence")
+    sequences = {node.get("name").removesuffix("-Sequence"): node for node in scene}
+    devices = {"NeedleTipToNeedle": read_slicer_transform(folder / "NeedleTipToNeedle.h5")}
+    for name in ("NeedleToReference", "ImageToReference"):
+        entries = sequences[name].get("indexValues").strip(";").split(";")
+        times = np.array([float(entry.split(":")[1]) for entry in entries])
+        with (
+            zipfile.ZipFile(folder / f"{name}-Sequence.mrb") as bundle,
+            tempfile.TemporaryDirectory() as unpacked,
+        ):
+            bundle.extractall(unpacked)
+            files = [f"{name}_{n}" if n else name for n in range(len(entries))]
+            data = Path(unpacked, f"{name}-Sequence", "Data")
+            devices[name] = np.array([read_slicer_transform(data / f"{n}.h5") for n in files])
     devices["NeedleTipToNeedle"] = devices["NeedleToReference"] @ devices["NeedleTipToNeedle"]
     return times, devices, folder / "TissueModel.stl"
 

@@ -60,8 +60,7 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
     """The valid poses of a body.
 
     Args:
-        path: a bag, or a tracker recording of Plus (.igs.mha, .igs.nrrd) or of 3D
-            Slicer (.mrml, .mrb).
+        path: a bag, or a tracker recording of Plus (.igs.mha, .igs.nrrd).
         name: a topic; or a transform such as StylusToTracker, or StylusToReference where both
             are recorded. May be None where there is one.
 

@@ -34,8 +34,8 @@ from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.topic import BagTopic, QosProfile
 from us_sim.recording.writer import BagWriter
+from us_sim.volume.sequences.itk_transform import TRANSFORM_SUFFIXES
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
-from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, SLICER_TRANSFORMS
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
@@ -220,10 +220,7 @@ def _at(track: tuple[Times, NDArray[np.float64]], stamps: Times, *, is_fixed: bo
     return found
 
 
-_PATHS = (
-    "give a bag (.mcap, .db3), a tracker recording of PLUS (.igs.mha, .igs.nrrd) or a scene of 3D "
-    "Slicer (.mrml, .mrb)"
-)
+_PATHS = "give a bag (.mcap, .db3) or a tracker recording of PLUS (.igs.mha, .igs.nrrd)"
 _MOST_NAMES = 20  # bodies that are listed where one has to be named
 
 
@@ -277,8 +274,7 @@ class ProbePath:
 
 
 def read_path(path: str | Path, topic: str | None = None, *, option: str = "topic") -> ProbePath:
-    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``)
-    or 3D Slicer (``.mrml``, ``.mrb``).
+    """Reads the poses of a bag, or of a tracker recording of Plus (``.mha``, ``.nrrd``).
 
     Poses that are not finite or have no orientation are left out and counted.
 
@@ -306,7 +302,7 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
     try:
         bag = read_bag(path)
     except NoBagError as error:
-        single = Path(path).suffix.lower() in SLICER_TRANSFORMS
+        single = Path(path).suffix.lower() in TRANSFORM_SUFFIXES
         remedy = "a single transform belongs in `registration` or `calibration`; " if single else ""
         raise BagError(f"{error}; {remedy}{_PATHS}") from None
     read = _read(bag, topic or _only_body(bag, option))
@@ -318,8 +314,8 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
 
 
 def is_tracker_recording(path: str | Path) -> bool:
-    """Whether a file's name is that of a sequence of Plus, or of a scene of 3D Slicer."""
-    return Path(path).suffix.lower() in (*SEQUENCE_SUFFIXES, *SLICER_SCENES)
+    """Whether a file's name is that of a sequence of Plus or 3D Slicer."""
+    return Path(path).suffix.lower() in SEQUENCE_SUFFIXES
 
 
 def write_path(file: str | Path, path: ProbePath, *, sidecar: bool = True) -> None:

@@ -1,5 +1,4 @@
-"""Tracker recordings: a sequence file of Plus (`.igs.mha`, `.igs.nrrd`), with or without images, or
-a scene or sequence of 3D Slicer (`.mrml`, `.mrb`).
+"""Tracker recordings: sequence files of Plus (`.igs.mha`, `.igs.nrrd`), with or without images.
 
 Every sample has a time and named transforms (``ProbeToTracker``), each with a status.
 """
@@ -18,7 +17,6 @@ from us_sim.errors import TrackingError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.recording.path import ProbePath
 from us_sim.volume.sequences.sequence import read_sequence
-from us_sim.volume.sequences.slicer_transforms import SLICER_SCENES, read_slicer_sequences
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
     TransformChain,
@@ -135,7 +133,7 @@ class TrackerRecording:
 
 
 def read_tracker_recording(path: str | Path) -> TrackerRecording:
-    """The transforms of a sequence file of Plus, or of a scene or sequence of 3D Slicer.
+    """The transforms of a sequence file of Plus.
 
     A transform whose status is not OK, or that is not rigid (Plus writes zeros for a tool
     that it has not seen), is not valid; a sample without a time is left out whole. Both are
@@ -147,23 +145,20 @@ def read_tracker_recording(path: str | Path) -> TrackerRecording:
     """
     path = Path(path)
     try:
-        if path.suffix.lower() in SLICER_SCENES:
-            times, found = read_slicer_sequences(path)
-        else:
-            sequence = read_sequence(path)
-            times, found = sequence.times, dict(sequence.transforms)
+        sequence = read_sequence(path)
     except VolumeError as error:
         raise TrackingError(str(error)) from error
+    times = sequence.times
     timed = np.flatnonzero(np.isfinite(times))
     transforms = {
         name: _rigid(series, timed)
-        for name, series in found.items()
+        for name, series in sequence.transforms.items()
         if not any(map(is_image_frame, split_transform_name(name) or ()))
     }
     if not transforms:
         raise TrackingError(
             f"{path}: holds no transforms (Seq_Frame0000_ProbeToTrackerTransform); give a tracker "
-            f"recording of Plus or 3D Slicer"
+            f"recording of Plus"
         )
     recording = TrackerRecording(path, times[timed], transforms, len(times) - len(timed))
     if not any(series.valid.any() for series in transforms.values()):

@@ -219,8 +219,8 @@ GRADIENT = np.arange(np.prod(SHAPE), dtype=np.int16).reshape(SHAPE)
         ("a.mha", GRADIENT / np.float32(3), {}, "fractions"),
         ("a.nrrd", np.ones((*SHAPE, 2), np.uint8), {}, "2 numbers per voxel"),
         ("a.seg.nrrd", ONES, segments(("vein", 1, 4)), "layer 4 of 1"),
-        ("a.seg.nrrd", ONES, segments(("vein", "x", 0)), "LabelValue is 'x'"),
-        ("a.seg.nrrd", ONES, segments(("vein", 1, 0, {"Extent": "0 1"})), "six whole numbers"),
+        ("a.seg.nrrd", ONES, segments(("vein", "x", 0)), "Segment0"),
+        ("a.seg.nrrd", ONES, segments(("vein", 1, 0, {"Extent": "0 1"})), "Extent 0 1"),
         ("a.seg.nrrd", ONES, {"Segmentation_MasterRepresentation": "Fractional"}, "Fractional"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Volume files: hand-written MetaImage and NIfTI, what SimpleITK writes, and a real sweep."""
+"""Volume files: hand-written MetaImage, NRRD and NIfTI, what SimpleITK writes, and real ones."""
 
 import bz2
 import gzip
@@ -11,7 +11,14 @@ import SimpleITK as sitk
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files import stored_image
-from us_sim.volume.files.readers import grey_voxels, open_image, read_placement, read_volume
+from us_sim.volume.files.readers import (
+    grey_voxels,
+    open_image,
+    read_placement,
+    read_volume,
+    sequence_use,
+)
+from us_sim.volume.files.writing import write_volume
 
 SHAPE = (4, 5, 6)
 GREY = np.random.default_rng(2).integers(0, 256, SHAPE, dtype=np.uint8)
@@ -227,59 +234,44 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
     [
         ({}, b"\0" * 60, "holds 60 bytes .* 120"),
         ({}, b"\0" * 121, "holds 121 bytes .* 120"),
-        ({"DimSize": "4 5 7"}, None, "holds 120 bytes .* 140"),
         ({"ElementType": "MET_SHORT"}, None, "header says 240"),
         ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
         ({"ElementSpacing": "1 -2 1"}, None, "spacing 1 × -2 × 1 mm"),
-        ({"ElementSpacing": "1 nan 1"}, None, "a number"),
-        ({"ElementSpacing": "1 1 inf"}, None, "a number"),
-        ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular"),
-        ({"DimSize": "4 5 1"}, b"\0" * 20, "each axis"),
-        ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers"),
-        ({"DimSize": ":4 5 6"}, None, "DimSize is ':4 5 6'"),
-        ({"DimSize": "-4 5 6"}, None, "above zero"),
-        ({"DimSize": "4 5_0 6"}, None, "above zero"),
-        ({"NDims": "2"}, None, "NDims"),
-        ({"DimSize": "1024 1024 1024"}, None, "536870912"),
-        ({"DimSize": "4000000000 4000000000 4000000000"}, None, "536870912"),
+        ({"ElementSpacing": "1 nan 1"}, None, "ElementSpacing"),
         ({"ElementSpacing": "1e-30 1 1"}, None, "spacing 1e-30"),
-        ({"Offset": "nan 0 0"}, None, "Offset is 'nan 0 0'"),
-        ({"Offset": "0 0"}, None, "3 finite"),
+        ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular"),
+        ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "27°"),
+        ({"TransformMatrix": "2 0 0 0 2 0 0 0 2"}, None, "scaled"),
+        ({"Offset": "0 0"}, None, "Offset"),
         ({"Offset": "0 0 1e9"}, None, "1e\\+06 m"),
-        ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "sheared"),
-        ({"TransformMatrix": "2 0 0 0 2 0 0 0 2"}, None, "sheared"),
+        ({"DistanceUnits": "furlong"}, None, "furlong"),
+        ({"DimSize": "4 5 1"}, b"\0" * 20, "each axis"),
+        ({"DimSize": "-4 5 6"}, None, "DimSize"),
+        ({"DimSize": "1024 1024 1024"}, None, "536870912"),
+        ({"NDims": "2"}, None, "NDims"),
+        ({"NDims": "2", "DimSize": "4 30"}, None, "2-dimensional"),
+        ({"DimSize": "2 5 6", "ElementNumberOfChannels": "2"}, None, "2 numbers"),
+        ({"ElementType": "MET_STRING"}, None, "MET_CHAR"),
         ({"HeaderSize": "-2"}, None, "HeaderSize"),
         ({"BinaryData": "False"}, b"1 2 3", "holds 3 bytes"),
-        ({"BinaryData": "False"}, b"1 2 x", "uint8"),
-        ({"BinaryData": "False"}, b"256 " * 120, "uint8"),
-        ({"DistanceUnits": "furlong"}, None, "furlong"),
-        ({"ElementType": "MET_STRING"}, None, "MET_CHAR"),
+        ({"BinaryData": "False"}, b"1 2 x", "broken"),
     ],
 )
 def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, message):
     refused(_metaimage(tmp_path / "bad.mha", data, **fields), message)
 
 
-def _compressed(path, data, **fields):
-    packed = zlib.compress(data)
-    size = str(len(packed))
-    return _metaimage(path, packed, CompressedData="True", CompressedDataSize=size, **fields)
-
-
 def test_a_compressed_metaimage_holds_what_its_header_says(tmp_path):
-    data = GREY.tobytes(order="F")
-    np.testing.assert_array_equal(
-        read_volume(_compressed(tmp_path / "a.mha", data)).intensities, GREY
-    )
-    for wrong, held in ((data[:60], "60"), (b"", "0"), (data + b"\0", "121 or more")):
-        refused(_compressed(tmp_path / "a.mha", wrong), f"holds {held} bytes .* 120")
+    """Where SimpleITK makes an image of what was in memory."""
 
+    def packed(data):
+        return _metaimage(tmp_path / "a.mha", data, CompressedData="True")
 
-def test_what_unpacks_to_more_than_it_says_is_not_unpacked(tmp_path):
-    much, vast = bytes(100 << 20), {"DimSize": "1024 1024 1024"}
-    refused(_compressed(tmp_path / "a.mha", much), "or more bytes .* 120")
-    refused(_compressed(tmp_path / "a.mha", bytes(100), **vast), "536870912")
-    refused(_nifti(tmp_path / "a.nii.gz", much, np.eye(4)), "or more bytes .* 120")
+    whole = GREY.tobytes(order="F")
+    np.testing.assert_array_equal(read_volume(packed(zlib.compress(whole))).intensities, GREY)
+    refused(packed(zlib.compress(whole[:60])), "60 bytes .* 120")
+    refused(packed(zlib.compress(whole + bytes(100 << 20))), "121 or more bytes .* 120")
+    refused(packed(zlib.compress(whole)[:-20]), "broken or cut")
 
 
 def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
@@ -293,14 +285,13 @@ def test_a_volume_that_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch
         ("sizes: 4 5 6", "sizes: 4 5 7", "holds 120 bytes .* 140"),
         ("sizes: 4 5 6", "sizes: 4 5 6 1", "dimension"),
         ("sizes: 4 5 6", "sizes: 4 5 -6", "above zero"),
-        # ITK writes beyond its memory for these.
         ("space directions: ", "space directions: " + 25 * "(1,0,0) ", "28 entries"),
-        ("space origin: (0,0,0)", "space origin: (0,0,nan)", "three finite"),
+        ("space origin: (0,0,0)", "space origin: (0,0,nan)", "finite"),
         ("encoding: raw", "encoding: hex", "'hex'"),
-        ("encoding: raw", "encoding: raw\nencoding: gzip", "'encoding' twice"),
-        ("encoding: raw", "encoding: raw\nbyte skip: -2", "byte skip"),
+        ("encoding: raw", "encoding: raw\nencoding: gzip", "Duplicate"),
         ("encoding: raw", "encoding: raw\nbyte skip: 9", "holds 111 bytes"),
-        ("encoding: raw", "encoding: bzip2", "compression"),
+        ("encoding: raw", "encoding: bzip2", "broken"),
+        ("space: left-posterior-superior", "space: scanner-xyz", "scanner-xyz"),
         ("space directions: ", "space units: furlong mm mm\nspace directions: ", "furlong"),
     ],
 )
@@ -312,25 +303,17 @@ def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, old, new, message
     refused(path, message)
 
 
-def test_an_nrrd_header_may_say_much_in_its_own_words(tmp_path):
-    path = _stored(tmp_path / "a.nrrd", GREY.T)
-    words = f"# {3000 * 'a'}\nterminology:={3000 * 'b'}\nencoding: "
-    path.write_bytes(path.read_bytes().replace(b"encoding: ", words.encode()))
-    np.testing.assert_array_equal(read_volume(path).intensities, GREY)
-
-
 @pytest.mark.parametrize(
     ("at", "form", "value", "message"),
     [
-        (40, "<2h", (3, -4), "axes of -4, 5, 6"),
-        (40, "<h", (8,), "says 8 axes"),
+        (40, "<2h", (3, -4), "each axis"),
         (70, "<h", (4,), "holds 120 bytes .* 240"),
-        (70, "<h", (77,), "data type 77"),
-        (108, "<f", (np.nan,), "from byte nan"),
-        (108, "<f", (np.inf,), "from byte inf"),
+        (70, "<h", (77,), "77"),
+        (108, "<f", (np.nan,), "an image"),
         (108, "<f", (1e9,), "holds 0 bytes"),
-        (288, "<f", (0.4,), "sheared"),
-        (344, "<i", (0,), r"Analyze 7\.5"),
+        (288, "<f", (0.4,), "22°"),
+        (344, "<i", (0,), "an image"),
+        (76, "<4f", (1, 1, 1, 2), "two sizes"),
     ],
 )
 def test_a_nifti_header_that_does_not_fit_is_refused(tmp_path, at, form, value, message):
@@ -345,26 +328,7 @@ def test_a_cut_file_is_refused(tmp_path, suffix, compressed):
     image = sitk.GetImageFromArray(np.resize(GREY, (20, 20, 20)))
     sitk.WriteImage(image, str(path), compressed)
     path.write_bytes(path.read_bytes()[:-40])
-    refused(path, "bytes of image data|broken or cut|cannot be read")
-
-
-@pytest.mark.parametrize(
-    ("name", "image", "message"),
-    [
-        ("flat.mha", sitk.Image([6] * 2, sitk.sitkUInt8), "2-dimensional"),
-        ("flat.mha", sitk.Image([6] * 5, sitk.sitkUInt8), "5-dimensional"),
-        ("colour.nrrd", sitk.Image([6] * 3, sitk.sitkVectorUInt8, 3), "3 numbers"),
-    ],
-)
-def test_images_of_other_dimensions_and_colour_are_refused(tmp_path, name, image, message):
-    sitk.WriteImage(image, str(tmp_path / name))
-    refused(tmp_path / name, message)
-
-
-def test_a_header_without_its_data_file_is_refused(tmp_path):
-    path = _stored(tmp_path / "a.mhd", GREY)
-    (tmp_path / "a.raw").unlink()
-    refused(path, r"a\.raw")
+    refused(path, "bytes of image data|broken or cut")
 
 
 @pytest.mark.parametrize("name", ["note.txt", "note.mha", "note.nii", "note.nrrd", "note"])
@@ -375,29 +339,27 @@ def test_what_is_no_image_is_refused(tmp_path, name, content):
     refused(path, "an image")
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+def test_what_is_not_there_is_named(tmp_path):
     refused(tmp_path / "nowhere.mha", "no such file")
     refused(tmp_path, "no DICOM files")
+    image = sitk.GetImageFromArray(GREY)
+    for header, data in (("a.mhd", "a.raw"), ("a.nhdr", "a.raw"), ("a.hdr", "a.img")):
+        sitk.WriteImage(image, str(tmp_path / header))
+        (tmp_path / data).unlink()
+        refused(tmp_path / header, data)
 
 
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
-@pytest.mark.parametrize(
-    ("slope", "intercept"), [(2.0, -10.0), (0.5, 0.0), (1.0, 3.0), (-1.0, 255.0)]
-)
-@pytest.mark.parametrize("kind", [np.uint8, np.int16])
+@pytest.mark.parametrize(("slope", "intercept"), [(2.0, -10.0), (1.0, 3.0), (-1.0, 255.0)])
 def test_stored_numbers_of_nifti_that_stand_for_others_are_read_as_those(
-    tmp_path, suffix, slope, intercept, kind
+    tmp_path, suffix, slope, intercept
 ):
-    plain = tmp_path / f"a{suffix}"
-    ramp = np.arange(256, dtype=kind).reshape(4, 8, 8)
-    sitk.WriteImage(sitk.GetImageFromArray(ramp), str(plain))
-    packed = suffix == ".nii.gz"
-    if packed:
-        plain.write_bytes(gzip.decompress(plain.read_bytes()))
-    _changed(plain, 112, "<2f", slope, intercept)
-    if packed:
-        plain.write_bytes(gzip.compress(plain.read_bytes()))
-    read = read_volume(plain).intensities
+    ramp = np.arange(256, dtype=np.uint8).reshape(4, 8, 8)
+    path = _stored(tmp_path / "a.nii", ramp)
+    _changed(path, 112, "<2f", slope, intercept)
+    if suffix == ".nii.gz":
+        (tmp_path / "a.nii.gz").write_bytes(gzip.compress(path.read_bytes()))
+    read = read_volume(tmp_path / f"a{suffix}").intensities
     expected = ramp if slope > 0 else 255 - ramp  # stretched over all grey values
     np.testing.assert_array_equal(read, expected.T)
 
@@ -425,7 +387,6 @@ PLACED = ("space: LPS", "space directions: (0.5,0,0) (0,0.25,0) (0,0,2)", "space
         ("raw\nendian: big", RAW.astype(">i2").tobytes(order="F")),
         ("gz", gzip.compress(MARKED)),
         ("bzip2", bz2.compress(MARKED)),
-        ("bz2\nbyte skip: 5", bz2.compress(b"12345" + MARKED)),
         ("ascii", " ".join(map(str, RAW.ravel(order="F"))).encode()),
         ("raw\nbyte skip: 9", b"123456789" + MARKED),
         ("raw\nbyte skip: -1", b"more or less" + MARKED),
@@ -438,8 +399,6 @@ def test_nrrd_is_read_in_every_encoding_and_behind_what_is_skipped(tmp_path, enc
     (tmp_path / "a.bin").write_bytes(data)
     header = _nrrd(tmp_path / "a.nhdr", b"", *PLACED, "data file: a.bin", f"encoding: {encoding}")
     np.testing.assert_array_equal(read_volume(header).intensities, SPREAD)
-    cut = _nrrd(tmp_path / "a.nrrd", data[:9], *PLACED, f"encoding: {encoding}")
-    refused(cut, "bytes of image data|broken or cut")
 
 
 @pytest.mark.parametrize(
@@ -456,7 +415,7 @@ def test_metaimage_is_read_as_text_and_behind_other_headers(tmp_path, fields, da
     np.testing.assert_array_equal(read_volume(path).intensities, SPREAD)
 
 
-@pytest.mark.parametrize("space", ["LPS", "right-anterior-superior", "LAS", "3D-right-handed"])
+@pytest.mark.parametrize("space", ["LPS", "right-anterior-superior", "LAS"])
 def test_nrrd_lies_where_itk_says_in_every_space(tmp_path, space):
     lines = (f"space: {space}", "space directions: (0,0.5,0) (-0.25,0,0) (0,0,2)")
     path = _nrrd(tmp_path / "a.nrrd", MARKED, *lines, "space origin: (1,2,3)", "encoding: raw")
@@ -503,7 +462,8 @@ def _nifti_2(path, data, matrix_ras, size=SHAPE, unit=2, magic=b"n+2"):
     header = bytearray(544)
     struct.pack_into("<i4s4s", header, 0, 540, magic, b"\r\n\x1a\n")
     struct.pack_into("<2h8q", header, 12, 4, 16, len(size), *size, *[1] * (7 - len(size)))
-    struct.pack_into("<8d", header, 104, *[1.0] * 8)
+    steps = np.linalg.norm(matrix_ras[:3, :3], axis=0)
+    struct.pack_into("<8d", header, 104, 1.0, *steps, *[1.0] * 4)
     struct.pack_into("<q", header, 168, 544 if magic[1:2] == b"+" else 0)
     struct.pack_into("<2i", header, 344, 0, 1)
     struct.pack_into("<12d", header, 400, *matrix_ras[:3].ravel())
@@ -521,18 +481,6 @@ def test_nifti_2_in_one_file_and_in_two_is_read(tmp_path):
         np.testing.assert_array_equal(volume.intensities, SPREAD)
         np.testing.assert_allclose(volume.index_to_patient, MATRIX_LPS, atol=1e-12)
     np.testing.assert_allclose(read_placement(tmp_path / "c.nii")[:, :3], MATRIX_LPS[:, :3])
-
-
-def test_nifti_1_in_two_files_is_read_and_one_half_alone_is_not(tmp_path):
-    image = sitk.GetImageFromArray(GREY.transpose(2, 1, 0))
-    image.SetSpacing((0.5, 0.25, 2.0))
-    sitk.WriteImage(image, str(tmp_path / "a.hdr"))
-    np.testing.assert_array_equal(read_volume(tmp_path / "a.img").intensities, GREY)
-    np.testing.assert_allclose(
-        np.diag(read_placement(tmp_path / "a.hdr"))[:3] * 1e3, [0.5, 0.25, 2]
-    )
-    (tmp_path / "a.img").unlink()
-    refused(tmp_path / "a.hdr", r"a\.img")
 
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
@@ -569,3 +517,51 @@ def test_real_files_lie_where_other_programs_say(shared_file, name, spacing, ori
     there = open_image(path).placement() * 1e3
     np.testing.assert_allclose(np.linalg.norm(there[:3, :3], axis=0), spacing, rtol=1e-6)
     np.testing.assert_allclose(there[:3, 3], origin, rtol=1e-5)
+
+
+def test_two_sizes_of_a_nifti_file_are_told_and_the_right_one_can_be_said(shared_file):
+    for name, sizes in (
+        ("itk3514_vinci", (0.865759, 0.865759, 0.796)),
+        ("ants1675", (0.9375, 0.9375, 1.2)),
+    ):
+        path = shared_file(f"cases/nifti-unit-sform/{name}.nii")
+        refused(path, rf"1 × 1 × 1 and {sizes[0]} .*--spacing")
+        there = open_image(path, spacing=sizes).placement()
+        np.testing.assert_allclose(np.linalg.norm(there[:3, :3], axis=0) * 1e3, sizes)
+
+
+def test_a_spacing_of_0_is_not_taken_for_1_mm(tmp_path):
+    path = _nifti(tmp_path / "a.nii", GREY.tobytes(order="F"), np.eye(4))
+    _changed(path, 254, "<h", 0)
+    refused(_changed(path, 80, "<3f", 0, 0, 0), "--spacing")
+
+
+def test_axes_that_are_rounded_are_read_and_written_and_sheared_ones_refused(shared_file, tmp_path):
+    rounded = read_volume(shared_file("cases/nifti-shear/shear_2e-4.nii"))
+    for suffix in (".nii", ".nrrd", ".mha"):
+        write_volume(tmp_path / f"a{suffix}", rounded)
+        there = read_placement(tmp_path / f"a{suffix}")
+        np.testing.assert_allclose(there, rounded.index_to_patient, atol=1e-8)
+    refused(shared_file("cases/nifti-shear/shear_2e-2.nii"), r"1\.1°")
+
+
+def test_the_space_of_nrrd_is_read_and_one_of_no_body_is_refused(shared_file, tmp_path):
+    folder = shared_file("cases/nrrd-space/scanner_xyz.nhdr").parent
+    refused(folder / "scanner_xyz.nhdr", "scanner-xyz")
+    one, other = (read_volume(folder / f"{n}.nhdr") for n in ("slicer8694_las", "the_same_in_lps"))
+    np.testing.assert_allclose(one.index_to_patient, other.index_to_patient, atol=1e-12)
+    np.testing.assert_array_equal(one.intensities, other.intensities)
+    bare = _nrrd(tmp_path / "a.nrrd", MARKED, "encoding: raw", "spacings: 1 1 1")
+    assert "assumed" in grey_voxels(open_image(bare))[1][0]
+
+
+def test_radio_frequency_data_are_told_from_b_mode(shared_file):
+    refused(shared_file("cases/metaimage-rf/MouseLiverRF.mha"), "radio-frequency")
+    volume = read_volume(shared_file("cases/metaimage-rf/MouseLiverB.mha"))
+    assert volume.shape == (128, 512, 4)
+
+
+def test_a_sequence_with_frame_numbers_of_ten_digits_is_one(shared_file):
+    path = shared_file("cases/ibis-sequence/ibis.igs.mha")
+    assert "tracked frames" in sequence_use(path)
+    refused(path, "tracked frames")

@@ -33,7 +33,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
-from us_sim.volume.sequences.slicer_transforms import SLICER_TRANSFORMS, read_slicer_transform
+from us_sim.volume.sequences.itk_transform import TRANSFORM_SUFFIXES, read_slicer_transform
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class _Written(Settings):
 def read_transform(path: str | Path) -> Pose:
     """The pose of the file's frame `from` in its frame `to`, m.
 
-    A file of 3D Slicer (.h5, .tfm) holds the transform to the parent, in RAS.
+    A file of 3D Slicer (.h5, .tfm, .txt) holds the transform to the parent, in RAS.
 
     Raises:
         CalibrationError: the file is missing, is no YAML, lacks the position or orientation, or
@@ -57,7 +57,7 @@ def read_transform(path: str | Path) -> Pose:
     """
     path = Path(path)
     try:
-        if path.suffix.lower() in SLICER_TRANSFORMS:
+        if path.suffix.lower() in TRANSFORM_SUFFIXES:
             return Pose.from_matrix(read_slicer_transform(path))
         document = _document(path)
         written = {key: document[key] for key in ("position", "orientation") if key in document}

@@ -29,8 +29,8 @@ from us_sim.volume.volume import LabelMap, Volume
 
 _MOST = 255
 _Known = dict[int, tuple[str, Colour | None]]
-_SLICER = re.compile(r"(\d{1,9})\s+(\S+)\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})")
-_SNAP = re.compile(r"(\d{1,9})\s+(\d{1,3})\s+(\d{1,3})\s+(\d{1,3})(?:\s+[\d.]{1,9}){3}\s+\"(.*)\"")
+_SLICER = re.compile(r"(\d+)\s+(\S+)\s+(\d+)\s+(\d+)\s+(\d+)\s+\d+")
+_SNAP = re.compile(r"(\d+)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+[\d.]+){3}\s+\"(.*)\"")
 
 
 def read_labels(
@@ -91,13 +91,13 @@ def _read(path: Path, remarks: list[str]) -> tuple[NDArray[np.uint8], _Known, ND
     segments, layers = segments_of(path, image.texts), _layers(path, image)
     if not segments:
         return *_from_values(path, layers, remarks), placement
+    deepest = max(segment.layer for segment in segments)
+    if deepest >= len(layers):
+        raise VolumeError(
+            f"{path}: says that a segment is in layer {deepest} of {len(layers)}; save it again"
+        )
 
     def mask(segment: Segment) -> NDArray[np.bool_]:
-        if segment.layer >= len(layers):
-            raise VolumeError(
-                f"{path}: says that a segment is in layer {segment.layer} of {len(layers)}; save "
-                f"it again"
-            )
         inside = layers[segment.layer] == segment.value
         if segment.extent is None:
             return inside
@@ -110,18 +110,17 @@ def _read(path: Path, remarks: list[str]) -> tuple[NDArray[np.uint8], _Known, ND
 
 
 def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
-    """Stored values (layer, i, j, k), whole numbers from 0 on."""
+    """Read stored values (layer, i, j, k), whole numbers from 0 on."""
     if image.volumes > 1:
         raise VolumeError(f"{path}: holds {image.volumes} volumes; give one of labels")
     stored = np.stack(list(image.slices()))
     layers = (stored if image.components > 1 else stored[..., None]).transpose(3, 2, 1, 0)
-    if layers.dtype.kind == "f":
-        for layer in layers:
-            if not (np.isfinite(layer).all() and (layer == np.rint(layer)).all()):
-                raise VolumeError(
-                    f"{path}: its values are no labels but numbers with fractions; give a label "
-                    f"image"
-                )
+    if layers.dtype.kind == "f" and not all(
+        np.isfinite(plane).all() and (plane == np.rint(plane)).all() for plane in stored
+    ):
+        raise VolumeError(
+            f"{path}: its values are no labels but numbers with fractions; give a label image"
+        )
     if layers.min() < 0:
         raise VolumeError(f"{path}: its values go down to {layers.min():g}; labels are 0 or more")
     return layers
@@ -321,26 +320,18 @@ def read_label_table(path: Path) -> dict[int, tuple[str, Colour | None]]:
         VolumeError: the file cannot be read, or a line is none of these.
     """
     try:
-        text = read_text(path)
+        lines = read_text(path).lstrip("\ufeff").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise VolumeError(f"{path}: cannot be read as a table of labels: {error}") from error
-    if len(text) > 1 << 20:
-        raise VolumeError(f"{path}: has {len(text)} characters, too many for a table of labels")
     table: dict[int, tuple[str, Colour | None]] = {}
-    lines = [line.strip() for line in text.lstrip("\ufeff").splitlines()]
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(map(str.strip, lines), start=1):
         if not line or line.startswith("#") or (not table and not line[0].isdigit()):
             continue
         entry = _entry(line)
-        if entry is None:
-            raise VolumeError(
-                f"{path}: line {number}: {shown(line[:80])} is no label: write `6 vein 0 0 255 "
-                f"255`, or `6,vein`"
-            )
-        label, name, colour = entry
-        if label in table:
-            raise VolumeError(f"{path}: line {number}: label {label} is there twice: keep one")
-        table[label] = (name, colour)
+        if entry is None or entry[0] in table:
+            why = "is there twice" if entry else "is none: write `6 vein 0 0 255 255`, or `6,vein`"
+            raise VolumeError(f"{path}: line {number}: the label {shown(line[:80])} {why}")
+        table[entry[0]] = entry[1:]
     if not table:
         raise VolumeError(f"{path}: holds no labels; write a line such as `6 vein 0 0 255 255`")
     return table
@@ -349,16 +340,10 @@ def read_label_table(path: Path) -> dict[int, tuple[str, Colour | None]]:
 def _entry(line: str) -> tuple[int, str, Colour | None] | None:
     if match := _SLICER.fullmatch(line):
         label, name, *colour = match.groups()
-        return int(label), name, _colour(colour[:3])
-    if match := _SNAP.fullmatch(line):
+    elif match := _SNAP.fullmatch(line):
         label, *colour, name = match.groups()
-        return int(label), name.strip(), _colour(colour)
-    cells = next(csv.reader([line], skipinitialspace=True), [])
-    if len(cells) >= 2 and re.fullmatch(r"\d{1,9}", cells[0].strip()) and cells[1].strip():
-        return int(cells[0]), cells[1].strip(), None
-    return None
-
-
-def _colour(texts: list[str]) -> Colour | None:
-    red, green, blue = (int(text) / 255 for text in texts)
-    return (red, green, blue) if max(red, green, blue) <= 1.0 else None
+    else:
+        label, name, *colour = (cell.strip() for cell in [*next(csv.reader([line])), ""][:2])
+        return (int(label), name, None) if label.isdecimal() and name else None
+    red, green, blue = (int(text) / 255 for text in colour)
+    return int(label), name.strip(), (red, green, blue) if max(red, green, blue) <= 1.0 else None

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.settings.spelling import shown
 
 MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "nm": 1e-6}
 MILLIMETRES |= {"meter": 1e3, "centimeter": 10.0, "millimeter": 1.0, "micron": 1e-3, "inch": 25.4}
@@ -16,10 +15,11 @@ MILLIMETRES |= {"meter": 1e3, "centimeter": 10.0, "millimeter": 1.0, "micron": 1
 
 _SPACINGS = (1e-4, 1e2)  # mm, from a microscope's to one voxel for half a limb
 _FARTHEST = 1e5  # mm
+_RIGHT_ANGLE = 1e-3  # cosine between axes, of files read and written; rounding makes 2e-4
 
 
 def millimetres(path: Path | str, unit: str) -> float:
-    """How many millimetres a unit has that a header names; an empty name means millimetres.
+    """Return how many millimetres a unit has that a header names; an empty name means millimetres.
 
     Raises:
         VolumeError: it is no unit of length.
@@ -30,9 +30,18 @@ def millimetres(path: Path | str, unit: str) -> float:
             return MILLIMETRES[known]
     if name in ("", "?"):
         return 1.0
-    raise VolumeError(
-        f"{path}: states its lengths in {shown(unit[:80])}, which is no known unit: write mm"
-    )
+    raise VolumeError(f"{path}: states its lengths in {unit!r}, which is no known unit: write mm")
+
+
+def is_right_angled(direction: NDArray[np.float64]) -> bool:
+    """Whether axes of length 1, the columns (3, 3), are at right angles but for rounding."""
+    return bool(np.abs(direction.T @ direction - np.eye(3)).max() <= _RIGHT_ANGLE)
+
+
+def degrees_off(direction: NDArray[np.float64]) -> float:
+    """Return by how many degrees the farthest two axes are off a right angle."""
+    cosines = np.abs(np.triu(direction.T @ direction, 1)).max()
+    return float(np.degrees(np.arcsin(min(cosines, 1.0))))
 
 
 def checked_placement(
@@ -42,7 +51,7 @@ def checked_placement(
     origin: ArrayLike,
     given: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """(4, 4) from voxel indices to m.
+    """Place voxels: (4, 4) from their indices to m.
 
     Args:
         path: which errors name.
@@ -66,24 +75,25 @@ def checked_placement(
     spacing = np.asarray(given if spacing is None else spacing, np.float64)
     origin = np.asarray(origin, np.float64)
     direction = np.asarray(direction, np.float64).reshape(3, 3)
+    lengths = np.linalg.norm(direction, axis=0)
+    along = direction / np.where(lengths > 0.0, lengths, 1.0)
     sides = " × ".join(f"{side:g}" for side in spacing)
-    # MetaImage turns a spacing that is not a number into 0 before it comes here.
-    if not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
-        problem = f"has the voxel spacing {sides} mm; every spacing must be a number above zero"
-    elif not (np.isfinite(direction).all() and np.isfinite(origin).all()):
-        problem = "has an origin or a direction matrix that is not finite"
-    elif abs(np.linalg.det(direction)) < 1e-6:
-        problem = "has a singular direction matrix, so its axes span no volume"
-    elif np.abs(direction.T @ direction - np.eye(3)).max() > 1e-3:  # more than rounding
-        problem = (
-            "has axes that are sheared or scaled by its direction matrix; resample it on a grid "
-            "with right angles"
-        )
-    elif not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):
+    if not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):  # nan is not
         problem = (
             f"has the voxel spacing {sides} mm; that of a body is {_SPACINGS[0]:g} to "
             f"{_SPACINGS[1]:g} mm: correct it"
         )
+    elif not (np.isfinite(direction).all() and np.isfinite(origin).all()):
+        problem = "has an origin or a direction matrix that is not finite: correct it"
+    elif abs(np.linalg.det(along)) < 1e-6:
+        problem = "has a singular direction matrix, so its axes span no volume: correct it"
+    elif not is_right_angled(along):
+        problem = (
+            f"has axes that are {degrees_off(along):.2g}° off a right angle (sheared); resample it "
+            f"on a grid with right angles"
+        )
+    elif np.abs(lengths - 1.0).max() > _RIGHT_ANGLE:
+        problem = "has axes that are scaled by its direction matrix: give each the length 1"
     elif np.abs(origin).max() > _FARTHEST:
         problem = (
             f"lies {np.abs(origin).max() / 1e3:.3g} m from its origin; {_FARTHEST / 1e3:g} m are "

@@ -16,6 +16,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,12 @@ from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
 from us_sim.volume.files.metaimage import metaimage_header, metaimage_image
 from us_sim.volume.files.nifti import nifti_image
 from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
-from us_sim.volume.files.stored_image import GreyLevels, StoredImage, volume_of_slices
+from us_sim.volume.files.stored_image import (
+    GreyLevels,
+    StoredImage,
+    check_brightness,
+    volume_of_slices,
+)
 from us_sim.volume.volume import Volume
 
 _READERS = {"mha": metaimage_image, "mhd": metaimage_image, "nrrd": nrrd_image, "nhdr": nrrd_image}
@@ -35,7 +41,7 @@ _READERS |= {"nii": nifti_image, "hdr": nifti_image, "img": nifti_image}
 ENDINGS = (*(f".{ending}" for ending in _READERS), ".nii.gz", ".hdr.gz", ".img.gz")
 """Of the files of these formats; all others are DICOM, or none."""
 
-FRAME_KEY = re.compile(r"Seq_Frame([0-9]{1,9})_(\w+)")
+FRAME_KEY = re.compile(r"Seq_Frame([0-9]+)_(\w+)")
 """Keys of the fields of a frame of a tracked sequence: its number, and the field's name."""
 
 
@@ -87,7 +93,7 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 def open_image(
     path: Path, *, layers: bool = False, spacing: ArrayLike | None = None
 ) -> StoredImage:
-    """The image that the header of a MetaImage, NRRD or NIfTI file describes.
+    """Describe the image of a MetaImage, NRRD or NIfTI file by its header.
 
     Args:
         path: of the file.
@@ -97,9 +103,9 @@ def open_image(
     Raises:
         VolumeError: as `read_volume`, except for faults of the voxels and of where they lie.
     """
-    if not os.path.exists(path):
+    if not path.exists():
         raise VolumeError(f"{path}: there is no such file")
-    if not os.path.isfile(path):
+    if not path.is_file():
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD, NIfTI or DICOM volume")
     if not path.name.lower().endswith(ENDINGS):
         if packed := packed_in(path):
@@ -108,8 +114,8 @@ def open_image(
             f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume, which "
             f"3D Slicer makes of others"
         )
-    if remedy := _sequence_remedy(path):
-        raise VolumeError(f"{path}: is no volume but {remedy}")
+    if use := sequence_use(path):
+        raise VolumeError(f"{path}: is no volume but {use}")
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
     image = _READERS[ending](path, spacing)
     image.check(layers=layers)
@@ -117,27 +123,27 @@ def open_image(
 
 
 def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
-    """The grey values (i, j, k) of one of an image's volumes, and the conversion of its numbers in
-    words.
+    """Read the grey values (i, j, k) of one of an image's volumes; say how they came about.
 
     Raises:
-        VolumeError: its data cannot be read, or there is no such volume.
+        VolumeError: its data cannot be read, or are radio-frequency data, or there is no such
+            volume.
     """
+    path = image.voxels.header
     if not 1 <= volume <= image.volumes:
-        raise VolumeError(
-            f"{image.voxels.header}: holds {image.volumes} volumes; number {volume} is none of them"
-        )
-    levels, said = GreyLevels(), []
+        raise VolumeError(f"{path}: holds {image.volumes} volumes; number {volume} is none of them")
+    levels, said = GreyLevels(), list(image.remarks)
     if image.voxels.type != np.uint8 or image.scaling != (1.0, 0.0):
-        levels = GreyLevels.over(image.voxels.header, image.slices(volume))
-        said = levels.described(8 * image.voxels.type.itemsize)
+        check_brightness(path, next(islice(image.slices(volume), image.shape[2] // 2, None)))
+        levels = GreyLevels.over(path, image.slices(volume))
+        said += levels.described(8 * image.voxels.type.itemsize)
     if image.volumes > 1:
         said.append(f"volume {volume} of {image.volumes}")
     slices = (levels(plane) for plane in image.slices(volume))
     return volume_of_slices(slices, image.shape[2]), tuple(said)
 
 
-def is_sequence(kinds: str, keys: Iterable[str]) -> bool:
+def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:
     """Whether a header is that of a sequence of frames, not of one volume.
 
     Plus leaves ``Seq_Frame0000_ImageStatus`` in the header of volumes that it has reconstructed, so
@@ -149,31 +155,36 @@ def is_sequence(kinds: str, keys: Iterable[str]) -> bool:
             and then transforms of frames, or fields of several frames, make a sequence.
         keys: of the header.
     """
-    if words := kinds.lower().split():
+    if words := [kind.lower() for kind in kinds]:
         return words[-1] in ("list", "time")
     frames = [match for match in map(FRAME_KEY.fullmatch, keys) if match]
     described = {int(match[1]) for match in frames}
     return len(described) > 1 or any(match[2].endswith("Transform") for match in frames)
 
 
-def _sequence_remedy(path: Path) -> str | None:
-    """Kind and use of a MetaImage or NRRD file of a sequence; None of others."""
+def sequence_use(path: Path) -> str | None:
+    """Say what a MetaImage or NRRD file of a sequence is, and its use; None of other files.
+
+    Raises:
+        VolumeError: it has no header of its format.
+    """
     name = path.name.lower()
     if name.endswith((".nrrd", ".nhdr")):
-        fields, keys, _ = nrrd_header(path)
-        kinds, sizes = fields.get("kinds", ""), fields.get("sizes", "").split()
+        keys, _ = nrrd_header(path)
+        kinds, sizes = keys.get("kinds", []), [str(length) for length in keys.get("sizes", ())]
     elif name.endswith((".mha", ".mhd")):
         keys, _ = metaimage_header(path)
-        kinds, sizes = keys.get("Kinds", ""), keys.get("DimSize", "").split()
+        kinds, sizes = keys.get("Kinds", "").split(), keys.get("DimSize", "").split()
     else:
         return None
     if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != "1" and sizes[0] != "0"):
         return None  # several volumes in time are no sequence of flat images
-    if "time" not in kinds.lower() and len(sizes) == 3 and not any(map(FRAME_KEY.match, keys)):
+    frames = [match for match in map(FRAME_KEY.match, keys) if match]
+    if "time" not in kinds and len(sizes) == 3 and not frames:
         return None  # Plus also writes volumes with the axes of a sequence, but without frames
     if "0" in sizes:
         return f"a recording of poses without images; play it with `--path {path.name}`"
-    if not any(match and match[2].endswith("Transform") for match in map(FRAME_KEY.match, keys)):
+    if not any(match[2].endswith("Transform") for match in frames):
         return "a sequence of images without poses; record it again with a tracked probe"
     return (
         f"a sequence of tracked frames; make a volume of it with `us-sim reconstruct {path.name} "

@@ -7,7 +7,6 @@ of Slicer before 5 have a layer for each segment, in which it is 1
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -53,17 +52,25 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
     segments = []
     for at, number in enumerate(sorted(found)):
         fields = found[number]
-        name = "".join(c if c.isprintable() else " " for c in fields.get("Name", "")).strip()
-        segments.append(
-            Segment(
-                name or f"structure {number + 1}",
-                _whole(path, number, fields, "LabelValue", 1, least=1),
-                _whole(path, number, fields, "Layer", 0 if shared else at, least=0),
+        extent = fields.get("Extent")
+        try:
+            segment = Segment(
+                fields.get("Name", "").strip() or f"structure {number + 1}",
+                int(fields.get("LabelValue", 1)),
+                int(fields.get("Layer", 0 if shared else at)),
                 _colour(fields.get("Color", "")),
-                _extent(path, number, fields.get("Extent")),
+                None if extent is None else tuple(map(int, extent.split())),
                 _codes(fields.get("Tags", "")),
             )
-        )
+        except ValueError as error:
+            raise VolumeError(f"{path}: its Segment{number}: {error}; save it again") from None
+        if segment.value < 1 or segment.layer < 0 or len(segment.extent or range(6)) != 6:
+            raise VolumeError(
+                f"{path}: its Segment{number} has the LabelValue {segment.value}, the Layer "
+                f"{segment.layer} and the Extent {extent}, where a number from 1 on, one from 0 on "
+                f"and six numbers belong; save it again"
+            )
+        segments.append(segment)
     return segments
 
 
@@ -87,38 +94,10 @@ def _codes(tags: str) -> tuple[str, ...]:
     return tuple(part[1] for part in parts if part[0] == "SCT" and len(part) > 1)
 
 
-def _whole(
-    path: Path, number: int, fields: Mapping[str, str], key: str, default: int, least: int
-) -> int:
-    text = fields.get(key)
-    if text is None:
-        return default
-    if not re.fullmatch(r"\d{1,9}", text) or int(text) < least:
-        raise VolumeError(
-            f"{path}: its Segment{number}_{key} is {shown(text)} where a whole number from {least} "
-            f"on belongs; save it again"
-        )
-    return int(text)
-
-
 def _colour(text: str) -> Colour | None:
-    """A colour; where it is none, the structure's name suggests one."""
+    """Read a colour; where it is none, the structure's name suggests one."""
     try:
         red, green, blue = (float(word) for word in text.split())
     except ValueError:
         return None
-    if not all(math.isfinite(part) and 0.0 <= part <= 1.0 for part in (red, green, blue)):
-        return None
-    return red, green, blue
-
-
-def _extent(path: Path, number: int, text: str | None) -> tuple[int, ...] | None:
-    if text is None:
-        return None
-    words = text.split()
-    if len(words) != 6 or not all(re.fullmatch(r"-?\d{1,9}", word) for word in words):
-        raise VolumeError(
-            f"{path}: its Segment{number}_Extent is {shown(text)} where six whole numbers belong; "
-            f"save it again"
-        )
-    return tuple(map(int, words))
+    return (red, green, blue) if all(0.0 <= part <= 1.0 for part in (red, green, blue)) else None

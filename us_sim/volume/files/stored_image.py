@@ -1,8 +1,7 @@
 """Images in files: their numbers as a header says that they are stored, read piece by piece.
 
-A header is a stranger's claim: memory is taken only for what can be, and where a file holds less
-or more than its header says it is refused. SimpleITK's readers take the memory that a header asks
-for, and read packed data of any length, so they are not used for reading.
+The headers are read by each format's library. The numbers of all formats are read here, since a
+volume of 512³ shall not be in memory twice, and its bytes are compared with the header once.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from us_sim.errors import VolumeError
 LARGEST_VOLUME = 1 << 29  # numbers in the largest image that is read: 1024 × 1024 × 512
 
 _STEP = 1 << 20
-_ZLIB_OR_GZIP = 32 + zlib.MAX_WBITS
 
 Encoding = Literal["raw", "packed", "bzip2", "text"]
 """As they are; by zlib or gzip; by bzip2; as words."""
@@ -53,23 +51,16 @@ class StoredVoxels:
         return math.prod(self.size) * self.type.itemsize
 
     def check_bytes(self) -> None:
-        """Compare the bytes with the header, packed ones by unpacking them in steps.
+        """Compare the bytes of raw numbers with the header; packed ones are compared as read.
 
         Raises:
-            VolumeError: there are more or fewer, or the compression is broken.
+            VolumeError: there are more or fewer.
         """
-        there, enough = 0, self.skip + self.expected
         if self.encoding == "raw":
-            there = self.file.stat().st_size - self.start
-        else:
-            with self._stream() as stream:
-                while there <= enough and (data := stream.read(_STEP)):
-                    there += len(data)
-        if there != enough:
-            raise self._other(there - self.skip)
+            self._check_length(self.file.stat().st_size - self.start - self.skip)
 
     def pieces(self, size: int, wanted: Iterable[int] | None = None) -> Iterator[NDArray[Any]]:
-        """Arrays of ``size`` numbers each, such as the slices of a volume.
+        """Yield arrays of ``size`` numbers each, such as the slices of a volume.
 
         Args:
             size: numbers of a piece.
@@ -78,69 +69,54 @@ class StoredVoxels:
         Raises:
             VolumeError: there are fewer or more than the header says, or they are damaged.
         """
-        if self.encoding == "raw":
-            self.check_bytes()
+        self.check_bytes()
         step, at = size * self.type.itemsize, -self.skip
         with self._stream() as stream:
             for number in range(self.expected // step) if wanted is None else wanted:
                 at += _pass(stream, number * step - at)
-                data = stream.read(step) if at == number * step else b""
+                data = stream.read(step)
                 at += len(data)
                 if len(data) != step:
-                    raise self._other(at)
+                    self._check_length(at)
                 yield np.frombuffer(data, self.type)
-            if wanted is None and (more := stream.read(1)):
-                raise self._other(at + len(more))
+            if wanted is None:
+                self._check_length(at + len(stream.read(1)))
 
     @contextmanager
     def _stream(self) -> Iterator[_Stream]:
-        """The bytes after unpacking, from those on that are skipped."""
+        """Open the bytes after unpacking, from those on that are skipped."""
         try:
             with self.file.open("rb") as file:
                 file.seek(self.start)
-                if self.encoding == "text":
-                    yield io.BytesIO(self._words(file))
-                elif self.encoding == "bzip2":
-                    with bz2.BZ2File(file) as unpacked:
-                        yield unpacked
-                else:
-                    yield _Inflated(file) if self.encoding == "packed" else file
-        except (zlib.error, EOFError, OSError) as error:
+                match self.encoding:
+                    case "raw":
+                        yield file
+                    case "packed":
+                        yield _Inflated(file)
+                    case "bzip2":
+                        yield bz2.BZ2File(file)
+                    case "text":
+                        words = np.array(file.read().split())
+                        yield io.BytesIO(words.astype(self.type).tobytes())
+        except (zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
             if isinstance(error, OSError) and error.errno is not None:
                 raise  # the file cannot be read at all
             raise VolumeError(
-                f"{self.header}: its compression is broken or cut short; copy it again"
+                f"{self.header}: its image data are broken or cut short ({error}); copy or export "
+                f"it again"
             ) from error
 
-    def _words(self, file: BinaryIO) -> bytes:
-        most = 32 * math.prod(self.size) + _STEP
-        text = file.read(most + 1)
-        try:
-            words = np.array(text.replace(b",", b" ").split(), np.float64)
-        except ValueError:
-            words = np.array([math.nan])
-        # Only numbers with a fraction may be something else than finite.
-        limits = np.iinfo(self.type) if self.type.kind != "f" else None
-        if len(text) > most or (
-            limits and not ((words >= limits.min) & (words <= limits.max) & (words % 1 == 0)).all()
-        ):
+    def _check_length(self, there: int) -> None:
+        if there != self.expected:
+            more = " or more" if self.encoding != "raw" and there > self.expected else ""
             raise VolumeError(
-                f"{self.header}: its image data are not the {self.type} numbers that its header "
-                f"says; copy or export it again"
+                f"{self.header}: holds {max(there, 0)}{more} bytes of image data where its header "
+                f"says {self.expected}; copy or export it again"
             )
-        return words.astype(self.type).tobytes()
-
-    def _other(self, there: int) -> VolumeError:
-        """More or fewer bytes than there should be."""
-        more = " or more" if self.encoding != "raw" and there > self.expected else ""
-        return VolumeError(
-            f"{self.header}: holds {max(there, 0)}{more} bytes of image data where its header says "
-            f"{self.expected}; copy or export it again"
-        )
 
 
 def _pass(stream: _Stream, count: int) -> int:
-    """Skip bytes; returns ``count``, or fewer at the end."""
+    """Skip bytes; return ``count``, or fewer at the end."""
     if isinstance(stream, io.BufferedReader):
         stream.seek(count, io.SEEK_CUR)
         return count
@@ -151,26 +127,30 @@ def _pass(stream: _Stream, count: int) -> int:
 
 
 class _Inflated:
-    """The plain bytes of a zlib or gzip stream in a file, a piece at a time."""
+    """The plain bytes of a zlib or gzip stream in a file, a piece at a time.
+
+    MetaImage packs by zlib, for which the standard library has no file; IGSIO writes gzip in
+    several members, of which pynrrd reads the first.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._inflate = zlib.decompressobj(_ZLIB_OR_GZIP)
+        self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)
 
     def read(self, count: int, /) -> bytes:
-        """The next ``count`` bytes, fewer at the end; EOFError where the stream breaks off."""
+        """Return the next bytes, fewer at the end; EOFError where the stream breaks off."""
         pieces = []
         while count:
-            if self._inflate.eof:  # gzip may come in members
-                packed = self._inflate.unused_data or self._file.read(_STEP)
+            done = self._inflate.eof
+            packed = self._inflate.unused_data if done else self._inflate.unconsumed_tail
+            packed = packed or self._file.read(_STEP)
+            if done:  # the next member, if there is one
                 if not packed:
                     break
-                self._inflate = zlib.decompressobj(_ZLIB_OR_GZIP)
-            else:
-                packed = self._inflate.unconsumed_tail or self._file.read(_STEP)
+                self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)
             piece = self._inflate.decompress(packed, count)
             if not packed and not piece and not self._inflate.eof:
-                raise EOFError
+                raise EOFError("its compression ends too early")
             pieces.append(piece)
             count -= len(piece)
         return b"".join(pieces)
@@ -197,6 +177,32 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
         )
 
 
+def check_brightness(path: Path, image: NDArray[Any]) -> None:
+    """Refuse an image of radio-frequency data, which swing about zero along the beam.
+
+    Other signed images, such as CT, seldom change sign between neighbours.
+
+    Args:
+        path: which errors name.
+        image: (j, i) of a volume, or of a sequence; beams along either axis.
+
+    Raises:
+        VolumeError: it is one.
+    """
+    if image.dtype.kind not in "if" or max(image.shape) < 64:
+        return
+    below = image < 0
+    turns = max(
+        float(np.mean(below[1:] != below[:-1])), float(np.mean(below[:, 1:] != below[:, :-1]))
+    )
+    share, mean, spread = below.mean(), image.mean(dtype=np.float64), image.std(dtype=np.float64)
+    if 0.3 < share < 0.7 and turns > 0.2 and abs(mean) < 0.25 * spread:
+        raise VolumeError(
+            f"{path}: looks like radio-frequency data ({100 * share:.0f} % of it is below zero and "
+            f"it swings about zero), not like a B-mode image: give the logarithm of its envelope"
+        )
+
+
 def free_memory() -> float:
     """Bytes of memory that programs may still take, as Linux estimates it; elsewhere no limit."""
     try:
@@ -216,6 +222,7 @@ class StoredImage:
     placement: Callable[[], NDArray[np.float64]]  # (4, 4) m, from indices; raises VolumeError
     scaling: tuple[float, float] = (1.0, 0.0)  # slope and offset of the stored numbers
     texts: Mapping[str, str] = field(default_factory=dict)  # further keys and values
+    remarks: tuple[str, ...] = ()  # on what the header leaves open, a sentence each
 
     @property
     def axes(self) -> tuple[int, ...]:
@@ -257,17 +264,14 @@ class StoredImage:
         check_claim(path, (*self.shape, self.components), self.voxels.type.itemsize)
 
     def slices(self, volume: int = 1) -> Iterator[NDArray[Any]]:
-        """The slices (j, i) of one of the volumes, or (j, i, component), scaled as the header says.
+        """Yield the slices (j, i) of one of the volumes, or (j, i, component), scaled.
 
         Raises:
             VolumeError: the file holds more or fewer numbers, or is damaged.
         """
         i, j, k = self.shape
         slope, offset = self.scaling
-        wanted = None
-        if self.volumes > 1:
-            self.voxels.check_bytes()
-            wanted = range(k * (volume - 1), k * volume)
+        wanted = range(k * (volume - 1), k * volume) if self.volumes > 1 else None
         form = (j, i, self.components) if self.components > 1 else (j, i)
         for numbers in self.voxels.pieces(i * j * self.components, wanted):
             image = numbers.reshape(form)

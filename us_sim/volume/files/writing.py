@@ -1,38 +1,31 @@
 """Volumes, labels and image sequences into files: NRRD, MetaImage and NIfTI.
 
 A file is written beside its place under another name and renamed, so it is whole or absent. Grey
-values go into NRRD and MetaImage files a slab at a time: SimpleITK, which writes the others, needs
-the whole image a second time, turned to the files' order of axes.
+values go into NRRD files a slab at a time: SimpleITK and nibabel, which write the others, have the
+whole image a second time, turned to the files' order of axes.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
+from us_sim.volume.files.placement import degrees_off, is_right_angled
 from us_sim.volume.files.stored_image import file_order
 from us_sim.volume.partial_file import partial_file
 from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
-_Grid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-"""Spacing (3,) mm, direction (3, 3) and origin (3,) mm."""
-_METAIMAGE = {
-    "ObjectType": "Image",
-    "NDims": "3",
-    "BinaryData": "True",
-    "BinaryDataByteOrderMSB": "False",
-    "CompressedData": "False",
-}
-"""Beginning of a MetaImage header."""
+_SLAB = 1 << 23  # bytes
 
 
 def write_volume(
@@ -53,19 +46,17 @@ def write_volume(
             in a header, or the file cannot be written.
     """
     path = Path(path)
-    name = path.name.lower()
-    if name.endswith(".seg.nrrd"):
+    if path.name.lower().endswith(".seg.nrrd"):
         raise VolumeError(f"{path}: .seg.nrrd is for labels; name the volume .nrrd")
     fields, voxels = dict(header or {}), volume.intensities
-    if not name.endswith((".nrrd", ".mha")):
-        _write_by_itk(path, voxels, volume, fields, packed=False)
+    if not path.name.lower().endswith(".nrrd"):
+        _write_image(path, voxels, volume, fields, packed=False)
         return
-    grid = _grid_in_mm(path, volume)
-    _check_fields(path, fields)
-    head = (_nrrd_header if name.endswith(".nrrd") else _metaimage_header)(volume, grid, fields)
-    with partial_file(path, f"image{path.suffix}") as partial, partial.open("wb") as file:
+    head = _nrrd_header(path, volume, fields)
+    with partial_file(path, "image.nrrd") as partial, partial.open("wb") as file:
         file.write(head.encode("utf-8"))
-        for k, step in _slabs(voxels):
+        step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
+        for k in range(0, voxels.shape[2], step):
             file.write(file_order(voxels[:, :, k : k + step]).data)
 
 
@@ -92,7 +83,7 @@ def write_labels(
     fields = {}
     if path.name.lower().endswith(".nrrd"):
         fields = _segment_fields(volume.labels, volume.label_names, dict(colours or {}))
-    _write_by_itk(path, volume.labels, volume, fields, packed=True)
+    _write_image(path, volume.labels, volume, fields, packed=True)
 
 
 def write_image_sequence(
@@ -122,7 +113,11 @@ def write_image_sequence(
     assert len(times) == count
     assert all(map(math.isfinite, times))
     fields = {
-        **_METAIMAGE,
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": "False",
+        "CompressedData": "False",
         "DimSize": f"{columns} {rows} {count}",
         "ElementSpacing": f"{pixel_mm[0]:.9g} {pixel_mm[1]:.9g} 1",
         "ElementType": "MET_UCHAR",
@@ -136,89 +131,63 @@ def write_image_sequence(
         fields[f"Seq_Frame{number:04}_Timestamp"] = f"{time:.9g}"
     fields["ElementDataFile"] = "LOCAL"
     with partial_file(path, "image.mha") as partial, partial.open("wb") as file:
-        file.write(_lines(fields).encode("ascii"))
+        file.write("".join(f"{key} = {value}\n" for key, value in fields.items()).encode("ascii"))
         for image in images:
             file.write(np.ascontiguousarray(image).tobytes())
 
 
-def _grid_in_mm(path: Path, volume: Volume) -> _Grid:
-    """A volume's grid."""
+def _grid_in_mm(
+    path: Path, volume: Volume, fields: Mapping[str, str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return spacing (3,), direction (3, 3) and origin (3,) of a volume that can be written.
+
+    Raises:
+        VolumeError: it cannot, or one of the fields cannot stand in a header.
+    """
     matrix = volume.index_to_patient[:3, :3] * 1e3
     spacing = np.linalg.norm(matrix, axis=0)
     direction = matrix / spacing
-    if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-6:  # readers allow more
+    if not is_right_angled(direction):
         raise VolumeError(
-            f"{path}: the volume's axes are not at right angles, which image files cannot hold; "
-            f"resample it on a grid with right angles"
+            f"{path}: the volume's axes are {degrees_off(direction):.2g}° off a right angle, which "
+            f"image files cannot hold; resample it on a grid with right angles"
         )
     if min(volume.shape) < 2:
         raise VolumeError(
             f"{path}: the volume has {' × '.join(map(str, volume.shape))} voxels; two or more "
             f"along each axis can be written"
         )
-    return spacing, direction, volume.index_to_patient[:3, 3] * 1e3
-
-
-def _check_fields(path: Path, fields: Mapping[str, str]) -> None:
-    """Refuse fields that would be read as something else."""
     for key, value in fields.items():
         if not (key.isprintable() and value.isprintable()) or set(key) & set(":= ") or not key:
             raise VolumeError(
                 f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
                 f"without blanks, colons and equals signs, and one line of text"
             )
+    return spacing, direction, volume.index_to_patient[:3, 3] * 1e3
 
 
-def _slabs(voxels: NDArray[np.uint8]) -> Iterator[tuple[int, int]]:
-    """First slice and number of slices of parts of 8 MiB."""
-    step = max(1, (1 << 23) // (voxels.shape[0] * voxels.shape[1]))
-    return ((k, step) for k in range(0, voxels.shape[2], step))
-
-
-def _nrrd_header(volume: Volume, grid: _Grid, fields: Mapping[str, str]) -> str:
+def _nrrd_header(path: Path, volume: Volume, fields: Mapping[str, str]) -> str:
     """teem.sourceforge.net/nrrd/format.html, with pairs of keys and values behind the fields."""
-    spacing, direction, origin = grid
-    steps = " ".join(f"({_joined(axis, ',')})" for axis in (direction * spacing).T)
+    spacing, direction, origin = _grid_in_mm(path, volume, fields)
     lines = [
         "NRRD0004",
         "type: unsigned char",
         "dimension: 3",
         "space: left-posterior-superior",
         f"sizes: {' '.join(map(str, volume.shape))}",
-        f"space directions: {steps}",
+        f"space directions: {' '.join(map(_vector, (direction * spacing).T))}",
         "kinds: domain domain domain",
         "endian: little",
         "encoding: raw",
-        f"space origin: ({_joined(origin, ',')})",
+        f"space origin: {_vector(origin)}",
         *(f"{key}:={value}" for key, value in fields.items()),
     ]
     return "\n".join([*lines, "", ""])
 
 
-def _metaimage_header(volume: Volume, grid: _Grid, fields: Mapping[str, str]) -> str:
-    """itk.org/Wiki/MetaIO/Documentation, with further fields in between."""
-    spacing, direction, origin = grid
-    said = {
-        **_METAIMAGE,
-        "TransformMatrix": _joined(direction.T.ravel(), " "),
-        "Offset": _joined(origin, " "),
-        "CenterOfRotation": "0 0 0",
-        "ElementSpacing": _joined(spacing, " "),
-        "DimSize": " ".join(map(str, volume.shape)),
-        **fields,
-        "ElementType": "MET_UCHAR",
-        "ElementDataFile": "LOCAL",
-    }
-    return _lines(said)
-
-
-def _lines(fields: Mapping[str, str]) -> str:
-    return "".join(f"{key} = {value}\n" for key, value in fields.items())
-
-
-def _joined(numbers: NDArray[np.float64], between: str) -> str:
+def _vector(numbers: NDArray[np.float64]) -> str:
     """Numbers to their last digit; without -0, which says nothing."""
-    return between.join(f"{number + 0.0:.17g}" for number in numbers)
+    return f"({','.join(f'{number + 0.0:.17g}' for number in numbers)})"
 
 
 def _segment_fields(
@@ -249,7 +218,7 @@ def _segment_fields(
     return fields
 
 
-def _write_by_itk(
+def _write_image(
     path: Path,
     voxels: NDArray[np.uint8],
     volume: Volume,
@@ -257,22 +226,24 @@ def _write_by_itk(
     *,
     packed: bool,
 ) -> None:
-    """Voxels (i, j, k) where the volume places them."""
-    spacing, direction, origin = _grid_in_mm(path, volume)
+    """Write voxels (i, j, k) where the volume places them."""
+    spacing, direction, origin = _grid_in_mm(path, volume, fields)
     ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
     if ending is None:
         raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
-    _check_fields(path, fields)
-    image = sitk.Image(list(voxels.shape), sitk.sitkUInt8)
-    for k, step in _slabs(voxels):
-        slab = sitk.GetImageFromArray(file_order(voxels[:, :, k : k + step]))
-        image[:, :, k : k + step] = slab
-    image.SetSpacing(spacing.tolist())
-    image.SetOrigin(origin.tolist())
-    image.SetDirection(direction.ravel().tolist())
-    for key, value in fields.items():
-        image.SetMetaData(key, value)
     with partial_file(path, f"image{ending}") as partial:
+        if ending.startswith(".nii"):  # ITK refuses axes that are rounded
+            matrix = np.diag([-1e3, -1e3, 1e3, 1.0]) @ volume.index_to_patient
+            nifti = nibabel.Nifti1Image(voxels, matrix)  # type: ignore[attr-defined,no-untyped-call]
+            nifti.header.set_xyzt_units("mm")
+            nifti.to_filename(partial)
+            return
+        image = sitk.GetImageFromArray(file_order(voxels))
+        image.SetSpacing(spacing.tolist())
+        image.SetOrigin(origin.tolist())
+        image.SetDirection(direction.ravel().tolist())
+        for key, value in fields.items():
+            image.SetMetaData(key, value)
         try:
             # zlib's fastest level; speckle hardly becomes smaller with any other
             sitk.WriteImage(image, str(partial), packed, 1)

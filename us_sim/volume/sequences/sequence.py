@@ -16,10 +16,11 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,12 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
 from us_sim.volume.files.nrrd import nrrd_header, nrrd_voxels
 from us_sim.volume.files.readers import is_sequence
-from us_sim.volume.files.stored_image import GreyLevels, StoredVoxels
+from us_sim.volume.files.stored_image import (
+    GreyLevels,
+    StoredVoxels,
+    check_brightness,
+    check_claim,
+)
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
     frame_fields,
@@ -39,26 +45,10 @@ from us_sim.volume.sequences.transforms import (
 SEQUENCE_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 
 _GIVE = "give a sequence of Plus or 3D Slicer (.igs.mha, .igs.nrrd, .seq.nrrd)"
-_MOST_FRAMES = 1 << 20  # four hours at 60 Hz
-_LARGEST_IMAGE = 1 << 24  # pixels, 4096 × 4096
 
 NO_TIME = "no Timestamp"
 NO_IMAGE = "ImageStatus is not OK"
 NO_FIELDS = "no field in the header"  # why frames cannot be used
-
-
-@dataclass(frozen=True)
-class _Header:
-    """The header of a sequence; the images are as they are stored."""
-
-    path: Path
-    columns: int  # along the file's first axis of an image; 0 where there are no images
-    rows: int
-    channels: int  # numbers a pixel
-    count: int  # frames
-    orientation: str
-    frames: Mapping[int, Mapping[str, str]]  # fields by the frame's number
-    voxels: Callable[[], StoredVoxels]  # where the images are; raises VolumeError
 
 
 @dataclass(frozen=True)
@@ -97,7 +87,10 @@ class StoredImages:
     def _levels(self) -> GreyLevels:
         if self.voxels.type == np.uint8:
             return GreyLevels()
-        return GreyLevels.over(self.voxels.header, self.voxels.pieces(self._size))
+        path = self.voxels.header
+        first = next(self.voxels.pieces(self._size, [0]))
+        check_brightness(path, first.reshape(self.rows, self.columns * self.channels))
+        return GreyLevels.over(path, self.voxels.pieces(self._size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +152,7 @@ class TrackedSequence:
 
 
 def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
-    """A sequence file of Plus or 3D Slicer, MetaImage or NRRD, raw or packed by zlib or gzip.
+    """Read a sequence file of Plus or 3D Slicer, MetaImage or NRRD, raw or packed.
 
     Transforms that are missing, not finite or singular, whose status is not OK, or that are the
     identity that Plus fills in for what it has not seen, are not valid; the reason is kept.
@@ -168,66 +161,104 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         VolumeError: the file is missing, is of another format, a volume, or cut within its
             header, or says no usable size.
     """
-    file = _header(Path(path))
-    numbers = sorted(number for number in file.frames if number < file.count)
+    path = Path(path)
+    keys, kinds, sizes, start = _header(path)
+    described = frame_fields(keys)
+    if not described or (kinds and not is_sequence(kinds, keys)):
+        axes = f" (its axes are {' '.join(kinds)})" if kinds else ""
+        raise VolumeError(f"{path}: is a volume{axes}, as it holds no tracked frames; {_GIVE}")
+    channels = int(keys.get("ElementNumberOfChannels", 1))
+    if kinds and kinds[0] in ("vector", "rgb-color", "3-color", "list"):
+        channels, *sizes = sizes
+    # Newer versions of Plus write a depth of 1 before the number of frames.
+    if len(sizes) not in (3, 4) or sizes[-1] < 1 or any(depth > 1 for depth in sizes[2:-1]):
+        raise VolumeError(
+            f"{path}: has the size {' '.join(map(str, sizes))} where a sequence of flat images has "
+            f"columns, rows and frames; export it again"
+        )
+    columns, rows, count = sizes[0], sizes[1], sizes[-1]
+    numbers = sorted(number for number in described if number < count)
     if not numbers:
         raise VolumeError(
-            f"{path}: describes none of the {file.count} frames that it holds; export it again"
+            f"{path}: describes none of the {count} frames that it holds; export it again"
         )
-    frames = [file.frames[number] for number in numbers]
-    columns, rows = file.columns, file.rows
-    if _is_orientation(file.orientation) and file.orientation[0] in "FN":
+    frames = [described[number] for number in numbers]
+    # Older versions of Plus write the key with blanks.
+    code = keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
+    stored: StoredImages | VolumeError
+    try:
+        stored = _stored_images(path, keys, start, (columns, rows, channels, count), code)
+    except VolumeError as error:  # for whoever asks for them
+        stored, columns, rows = error, max(columns, 0), max(rows, 0)
+    if code[0] in "FN":
         columns, rows = rows, columns
     return TrackedSequence(
-        file.path,
+        path,
         columns,
         rows,
-        file.count,
+        count,
         np.array(numbers, dtype=np.int64),
         np.array([frame_time(fields) for fields in frames]),
         np.array([fields.get("ImageStatus", "OK").upper() == "OK" for fields in frames]),
-        read_transforms(file.path, frames),
-        file.channels > 1,
-        _stored_images(file),
+        read_transforms(frames),
+        channels > 1,
+        stored,
     )
 
 
-def _stored_images(file: _Header) -> StoredImages | VolumeError:
-    """The images, or the error for whoever asks for them."""
-    path = file.path
-    if not file.columns:
-        return VolumeError(
-            f"{path}: holds poses without images ({file.count} frames); record the images too"
-        )
-    if file.columns * file.rows > _LARGEST_IMAGE:
-        return VolumeError(
-            f"{path}: says it holds {file.count} images of {file.columns} × {file.rows} pixels; "
-            f"{_LARGEST_IMAGE} pixels are read at most: export a part of it"
-        )
-    if file.channels not in (1, 3):
-        return VolumeError(
-            f"{path}: holds {file.channels} numbers per pixel; save it as grey values or colours"
-        )
-    if not _is_orientation(file.orientation):
-        return VolumeError(
-            f"{path}: its images are stored in the orientation {file.orientation[:20]!r}; save it "
-            f"with UltrasoundImageOrientation MF, UF, MN, UN, FM, FU, NM or NU"
-        )
+def _header(path: Path) -> tuple[dict[str, Any], list[str], list[int], int]:
+    """Read the keys of a sequence, the kinds and lengths of its axes, and the header's bytes."""
+    if not path.is_file():
+        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
+    if path.name.lower().endswith((".nrrd", ".nhdr")):
+        keys, start = nrrd_header(path)
+        kinds = [kind.lower() for kind in keys.get("kinds", ())]
+        return keys, kinds, [int(length) for length in keys.get("sizes", ())], start
+    keys, start = metaimage_header(path)
     try:
-        voxels = file.voxels()
-        if voxels.encoding == "raw":  # packed images are checked as they are read
-            voxels.check_bytes()
-    except VolumeError as error:
-        return error
-    return StoredImages(voxels, file.columns, file.rows, file.channels, file.orientation)
+        sizes = [int(word) for word in keys.get("DimSize", "").split()]
+    except ValueError:
+        raise VolumeError(f"{path}: its DimSize is {keys['DimSize']!r}; export it again") from None
+    return keys, keys.get("Kinds", "").lower().split(), sizes, start
 
 
-def _is_orientation(code: str) -> bool:
-    return re.fullmatch(r"([UM][FN]|[FN][UM])[AD]?", code) is not None
+def _stored_images(
+    path: Path, keys: Mapping[str, Any], start: int, size: tuple[int, int, int, int], code: str
+) -> StoredImages:
+    """Describe the images, as (columns, rows, channels, frames).
+
+    Raises:
+        VolumeError: there are none, or none that can be read.
+    """
+    columns, rows, channels, count = size
+    if min(columns, rows) < 1:
+        raise VolumeError(
+            f"{path}: holds poses without images ({count} frames); record the images too"
+        )
+    check_claim(path, (columns, rows, channels), 1)
+    if channels not in (1, 3):
+        raise VolumeError(
+            f"{path}: holds {channels} numbers per pixel; save it as grey values or colours"
+        )
+    if not re.fullmatch(r"([UM][FN]|[FN][UM])[AD]?", code):
+        raise VolumeError(
+            f"{path}: its images are stored in the orientation {code!r}; save it with "
+            f"UltrasoundImageOrientation MF, UF, MN, UN, FM, FU, NM or NU"
+        )
+    kind = keys.get("UltrasoundImageType", keys.get("ultrasound image type", "BRIGHTNESS")).upper()
+    if kind not in ("BRIGHTNESS", "RGB_COLOR"):
+        raise VolumeError(
+            f"{path}: its images are of the type {kind}, no B-mode: give the logarithm of their "
+            f"envelopes (BRIGHTNESS)"
+        )
+    read = nrrd_voxels if path.name.lower().endswith((".nrrd", ".nhdr")) else metaimage_voxels
+    voxels = read(path, keys, start)
+    voxels.check_bytes()
+    return StoredImages(voxels, columns, rows, channels, code)
 
 
 def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
-    """A view of an image (rows, columns) that was stored in an orientation, as it is in ``MF``.
+    """Turn an image (rows, columns) that was stored in an orientation, as it is in ``MF``.
 
     >>> turned(np.array([[1, 2], [3, 4], [5, 6]]), "FM")
     array([[1, 3, 5],
@@ -239,110 +270,3 @@ def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:
     if across == "U":
         image = image[:, ::-1]
     return image[::-1] if down == "N" else image
-
-
-def _header(path: Path) -> _Header:
-    if not os.path.isfile(path):
-        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
-    with path.open("rb") as file:
-        start = file.read(256)
-    # The first bytes tell, so that a vast file of another kind is not read as a header.
-    if start.startswith(b"NRRD"):
-        return _nrrd(path)
-    if b"=" not in start:
-        raise VolumeError(f"{path}: is neither MetaImage nor NRRD; {_GIVE}")
-    return _metaimage(path)
-
-
-def _metaimage(path: Path) -> _Header:
-    header, header_bytes = metaimage_header(path)
-    if "ElementDataFile" not in header:
-        raise VolumeError(
-            f"{path}: ends within its header, so it is cut; copy it again, or {_GIVE}"
-        )
-    stated = header.get("DimSize", "")
-    sizes = _whole_numbers(path, "DimSize", stated)
-    (channels,) = _whole_numbers(path, "channels", header.get("ElementNumberOfChannels", "1"))
-    return _Header(
-        path,
-        *_size(path, "DimSize", stated, sizes, channels),
-        _orientation(header),
-        _frames(path, header.get("Kinds", ""), header),
-        lambda: metaimage_voxels(path, header, header_bytes),
-    )
-
-
-def _nrrd(path: Path) -> _Header:
-    fields, pairs, _ = nrrd_header(path)
-    kinds = fields.get("kinds", "").lower().split()
-    if frame_fields(pairs) and {"list", "time"} & set(kinds[:-1]) and kinds[-1] == "domain":
-        raise VolumeError(
-            f"{path}: stores its frames along another axis than the last ({' '.join(kinds)[:80]}); "
-            f"export it as Plus does: domain domain domain list"
-        )
-    frames = _frames(path, " ".join(kinds), pairs)
-    stated = fields.get("sizes", "")
-    sizes = _whole_numbers(path, "sizes", stated)
-    if kinds and len(kinds) != len(sizes):
-        raise _no_size(path, "sizes", stated)
-    channels = 1
-    if kinds and kinds[0] in ("vector", "rgb-color", "3-color", "list"):
-        channels, *sizes = sizes
-    return _Header(
-        path,
-        *_size(path, "sizes", stated, sizes, channels),
-        _orientation(pairs),
-        frames,
-        lambda: nrrd_voxels(path),
-    )
-
-
-def _orientation(keys: Mapping[str, str]) -> str:
-    """The images' orientation; older versions of Plus write the key with blanks."""
-    return keys.get("UltrasoundImageOrientation", keys.get("ultrasound image orientation", "MF"))
-
-
-def _frames(path: Path, kinds: str, keys: Mapping[str, str]) -> dict[int, dict[str, str]]:
-    frames = frame_fields(keys)
-    if kinds and not is_sequence(kinds, keys):
-        raise VolumeError(
-            f"{path}: is a volume, as its axes are {kinds}, and holds no tracked frames; {_GIVE}"
-        )
-    if not frames:
-        raise VolumeError(f"{path}: holds no tracked frames (Seq_Frame0000_...); {_GIVE}")
-    return frames
-
-
-def _size(
-    path: Path, key: str, stated: str, sizes: Sequence[int], channels: int
-) -> tuple[int, int, int, int]:
-    """Columns, rows, channels and frames that can be."""
-    # Newer versions of Plus write a depth of 1 before the number of frames.
-    if len(sizes) not in (3, 4):
-        raise _no_size(path, key, stated)
-    columns, rows, *between, count = sizes
-    if any(depth > 1 for depth in between):
-        raise VolumeError(f"{path}: is a sequence of volumes; give one of flat images")
-    if not 1 <= count <= _MOST_FRAMES:
-        raise VolumeError(
-            f"{path}: says it holds {count} frames; 1 to {_MOST_FRAMES} can be read: export it "
-            f"again, or a part of it"
-        )
-    if min(columns, rows) < 1 or not all(between):
-        columns = rows = 0  # poses alone
-    return columns, rows, channels, count
-
-
-def _whole_numbers(path: Path, key: str, said: str) -> list[int]:
-    words = said.split()
-    # int() would also take 1_000 and the digits of other scripts.
-    if not words or not all(re.fullmatch(r"-?[0-9]{1,18}", word) for word in words):
-        raise _no_size(path, key, said)
-    return list(map(int, words))
-
-
-def _no_size(path: Path, key: str, said: str) -> VolumeError:
-    return VolumeError(
-        f"{path}: its {key} is {said[:80]!r} where a sequence has columns, rows and frames; export "
-        f"it again"
-    )

@@ -8,16 +8,13 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import VolumeError
 from us_sim.volume.files.readers import FRAME_KEY
 
 _LARGEST = 1e7  # mm, of any transform's numbers, so that products of them stay finite
-_MOST_NUMBERS = 1 << 27  # 1 GiB; eight transforms a frame for four hours at 60 Hz
 UNSEEN = "an identity among poses that are none"
 
 
@@ -124,21 +121,11 @@ def frame_time(fields: Mapping[str, str]) -> float:
     return time if math.isfinite(time) else math.nan
 
 
-def read_transforms(path: Path, frames: Sequence[Mapping[str, str]]) -> dict[str, FrameTransforms]:
-    """The transforms of all frames, given the fields of each, by name; errors name the path.
-
-    Raises:
-        VolumeError: the header names more transforms than any recording has.
-    """
+def read_transforms(frames: Sequence[Mapping[str, str]]) -> dict[str, FrameTransforms]:
+    """Read the transforms of all frames, given the fields of each, by name."""
     keys = sorted({key for fields in frames for key in fields if key.endswith("Transform")})
     names = [key.removesuffix("Transform") for key in keys]
-    names = [name for name in names if split_transform_name(name)]
-    if 16 * len(names) * len(frames) > _MOST_NUMBERS:
-        raise VolumeError(
-            f"{path}: names {len(names)} transforms for {len(frames)} frames, more than can be "
-            f"read; export a part of it"
-        )
-    return {name: _over_frames(frames, name) for name in names}
+    return {name: _over_frames(frames, name) for name in names if split_transform_name(name)}
 
 
 def _over_frames(frames: Sequence[Mapping[str, str]], name: str) -> FrameTransforms:
