@@ -8,8 +8,8 @@ sequence its time grows with the square of the frames.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,10 +56,9 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
         VolumeError: a field is missing or not made of the numbers that belong there, the data file
             is missing, or they are stored in a way that is not read.
     """
-    size = _whole_numbers(path, fields, "DimSize", "NDims")
-    channels = _whole_numbers(
-        path, {"ElementNumberOfChannels": "1", **fields}, "ElementNumberOfChannels"
-    )
+    channels = _whole_numbers(path, fields, "ElementNumberOfChannels", 1, "1")
+    (count,) = _whole_numbers(path, fields, "NDims", 1)
+    size = _whole_numbers(path, fields, "DimSize", count)
     element, name = fields.get("ElementType", ""), fields["ElementDataFile"]
     if element not in _TYPES:
         raise VolumeError(
@@ -131,29 +130,25 @@ def _numbers(
     key = next((key for key in keys if key in fields), None)
     if key is None:
         return None
-    try:
+    with suppress(ValueError):
         numbers = np.array([float(word) for word in fields[key].split()])
-    except ValueError:
-        numbers = np.array([math.nan])
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise VolumeError(
-            f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers belong: "
-            f"export it again"
-        )
-    return numbers
+        if len(numbers) == count and np.isfinite(numbers).all():
+            return numbers
+    raise VolumeError(
+        f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers belong: export it "
+        f"again"
+    )
 
 
 def _whole_numbers(
-    path: Path, fields: Mapping[str, str], key: str, counted_by: str = ""
+    path: Path, fields: Mapping[str, str], key: str, count: int, default: str = ""
 ) -> tuple[int, ...]:
-    """Read the whole numbers of a field, as many as another one says."""
-    words = fields.get(key, "").split()
-    count = fields.get(counted_by, "") if counted_by else "1"
-    if str(len(words)) != count or not all(word.isdecimal() and int(word) for word in words):
+    """Read so many whole numbers above zero of a field."""
+    words = fields.get(key, default).split()
+    if len(words) != count or not all(word.isdecimal() and int(word) for word in words):
         raise VolumeError(
-            f"{path}: cannot be read as an image: its {key} is {fields.get(key, '')[:80]!r} where "
-            f"{count or 'no'} whole numbers above zero belong ({counted_by or 'one'}); export it "
-            f"again"
+            f"{path}: cannot be read as an image: its {key} is {' '.join(words)[:80]!r} where "
+            f"{count} whole numbers above zero belong (NDims); export it again"
         )
     return tuple(map(int, words))
 

@@ -27,7 +27,8 @@ _TO_LPS = {
 }
 _TO_LPS |= {"lps": (1, 1, 1), "ras": (-1, -1, 1), "las": (1, -1, 1)}
 """Signs that turn a space's axes to left-posterior-superior."""
-_BY_AXIS = ("space directions", "kinds", "spacings", "units", "axis mins")
+_DIRECTIONS = "space directions"
+_BY_AXIS = (_DIRECTIONS, "kinds", "spacings", "units", "axis mins")
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
@@ -131,8 +132,8 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
 
 def _axes_of_space(fields: Mapping[str, Any], count: int) -> list[int]:
     """The axes with a direction, or of a kind along which the body extends; else the first 3."""
-    if "space directions" in fields:
-        return [n for n, each in enumerate(fields["space directions"]) if not np.isnan(each).all()]
+    if _DIRECTIONS in fields:
+        return [n for n, each in enumerate(fields[_DIRECTIONS]) if not np.isnan(each).all()]
     kinds = fields.get("kinds", ())
     of_space = [n for n, kind in enumerate(kinds) if kind.lower() in ("domain", "space")]
     return of_space or list(range(min(count, 3)))
@@ -149,7 +150,7 @@ def _placement(
             f"the one that it is into its header: left-posterior-superior, left-anterior-superior "
             f"or right-anterior-superior"
         )
-    if "space directions" not in fields:
+    if _DIRECTIONS not in fields:
         units = fields.get("units", [""] * (axes[-1] + 1))
         scale = np.array([_millimetres(path, units[n]) for n in axes])
         stated = np.asarray(fields.get("spacings", np.full(axes[-1] + 1, np.nan)))[axes] * scale
@@ -158,7 +159,7 @@ def _placement(
         return checked_placement(path, spacing, np.eye(3), np.nan_to_num(starts) * scale, given)
     to_lps = np.array(_TO_LPS[space], np.float64)
     to_lps *= [_millimetres(path, unit) for unit in fields.get("space units", [""] * 3)]
-    steps = np.asarray(fields["space directions"])[axes].T
+    steps = np.asarray(fields[_DIRECTIONS])[axes].T
     origin = np.asarray(fields.get("space origin", np.zeros(3)))
     if steps.shape != (3, 3) or origin.shape != (3,):
         raise VolumeError(f"{path}: its axes are not placed in three dimensions; export it again")

@@ -16,7 +16,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,6 @@ from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
 from us_sim.volume.files.stored_image import (
     GreyLevels,
     StoredImage,
-    check_brightness,
     volume_of_slices,
 )
 from us_sim.volume.volume import Volume
@@ -134,7 +132,6 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
         raise VolumeError(f"{path}: holds {image.volumes} volumes; number {volume} is none of them")
     levels, said = GreyLevels(), list(image.remarks)
     if image.voxels.type != np.uint8 or image.scaling != (1.0, 0.0):
-        check_brightness(path, next(islice(image.slices(volume), image.shape[2] // 2, None)))
         levels = GreyLevels.over(path, image.slices(volume))
         said += levels.described(8 * image.voxels.type.itemsize)
     if image.volumes > 1:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Protocol
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,6 @@ _STEP = 1 << 20
 
 Encoding = Literal["raw", "packed", "bzip2", "text"]
 """As they are; by zlib or gzip; by bzip2; as words."""
-
-
-class _Stream(Protocol):
-    def read(self, count: int, /) -> bytes: ...
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ class StoredVoxels:
                 self._check_length(at + len(stream.read(1)))
 
     @contextmanager
-    def _stream(self) -> Iterator[_Stream]:
+    def _stream(self) -> Iterator[Any]:
         """Open the bytes after unpacking, from those on that are skipped."""
         try:
             with self.file.open("rb") as file:
@@ -115,7 +111,7 @@ class StoredVoxels:
             )
 
 
-def _pass(stream: _Stream, count: int) -> int:
+def _pass(stream: Any, count: int) -> int:
     """Skip bytes; return ``count``, or fewer at the end."""
     if isinstance(stream, io.BufferedReader):
         stream.seek(count, io.SEEK_CUR)
@@ -177,7 +173,7 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
         )
 
 
-def check_brightness(path: Path, image: NDArray[Any]) -> None:
+def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
     """Refuse an image of radio-frequency data, which swing about zero along the beam.
 
     Other signed images, such as CT, seldom change sign between neighbours.
@@ -292,13 +288,15 @@ class GreyLevels:
 
     @classmethod
     def over(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
-        """The levels of images, read once; errors name the path.
+        """Find the levels of images (rows, columns), read once; errors name the path.
 
         Raises:
-            VolumeError: there is no finite value.
+            VolumeError: there is no finite value, or they are radio-frequency data.
         """
         low, high, missing, infinite = math.inf, -math.inf, 0, 0
-        for image in images:
+        for number, image in enumerate(images):
+            if number % 16 == 0:
+                check_brightness(path, image)
             values = image
             if image.dtype.kind == "f":
                 missing += int(np.count_nonzero(np.isnan(image)))

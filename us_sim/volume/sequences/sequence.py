@@ -32,7 +32,6 @@ from us_sim.volume.files.readers import is_sequence
 from us_sim.volume.files.stored_image import (
     GreyLevels,
     StoredVoxels,
-    check_brightness,
     check_claim,
 )
 from us_sim.volume.sequences.transforms import (
@@ -87,10 +86,8 @@ class StoredImages:
     def _levels(self) -> GreyLevels:
         if self.voxels.type == np.uint8:
             return GreyLevels()
-        path = self.voxels.header
-        first = next(self.voxels.pieces(self._size, [0]))
-        check_brightness(path, first.reshape(self.rows, self.columns * self.channels))
-        return GreyLevels.over(path, self.voxels.pieces(self._size))
+        images = (each.reshape(self.rows, -1) for each in self.voxels.pieces(self._size))
+        return GreyLevels.over(self.voxels.header, images)
 
 
 @dataclass(frozen=True, eq=False)
