@@ -90,7 +90,7 @@ def nifti_seeds(_: Path) -> Iterator[bytes]:
         struct.pack_into("<8q", header, 16, 2 + count, 4, 5, 6, count, 1, 1, 1)
         struct.pack_into("<8dq", header, 104, 1, 0.5, 0.25, 2, 1, 1, 1, 1, 544)
         struct.pack_into("<2i6d", header, 344, 2 - count, count - 1, 0.3, -0.5, 0.2, 4, 5, 6)
-        struct.pack_into("<12d", header, 400, 2, 0, 0, 5, 0, 0, -3, 6, 0, 4, 0, 7)
+        struct.pack_into("<12d", header, 400, 0.5, 0, 0, 5, 0, 0, -2, 6, 0, 0.25, 0, 7)
         yield bytes(header) + VOXELS.astype("<i2").tobytes() * count
 
 

@@ -80,7 +80,8 @@ def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxe
     with file.open("rb") as opened:
         opened.seek(start if data is None else 0)
         for _ in range(fields.get("line skip", fields.get("lineskip", 0))):
-            opened.readline()
+            if not opened.readline():
+                break
         start = opened.tell()
     skip = fields.get("byte skip", fields.get("byteskip", 0))
     number = np.dtype(name).newbyteorder(">" if fields.get("endian") == "big" else "<")

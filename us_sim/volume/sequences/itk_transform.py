@@ -30,7 +30,7 @@ def read_slicer_transform(path: str | Path) -> NDArray[np.float64]:
         raise VolumeError(f"{path}: there is no such file")
     try:
         transform = sitk.ReadTransform(str(path))
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         raise VolumeError(
             f"{path}: is damaged, or no transform of ITK; export a linear one from 3D Slicer"
         ) from error
