@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bz2
 import gzip
-import struct
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,8 +12,7 @@ import SimpleITK as sitk
 
 from tests.fuzz.target import target
 from us_sim.recording.path import read_path
-from us_sim.volume.deidentification.kept_values import other_names
-from us_sim.volume.files.readers import grey_voxels, open_image, read_volume
+from us_sim.volume.files.readers import read_volume
 from us_sim.volume.reconstruction.calibration_file import read_calibration
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -65,60 +62,6 @@ def read(path: Path) -> None:
 
 for name in ("mha", "nrrd", "nii", "nii.gz"):
     target(name.replace(".", "-"), f".{name}", seeds_of(f".{name}"))(read)
-
-
-def nrrd_seeds(_: Path) -> Iterator[bytes]:
-    """Other encodings, skipped lines and bytes, units, no directions, and layers."""
-    raw = VOXELS.astype("<i2").tobytes()
-    words = " ".join(map(str, VOXELS.ravel())).encode()
-    placed = "space: RAS\nspace directions: (0.5,0,0) (0,0.25,0) (0,0,2)\nspace origin: (7,8,9)"
-    for encoding, data, place in (
-        ("bzip2", bz2.compress(raw), placed),
-        ("ascii", words, f'{placed}\nspace units: "cm" "cm" "cm"'),
-        ("raw\nline skip: 1\nbyte skip: 3", b"one\ntwo" + raw, "spacings: 0.5 0.25 2"),
-        ("raw\nbyte skip: -1", b"anything" + raw, 'spacings: 1 1 1\nunits: "mm" "mm" "um"'),
-    ):
-        header = f"NRRD0004\ntype: short\nendian: little\ndimension: 3\nsizes: 4 5 6\n{place}\n"
-        yield f"{header}encoding: {encoding}\n\n".encode() + data
-
-
-def nifti_seeds(_: Path) -> Iterator[bytes]:
-    """NIfTI-2, of one volume and of two, by its matrix and by its quaternion."""
-    for count in (1, 2):
-        header = bytearray(544)
-        struct.pack_into("<i4s4s2h", header, 0, 540, b"n+2", b"\r\n\x1a\n", 4, 16)
-        struct.pack_into("<8q", header, 16, 2 + count, 4, 5, 6, count, 1, 1, 1)
-        struct.pack_into("<8dq", header, 104, 1, 0.5, 0.25, 2, 1, 1, 1, 1, 544)
-        struct.pack_into("<2i6d", header, 344, 2 - count, count - 1, 0.3, -0.5, 0.2, 4, 5, 6)
-        struct.pack_into("<12d", header, 400, 0.5, 0, 0, 5, 0, 0, -2, 6, 0, 0.25, 0, 7)
-        yield bytes(header) + VOXELS.astype("<i2").tobytes() * count
-
-
-def read_any(path: Path) -> None:
-    """A volume of those in the file, and its import."""
-    image = open_image(path)
-    placement = image.placement()
-    voxels, _ = grey_voxels(image, image.volumes)
-    assert voxels.shape == image.shape
-    assert np.isfinite(placement).all()
-    assert other_names(path) is not None
-
-
-target("nrrd-encodings", ".nrrd", nrrd_seeds)(read_any)
-target("nifti-2", ".nii", nifti_seeds)(read_any)
-
-
-def pair_seeds(folder: Path) -> Iterator[bytes]:
-    """A header of NIfTI-2 whose voxels are in a file beside it, from its first byte on."""
-    whole, _ = nifti_seeds(folder)
-    yield whole[:4] + b"ni2" + whole[7:168] + bytes(8) + whole[176:544]
-
-
-@target("nifti-pair", ".hdr", pair_seeds)
-def nifti_pair(path: Path) -> None:
-    """The header of a pair of files, changed."""
-    path.with_suffix(".img").write_bytes(VOXELS.astype("<i2").tobytes())
-    read_any(path)
 
 
 def sequence_seeds(_: Path) -> Iterator[bytes]:

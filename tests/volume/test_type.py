@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from us_sim.errors import VolumeError
 from us_sim.volume.volume import Volume
@@ -16,18 +17,6 @@ STEPS = st.floats(1e-5, 1e-2)
 OFFSETS = st.floats(-1.0, 1.0)
 
 
-def _rotation(angles: tuple[float, float, float]) -> np.ndarray:
-    matrix = np.eye(3)
-    for axis, angle in enumerate(angles):
-        cosine, sine = np.cos(angle), np.sin(angle)
-        turn = np.eye(3)
-        a, b = [i for i in range(3) if i != axis]
-        turn[a, a] = turn[b, b] = cosine
-        turn[a, b], turn[b, a] = -sine, sine
-        matrix = turn @ matrix
-    return matrix
-
-
 @given(
     steps=st.tuples(STEPS, STEPS, STEPS),
     offset=st.tuples(OFFSETS, OFFSETS, OFFSETS),
@@ -36,7 +25,7 @@ def _rotation(angles: tuple[float, float, float]) -> np.ndarray:
 @settings(max_examples=30, deadline=None)
 def test_patient_to_index_undoes_index_to_patient(steps, offset, angles):
     matrix = np.eye(4)
-    matrix[:3, :3] = _rotation(angles) * steps
+    matrix[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix() * steps
     matrix[:3, 3] = offset
     volume = Volume(GREY, matrix)
     index = np.array([1.0, 2.5, -3.0, 1.0])
