@@ -16,6 +16,7 @@ from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
 
 _FLUSH = 0.5  # s, after which messages are handed to the operating system
+_PAUSE = 0.05  # s, in which messages gather: to be woken for each costs whoever has them time
 _RETRY = 1.0  # s, between tries to write to a disk that was full
 _BATCH = 512 * 1024  # bytes that may wait where `put` waits for the disk
 
@@ -145,6 +146,8 @@ class WriteBehind:
     def _run(self) -> None:
         flush_at = time.monotonic() + _FLUSH
         while True:
+            if self._limit and self._queue.empty():
+                self._ending.wait(_PAUSE)
             try:
                 item = self._queue.get(timeout=max(0.0, flush_at - time.monotonic()))
                 if item is None:
