@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from us_sim.errors import PoseError
-from us_sim.geometry.pose import FrameTree, Pose
+from us_sim.geometry.pose import Pose
 
 numbers = st.floats(-1.0, 1.0)
 poses = (
@@ -67,29 +67,3 @@ def test_a_mirror_or_a_scaling_is_not_rigid():
     for matrix in (np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1]), np.full((4, 4), np.nan)):
         with pytest.raises(PoseError):
             Pose.from_matrix(matrix)
-
-
-def test_the_pose_along_a_way_is_the_product_of_its_matrices():
-    random = np.random.default_rng(3)
-    tree, product = FrameTree(), np.eye(4)
-    for number in range(5):
-        pose = Pose(random.normal(size=3), random.normal(size=4))
-        tree.set_pose(f"{number + 1}", f"{number}", pose)
-        product = product @ pose.matrix
-    np.testing.assert_allclose(tree.pose(tree.chain("5", "0")).matrix, product, atol=1e-12)
-
-
-def test_frames_that_do_not_meet_or_go_round_have_no_chain():
-    tree = FrameTree()
-    tree.set_pose("a", "b", Pose())
-    tree.set_pose("b", "a", Pose())
-    assert tree.chain("a", "world") is None
-    assert tree.chain("nowhere", "world") is None
-    assert tree.chain("world", "world") == []
-
-
-def test_a_flood_of_frames_ends():
-    tree = FrameTree()
-    taken = [tree.set_pose(f"{n}", "world", Pose()) for n in range(1001)]
-    assert (taken.count(True), taken[-1]) == (1000, False)
-    assert tree.set_pose("5", "world", Pose([1.0, 0, 0]))  # one that is known still moves

@@ -1,5 +1,6 @@
 """Node processes: parameters, signals and threads; one simulation on a ROS domain."""
 
+import mmap
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 
 from us_sim.errors import UsSimError
 from us_sim.run import monitored as domain_lock
+from us_sim.run import shared_memory
 from us_sim.run.monitored import alone_on_domain
 from us_sim.run.plan import NodeProcess
 from us_sim.run.processes import ProcessGroup
@@ -71,6 +73,21 @@ def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(mo
     finally:
         for group in groups:
             group.stop()
+
+
+def test_a_port_goes_only_when_nobody_uses_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(shared_memory, "FOLDER", tmp_path)
+    unused, mapped, listened = (tmp_path / f"fastrtps_port{number}" for number in (1, 2, 3))
+    for port in (unused, mapped, listened):
+        port.write_bytes(bytes(4096))
+        (tmp_path / f"sem.{port.name}_mutex").touch()
+    (tmp_path / f"{listened.name}_el").touch()
+    with mapped.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
+        shared_memory.remove_unused_ports()
+    assert not unused.exists()
+    assert not (tmp_path / f"sem.{unused.name}_mutex").exists()
+    assert mapped.exists()
+    assert listened.exists()
 
 
 STARTS = """

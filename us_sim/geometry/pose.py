@@ -10,7 +10,6 @@ array([[0.   , 0.   , 0.042]])
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -191,40 +190,3 @@ class Placement(Settings):
     def pose(self) -> Pose:
         """The same as a rigid transform."""
         return Pose(np.array(self.position), np.array(self.orientation))
-
-
-_MOST = 1000  # Most frames kept; a tree of more is somebody's mistake
-
-
-class FrameTree:
-    """The last known pose of each frame in its parent."""
-
-    def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Pose]] = {}
-
-    def __len__(self) -> int:
-        return len(self._parents)
-
-    def set_pose(self, frame: str, parent: str, pose: Pose) -> bool:
-        """Put a frame at a pose in its parent; False where there are too many frames."""
-        if frame not in self._parents and len(self._parents) >= _MOST:
-            return False
-        self._parents[frame] = parent, pose
-        return True
-
-    def chain(self, frame: str, top: str) -> list[str] | None:
-        """The frames from ``frame`` up to below ``top``; None when they do not meet."""
-        frames: list[str] = []
-        while frame != top:
-            if frame not in self._parents or frame in frames:
-                return None
-            frames.append(frame)
-            frame = self._parents[frame][0]
-        return frames
-
-    def pose(self, chain: Sequence[str]) -> Pose:
-        """The pose of a chain's first frame in the parent of its last frame."""
-        pose = Pose()
-        for frame in chain:
-            pose = self._parents[frame][1] @ pose
-        return pose
