@@ -1,6 +1,5 @@
 """Node processes: parameters, signals and threads; one simulation on a ROS domain."""
 
-import mmap
 import os
 import signal
 import subprocess
@@ -75,6 +74,14 @@ def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(mo
             group.stop()
 
 
+MAPS = """
+import mmap, sys
+with open(sys.argv[1], "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
+    print("mapped", flush=True)
+    sys.stdin.read()
+"""
+
+
 def test_a_port_goes_only_when_nobody_uses_it(tmp_path, monkeypatch):
     monkeypatch.setattr(shared_memory, "FOLDER", tmp_path)
     unused, mapped, listened = (tmp_path / f"fastrtps_port{number}" for number in (1, 2, 3))
@@ -82,8 +89,11 @@ def test_a_port_goes_only_when_nobody_uses_it(tmp_path, monkeypatch):
         port.write_bytes(bytes(4096))
         (tmp_path / f"sem.{port.name}_mutex").touch()
     (tmp_path / f"{listened.name}_el").touch()
-    with mapped.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
+    command = [sys.executable, "-c", MAPS, mapped]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as user:
+        assert user.stdout.readline()
         shared_memory.remove_unused_ports()
+        user.stdin.close()
     assert not unused.exists()
     assert not (tmp_path / f"sem.{unused.name}_mutex").exists()
     assert mapped.exists()

@@ -9,6 +9,7 @@ with is never removed by the others, though none of them listens to it any more.
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 FOLDER = Path("/dev/shm")  # on Linux; elsewhere there is none
@@ -28,9 +29,9 @@ def remove_abandoned_segments() -> None:
 
 
 def remove_unused_ports() -> None:
-    """Remove ports to which nobody listens, and which no process has in its memory."""
+    """Remove ports to which nobody listens, and which no other process has in its memory."""
     ports = {each for each in FOLDER.glob("fastrtps_port*") if each.name[-3:] not in ("_el", "_sl")}
-    for maps in Path("/proc").glob("[0-9]*/maps"):
+    for maps in set(Path("/proc").glob("[0-9]*/maps")) - {Path(f"/proc/{os.getpid()}/maps")}:
         with contextlib.suppress(OSError):
             mapped = maps.read_text(errors="replace")
             ports = {each for each in ports if f"{each}\n" not in mapped}
