@@ -68,8 +68,10 @@ def cine_seeds(folder: Path) -> Iterator[bytes]:
     yield write(file, grey).read_bytes()
     yield write(file, grey, ExplicitVRBigEndian).read_bytes()
     colour = header(np.repeat(CINE[..., None], 3, axis=3), US_MULTI_FRAME)
+    colour.PixelSpacing = [0.5, 0.5]
     yield write(file, colour).read_bytes()
     palette = header(CINE[:1] % 4, US_IMAGE, PhotometricInterpretation="PALETTE COLOR")
+    palette.PixelSpacing = [0.5, 0.5]
     for name in ("Red", "Green", "Blue"):
         setattr(palette, f"{name}PaletteColorLookupTableDescriptor", [4, 0, 16])
         table = np.array([0, 20000, 40000, 65535], "<u2").tobytes()

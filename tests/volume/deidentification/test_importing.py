@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
 from pydicom.datadict import tag_for_keyword
 from pydicom.uid import JPEG2000Lossless
@@ -18,12 +16,9 @@ from pydicom.uid import JPEG2000Lossless
 from us_sim.command.main import main
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.deidentification.importing import find_text, import_files, look_at
-from us_sim.volume.deidentification.kept_values import CLOSED_LISTS, NUMBERS, USED, kept_values
-from us_sim.volume.deidentification.report import report_picture, report_text
+from us_sim.volume.deidentification.importing import import_files, look_at
+from us_sim.volume.deidentification.kept_values import CLOSED_LISTS, NUMBERS, kept_values
 from us_sim.volume.deidentification.settings import ImportSettings
-from us_sim.volume.files.dicom.header import open_dicom
-from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -40,6 +35,7 @@ def volume(tmp_path):
 @pytest.fixture
 def cine(tmp_path):
     made = header(CINE, US_MULTI_FRAME, FrameTime=40.0, FrameIncrementPointer=0x00181063)
+    made.PixelSpacing = [0.2, 0.2]
     return write(tmp_path / "DOE_JANE.dcm", made)
 
 
@@ -89,7 +85,7 @@ def test_without_regions_a_person_decides(cine, tmp_path, capsys):
     assert main(["import", str(cine), "--out", str(out)]) == 1
     said = capsys.readouterr().err
     assert "ultrasound regions" in said
-    assert "--crop 0,0,79,59 (a proposal)" in said
+    assert "--crop X0,Y0,X1,Y1" in said
     assert not list(out.parent.iterdir())
     assert main(["import", str(cine), "--out", str(out), "--keep-whole-image"]) == 0
 
@@ -114,87 +110,71 @@ def test_regions_that_cannot_be_true_are_not_believed(tmp_path, edges, kind, dou
         import_files([write(tmp_path / "a.dcm", made)], tmp_path / "a.igs.mha")
 
 
-def written_on(shape):
-    """Images (images, rows, columns) with a name on the black above each."""
-    frames = np.random.default_rng(4).integers(20, 90, shape, dtype=np.uint8)
-    frames[:, :60] = 0
-    for frame in frames:
-        cv2.putText(frame, "DOE JANE 4711", (30, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 240, 1)
-    return frames
-
-
-def test_text_that_remains_is_told_shown_and_blanked_on_request(tmp_path):
-    frames = written_on((5, 200, 300))
-    path = write(tmp_path / "a.dcm", header(frames, US_MULTI_FRAME))
-    found = look_at([path], None, ImportSettings())
-    (line,) = found.imported.text
-    where = np.argwhere(frames[0, :60] > 0)
-    found_at = (line.top, line.left), (line.bottom, line.right)
-    np.testing.assert_allclose(found_at, (where.min(axis=0), where.max(axis=0)), atol=1)
-    assert found.imported.proposal.top >= 55  # what moves is below
-    picture = report_picture(found.imported)
-    assert (picture == (60, 60, 255)).all(axis=-1).sum() > 200  # the red box
-    kept = look_at([path], tmp_path / "b.igs.mha", WHOLE)
-    assert "1 would go on" in report_text(kept.imported)
-    blank = ImportSettings(keep_whole_image=True, blank_text=True)
-    import_files([path], tmp_path / "c.igs.mha", blank)
-    (first, *_) = read_sweep(tmp_path / "c.igs.mha", tracked=False).images()
-    assert not first[:60].any()
-    assert np.array_equal(first[80:], frames[0, 80:])
-
-
-@pytest.mark.parametrize("kind", [".nrrd", ".mha", ".nii.gz", ".dcm", "turned.nrrd"])
-def test_what_may_be_text_wants_a_decision_in_files_of_every_kind(tmp_path, kind):
-    voxels = written_on((6, 140, 300)).T  # (i, j, k)
-    path, out = tmp_path / f"a{kind}", tmp_path / "o.nrrd"
-    if kind == ".dcm":
-        write(path, enhanced(voxels, turned()))
-    else:  # "turned": the axes are stored in another order
-        order = (0, 1, 2) if kind[0] == "t" else (2, 1, 0)
-        image = sitk.GetImageFromArray(np.ascontiguousarray(voxels.transpose(order)))
-        sitk.WriteImage(image, str(path))
-    with pytest.raises(VolumeError, match=r"may be text.*--keep-whole-image"):
-        import_files([path], out)
-    assert not out.exists()
-    import_files([path], out, WHOLE)
-    assert np.ptp(read_volume(out).intensities) > 200
-    if kind[0] == "t":  # blanking looks at the images, and not across them
-        with pytest.raises(VolumeError, match="other axes"):
-            import_files([path], tmp_path / "b.nrrd", ImportSettings(blank_text=True))
-    else:
-        import_files([path], tmp_path / "b.nrrd", ImportSettings(blank_text=True))
-        assert not read_volume(tmp_path / "b.nrrd").intensities[:, :55].any()
-        import_files([path], tmp_path / "c.nrrd", ImportSettings(crop="0,70,299,139"))
-
-
-def test_nothing_is_promised_that_was_not_looked_at(tmp_path):
-    path = tmp_path / "a.nrrd"
-    sitk.WriteImage(sitk.GetImageFromArray(VOXELS.astype(np.int16)), str(path))
-    found = look_at([path], None, ImportSettings()).imported
-    assert "12 of 30 images" in found.blanked
-    assert any("spread over 0 to 255" in each for each in found.conversions)
-
-
 @pytest.mark.parametrize(
-    ("values", "options", "size"),
+    ("values", "size"),
     [
-        ({"PixelSpacing": [0.2, 0.25]}, {}, (0.25, 0.2)),
-        ({"NominalScannedPixelSpacing": [0.2, 0.25]}, {}, (0.25, 0.2)),
-        ({"PixelAspectRatio": [4, 5]}, {}, (1.0, 0.8)),
-        ({}, {}, (1.0, 1.0)),
-        ({}, {"spacing": "0.3,0.4"}, (0.3, 0.4)),
+        ({"PixelSpacing": [0.2, 0.25]}, (0.25, 0.2)),
+        ({"NominalScannedPixelSpacing": [0.2, 0.25]}, (0.25, 0.2)),
+        ({"PixelAspectRatio": [4, 5]}, None),
+        ({}, None),
     ],
 )
-def test_the_size_of_pixels_is_what_the_header_or_a_person_says(tmp_path, values, options, size):
-    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values))
-    out = tmp_path / "a.mha"
-    made = import_files([path], out, ImportSettings(keep_whole_image=True, **options))
-    assert sitk.ReadImage(str(out)).GetSpacing()[:2] == size
-    stated = "Spacing" in " ".join(values)
-    assert stated != any("is not stated" in each for each in made.conversions)
-    if stated:
-        with pytest.raises(VolumeError, match="leave out"):
-            look_at([path], tmp_path / "b.mha", ImportSettings(spacing="1,1"))
+def test_the_size_of_pixels_is_what_the_header_or_a_person_says(tmp_path, values, size):
+    path, out = (
+        write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values)),
+        tmp_path / "a.mha",
+    )
+    given = ImportSettings(keep_whole_image=True, spacing="0.3,0.4")
+    without, with_it = (WHOLE, given) if size else (given, WHOLE)
+    with pytest.raises(VolumeError, match="--spacing"):
+        import_files([path], out, with_it)
+    import_files([path], out, without)
+    assert sitk.ReadImage(str(out)).GetSpacing()[:2] == (size or (0.3, 0.4))
+
+
+REGIONS = {"two_scales": {"184,75,491,554": 0.0616, "492,75,799,554": 0.1232}}
+REGIONS["second_without_units"] = {"184,75,491,554": 0.0616}
+
+
+@pytest.mark.parametrize("name", REGIONS)
+def test_a_crop_has_the_scale_of_its_region(shared_file, tmp_path, name):
+    path = shared_file(f"cases/dicom-two-scales/{name}.dcm")
+    for refused in (ImportSettings(), WHOLE, ImportSettings(crop="400,75,600,554")):
+        with pytest.raises(VolumeError, match="--crop 184,75,491,554"):
+            import_files([path], tmp_path / "o.mha", refused)
+    for crop, scale in REGIONS[name].items():
+        out = tmp_path / f"{crop}.mha"
+        import_files([path], out, ImportSettings(crop=crop))
+        assert sitk.ReadImage(str(out)).GetSpacing()[:2] == pytest.approx((scale, scale), rel=1e-4)
+    second = ImportSettings(crop="492,75,799,554")
+    if name == "second_without_units":
+        with pytest.raises(VolumeError, match="--spacing"):
+            import_files([path], tmp_path / "o.mha", second)
+    with pytest.raises(VolumeError, match="nothing of the ultrasound regions"):
+        import_files([path], tmp_path / "o.mha", ImportSettings(crop="0,0,100,60"))
+
+
+def test_a_crop_shows_nothing_outside_the_regions(shared_file, tmp_path):
+    path = shared_file("cases/dicom-two-scales/two_scales.dcm")
+    out = tmp_path / "o.mha"
+    import_files([path], out, ImportSettings(crop="100,0,450,500"))
+    (image,) = read_sweep(out, tracked=False).images()
+    assert not image[:75].any()
+    assert not image[:, :84].any()
+    assert image[75:, 84:].any()
+
+
+def test_images_with_places_and_a_persons_spacing_are_a_volume(shared_file, tmp_path):
+    folder = shared_file("cases/dicom-single-images") / "slicer_us_without_pixel_spacing"
+    with pytest.raises(VolumeError, match=r"states where its images lie.*--spacing"):
+        import_files([folder], tmp_path / "o.nrrd")
+    with pytest.raises(VolumeError, match=r"0\.21239 mm apart"):
+        import_files([folder], tmp_path / "o.nrrd", ImportSettings(spacing="0.21239,0.21239,1"))
+    given = ImportSettings(spacing="0.21239,0.21239,0.21239")
+    made = import_files([folder], tmp_path / "o.nrrd", given)
+    assert "64 × 128 × 16" in made.what
+    steps = np.linalg.norm(read_volume(tmp_path / "o.nrrd").index_to_patient[:3, :3], axis=0)
+    np.testing.assert_allclose(steps, 0.21239e-3, rtol=1e-6)
 
 
 def test_a_volume_without_spacing_is_imported_with_that_of_a_person(tmp_path):
@@ -227,23 +207,14 @@ def test_of_several_volumes_the_one_of_that_number_is_imported(tmp_path):
     assert (read_volume(tmp_path / "o.nrrd").intensities == 7).all()
 
 
-def test_real_files_with_a_hospitals_name_or_a_size_of_pixels(shared_file, tmp_path):
-    folder = shared_file("foreign-files")
-    with pytest.raises(VolumeError, match="may be text"):
-        import_files([folder / "burned_in_stack.nrrd"], tmp_path / "a.nrrd")
-    import_files([folder / "us1_pixelspacing.dcm"], tmp_path / "a.igs.mha", WHOLE)
-    assert sitk.ReadImage(str(tmp_path / "a.igs.mha")).GetSpacing()[:2] == (0.25, 0.2)
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--spacing", "0"], "three numbers"),
+        (["--spacing", "0"], "two or three numbers"),
         (["--spacing", "1,1,1"], "2D images"),
         (["--crop", "0,0,80,59"], "79"),
         (["--crop", "5,5,4,9"], "no pixel"),
         (["--crop", "5;5;4;9"], "rectangle"),
-        (["--crop", "0,0,9,9", "--keep-whole-image"], "keep one"),
         (["--volume", "0"], "volume"),
     ],
 )
@@ -289,7 +260,7 @@ def test_files_that_do_not_go_together_are_refused(volume, tmp_path):
 
 
 def test_a_damaged_image_leaves_nothing_behind(tmp_path):
-    made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
+    made = compressed(header(CINE, US_MULTI_FRAME, PixelSpacing=[1, 1]), JPEG2000Lossless)
     data = bytearray(made.PixelData)
     last = bytes(data).rindex(b"\xff\x4f\xff\x51")  # the beginning of the last code stream
     data[last + 4 : last + 60] = bytes(56)
@@ -340,7 +311,7 @@ def test_only_numbers_in_their_ranges_and_words_of_closed_lists_go_on():
 
 
 def test_every_name_on_the_positive_list_is_the_standards():
-    keywords = {number.keyword for number in NUMBERS} | USED
+    keywords = {number.keyword for number in NUMBERS}
     keywords |= {keyword for keyword, _ in CLOSED_LISTS.values()}
     assert {keyword for keyword in keywords if tag_for_keyword(keyword) is None} == set()
     assert not {keyword for keyword in keywords if "Patient" in keyword} - {
@@ -375,54 +346,6 @@ def test_an_import_takes_no_more_than_three_times_its_size(tmp_path):
 
 
 def test_a_single_image_is_a_sequence_of_one(tmp_path):
-    path = write(tmp_path / "a.dcm", header(CINE[:1], US_IMAGE))
+    path = write(tmp_path / "a.dcm", header(CINE[:1], US_IMAGE, PixelSpacing=[1, 1]))
     import_files([path], tmp_path / "a.mha", WHOLE)
     assert (tmp_path / "a.mha").read_bytes().endswith(CINE[0].tobytes())
-
-
-SEEN = {
-    "US1_UNCR": {"hospital": (15, 20, 160, 55), "lymph node": (248, 358, 362, 375)},
-    "OBXXXX1A_rle_2frame": {"maker": (325, 25, 505, 45), "date": (665, 5, 770, 25)},
-    "gdcm-US-ALOKA-16": {"hospital": (80, 0, 255, 12), "pelvis": (35, 455, 98, 470)},
-}
-"""Boxes in pixels that were drawn around words by eye."""
-
-
-@pytest.mark.parametrize("name", SEEN)
-def test_words_in_real_images_are_found(shared_file, name):
-    path = shared_file(f"dicom-us-2d/{name}.dcm")
-    image = next(GreyImages([open_dicom(path)]).images())
-    covered = np.zeros(image.shape, bool)
-    for line in find_text([image]):
-        covered[line.slices] = True
-    for word, (left, top, right, bottom) in SEEN[name].items():
-        assert covered[top:bottom, left:right].mean() > 0.25, word
-
-
-def test_a_sweep_without_text_has_none(shared_file):
-    folder = shared_file("imfusion-liver-sweep")
-    frames = list(read_sweep(folder / "liver_sweep.igs.mha").images(range(0, 140, 35)))
-    assert find_text(frames) == []
-    assert [find_text([frame]) for frame in frames[:2]] == [[], []]
-    voxels = read_volume(folder / "liver_sweep_compounded_1mm.mha").intensities
-    assert find_text([voxels[:, :, k].T for k in (40, 77, 110)]) == []
-
-
-@given(
-    text=st.text("ABCDEFGHJKLMNPRSTUVWXYZ0123456789", min_size=5, max_size=9),
-    size=st.floats(0.4, 1.2),
-    seed=st.integers(0, 1000),
-)
-@settings(max_examples=12, deadline=None)
-def test_any_word_on_black_is_found_beside_moving_speckle(text, size, seed):
-    rng = np.random.default_rng(seed)
-    frames = rng.rayleigh(40, (4, 160, 320)).clip(0, 255).astype(np.uint8)
-    frames[:, :60] = 0
-    for frame in frames:
-        cv2.putText(frame, text, (12, 40), cv2.FONT_HERSHEY_SIMPLEX, size, 220, 1, cv2.LINE_AA)
-    ink = frames[0, :60] > 150
-    covered = np.zeros(frames[0].shape, bool)
-    for line in find_text(list(frames)):
-        covered[line.slices] = True
-    assert (covered[:60] & ink).sum() > 0.6 * ink.sum()
-    assert covered[64:].mean() < 0.02

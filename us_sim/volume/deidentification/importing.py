@@ -2,11 +2,6 @@
 
 Only voxels, their place and time, and the values of `kept_values` go on. The source is read, the
 rest is blanked, and the result is written anew: nothing is copied.
-
-Burned-in text is detected, not read: thin strokes, brighter or darker than their surroundings, the
-same in every image, of about one brightness, and beside one another on a line. Speckle has the
-strokes, but neither the one brightness nor the line. It helps a person who looks at the picture,
-and is no proof: it misses letters across bright tissue, handwriting, and faces.
 """
 
 from __future__ import annotations
@@ -16,17 +11,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
-from us_sim.volume.deidentification.kept_values import sorted_out
 from us_sim.volume.deidentification.settings import ImportSettings, Rectangle
 from us_sim.volume.deidentification.source import (
     Progress,
-    Regions,
+    Scale,
     Source,
     dicom_source,
     file_source,
@@ -36,140 +29,6 @@ from us_sim.volume.files.readers import ENDINGS
 from us_sim.volume.files.writing import write_image_sequence, write_volume
 from us_sim.volume.volume import Volume
 
-_STILL = 12  # grey levels by which the same letter differs between images; JPEG makes about ten
-_STROKE = 11  # px, wider than the strokes of the largest letters
-_HEIGHTS = (5, 60)  # px
-
-
-@dataclass(frozen=True)
-class _Glyphs:
-    """Bright spots; each array has one number a spot."""
-
-    left: NDArray[np.int64]
-    top: NDArray[np.int64]
-    right: NDArray[np.int64]  # the last column that belongs to it
-    bottom: NDArray[np.int64]
-
-    @property
-    def height(self) -> NDArray[np.int64]:
-        return self.bottom - self.top + 1
-
-
-def find_text(images: Sequence[NDArray[np.uint8]]) -> list[Rectangle]:
-    """Lines of possible text in images (rows, columns) of equal size, from the top down.
-
-    Several, from all over a recording, tell text from moving echoes.
-    """
-    stack = np.stack(images)
-    low, high = stack.min(axis=0), stack.max(axis=0)
-    still = (high - low) <= _STILL
-    # Grey levels; in three images or more hardly anything but text stands still.
-    contrast = 45 if len(images) < 3 else 16
-    lines = []
-    # In a picture with few rows or columns letters may touch.
-    for scale in (1, 2) if min(low.shape) <= 600 else (1,):
-        for picture in (low, 255 - high):
-            lines += _lines(_glyphs(picture, still, contrast, scale), scale)
-    kept: list[Rectangle] = []  # each line once, where it was found at both scales
-    for line in sorted(lines, key=lambda line: -line.size[0] * line.size[1]):
-        x, y = (line.left + line.right) / 2, (line.top + line.bottom) / 2
-        if not any(one.left <= x <= one.right and one.top <= y <= one.bottom for one in kept):
-            kept.append(line)
-    return sorted(kept, key=lambda line: (line.top, line.left))
-
-
-def proposed_part(
-    images: Sequence[NDArray[np.uint8]], text: Sequence[Rectangle]
-) -> Rectangle | None:
-    """The part of images (rows, columns) to keep, for a person to decide: the largest connected
-    part that moves, or of one image that is not black; no places of possible text.
-    """
-    stack = np.stack(images)
-    moving = np.ptp(stack, axis=0) > 16  # grey levels
-    seen = moving if moving.mean() > 0.01 else stack.max(axis=0) > 8
-    seen = seen.astype(np.uint8)
-    for line in text:
-        seen[line.slices] = 0
-    opened = cv2.morphologyEx(seen, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8))
-    count, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    if count < 2:
-        return None
-    left, top, width, height, _ = (
-        int(each) for each in stats[1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))]
-    )
-    return Rectangle(left, top, left + width - 1, top + height - 1)
-
-
-def _glyphs(
-    picture: NDArray[np.uint8], still: NDArray[np.bool_], contrast: float, scale: int
-) -> _Glyphs:
-    """Strokes that stand out brightly, connected, and of a letter's size and evenness."""
-    if scale > 1:
-        size = (picture.shape[1] * scale, picture.shape[0] * scale)
-        larger = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
-        picture = np.asarray(larger, np.uint8)
-        still = still.repeat(scale, axis=0).repeat(scale, axis=1)
-    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (_STROKE, _STROKE))
-    stands_out = cv2.morphologyEx(picture, cv2.MORPH_TOPHAT, kernel)
-    enough = np.maximum(0.5 * cv2.dilate(stands_out, kernel), contrast)
-    strokes = ((stands_out > enough) & still).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(strokes, connectivity=8)
-    left, top, width, height, area = stats.T.astype(np.int64)
-    where = np.flatnonzero(strokes)
-    flat, heights = labels.ravel()[where], stands_out.ravel()[where]
-    brightest = np.zeros(count, np.int64)
-    np.maximum.at(brightest, flat, heights)
-    even = np.bincount(flat, heights >= 0.6 * brightest[flat], count) / area
-    filled = area / (width * height)
-    good = (_HEIGHTS[0] <= height) & (height <= _HEIGHTS[1]) & (width <= 2 * height)
-    good &= (filled > 0.12) & ((filled < 0.9) | (width < 0.5 * height)) & (even > 0.5)
-    good[0] = False  # the background of the strokes
-    edges = (left, top, left + width - 1, top + height - 1)
-    return _Glyphs(*(each[good] for each in edges))
-
-
-def _lines(glyphs: _Glyphs, scale: int) -> list[Rectangle]:
-    """Three glyphs or more of about one height, beside one another on a common base or top."""
-    order = np.argsort(glyphs.left, kind="stable")
-    groups = np.arange(len(order))
-    for place, a in enumerate(order):
-        reach = 1.3 * glyphs.height[a]
-        for b in order[place + 1 :]:
-            if glyphs.left[b] - glyphs.right[a] > reach:
-                break  # those that begin further right are no nearer
-            if _beside(glyphs, a, b):
-                groups[groups == groups[b]] = groups[a]
-    lines = []
-    for group in np.unique(groups):
-        members = np.flatnonzero(groups == group)
-        if len(members) >= 3 and _is_line(glyphs, members):
-            first = glyphs.left[members].min(), glyphs.top[members].min()
-            last = glyphs.right[members].max(), glyphs.bottom[members].max()
-            lines.append(Rectangle(*(int(edge) // scale for edge in (*first, *last))))
-    return lines
-
-
-def _beside(glyphs: _Glyphs, a: int, b: int) -> bool:
-    low, high = sorted((int(glyphs.height[a]), int(glyphs.height[b])))
-    between = glyphs.left[b] - glyphs.right[a]
-    overlap = min(glyphs.bottom[a], glyphs.bottom[b]) - max(glyphs.top[a], glyphs.top[b])
-    return bool(high <= 1.8 * low and -2 <= between <= high and overlap > 0.5 * low)
-
-
-def _is_line(glyphs: _Glyphs, members: NDArray[np.int64]) -> bool:
-    """Whether most stand on one base, or hang from one top, and the whole is wide."""
-    height = float(np.median(glyphs.height[members]))
-    slack = 1.0 + 0.08 * height
-    width = glyphs.right[members].max() - glyphs.left[members].min()
-    aligned = max(
-        np.mean(np.abs(edge - np.median(edge)) <= slack)
-        for edge in (glyphs.bottom[members], glyphs.top[members])
-    )
-    return bool(aligned >= 0.7 and width > 1.5 * height)
-
-
-_MARGIN = 3  # pixels around text that are blanked with it: shadows and blurred edges
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
 
 
@@ -181,17 +40,12 @@ class Imported:
     files: int
     what: str  # the result, with its size, for a person
     kept: Mapping[str, str]  # values that go on, by their fields
-    used: Mapping[str, int]  # elements of which only the effect goes on, and how many of each
-    dropped: Mapping[str, int]  # all others
+    dropped: Mapping[str, int]  # all other elements, and how many of each
     conversions: tuple[str, ...]
     blanked: str  # the part of the images that is not kept, for a person
     first: NDArray[np.uint8]  # (rows, columns) the first image as it was: it may show a name
-    regions: tuple[Rectangle, ...]  # its parts that are kept
-    text: tuple[Rectangle, ...]  # where text may be, in `first`
-    remaining: tuple[Rectangle, ...]  # of these, those that are kept: partly or wholly
-    undecided: str = ""  # why nothing can be written before a person has decided
-    blanking_settles: bool = False  # that --blank-text would be a decision
-    proposal: Rectangle | None = None  # the part to keep, by its movement and brightness
+    parts: tuple[Rectangle, ...]  # of it, those that are kept
+    undecided: str = ""  # what a person has to say before anything can be written
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +58,7 @@ class Import:
     source: Source
     imported: Imported
     keep: NDArray[np.bool_] | None  # (rows, columns) of every image; None: all of it
+    pixel_mm: Scale | None  # of images without a place
 
     def write(self, progress: Progress | None = None) -> None:
         """Write the result.
@@ -216,12 +71,7 @@ class Import:
         facts = self.imported
         assert self.out is not None
         if facts.undecided:
-            blank = "--blank-text, " if facts.blanking_settles else ""
-            proposed = f"{facts.proposal} (a proposal)" if facts.proposal else "X0,Y0,X1,Y1"
-            raise VolumeError(
-                f"{self.paths[0]}: {facts.undecided}; look at the picture of --report, then give "
-                f"--crop {proposed}, {blank}or --keep-whole-image if there is nothing to hide"
-            )
+            raise VolumeError(f"{self.paths[0]}: {facts.undecided}")
         if self.source.placement is None:
             self._write_images(self.out, progress)
         else:
@@ -230,6 +80,7 @@ class Import:
     def _write_images(self, out: Path, progress: Progress | None) -> None:
         """Images without a place, one after another in time."""
         source, part = self.source, self.settings.part
+        assert self.pixel_mm is not None
         columns, rows, count = source.shape
         cut = part.slices if part else (slice(None), slice(None))
         columns, rows = part.size if part else (columns, rows)
@@ -242,7 +93,7 @@ class Import:
                     progress(number / count, f"{number} of {count} images")
 
         shape = (count, rows, columns)
-        write_image_sequence(out, images(), shape, source.times, source.pixel_mm, source.kept)
+        write_image_sequence(out, images(), shape, source.times, self.pixel_mm, source.kept)
 
     def _write_volume(
         self, out: Path, placement: NDArray[np.float64], progress: Progress | None
@@ -269,8 +120,7 @@ class Import:
         counts = {
             "files": facts.files,
             "elements dropped": sum(facts.dropped.values()),
-            "regions kept": len(facts.regions),
-            "places that may be text": len(facts.remaining),
+            "regions kept": len(facts.parts),
         }
         with new_case(out) as folder:
             write_volume(folder / "volume.nrrd", volume, source.kept)
@@ -303,8 +153,7 @@ def look_at(
     if out is not None:
         _check_free(out)
     source = _source(paths, out, settings)
-    imported, keep = _planned(paths, source, settings)
-    return Import(paths, out, settings, source, imported, keep)
+    return _planned(paths, out, settings, source)
 
 
 def import_files(
@@ -334,11 +183,9 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
     others = [path for path in paths if path.name.lower().endswith(ENDINGS)]
     spacing = settings.spacing_mm
     needs_volume = out is not None and not out.name.lower().endswith(".mha")
-    if spacing and len(spacing) != (3 if others or needs_volume else 2):
-        raise VolumeError(
-            "--spacing: write three numbers for a volume, X,Y,Z, and two for 2D images, X,Y"
-        )
     if len(paths) == 1 and others:
+        if len(spacing) == 2:
+            raise VolumeError("--spacing: write three numbers for a volume: X,Y,Z")
         return file_source(paths[0], settings.volume, spacing or None)
     strange = [*others, *(path for path in paths if path not in others and not is_dicom(path))]
     if strange:
@@ -352,91 +199,114 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
 
 
 def _planned(
-    paths: list[Path], source: Source, settings: ImportSettings
-) -> tuple[Imported, NDArray[np.bool_] | None]:
-    """The facts of an import, and the part of every image that is kept where that is not all."""
-    regions, undecided = _kept_part(source, settings)
+    paths: list[Path], out: Path | None, settings: ImportSettings, source: Source
+) -> Import:
+    """Find out what of every image is kept, and its scale."""
     columns, rows, _ = source.shape
-    keep = regions.mask(rows, columns) if regions.kept else np.ones((rows, columns), bool)
-    found = find_text(source.samples)
-    marked = [line for line in found if keep[line.slices].any()] if settings.blank_text else []
-    for line in marked:
-        keep[line.grown(_MARGIN).slices] = False
-    remaining = tuple(line for line in found if keep[line.slices].any())
-    sides = source.sides(None if keep.all() else keep) if source.sides else ()
-    across = sum(len(find_text(side)) for side in sides)
+    whole = Rectangle(0, 0, columns - 1, rows - 1)
+    part = settings.part or whole
+    if part.common(whole) != part:
+        raise VolumeError(
+            f"--crop {part}: is larger than the images, whose last column is {columns - 1} and "
+            f"last row {rows - 1}"
+        )
+    regions = () if settings.keep_whole_image else source.regions.kept
+    shown = tuple(filter(None, (part.common(region.part) for region in regions)))
+    if regions and not shown:
+        raise VolumeError(
+            f"--crop {part}: shows nothing of the ultrasound regions "
+            f"{', '.join(str(region.part) for region in regions)}; keep a part of these, or give "
+            f"--keep-whole-image with it if there is nothing to hide"
+        )
+    keep = np.full((rows, columns), not regions)
+    for each in shown:
+        keep[each.slices] = True
     is_told = settings.part is not None or settings.keep_whole_image
-    if (remaining or across) and not undecided and not is_told:
-        others = f", and {across} in slices across its other axes" if across else ""
-        undecided = f"{len(remaining)} places that would go on may be text{others}"
-    used, dropped = sorted_out(source.names, source.kept)
-    imported = Imported(
+    undecided = ""
+    if source.needs_part and not regions and not is_told:
+        undecided = (
+            f"names and dates may be burned into its images, and nothing says which part of them "
+            f"holds echoes ({source.regions.doubt}); look at the picture of --report, then give "
+            f"--crop X0,Y0,X1,Y1, or --keep-whole-image if there is nothing to hide"
+        )
+    pixel = None
+    if source.placement is None:
+        pixel, unknown = _scale(paths[0], source, part, settings.spacing_mm)
+        undecided = "; ".join(filter(None, (undecided, unknown)))
+    facts = Imported(
         kind=source.kind,
         files=len(paths),
-        what=_result(source, settings.part),
+        what=_result(source, part, pixel),
         kept=source.kept,
-        used=used,
-        dropped=dropped,
+        dropped=source.dropped,
         conversions=source.conversions,
-        blanked=_blanked(source, regions, settings, undecided, len(marked)),
-        first=source.samples[0],
-        regions=regions.kept,
-        text=tuple(found),
-        remaining=remaining,
+        blanked=_blanked(source, settings, shown, undecided),
+        first=source.first,
+        parts=shown or ((part,) if settings.part else ()),
         undecided=undecided,
-        blanking_settles=bool(undecided) and not source.regions.doubt and not across,
-        proposal=proposed_part(source.samples, found) if undecided else None,
     )
-    return imported, None if keep.all() else keep
+    return Import(paths, out, settings, source, facts, None if keep.all() else keep, pixel)
 
 
-def _kept_part(source: Source, settings: ImportSettings) -> tuple[Regions, str]:
-    """The part of every image that is kept, and why a person has to decide, where that is so."""
-    part = settings.part
-    if part is not None:
-        columns, rows, _ = source.shape
-        if part.right >= columns or part.bottom >= rows:
-            raise VolumeError(
-                f"--crop {part}: is larger than the images, whose last column is {columns - 1} "
-                f"and last row {rows - 1}"
-            )
-        return Regions((part,)), ""
-    if settings.keep_whole_image:
-        return Regions(()), ""
-    if source.regions.doubt:
-        return Regions(()), (
-            f"names and dates may be burned into its images, and nothing says which part of them "
-            f"holds echoes ({source.regions.doubt})"
+def _scale(
+    path: Path, source: Source, part: Rectangle, given: tuple[float, ...]
+) -> tuple[Scale | None, str]:
+    """Return the size of pixels in a part of an image, mm, or what a person has to say about it.
+
+    Regions have scales of their own, so that a part with two of them has none.
+    """
+    if len(given) == 3:
+        raise VolumeError("--spacing: write two numbers for 2D images, X,Y")
+    inside = [region for region in source.regions.kept if part.common(region.part)]
+    scales = {region.pixel_mm for region in inside}
+    if len(scales) > 1:
+        listed = ", or ".join(
+            f"--crop {region.part} ({_millimetres(region.pixel_mm)})" for region in inside
         )
-    return source.regions, ""
+        return None, f"its ultrasound regions have different sizes of pixels: give {listed}"
+    stated = next(iter(scales), None) or source.pixel_mm
+    if stated and given:
+        raise VolumeError(f"{path}: states the size of its pixels: leave out --spacing")
+    if given:
+        return (given[0], given[1]), ""
+    if stated is None:
+        return None, "its size of pixels is not stated: say it with --spacing X,Y (mm)"
+    return stated, ""
 
 
-def _result(source: Source, part: Rectangle | None) -> str:
-    columns, rows, count = source.shape
-    if part is not None:
-        columns, rows = part.size
+def _millimetres(pixel: Scale | None) -> str:
+    return f"{pixel[0]:.4g} × {pixel[1]:.4g} mm" if pixel else "of a size that is not stated"
+
+
+def _result(source: Source, part: Rectangle, pixel: Scale | None) -> str:
+    columns, rows = part.size
+    count = source.shape[2]
     if source.placement is None:
-        return f"{counted(count, 'image')} of {columns} × {rows} pixels"
+        return f"{counted(count, 'image')} of {columns} × {rows} pixels {_millimetres(pixel)}"
     steps = np.linalg.norm(source.placement[:3, :3], axis=0) * 1e3
     apart = " × ".join(f"{step:.4g}" for step in steps)
     return f"a volume of {columns} × {rows} × {count} voxels of {apart} mm"
 
 
 def _blanked(
-    source: Source, regions: Regions, settings: ImportSettings, undecided: str, lines: int
+    source: Source, settings: ImportSettings, shown: Sequence[Rectangle], undecided: str
 ) -> str:
     if undecided:
         return "nothing yet: it has to be said what is kept"
-    marked = f"; {counted(lines, 'place')} that may be text" if lines else ""
+    said = []
     if settings.part is not None:
-        return f"all but columns and rows {settings.part} is cut off{marked}"
-    if not regions.kept:
-        said = f"no text was found in {len(source.samples)} of {source.shape[2]} images"
-        said = "as was said" if settings.keep_whole_image else said
-        return f"{counted(lines, 'place')} that may be text" if lines else f"nothing ({said})"
-    kept = ", ".join(map(str, regions.kept))
-    others = f", and {regions.blanked} of other kinds" if regions.blanked else ""
-    return f"everything outside the ultrasound regions {kept}{others}{marked}"
+        said.append(f"all but columns and rows {settings.part} is cut off")
+    if shown:
+        others = source.regions.blanked
+        said.append(
+            f"everything outside the ultrasound regions {', '.join(map(str, shown))}"
+            + (f", and {others} of other kinds" if others else "")
+        )
+    if said:
+        return "; ".join(said)
+    if settings.keep_whole_image:
+        return "nothing (as was said)"
+    return "nothing (volumes are not searched for text: look at the slices)"
 
 
 def _cropped(

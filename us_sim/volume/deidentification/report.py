@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -19,7 +19,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.importing import Imported
 from us_sim.volume.deidentification.kept_values import NUMBERS
-from us_sim.volume.deidentification.settings import Rectangle
 
 _REPORT, _PICTURE = "report.md", "first_image.png"
 
@@ -29,34 +28,24 @@ def report_text(imported: Imported, picture: str = "") -> str:
     files = "1 file" if imported.files == 1 else f"{imported.files} files"
     lines = ["# Import", "", f"{files}: {imported.kind}. Made of it: {imported.what}.", ""]
     if imported.undecided:
-        blank = "`--blank-text` or " if imported.blanking_settles else ""
-        proposed = imported.proposal
-        proposal = f" `{proposed}` is proposed: the yellow box." if proposed else ""
-        lines += [
-            f"**Nothing can be written yet**: {imported.undecided}. Say `--crop X0,Y0,X1,Y1`, "
-            f"{blank}`--keep-whole-image`.{proposal}",
-            "",
-        ]
+        lines += [f"**Nothing can be written yet**: {imported.undecided}.", ""]
     lines += [f"Blanked: {imported.blanked}.", ""]
     if imported.conversions:
         lines += [f"Converted: {'; '.join(imported.conversions)}.", ""]
-    lines += [*_text_lines(imported), ""]
     if picture:
         lines += [
             f"![The first image]({picture})",
             "",
-            "*The first image as it was. Green: kept. Red: may be text. Yellow: proposed for "
-            "--crop. It may show a name: keep it where the original is kept.*",
+            "*The first image as it was. Green: kept. It may show a name: keep it where the "
+            "original is kept.*",
             "",
         ]
     reasons = {one.name: f": {one.why}" for one in NUMBERS}
     reasons["frame_of_reference_uid"] = ": a new one of random numbers, in place of the original's"
     lines += ["## Kept as they are", ""]
     lines += _listed({name + reasons.get(name, ""): 1 for name in imported.kept})
-    lines += ["", "## Used, so that their effect goes on", ""]
-    lines += ["The grid, the times, the grey values and what is blanked come of these.", ""]
-    lines += _listed(imported.used)
     lines += ["", "## Dropped", ""]
+    lines += ["The grid, the times, the grey values and what is blanked come of some of these.", ""]
     lines += ["Names only: with values this report would say whose it is.", ""]
     lines += _listed(imported.dropped)
     return "\n".join([*lines, ""])
@@ -67,27 +56,15 @@ def summary(imported: Imported) -> str:
     said = [imported.what, f"blanked: {imported.blanked}", *imported.conversions]
     dropped = sum(imported.dropped.values())
     said.append(f"{counted(dropped, 'element')} of the header dropped, {len(imported.kept)} kept")
-    if imported.remaining:
-        said.append(
-            f"{counted(len(imported.remaining), 'place goes', 'places go')} on that may be text: "
-            f"look at the picture of --report"
-        )
     return "; ".join(said)
 
 
 def report_picture(imported: Imported) -> NDArray[np.uint8]:
-    """(rows, columns, 3) the first image as it was, with its kept parts and those of text."""
+    """Return (rows, columns, 3) the first image as it was, with boxes around its kept parts."""
     picture = np.asarray(cv2.cvtColor(imported.first, cv2.COLOR_GRAY2BGR), np.uint8)
-    proposed = [imported.proposal] if imported.proposal else []
-    boxes: Iterable[tuple[Iterable[Rectangle], tuple[int, int, int], int]] = (
-        (imported.regions, (80, 220, 80), 0),  # blue, green, red, and pixels around a box
-        (imported.text, (60, 60, 255), 2),
-        (proposed, (0, 220, 255), 0),
-    )
-    for each, colour, margin in boxes:
-        for box in each:
-            first = (box.left - margin, box.top - margin)
-            cv2.rectangle(picture, first, (box.right + margin, box.bottom + margin), colour, 1)
+    for box in imported.parts:
+        first, last = (box.left, box.top), (box.right, box.bottom)
+        cv2.rectangle(picture, first, last, (80, 220, 80), 1)
     return picture
 
 
@@ -126,19 +103,6 @@ def refuse_report(folder: Path) -> None:
         raise VolumeError(f"--report {folder}: is a file; name a folder for the report")
     if os.path.lexists(folder / _REPORT):
         raise VolumeError(f"--report {folder}: holds a report already; name another folder")
-
-
-def _text_lines(imported: Imported) -> list[str]:
-    found, remaining = len(imported.text), imported.remaining
-    if not found:
-        return ["Nothing that looks like text was found, which is no proof that there is none."]
-    said = (
-        f"{counted(found, 'place')} may be text; {found - len(remaining)} of them blanked or cut "
-        f"off, and {len(remaining)} would go on"
-    )
-    if not remaining:
-        return [f"{said}."]
-    return [f"{said}:", "", *(f"- columns and rows {line}" for line in remaining)]
 
 
 def _listed(names: Mapping[str, int]) -> list[str]:

@@ -47,10 +47,11 @@ class Rectangle:
         """Of (rows, columns)."""
         return slice(self.top, self.bottom + 1), slice(self.left, self.right + 1)
 
-    def grown(self, margin: int) -> Rectangle:
-        """With so many more pixels on every side; none before the first column and row."""
-        left, top = max(self.left - margin, 0), max(self.top - margin, 0)
-        return Rectangle(left, top, self.right + margin, self.bottom + margin)
+    def common(self, other: Rectangle) -> Rectangle | None:
+        """Return the part that both have; None where they have none."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
+        return Rectangle(left, top, right, bottom) if left <= right and top <= bottom else None
 
     def __str__(self) -> str:
         return f"{self.left},{self.top},{self.right},{self.bottom}"
@@ -68,11 +69,7 @@ class ImportSettings(Settings):
         default=None,
     )
     keep_whole_image: bool = setting(
-        description="keep all of every image: nothing is burned in", default=False
-    )
-    blank_text: bool = setting(
-        description="blank what may be text within what is kept, too; look at the picture of "
-        "--report first",
+        description="keep what lies outside the ultrasound regions, too: nothing is burned in",
         default=False,
     )
     volume: int = setting(
@@ -88,10 +85,8 @@ class ImportSettings(Settings):
     )
 
     def check(self) -> None:
-        """Either a part is kept or all."""
+        """Refuse a crop that is no rectangle, and a spacing that is none."""
         if self.crop is not None:
-            if self.keep_whole_image:
-                raise self.refused("crop", "cannot be given with --keep-whole-image; keep one")
             try:
                 Rectangle.read(self.crop)
             except ValueError as error:

@@ -1,20 +1,17 @@
 """Images of DICOM files: grey values, claims of sizes, decoders."""
 
-import os
 import sys
-import zlib
 
 import numpy as np
 import pydicom
 import pytest
 from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
 from pydicom.data import get_testdata_file
-from pydicom.pixels import apply_color_lut, pixel_array
+from pydicom.pixels import apply_color_lut, get_decoder, pixel_array
 from pydicom.uid import ExplicitVRBigEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files import stored_image
-from us_sim.volume.files.dicom import pixels
 from us_sim.volume.files.dicom.header import open_dicom
 from us_sim.volume.files.dicom.pixels import GreyImages, image_format, stored_frames
 from us_sim.volume.files.dicom.planes import frame_times
@@ -146,11 +143,11 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
         ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "are read at most"),
         ({"NumberOfFrames": -1}, "holds -1 images"),
         ({"Rows": 0}, "10 × 0 pixels"),
-        ({"BitsAllocated": 1}, "its header says 60"),
+        ({"BitsAllocated": 1, "BitsStored": 1}, "its header says 60"),
         ({"BitsStored": 77}, "77 of 8 bits"),
         ({"SamplesPerPixel": 4}, "4 numbers as"),
         ({"PhotometricInterpretation": "RGB"}, "1 numbers as 'RGB'"),
-        ({"PhotometricInterpretation": "PALETTE COLOR"}, "table of red values is missing"),
+        ({"PhotometricInterpretation": "PALETTE COLOR"}, "table of colours is missing"),
     ],
 )
 def test_headers_that_cannot_be_are_refused(tmp_path, values, message):
@@ -164,18 +161,15 @@ def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch)
     refused(path, "of memory where")
 
 
-def test_a_small_compressed_file_that_claims_gigabytes_is_refused_at_once(tmp_path, monkeypatch):
-    def never(*_):
-        raise AssertionError("it was to be refused before anything is decoded")
-
-    monkeypatch.setattr(pixels.subprocess, "Popen", never)
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"NumberOfFrames": 5}, "damaged"), ({"Rows": 60000, "Columns": 60000}, "at most")],
+)
+def test_compressed_images_are_as_many_and_as_large_as_the_header_says(tmp_path, values, message):
     made = compressed(header(CINE, US_MULTI_FRAME), RLELossless)
-    for values in ({"NumberOfFrames": 5000}, {"Rows": 60000, "Columns": 60000}):
-        lying = made.copy()
-        for key, value in values.items():
-            setattr(lying, key, value)
-        path = write(tmp_path / "a.dcm", lying, RLELossless)
-        refused(path, r"4 compressed images where|are read at most")
+    for key, value in values.items():
+        setattr(made, key, value)
+    refused(write(tmp_path / "a.dcm", made, RLELossless), message)
 
 
 def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
@@ -208,15 +202,10 @@ def test_jpeg_of_12_bits_that_comes_with_pydicom_is_decoded():
 
 
 def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):
-    # A folder without packages stands for an installation without decoders.
     path = write(
         tmp_path / "a.dcm", compressed(header(CINE, US_IMAGE), JPEGBaseline8Bit), JPEGBaseline8Bit
     )
-    shadow = tmp_path / "shadow"
-    for name in ("PIL", "gdcm", "pylibjpeg"):
-        (shadow / name).mkdir(parents=True)
-        (shadow / name / "__init__.py").write_text("raise ImportError")
-    monkeypatch.setenv("PYTHONPATH", str(shadow), prepend=os.pathsep)
+    monkeypatch.setattr(get_decoder(JPEGBaseline8Bit), "_available", {})
     refused(path, r"JPEG Baseline.*us_sim\[dicom\]")
 
 
@@ -230,18 +219,6 @@ def test_without_pydicom_the_extra_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
     monkeypatch.setitem(sys.modules, "pydicom", None)
     with pytest.raises(VolumeError, match=r"us_sim\[dicom\]"):
-        open_dicom(path)
-
-
-def test_a_bomb_is_not_inflated(tmp_path):
-    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME), deflated=True)
-    start = path.read_bytes()
-    at = 144 + int.from_bytes(start[140:144], "little")
-    plain = zlib.decompress(start[at:], -zlib.MAX_WBITS)
-    pack = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-    bomb = pack.compress(plain) + b"".join(pack.compress(bytes(1 << 20)) for _ in range(200))
-    path.write_bytes(start[:at] + bomb + pack.flush())
-    with pytest.raises(VolumeError, match="inflates to more than the"):
         open_dicom(path)
 
 

@@ -1,50 +1,38 @@
-"""The images of DICOM files as grey values, a few in memory at a time.
+"""The images of DICOM files as grey values, read and decoded by pydicom, one in memory at a time.
 
 8-bit values are taken as they are; all others are spread so that the least becomes 0 and the
 greatest 255, as `us_sim.volume.files.readers` does. Colour becomes grey by its brightness.
-
-pydicom decodes compressed images, in a process of its own (`decoder`). Its `pixels.processing` was
-tried for palettes and rescaling and is not used: 1.8 kB of a segmented palette expand to 20 million
-entries, without a bound (ours stops at the entries that the header claims), it knows no rescaling
-of single frames (functional groups), and makes 64-bit numbers of all frames at once.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom import decoder
 from us_sim.volume.files.dicom.header import (
     EXTRA,
     DicomFile,
     items,
     number,
     numbers,
+    quiet,
     text,
-    value,
     whole,
 )
 from us_sim.volume.files.stored_image import GreyLevels, check_claim
 
 _GREY = ("MONOCHROME1", "MONOCHROME2", "PALETTE COLOR")
-_MOST_FRAMES = 1 << 20
-_DIRECT = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99", "")
 
-_WEIGHTS = {"Red": 77, "Green": 150, "Blue": 29}
-"""Of colours in a grey value, in 256ths (ITU-R BT.601, 2.5.1); a grey pixel stays as it is."""
+_WEIGHTS = np.array([77, 150, 29])
+"""Of red, green and blue in a grey value, in 256ths (ITU-R BT.601, 2.5.1)."""
 
 
 @dataclass(frozen=True)
@@ -56,263 +44,143 @@ class ImageFormat:
     columns: int
     samples: int  # numbers of a pixel: 1, or 3 of a colour
     photometric: str
-    type: np.dtype[np.generic]  # of a number as it is stored
+    type: np.dtype[np.generic]  # of a number
     bits: int  # of it that count
-    planar: bool  # the three colours one after another, not pixel by pixel
-    direct: bool  # stored as they are, so that no decoder is needed
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of an image that is not compressed."""
-        return self.rows * self.columns * self.samples * self.type.itemsize
-
-    @property
-    def native_bits(self) -> int:
-        """Bits that an image which is not compressed has in the file, where masks are packed."""
-        return self.frame_bytes if self.type == np.bool_ else 8 * self.frame_bytes
 
 
 def image_format(file: DicomFile) -> ImageFormat:
-    """The format that a header states, compared with the bytes that there are.
+    """Read the format that a header states, and compare it with the bytes that there are.
 
     Raises:
         VolumeError: there are no images, their number, size or type is missing or cannot be, or
-            the file holds fewer or more bytes, or fewer fragments, than they take.
+            the file holds fewer or more bytes than they take.
     """
     header, path = file.header, file.path
     if file.pixels is None:
+        from pydicom.uid import UID
+
+        uid = UID(text(header, "SOPClassUID"))
+        name = uid.name if uid.name != uid else "of no kind that is known"
         raise VolumeError(
-            f"{path}: holds no image ({_class_name(file)}); give the DICOM file of an image or a "
-            f"volume"
+            f"{path}: holds no image ({name}), or breaks off before it; give the DICOM file of an "
+            f"image or a volume"
         )
     frames = whole(header, "NumberOfFrames") if "NumberOfFrames" in header else 1
     samples = whole(header, "SamplesPerPixel") or 1
     rows, columns = whole(header, "Rows") or 0, whole(header, "Columns") or 0
-    if frames is None or not 1 <= frames <= _MOST_FRAMES or min(rows, columns) < 1:
+    if frames is None or min(frames, rows, columns) < 1:
         raise VolumeError(
             f"{path}: says that it holds {frames} images of {columns} × {rows} pixels; export it "
             f"again"
         )
-    bits, stored = _number_type(file, file.pixels.element)
     photometric = text(header, "PhotometricInterpretation") or "MONOCHROME2"
     if samples not in (1, 3) or (samples == 1) != (photometric in _GREY):
         raise VolumeError(
             f"{path}: its pixels have {samples} numbers as {photometric[:20]!r}; save it as grey "
             f"values or RGB"
         )
-    planar = samples == 3 and whole(header, "PlanarConfiguration") == 1
-    direct = file.syntax in _DIRECT and photometric in (*_GREY, "RGB") and file.little_endian
-    form = ImageFormat(frames, rows, columns, samples, photometric, stored, bits, planar, direct)
-    check_claim(path, (frames, rows, columns, samples), stored.itemsize)
-    _check_bytes(file, form)
-    return form
-
-
-def _number_type(file: DicomFile, element: int) -> tuple[int, np.dtype[np.generic]]:
-    """Bits of a number that count, and how it is stored."""
-    if element != 0x7FE00010:
-        bits = 32 if element == 0x7FE00008 else 64
-        return bits, np.dtype(f"<f{bits // 8}")
-    allocated = whole(file.header, "BitsAllocated")
-    stored = whole(file.header, "BitsStored") or allocated
-    if allocated == 1:
-        return 1, np.dtype(np.bool_)
-    if allocated not in (8, 16, 32) or not stored or not 1 <= stored <= allocated:
+    allocated = whole(header, "BitsAllocated")
+    bits = whole(header, "BitsStored") or allocated
+    if allocated not in (1, 8, 16, 32, 64) or not bits or not 1 <= bits <= allocated:
         raise VolumeError(
-            f"{file.path}: its pixels have {stored} of {allocated} bits; save it with 8, 16 or 32"
+            f"{path}: its pixels have {bits} of {allocated} bits; save it with 8, 16 or 32"
         )
-    sign = "i" if whole(file.header, "PixelRepresentation") == 1 else "u"
-    return stored, np.dtype(f"<{sign}{allocated // 8}")
-
-
-def _check_bytes(file: DicomFile, form: ImageFormat) -> None:
-    assert file.pixels is not None
-    length = file.pixels.length
-    if file.compressed != (length is None):
+    sign = "i" if whole(header, "PixelRepresentation") == 1 else "u"
+    sign = "f" if file.pixels.tag != 0x7FE00010 else sign
+    kind: np.dtype[Any] = np.dtype(bool) if allocated == 1 else np.dtype(f"{sign}{allocated // 8}")
+    check_claim(path, (frames, rows, columns, samples), kind.itemsize)
+    length = getattr(file.pixels, "length", None)  # none of images that came with the header
+    length = len(file.pixels.value) if length is None else length
+    expected = -(-frames * rows * columns * samples * allocated // 8)
+    if photometric == "YBR_FULL_422":
+        expected = frames * rows * math.ceil(columns / 2) * 4 * kind.itemsize
+    if length not in (0xFFFFFFFF, expected, expected + expected % 2):
         raise VolumeError(
-            f"{file.path}: its images are {'not ' if file.compressed else ''}in fragments, against "
-            f"its transfer syntax; export it again"
+            f"{path}: holds {length} bytes of images where its header says {expected}; copy or "
+            f"export it again"
         )
-    if length is None:
-        if (there := _fragments(file, file.pixels.start)) < form.frames:
-            raise VolumeError(
-                f"{file.path}: holds {there} compressed images where its header says "
-                f"{form.frames}; copy or export it again"
-            )
-        return
-    expected = -(-form.frames * form.native_bits // 8)
-    if form.photometric == "YBR_FULL_422":
-        expected = form.frames * form.rows * math.ceil(form.columns / 2) * 4 * form.type.itemsize
-    if length not in (expected, expected + expected % 2):
-        raise VolumeError(
-            f"{file.path}: holds {length} bytes of images where its header says {expected}; copy "
-            f"or export it again"
-        )
+    return ImageFormat(frames, rows, columns, samples, photometric, kind, bits)
 
 
-def _fragments(file: DicomFile, start: int) -> int:
-    """How many fragments there are behind the table of their offsets."""
-    count, size = -1, file.size
-    with file.open() as data:
-        data.seek(start)
-        while (head := data.read(8))[:4] == b"\xfe\xff\x00\xe0" and len(head) == 8:
-            data.seek(int.from_bytes(head[4:], "little"), 1)
-            if data.tell() > size:
-                break
-            count += 1
-    return count
-
-
-def _class_name(file: DicomFile) -> str:
-    from pydicom.uid import UID
-
-    kind = UID(text(file.header, "SOPClassUID"))
-    return kind.name if kind.name != kind else "of no kind that is known"
-
-
-def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
-    """The stored value that the colour table begins with, and the grey value of each that follows
-    (PS3.3, C.7.6.3.1.5 and C.7.9.2).
+def stored_frames(
+    file: DicomFile, form: ImageFormat, frames: Sequence[int]
+) -> Iterator[NDArray[Any]]:
+    """Yield images of a file, (rows, columns) or (rows, columns, RGB), by their numbers.
 
     Raises:
-        VolumeError: a table is missing or damaged.
+        VolumeError: an image is damaged, or its decoder is missing.
     """
-    order = "<" if file.little_endian else ">"
-    total = np.zeros(1, np.float64)
-    first = 0
-    for colour, weight in _WEIGHTS.items():
-        described = numbers(file.header, f"{colour}PaletteColorLookupTableDescriptor", 3)
-        count, first, bits = (int(each) for each in described or (1, 0, 0))
-        count = count % ((1 << 16) + 1) or 1 << 16
-        data = value(file.header, f"{colour}PaletteColorLookupTableData")
-        if isinstance(data, bytes):
-            table = _plain(data, count, order)
-        else:
-            data = value(file.header, f"Segmented{colour}PaletteColorLookupTableData")
-            table = _expanded(data, count, order) if isinstance(data, bytes) else None
-        if (
-            table is None
-            or len(table) != count
-            or bits not in (8, 16)
-            or len(total) not in (1, count)
-        ):
-            raise VolumeError(
-                f"{file.path}: its table of {colour.lower()} values is missing or damaged; export "
-                f"it in grey values or RGB"
-            )
-        # Some writers give numbers of 8 bits in entries that say 16.
-        top = 65535.0 if bits == 16 and table.max() > 255 else 255.0
-        total = total + weight / 256 * 255 * np.minimum(table / top, 1.0)
-    return first, np.floor(total + 0.5).astype(np.uint8)
+    from pydicom.pixels import iter_pixels, pixel_array
 
+    from us_sim.volume.files.dicom import twelve_bit_jpeg
 
-def _plain(data: bytes, count: int, order: str) -> NDArray[np.int64] | None:
-    """The entries, one after another in a byte or two."""
-    if len(data) in (count, count + count % 2) and count > 1:
-        return np.frombuffer(data[:count], np.uint8).astype(np.int64)
-    if len(data) == 2 * count:
-        return np.frombuffer(data, f"{order}u2").astype(np.int64)
-    return None
-
-
-def _expanded(data: bytes, count: int, order: str) -> NDArray[np.int64] | None:
-    """The entries of a segmented table: runs of values, and straight lines between two."""
-    words = np.frombuffer(data[: len(data) // 2 * 2], f"{order}u2").astype(np.int64)
-    pieces: list[NDArray[Any]] = []
-    made, at = 0, 0
-    last: int | None = None
-    while at + 1 < len(words) and made < count:
-        kind, length = int(words[at]), int(words[at + 1])
-        if kind == 0 and at + 2 + length <= len(words):
-            piece, at = words[at + 2 : at + 2 + length], at + 2 + length
-        elif kind == 1 and last is not None and at + 2 < len(words):
-            steps = np.arange(1, length + 1) / max(length, 1)
-            piece = np.floor(last + steps * (words[at + 2] - last) + 0.5).astype(np.int64)
-            at += 3
-        else:  # a segment that repeats others was never seen in an ultrasound image
-            return None
-        if len(piece):
-            pieces.append(piece)
-            made, last = made + len(piece), int(piece[-1])
-    return np.concatenate(pieces) if pieces and made == count else None
-
-
-def decoded_frames(
-    jobs: Sequence[tuple[DicomFile, Sequence[int]]], form: ImageFormat
-) -> Iterator[NDArray[np.generic]]:
-    """Compressed images of files, decoded in a process of its own, which starts in half a second.
-
-    Args:
-        jobs: files of one transfer syntax, and the numbers of the images wanted of each.
-        form: how their images are stored.
-
-    Yields:
-        (rows, columns) or (rows, columns, RGB).
-
-    Raises:
-        VolumeError: a decoder is missing, or an image cannot be decoded or is not of that form.
-    """
-    shape = (form.rows, form.columns) + ((3,) if form.samples == 3 else ())
-    total = form.rows * form.columns * form.samples * sum(len(which) for _, which in jobs)
-    task = {
-        "syntax": jobs[0][0].syntax,
-        "shape": shape,
-        "bytes": form.type.itemsize,
-        "memory": (1 << 30) + 16 * form.frame_bytes,  # bytes, beside several copies of an image
-        "seconds": int(60 + total / 1e6),  # run lengths decode at 30 million pixels a second
-        "files": [
-            {"path": str(file.path.resolve()), "frames": [int(frame) for frame in which]}
-            for file, which in jobs
-        ],
-    }
-    # -P: this folder is no place to import from.
-    command = [sys.executable, "-P", str(Path(decoder.__file__))]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdin
-        assert process.stdout
-        try:
-            try:
-                process.stdin.write(json.dumps(task).encode() + b"\n")
-                process.stdin.close()
-            except BrokenPipeError:  # it ended at once; the first missing image shows that
-                pass
-            for file, which in jobs:
-                for _ in which:
-                    data = process.stdout.read(form.frame_bytes)
-                    if len(data) != form.frame_bytes:
-                        raise _failure(file, process)
-                    yield np.frombuffer(data, dtype=form.type).reshape(shape)
-        finally:
-            process.kill()
-
-
-def _failure(file: DicomFile, process: subprocess.Popen[bytes]) -> VolumeError:
-    from pydicom.uid import UID
-
-    assert process.stderr
-    lines = process.stderr.read(1 << 16).decode(errors="replace").strip().splitlines()
-    process.wait()
+    twelve_bit_jpeg.add_plugin()
+    source: Any = file.header if file.deflated else file.path
+    more: dict[str, Any] = {}
+    if not file.deflated:
+        more = {"transfer_syntax_uid": file.syntax, "number_of_frames": form.frames}
     try:
-        kind = json.loads(lines[-1])["kind"]
-    except (ValueError, IndexError, TypeError, KeyError):
-        kind = decoder.WRONG
+        with quiet():
+            if form.type == np.bool_:  # pydicom finds packed images that begin within a byte in all
+                every = pixel_array(source, **more).reshape(-1, form.rows, form.columns)
+                found = iter([every[n] for n in frames])
+            else:
+                found = iter_pixels(source, indices=list(frames), **more)
+        for _ in frames:
+            with quiet():
+                image = next(found)
+            if image.shape[:2] != (form.rows, form.columns):
+                raise ValueError("another size")
+            yield image
+    except Exception as error:  # pydicom and its decoders raise many kinds of errors
+        raise _undecoded(file) from error
+
+
+def _undecoded(file: DicomFile) -> VolumeError:
+    from pydicom.pixels import get_decoder
+    from pydicom.uid import UID
+
     name = UID(file.syntax).name
-    name = name if name != file.syntax else "a way that is not known"
-    if kind == decoder.MISSING:
-        why = f"images are compressed as {name}, for which no decoder is installed: {EXTRA}"
-    elif kind == decoder.UNKNOWN:
+    try:
+        missing = not get_decoder(UID(file.syntax)).is_available
+    except NotImplementedError:
         why = (
             f"images are compressed as {name}, which is not read; export them uncompressed, or as "
             f"JPEG, JPEG 2000 or RLE"
         )
     else:
         why = (
-            "compressed images are damaged, or not of the size and type that its header says; copy "
-            "or export it again"
+            f"images are compressed as {name}, for which no decoder is installed: {EXTRA}"
+            if missing
+            else "images are damaged or cut short, or not of the size and type that its header "
+            "says; copy or export it again"
         )
     return VolumeError(f"{file.path}: its {why}")
+
+
+def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
+    """Return the stored value that a colour table begins with, and the grey value of each.
+
+    Raises:
+        VolumeError: a table is missing or damaged.
+    """
+    from pydicom.pixels import apply_color_lut
+
+    count, first, _ = map(
+        int, numbers(file.header, "RedPaletteColorLookupTableDescriptor", 3) or (0, 0, 0)
+    )
+    count = count or 1 << 16
+    try:
+        with quiet():
+            colours = apply_color_lut(np.arange(first, first + count), file.header)[..., :3]
+    except Exception as error:
+        raise VolumeError(
+            f"{file.path}: its table of colours is missing or damaged; export it in grey values or "
+            f"RGB"
+        ) from error
+    # Some writers give numbers of 8 bits in entries of 16.
+    top = 65535.0 if colours.max() > 255 else 255.0
+    return first, np.floor(colours @ _WEIGHTS / 256 * (255 / top) + 0.5).astype(np.uint8)
 
 
 class GreyImages:
@@ -416,64 +284,23 @@ class GreyImages:
             yield image if scale is None else image * scale[0] + scale[1]
 
     def _stored(self, which: Sequence[tuple[int, int]]) -> Iterator[NDArray[Any]]:
-        """The images as they are stored, colours last."""
-        runs = [(n, [k for _, k in run]) for n, run in groupby(which, key=lambda each: each[0])]
-        if not self.form.direct:
-            yield from decoded_frames([(self.files[n], frames) for n, frames in runs], self.form)
-            return
-        for n, frames in runs:
-            yield from _read(self.files[n], self.form, frames)
-
-
-def stored_frames(
-    file: DicomFile, form: ImageFormat, frames: Sequence[int]
-) -> Iterator[NDArray[Any]]:
-    """Images of a file as they are stored, by their numbers.
-
-    Raises:
-        VolumeError: an image is damaged, or its decoder is missing.
-    """
-    if frames:
-        yield from (
-            _read(file, form, frames) if form.direct else decoded_frames([(file, frames)], form)
-        )
-
-
-def _read(file: DicomFile, form: ImageFormat, frames: Sequence[int]) -> Iterator[NDArray[Any]]:
-    assert file.pixels is not None
-    with file.open() as data:
-        for frame in frames:
-            first, last = frame * form.native_bits, (frame + 1) * form.native_bits
-            data.seek(file.pixels.start + first // 8)
-            wanted = -(-last // 8) - first // 8
-            read = data.read(wanted)
-            if len(read) != wanted:
-                raise VolumeError(f"{file.path}: breaks off in its images; copy it again")
-            image = np.frombuffer(read, np.uint8 if form.type == np.bool_ else form.type)
-            if form.type == np.bool_:  # first the lowest bit; images follow without a gap
-                image = np.unpackbits(image, bitorder="little")[first % 8 :][: form.frame_bytes]
-            if form.samples == 1:
-                yield image.reshape(form.rows, form.columns)
-            elif form.planar:
-                yield image.reshape(3, form.rows, form.columns).transpose(1, 2, 0)
-            else:
-                yield image.reshape(form.rows, form.columns, 3)
+        """Yield the images as they are stored, colours last."""
+        for n, run in groupby(which, key=lambda each: each[0]):
+            yield from stored_frames(self.files[n], self.formats[n], [k for _, k in run])
 
 
 def _luma(image: NDArray[Any]) -> NDArray[Any]:
     """The brightness of (rows, columns, RGB), of the same type."""
     wide: NDArray[Any] = image.astype(np.uint16 if image.dtype == np.uint8 else np.int64)
-    weighted: NDArray[Any] = wide @ np.array(list(_WEIGHTS.values()), wide.dtype)
+    weighted: NDArray[Any] = wide @ _WEIGHTS.astype(wide.dtype)
     return ((weighted + 128) >> 8).astype(image.dtype)
 
 
 def _masked(image: NDArray[Any], form: ImageFormat) -> NDArray[Any]:
     """Without the bits that do not count, such as overlays of older files."""
-    if form.type.kind in "fb" or form.bits == 8 * form.type.itemsize or not form.direct:
+    spare = 8 * image.itemsize - form.bits
+    if image.dtype.kind == "f" or spare <= 0:
         return image
-    if form.type.kind == "u":
-        return image & image.dtype.type((1 << form.bits) - 1)
-    spare = 8 * form.type.itemsize - form.bits
     return (image << spare) >> spare  # moved up and down again, the sign is that of its last bit
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import number, open_dicom, text
+from us_sim.volume.files.dicom.header import number, numbers, open_dicom, text
 from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.dicom.planes import (
     Plane,
@@ -78,20 +78,24 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     return GreyImages(files)
 
 
-def is_flat(images: GreyImages) -> bool:
+def is_flat(images: GreyImages, spacing: Sequence[float] = ()) -> bool:
     """Whether the images are no volume: nothing says where they lie, or all lie at one place."""
-    planes, _ = _planes(images)
+    planes, _ = _planes(images, spacing)
     return planes is None or len({plane.position for plane in planes}) < 2
 
 
 def placed_images(
-    paths: Sequence[str | os.PathLike[str]] | GreyImages, volume: int = 1
+    paths: Sequence[str | os.PathLike[str]] | GreyImages,
+    volume: int = 1,
+    spacing: Sequence[float] = (),
 ) -> PlacedImages:
     """The volume that DICOM files hold: an enhanced or multi-frame one, or an image each.
 
     Args:
         paths: of the files, in any order; or their images.
         volume: which one where there are several in time, the first of which is 1.
+        spacing: mm, width and height of pixels and distance of images, of files that state where
+            their images lie, but not the size of pixels; or empty.
 
     Raises:
         VolumeError: the files hold no volume, or one that only its maker can read; or they do not
@@ -104,7 +108,7 @@ def placed_images(
             raise VolumeError(
                 f"{path}: and the other files are of several series; give the files of one"
             )
-    planes, times = _planes(images)
+    planes, times = _planes(images, spacing)
     if planes is None or len({plane.position for plane in planes}) < 2:
         raise VolumeError(f"{path}: {_why_flat(images, planes)}")
     kinds: list[str] = []
@@ -120,6 +124,7 @@ def placed_images(
         )
     chosen = groups[volume - 1]
     order, placement = grid_of(path, [planes[n] for n in chosen])
+    _check_spacing(path, spacing, placement)
     shape = images.form.columns, images.form.rows, len(chosen)
     if min(shape) < 2:
         raise VolumeError(
@@ -129,18 +134,31 @@ def placed_images(
     return PlacedImages(images, [wanted[chosen[n]] for n in order], placement, len(groups))
 
 
-def _planes(images: GreyImages) -> tuple[list[Plane] | None, list[float]]:
+def _planes(images: GreyImages, spacing: Sequence[float]) -> tuple[list[Plane] | None, list[float]]:
     """The place and time of every image; None where a file does not state them."""
     planes: list[Plane] = []
     times: list[float] = []
     for file, form in zip(images.files, images.formats, strict=True):
         found = vendor_planes(file, form.frames)
-        own = found[0] if found else stated_planes(file, form.frames)
+        own = found[0] if found else stated_planes(file, form.frames, spacing)
         if own is None:
             return None, []
         planes += own
         times += found[1] if found else image_times(file, form.frames)
     return planes, times
+
+
+def _check_spacing(path: Path, spacing: Sequence[float], placement: NDArray[np.float64]) -> None:
+    """Refuse a person's spacing that is not that of the files.
+
+    Raises:
+        VolumeError: it is not.
+    """
+    steps = np.linalg.norm(placement[:3, :3], axis=0) * 1e3
+    shown = ",".join(f"{step:.5g}" for step in steps)
+    for given, step in zip(spacing, steps, strict=False):
+        if abs(given - step) > 0.02 * step:
+            raise VolumeError(f"{path}: its voxels are {shown} mm apart: leave out --spacing")
 
 
 def _in_time(
@@ -183,6 +201,11 @@ def _why_flat(images: GreyImages, planes: Sequence[Plane] | None) -> str:
     kind = "a 2D image" if count == 1 else f"a 2D cine of {count} images"
     if len(images.files) > 1:
         kind = f"one of {len(images.files)} files with 2D images"
+    if numbers(images.files[0].header, "ImagePositionPatient", 3):
+        return (
+            f"states where {'its image lies' if count == 1 else 'its images lie'}, but not the "
+            f"size of pixels: say it with `us-sim import --spacing X,Y,Z` (mm)"
+        )
     timed = number(images.files[0].header, "FrameTime")
     kind += ", one after another in time" if timed and count > 1 else ""
     remedy = next(filter(None, map(hidden_volume, images.files)), "") or (

@@ -152,8 +152,10 @@ def _image_axes(path: Path | str, orientation: Sequence[float]) -> NDArray[np.fl
     return np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
 
 
-def stated_planes(file: DicomFile, frames: int) -> list[Plane] | None:
-    """The place of each of the images; None where the header does not state it.
+def stated_planes(file: DicomFile, frames: int, given: Sequence[float] = ()) -> list[Plane] | None:
+    """Return the place of each of the images; None where the header does not state it.
+
+    ``given`` is the width and height of pixels, mm, of a header without it.
 
     - Enhanced objects: groups of values for each image or shared by all (PS3.3, C.7.6.16; C.8.24.6
       for ultrasound, in the volume's own frame of reference).
@@ -166,7 +168,7 @@ def stated_planes(file: DicomFile, frames: int) -> list[Plane] | None:
         return _planes_of_groups(groups)
     position = numbers(header, "ImagePositionPatient", 3)
     orientation = numbers(header, "ImageOrientationPatient", 6)
-    spacing = numbers(header, "PixelSpacing", 2)
+    spacing = numbers(header, "PixelSpacing", 2) or tuple(given[1::-1])
     if position and orientation and spacing and frames == 1:
         return [Plane(position, orientation, spacing)]
     pointer = value_of(header, "FrameIncrementPointer")
