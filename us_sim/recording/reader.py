@@ -27,7 +27,13 @@ from rosbags.typesys.store import Typestore
 from us_sim.errors import BagError, printable
 from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_type
-from us_sim.recording.storage import Scratch, Storage, bag_files, open_storage
+from us_sim.recording.storage import (
+    Scratch,
+    Storage,
+    bag_files,
+    missing_files,
+    open_storage,
+)
 from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic, Fault
 from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 from us_sim.settings.spelling import aligned
@@ -87,6 +93,13 @@ class Bag:
         """The faults that were found when the bag was opened."""
         found = [fault for storage in self._storages for fault in storage.faults]
         if self.metadata is not None:
+            if missing := missing_files(self.path, self.metadata):
+                found.append(
+                    Fault(
+                        f"{self.path / 'metadata.yaml'} names {', '.join(missing)}, which "
+                        f"{'is' if len(missing) == 1 else 'are'} not there"
+                    )
+                )
             said, held = self.metadata.message_count, self.message_count
             if said > held:
                 text = f"{self.path} has {held} messages where its metadata.yaml says {said}"
@@ -171,9 +184,15 @@ class Bag:
             BagError: the bag has no such topic, or is damaged and ``damage`` is None.
         """
         names = {self.topic(name).name for name in topics} if topics is not None else self._topics
+        packed = 0
         streams = [storage.messages(names, damage, since) for storage in self._storages]
         for message in heapq.merge(*streams, key=lambda message: message.log_time):
-            yield self._unpacked(message)
+            unpacked = self._unpacked(message)
+            packed += unpacked is not message
+            yield unpacked
+        if packed and damage is not None and not self._decompress_messages:
+            text = f"{packed} messages of {self.path} are each packed with zstd"
+            damage.append(Fault(f"{text}, which no metadata.yaml says"))
 
     def latest(self, topics: Collection[str], before: int, count: int = 1) -> list[BagMessage]:
         """The last messages of each of these topics before a time, in the order of log times.
@@ -198,8 +217,13 @@ class Bag:
         return last[::-1]
 
     def _unpacked(self, message: BagMessage) -> BagMessage:
-        """The message, decompressed where each one is compressed by itself."""
-        if not self._decompress_messages:
+        """The message, decompressed where each one is compressed by itself.
+
+        Without metadata.yaml a frame of zstd is known by its first bytes: no CDR has them.
+        """
+        is_frame = message.data.startswith(zstandard.FRAME_HEADER)
+        is_cdr = self._topics[message.topic].encoding == "cdr"
+        if not (self._decompress_messages or (is_frame and is_cdr)):
             return message
         try:
             data = unpack(message.data, "zstd", LARGEST_CHUNK)

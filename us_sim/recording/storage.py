@@ -49,7 +49,6 @@ class SqliteFile:
         self._uri, unread = _address(path)
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                _check_tables(database)
                 self.topics = tuple(_topics(database, self._label))
                 self.start, self.end, rows, last = database.execute(
                     "SELECT MIN(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
@@ -163,14 +162,6 @@ def _address(path: Path) -> tuple[str, str]:
         )
 
 
-def _check_tables(database: sqlite3.Connection) -> None:
-    """Refuse tables that are queries in truth, which may never end."""
-    kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE type <> 'index'"))
-    for name in ("topics", "messages"):
-        if kinds.get(name) != "table":
-            raise sqlite3.DatabaseError(f"it has no table {name}")
-
-
 def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
     """Topics of a file of any schema version; its columns tell the version."""
     columns = {row[1] for row in database.execute("PRAGMA table_info(topics)")}
@@ -205,8 +196,13 @@ def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-_PART = re.compile(r"(.*?)(?:_(\d+))?(\.(?:mcap|db3)(?:\.zstd)?)")
+_PART = re.compile(r"(?P<name>.*?)(?:_(?P<part>\d+))?(?P<kind>\.(?:mcap|db3)(?:\.zstd)?)")
 """A file of a bag: FOLDER_0.mcap, FOLDER_1.mcap or session.mcap, session_1.mcap and so on."""
+_DATED_PART = re.compile(
+    r"(?P<part>\d+)_(?P<name>.+)_\d{4}(?:_\d\d){2}-\d\d(?:_\d\d){2}"
+    r"(?P<kind>\.(?:mcap|db3)(?:\.zstd)?)"
+)
+"""A file as the rosbag2 of ROS 2 Lyrical calls it: 0_FOLDER_2026_06_24-10_00_00.mcap."""
 
 
 Storage = McapFile | SqliteFile
@@ -248,15 +244,19 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
         raise BagError(f"there is no bag at {path}: give an .mcap or .db3 file, or a bag's folder")
     if os.path.isfile(path / "metadata.yaml"):
         metadata = read_metadata(path / "metadata.yaml")
-        return [_listed_file(path, file.path) for file in metadata.files], metadata
+        found = [_listed_file(path, file.path) for file in metadata.files]
+        if metadata.files and not any(found):
+            names = ", ".join(file.path for file in metadata.files)
+            raise BagError(f"{path / 'metadata.yaml'} names {names}, which is not there")
+        return [file for file in found if file is not None], metadata
     files = [file for file in sorted(path.iterdir()) if file.name.endswith(_SUFFIXES)]
     if not files:
         raise BagError(f"{path} holds no bag: neither metadata.yaml nor an .mcap or .db3 file")
-    parts = {file: _PART.fullmatch(file.name) for file in files}
-    if len({(part[1], part[3]) for part in parts.values() if part}) > 1:
+    parts = {file: _DATED_PART.fullmatch(file.name) or _PART.fullmatch(file.name) for file in files}
+    if len({(part["name"], part["kind"]) for part in parts.values() if part}) > 1:
         names = ", ".join(file.name for file in files)
         raise BagError(f"{path} holds several bags and no metadata.yaml: give one of {names}")
-    return sorted(files, key=lambda file: int(p[2] or -1) if (p := parts[file]) else 0), None
+    return sorted(files, key=lambda file: int(p["part"] or -1) if (p := parts[file]) else 0), None
 
 
 def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
@@ -276,15 +276,26 @@ def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
     if start == _SQLITE_MAGIC:
         return SqliteFile(file, label)
     if start.startswith(_ZSTD_MAGIC):
-        return open_storage(scratch.unpack(file), scratch, label)
+        copy = scratch.unpack(file)
+        if not copy.stat().st_size:
+            raise BagError(f"{label} is cut before anything of it can be unpacked: copy it again")
+        return open_storage(copy, scratch, label)
     if start.startswith(b"#ROSBAG"):
         raise BagError(f"{label} is a bag of ROS 1: convert it with rosbags-convert first")
     raise NoBagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")
 
 
-def _listed_file(folder: Path, listed: str) -> Path:
-    """A file that metadata.yaml names; before version 4 its path began with the bag's folder."""
+def missing_files(folder: Path, metadata: BagMetadata) -> list[str]:
+    """Return the names of the files that metadata.yaml lists and the folder lacks."""
+    return [file.path for file in metadata.files if _listed_file(folder, file.path) is None]
+
+
+def _listed_file(folder: Path, listed: str) -> Path | None:
+    """Return a file that metadata.yaml names, if it is there.
+
+    Before version 4 its path began with the bag's folder.
+    """
     for file in (folder / listed, folder / PurePosixPath(listed).name):
         if os.path.isfile(file):
             return file
-    raise BagError(f"{folder / 'metadata.yaml'} names {listed}, which is not there")
+    return None

@@ -39,6 +39,9 @@ _PERIODS = 5  # of a topic, that a gap has at least
 _REGULAR = 20  # messages of a topic, from which on its rate is known
 _APART = 1_000_000  # ns, by which two clocks may differ unnoticed
 _OTHER_TIME = 60 * 10**9  # ns of age, beyond which a stamp is of another recording
+_SHARED = ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray")
+"""Types of topics that many publish at once, each a little later than it stamps."""
+_SHARED_DELAY = 10**9  # ns, by which their stamps may go back
 _SEVERAL = 0.01  # of the numbers of a topic, that go back where several publishers count
 
 Times = NDArray[np.int64]
@@ -202,6 +205,15 @@ def _index(bag: Bag, faults: list[Fault], read: int) -> Iterator[Finding]:
             f"{bag.path} holds {bag.message_count} messages where its metadata.yaml says "
             f"{bag.metadata.message_count}: make it anew with `ros2 bag reindex`",
         )
+    elif bag.metadata is not None and bag.metadata.message_count == bag.message_count > 0:
+        start, end = bag.start or 0, bag.end or 0
+        said = bag.metadata.start, bag.metadata.start + bag.metadata.duration
+        if max(abs(said[0] - start), abs(said[1] - end)) > _APART:
+            yield Finding(
+                "index",
+                f"{bag.path} has messages from {start} to {end} ns, where its metadata.yaml says "
+                f"{said[0]} to {said[1]}: make it anew with `ros2 bag reindex`",
+            )
     if not read:
         yield Finding("index", f"{bag.path} holds no message: record again")
 
@@ -215,8 +227,14 @@ def _order(each: TopicCheck, origin: int) -> Iterator[Finding]:
             f"{each.topic.type_name}: find out what publishes them",
         )
     stamped = np.flatnonzero(_times(each.stamps))
-    back = stamped[1:][np.diff(_times(each.stamps)[stamped]) < 0]
-    if len(back) and (name.endswith(f"/{POSES}") or each.derived is not None):
+    may_go_back = _SHARED_DELAY if each.topic.type_name in _SHARED else 0
+    back = stamped[1:][np.diff(_times(each.stamps)[stamped]) < -may_go_back]
+    if each.read_stamp and len(each.stamps) and not len(stamped) and not each.topic.is_latched:
+        yield Finding(
+            "order",
+            f"all stamps of {name} are 0: let its publisher stamp what it sends",
+        )
+    if len(back) and not each.topic.is_latched:
         yield Finding(
             "order",
             f"the stamps of {name} go back {counted(len(back), 'time')}, first at "

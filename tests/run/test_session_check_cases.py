@@ -1,0 +1,61 @@
+"""Recordings of public reports: what `us-sim bag check` says about each."""
+
+import shutil
+
+import pytest
+
+from us_sim.errors import BagError
+from us_sim.recording.reader import read_bag
+from us_sim.run.session_check import check
+
+
+def found(path):
+    return [finding.text for finding in check(read_bag(path)).findings if finding.matters]
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("bag-packed-messages/soccer_goal_12.mcap", "packed with zstd"),
+        ("bag-time-back/looped_sim_time.mcap", "go back 1 time"),
+        ("bag-time-back/stamps_back_by_20_s.mcap", "go back 1 time"),
+    ],
+)
+def test_a_wrong_time_or_packing_is_one_finding(shared_file, case, words):
+    (text,) = found(shared_file(f"cases/{case}"))
+    assert words in text
+
+
+def test_all_stamps_zero_is_said_of_each_topic(shared_file):
+    """The images, and the poses of a PoseArray; those of the others rise."""
+    said = found(shared_file("cases/bag-stamps-zero/zed_like.mcap"))
+    assert len(said) == 2
+    assert any("all stamps of /zed/zed_node/left/image_rect_color" in text for text in said)
+
+
+def test_packed_messages_are_read_unpacked(shared_file):
+    bag = read_bag(shared_file("cases/bag-packed-messages/soccer_goal_12.mcap"))
+    images = [bag.deserialize(message) for message in bag.messages()]
+    assert len(images) == 2
+    assert {(image.height, image.width) for image in images} == {(480, 640)}
+
+
+def test_of_thirteen_parts_the_one_that_is_there_is_read(shared_file, tmp_path):
+    folder = shared_file("cases/bag-packed-messages/soccer_goal_12.mcap").parent
+    shutil.copy(folder / "soccer_goal_12.mcap", tmp_path)
+    shutil.copy(folder / "metadata_of_13_parts.yaml", tmp_path / "metadata.yaml")
+    bag = read_bag(tmp_path)
+    assert len(list(bag.messages())) == 2
+    assert all(f"soccer_goal_{part}.mcap" in bag.note for part in range(12))
+
+
+def test_parts_whose_names_begin_with_their_number_are_one_recording(shared_file):
+    folder = shared_file("cases/bag-parts-of-lyrical/0_session_2026_06_24-10_00_00.mcap").parent
+    times = [message.log_time for message in read_bag(folder).messages()]
+    assert len(times) == 600
+    assert times == sorted(times)
+
+
+def test_a_packed_file_that_is_cut_is_not_called_empty(shared_file):
+    with pytest.raises(BagError, match="cut"):
+        read_bag(shared_file("cases/bag-cut-zstd/part_0_cut.db3.zstd"))
