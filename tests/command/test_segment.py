@@ -15,7 +15,7 @@ from us_sim.volume.volume import Volume
 
 SEEDS = """structures:
   vein: {method: growing, upper: 40, seeds_mm: [[0, 0, 19]]}
-  body: {method: covered, priority: -1}
+  body: {method: growing, lower: 1, seeds_mm: [[0, 0, 40]], priority: -1}
 """
 
 

@@ -71,8 +71,8 @@ SEEDS = """structures:
     smooth: 0.3 mm
     close: 1 mm
     colour: [0.2, 0.4, 1]
-  muscle: {method: confidence, multiplier: 2.5, seeds_voxel: [[0, 0, 0]], keep: largest}
-  fat: {method: watershed, border: false, seeds_mm: [[6, 5, 5]], reach: 2 mm, priority: 2}
+  muscle: {method: growing, lower: 50, seeds_voxel: [[0, 0, 0]], reach: 2 mm}
+  fat: {method: dark_vessels, thinnest: 2 mm, priority: 2}
 """
 
 

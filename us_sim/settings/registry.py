@@ -50,12 +50,7 @@ SEGMENTATIONS = Choice(
     key="method",
     error=VolumeError,
     growing=f"{_SEGMENTATION}.methods:SeededGrowing",
-    confidence=f"{_SEGMENTATION}.methods:ConfidenceConnected",
-    threshold=f"{_SEGMENTATION}.methods:Threshold",
-    watershed=f"{_SEGMENTATION}.methods:Watershed",
-    vesselness=f"{_SEGMENTATION}.methods:Vesselness",
     dark_vessels=f"{_SEGMENTATION}.methods:DarkVessels",
-    covered=f"{_SEGMENTATION}.methods:Covered",
 )
 
 PROBES = Choice(

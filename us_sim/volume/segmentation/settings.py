@@ -44,25 +44,14 @@ class StructureSeeds(Settings):
     seeds_voxel: tuple[tuple[int, int, int], ...] = setting(
         _INDEX, "points in it, as indices of voxels", default=()
     )
-    outside_mm: tuple[_Point, ...] = setting(
-        _MILLIMETRES, "points that are not in it, mm; for the watershed", default=()
-    )
     reach: float | None = setting(
         Quantity("length", 1e-3, 1.0),
         "what is farther from all seeds is not looked at; not given: all is",
         default=None,
     )
-    within_mm: tuple[_Point, _Point] | None = setting(
-        _MILLIMETRES, "lower and upper corner of a box that is looked at, mm", default=None
-    )
-    smoothing: str = setting(
-        description="of the grey values before",
-        choices=("gaussian", "median", "diffusion"),
-        default="gaussian",
-    )
     smooth: float = setting(
         Quantity("length", 0.0, 0.02),
-        "standard deviation (gaussian, diffusion) or radius (median) of the smoothing, 0 for none",
+        "standard deviation of the Gaussian that smooths grey values before, 0 for none",
         default=0.0,
     )
     open: float = setting(
@@ -70,15 +59,6 @@ class StructureSeeds(Settings):
     )
     close: float = setting(
         _RADIUS, "gaps that a ball of this radius has no room in are filled", default=0
-    )
-    fill: bool = setting(description="holes within it are filled", default=True)
-    keep: str | None = setting(
-        description="which parts stay; not given: those that hold a seed, or all where no seed is",
-        choices=("seeded", "largest", "all"),
-        default=None,
-    )
-    smallest_mm3: float = setting(
-        Quantity("number", 0.0, 1e9), "parts that are smaller are left out, mm³", default=0.0
     )
     priority: int = setting(
         Quantity("number", -100, 100),
@@ -92,16 +72,9 @@ class StructureSeeds(Settings):
     )
 
     def check(self) -> None:
-        """Refuse parts by seeds where there is none, and a box without inside."""
-        if not (self.seeds_mm or self.seeds_voxel):
-            if self.keep == "seeded":
-                raise self.refused("keep", "is `seeded`, and there are no seeds: give `seeds_mm`")
-            if self.reach is not None:
-                raise self.refused("reach", "is from seeds, and there are none: give `seeds_mm`")
-        if self.within_mm is not None and not all(
-            low < high for low, high in zip(*self.within_mm, strict=True)
-        ):
-            raise self.refused("within_mm", "has a lower corner that is not below its upper one")
+        """Refuse a reach from nothing."""
+        if self.reach is not None and not (self.seeds_mm or self.seeds_voxel):
+            raise self.refused("reach", "is from seeds, and there are none: give `seeds_mm`")
 
 
 @dataclass(frozen=True)
