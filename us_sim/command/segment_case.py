@@ -105,10 +105,6 @@ def _segment_file(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Pr
         )
     if os.path.lexists(out):
         raise VolumeError(f"{out}: exists already; choose another name, or remove it")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise VolumeError(f"{out}: cannot be made: {error.strerror}") from error
     with partial_folder(out, VolumeError) as folder:
         progress(0.0, "reading")
         volume = read_volume(asked.case)
@@ -118,10 +114,6 @@ def _segment_file(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Pr
         write_labels(folder / "labels.seg.nrrd", labels.on(volume), labels.colours)
         _write(folder, volume, labels, made, asked, remarks)
         progress(1.0, "")
-        try:
-            os.rename(folder, out)
-        except OSError as error:
-            raise VolumeError(f"{out}: cannot be made: {error.strerror}") from error
     return _summary(out, made, remarks)
 
 

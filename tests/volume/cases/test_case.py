@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from us_sim.errors import CaseError, VolumeError
+from us_sim.errors import CaseError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.tissue.elasticity.material import Material
 from us_sim.volume.cases.case import case_roots, cases_in, find_case, read_case
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
-from us_sim.volume.files.writing import write_labels, write_volume
+from us_sim.volume.files.writing import write_labels
 from us_sim.volume.volume import Volume
 
 
@@ -91,39 +91,6 @@ def test_a_place_without_a_case_is_refused(tmp_path, make_case):
         read_case(folder)
 
 
-def test_links_in_a_circle_are_refused(tmp_path, make_case):
-    os.symlink(tmp_path / "b", tmp_path / "a")
-    os.symlink(tmp_path / "a", tmp_path / "b")
-    with pytest.raises(CaseError, match="circle"):
-        read_case(tmp_path / "a")
-    folder = make_case()
-    os.symlink("labels.nrrd", folder / "again")
-    (folder / "labels.nrrd").unlink()
-    os.symlink("again", folder / "labels.nrrd")
-    with pytest.raises(CaseError, match="circle"):
-        read_case(folder)
-
-
-def test_a_link_out_of_the_case_is_refused_and_one_to_the_case_is_not(tmp_path, make_case):
-    folder = make_case()
-    os.symlink(folder, tmp_path / "elsewhere")
-    assert read_case(tmp_path / "elsewhere").settings.name == "block"
-    shutil.move(folder / "labels.nrrd", tmp_path / "secret.nrrd")
-    os.symlink("../secret.nrrd", folder / "labels.nrrd")
-    with pytest.raises(CaseError, match="leads out"):
-        read_case(folder)
-
-
-def test_voxels_in_another_file_are_refused(tmp_path, make_case):
-    folder = make_case()
-    data = (folder / "volume.nrrd").read_bytes()
-    header, _, voxels = data.partition(b"\n\n")
-    (tmp_path / "secret.raw").write_bytes(voxels)
-    (folder / "volume.nrrd").write_bytes(header + b"\ndata file: ../secret.raw\n\n")
-    with pytest.raises(VolumeError, match="another file"):
-        read_case(folder).volume()
-
-
 def test_labels_must_be_on_the_volumes_grid(make_case, block):
     folder = make_case()
     shifted = block.index_to_patient.copy()
@@ -143,18 +110,6 @@ def test_every_label_is_a_structure_and_every_structure_is_there(make_case):
         read_case(folder).volume()
     changed(folder, "name: a\nstructures: {vein: {label: 6}, artery: {label: 7}}\n")
     with pytest.raises(CaseError, match=r"structures.artery: label 7"):
-        read_case(folder).volume()
-
-
-def test_a_damaged_volume_is_refused_before_it_takes_memory(make_case, block):
-    folder = make_case()
-    write_volume(folder / "volume.nrrd", block)
-    data = (folder / "volume.nrrd").read_bytes()
-    (folder / "volume.nrrd").write_bytes(data.replace(b"sizes: 30 20 25", b"sizes: 3000 20 25"))
-    with pytest.raises(VolumeError, match="its header"):
-        read_case(folder).volume()
-    (folder / "volume.nrrd").write_bytes(data.replace(b"sizes: 30 20 25", b"sizes: 9000 9000 9000"))
-    with pytest.raises(VolumeError, match="at most"):
         read_case(folder).volume()
 
 
@@ -217,8 +172,6 @@ def test_without_the_variable_cases_are_in_the_users_data(monkeypatch):
 def test_a_listing_passes_by_what_is_no_case(roots):
     (roots[1] / "notes").mkdir()
     (roots[1] / ".hidden").mkdir()
-    os.symlink("loop", roots[1] / "loop")
-    os.symlink("..", roots[1] / "up")
     assert cases_in(roots[1]) == [roots[1] / "arm", roots[1] / "liver"]
     assert cases_in(roots[1] / "arm") == [roots[1] / "arm"]
     with pytest.raises(CaseError, match="nowhere"):

@@ -21,13 +21,13 @@ import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
-from us_sim.errors import CaseError, UsSimError, VolumeError
+from us_sim.errors import CaseError, UsSimError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
 from us_sim.settings.spelling import aligned, nearest, unknown
 from us_sim.settings.text_files import read_yaml
-from us_sim.volume.cases.provenance import PROVENANCE, Step, read_steps
+from us_sim.volume.cases.provenance import Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.files.readers import open_image, read_placement, read_volume
 from us_sim.volume.volume import Volume
@@ -45,8 +45,15 @@ class Case:
 
     folder: Path
     settings: CaseSettings
-    steps: tuple[Step, ...]  # how it was made
-    shown: Path  # the folder that errors name
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """How it was made.
+
+        Raises:
+            CaseError: the file cannot be read.
+        """
+        return read_steps(self.folder)
 
     @property
     def has_labels(self) -> bool:
@@ -57,11 +64,7 @@ class Case:
     def surfaces(self) -> dict[str, Path]:
         """Files of surfaces, by the names of their structures."""
         folder = self.folder / SURFACES
-        if not folder.is_dir():
-            return {}
-        for file in folder.iterdir():
-            _check_inside(self.folder, f"{SURFACES}/{file.name}", self.shown)
-        return {file.stem: file for file in sorted(folder.iterdir()) if file.is_file()}
+        return {file.stem: file for file in sorted(folder.glob("*")) if file.is_file()}
 
     @property
     def tissue(self) -> Path | None:
@@ -75,7 +78,8 @@ class Case:
         Raises:
             VolumeError: the header cannot be used.
         """
-        return _placement(self.folder / VOLUME)
+        path = self.folder / VOLUME
+        return read_placement(path), open_image(path).shape
 
     def volume(self) -> Volume:
         """Grey values in the volume's own frame, with labels and their names where it has some.
@@ -95,13 +99,13 @@ class Case:
         for label in np.flatnonzero(there):
             if int(label) not in names:
                 raise CaseError(
-                    f"{self.shown / LABELS}: has the label {label}, which is no structure in "
+                    f"{self.folder / LABELS}: has the label {label}, which is no structure in "
                     f"{CASE}: name it there"
                 )
         for name, structure in self.settings.structures.items():
             if not there[structure.label]:
                 raise CaseError(
-                    f"{self.shown / CASE}: structures.{name}: label {structure.label} occurs "
+                    f"{self.folder / CASE}: structures.{name}: label {structure.label} occurs "
                     f"nowhere in {LABELS}: segment it, or remove the structure"
                 )
         return dataclasses.replace(volume, labels=labels, label_names=names)
@@ -114,20 +118,21 @@ class Case:
             VolumeError: a header cannot be used.
         """
         placement, shape = self.placement()
-        of_labels, other = _placement(self.folder / LABELS)
-        if open_image(self.folder / LABELS).voxels.type.itemsize != 1:
+        labels = open_image(self.folder / LABELS)
+        if labels.voxels.type.itemsize != 1:
             raise CaseError(
-                f"{self.shown / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
+                f"{self.folder / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
                 f"as unsigned char"
             )
-        last = np.array([*(np.array(shape) - 1.0), 1.0])
-        corners = np.array([[0.0, 0.0, 0.0, 1.0], last, [last[0], 0, 0, 1], [0, last[1], 0, 1]])
-        apart = np.abs((placement - of_labels) @ corners.T).max()  # m
-        if shape != other or apart > 1e-6:
+        corners = np.vstack([np.indices((2, 2, 2)).reshape(3, -1), np.ones(8)])
+        corners[:3] *= np.array(shape)[:, None] - 1
+        away = (placement - read_placement(self.folder / LABELS)) @ corners
+        if shape != labels.shape or np.abs(away).max() > 1e-6:
             raise CaseError(
-                f"{self.shown / LABELS}: is on another grid than {VOLUME} "
-                f"({' × '.join(map(str, other))} voxels, {' × '.join(map(str, shape))} there, up "
-                f"to {apart * 1e3:.3g} mm apart): segment this volume, or resample the labels"
+                f"{self.folder / LABELS}: is on another grid than {VOLUME} "
+                f"({' × '.join(map(str, labels.shape))} voxels, {' × '.join(map(str, shape))} "
+                f"there, up to {np.abs(away).max() * 1e3:.3g} mm apart): segment this volume, or "
+                f"resample the labels"
             )
 
 
@@ -136,66 +141,24 @@ def is_case(folder: str | os.PathLike[str]) -> bool:
     return os.path.isfile(Path(folder) / CASE)
 
 
-def read_case(folder: str | os.PathLike[str], shown: Path | None = None) -> Case:
+def read_case(folder: str | os.PathLike[str]) -> Case:
     """The case in a folder; its volume is not opened.
 
-    Args:
-        folder: of the case.
-        shown: the folder that errors name, where the case is about to be moved there.
-
     Raises:
-        CaseError: there is none, a file of it leads out of the folder or in a circle, or its
-            settings cannot be used.
+        CaseError: there is none, or its settings cannot be used.
     """
     folder = Path(folder)
-    try:
-        folder = folder.resolve(strict=True)
-    except FileNotFoundError:
-        left = sorted(folder.parent.glob(f".{folder.name}.before-*")) if folder.name else []
-        hint = f"; a change of it was broken off: rename {left[0].name} to it" if left else ""
-        raise CaseError(f"{folder}: there is no such case{hint}") from None
-    except (OSError, RuntimeError) as error:
-        raise CaseError(
-            f"{folder}: cannot be opened; its links may lead in a circle: "
-            f"{getattr(error, 'strerror', None) or error}"
-        ) from error
-    shown = shown or folder
-    for name in (CASE, VOLUME, LABELS, SURFACES, TISSUE, PROVENANCE):
-        _check_inside(folder, name, shown)
+    if not folder.exists():
+        raise CaseError(f"{folder}: there is no such case; `us-sim cases` lists some")
+    folder = folder.resolve()
     for name in (CASE, VOLUME):
         if not (folder / name).is_file():
-            raise CaseError(f"{shown}: is no case, as it has no {name}; `us-sim cases` lists some")
-    path = shown / CASE
-    document = read_yaml(folder / CASE, CaseError, path)
+            raise CaseError(f"{folder}: is no case, as it has no {name}; `us-sim cases` lists some")
+    path = folder / CASE
+    document = read_yaml(path, CaseError)
     if document is None:
         raise CaseError(f"{path}: is empty; a case has at least a name")
-    settings = Reader(str(path), None, CaseError).read(CaseSettings, document)
-    return Case(folder, settings, read_steps(folder), shown)
-
-
-def _check_inside(folder: Path, name: str, shown: Path) -> None:
-    """Refuse a link that leads elsewhere: a case may come from a stranger."""
-    path = folder / name
-    if not path.is_symlink():
-        return
-    try:
-        inside = path.resolve(strict=True).is_relative_to(folder)
-    except (OSError, RuntimeError):
-        inside = False
-    if not inside:
-        raise CaseError(
-            f"{shown / name}: is a link that leads out of the case, nowhere, or in a circle: put "
-            f"the file itself there"
-        )
-
-
-def _placement(path: Path) -> tuple[NDArray[np.float64], tuple[int, int, int]]:
-    image = open_image(path)
-    if image.voxels.file != path:
-        raise VolumeError(
-            f"{path}: keeps its voxels in another file, which a case must not: save it as one file"
-        )
-    return read_placement(path), image.shape
+    return Case(folder, Reader(str(path), None, CaseError).read(CaseSettings, document))
 
 
 def case_roots() -> list[Path]:
@@ -235,17 +198,14 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
     for place in places:
         if is_case(place):
             return place.resolve()
-    roots = case_roots()
     known: dict[str, Path] = {}
-    for root in roots:
+    for root in (roots := case_roots()):
         for case in cases_in(root) if root.is_dir() else []:
             known.setdefault(case.name, case)
     if str(name) in known:
         return known[str(name)].resolve()
-    for place in places:
-        if place.exists():
-            kind = f"folder without a {CASE}" if place.is_dir() else "file"
-            raise CaseError(f"{name}: is a {kind}, and there is no case of that name")
+    if any(place.exists() for place in places):
+        raise CaseError(f"{name}: is no case, as it has no {CASE}; `us-sim cases` lists some")
     for folder in {place.parent for place in places} if path.name != str(path) else ():
         beside = [path.with_name(case.name) for case in cases_in(folder)] if folder.is_dir() else []
         if beside:

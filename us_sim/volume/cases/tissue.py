@@ -6,13 +6,11 @@ It says what it was made from, and is made anew when that has changed.
 from __future__ import annotations
 
 import json
-import struct
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +19,6 @@ from us_sim.errors import CaseError, MeshError
 from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.partial_file import partial_file
-
-_LARGEST = 1 << 29  # bytes of the arrays together: a million nodes take less
-
-_DAMAGED = (
-    *(OSError, EOFError, KeyError, ValueError, TypeError, ArithmeticError, MemoryError),
-    *(AttributeError, NotImplementedError, RuntimeError, MeshError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
-"""Errors of zipfile and NumPy for files that are none or are changed."""
 
 _ARRAYS = ("nodes", "tetrahedra", "labels", "fractions", "made_from")
 _PLANES = ("planes_x", "planes_y", "planes_z")
@@ -76,12 +65,6 @@ def read_tissue(path: Path) -> CaseTissue:
         CaseError: it cannot be read, or holds something else.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            claimed = sum(entry.file_size for entry in archive.infolist())
-        if claimed > _LARGEST:
-            raise CaseError(
-                f"{path}: says it holds {claimed} bytes of arrays; {_LARGEST} are read at most"
-            )
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         nodes, tetrahedra, labels, fractions, made_from = (arrays[name] for name in _ARRAYS)
@@ -96,5 +79,5 @@ def read_tissue(path: Path) -> CaseTissue:
             raise CaseError(f"{path}: its arrays do not go together; remove it")
         fractions /= fractions.sum(axis=1, keepdims=True)
         return CaseTissue(mesh, labels.astype(np.uint8), fractions, said)
-    except _DAMAGED as error:
+    except (OSError, EOFError, LookupError, ValueError, BadZipFile, MeshError) as error:
         raise CaseError(f"{path}: is no tissue that us_sim wrote, or damaged; remove it") from error

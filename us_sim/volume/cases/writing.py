@@ -1,13 +1,12 @@
 """Making and changing case folders: all of a change is there, or nothing.
 
 A case is written into a folder beside its place, checked, and renamed; on any error that folder is
-removed. Rests of a program that was killed are removed by the next that writes there.
+removed.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import os
 import shutil
 import tempfile
@@ -42,17 +41,9 @@ def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         raise CaseError(f"{folder}: {problem}")
     if os.path.lexists(place):
         raise CaseError(f"{place}: exists already; choose another name, or remove it")
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CaseError(f"{place}: cannot be made: {error.strerror}") from error
     with partial_folder(place, CaseError) as partial:
         yield partial
         _finish(place, partial)
-        try:
-            os.rename(partial, place)
-        except OSError as error:
-            raise CaseError(f"{place}: cannot be made: {error.strerror}") from error
 
 
 @contextmanager
@@ -60,33 +51,16 @@ def changed_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """A copy of a case to change; it takes the case's place at the end, when it still is one.
 
     Raises:
-        CaseError: there is no case, another program is changing it, or what was written is none.
+        CaseError: there is no case, it cannot be copied, or what was written is none.
     """
     folder = read_case(folder).folder
-    held = _held(folder)
-    if held is None or not os.path.samestat(os.fstat(held), folder.stat()):
-        raise CaseError(f"{folder}: another program is changing this case; try again when it ended")
-    try:
-        with partial_folder(folder, CaseError) as partial:
-            try:
-                shutil.copytree(folder, partial, dirs_exist_ok=True)
-            except (OSError, shutil.Error) as error:
-                raise CaseError(f"{folder}: cannot be copied: {error}") from error
-            yield partial
-            _finish(folder, partial)
-            before = partial.with_name(partial.name.replace(".partial-", ".before-"))
-            try:
-                os.rename(folder, before)
-                try:
-                    os.rename(partial, folder)
-                except OSError:
-                    os.rename(before, folder)
-                    raise
-            except OSError as error:
-                raise CaseError(f"{folder}: cannot be changed: {error.strerror}") from error
-            shutil.rmtree(before, ignore_errors=True)
-    finally:
-        os.close(held)
+    with partial_folder(folder, CaseError, replaced=True) as partial:
+        try:
+            shutil.copytree(folder, partial, dirs_exist_ok=True)
+        except (OSError, shutil.Error) as error:
+            raise CaseError(f"{folder}: cannot be copied: {error}") from error
+        yield partial
+        _finish(folder, partial)
 
 
 def write_case_settings(folder: Path, settings: CaseSettings) -> None:
@@ -145,56 +119,45 @@ def _finish(folder: Path, partial: Path) -> None:
     Errors name the place that it was meant for.
     """
     try:
-        case = read_case(partial, shown=folder)
+        case = read_case(partial)
         case.placement()
         if case.has_labels:
             case.check_grids()
         start = case.settings.start
         if start is None or start.proposed or case.settings.probe is None:
             write_case_settings(partial, with_proposal(case.settings, case.volume()))
-    except VolumeError as error:  # of a file that cannot be read, which it names
-        raise VolumeError(f"{folder}: is not written: {error}") from error
+    except (CaseError, VolumeError) as error:
+        raise type(error)(str(error).replace(str(partial), str(folder))) from error
 
 
 @contextmanager
-def partial_folder(folder: Path, error_type: type[CaseError | VolumeError]) -> Iterator[Path]:
-    """A folder to fill beside another, removed at the end if it is still there.
+def partial_folder(
+    folder: Path, error_type: type[CaseError | VolumeError], *, replaced: bool = False
+) -> Iterator[Path]:
+    """A folder to fill beside another, whose place it takes at the end; on any error it is removed.
 
     Raises:
         CaseError, VolumeError: as asked for, it cannot be made.
     """
-    for left_over in folder.parent.glob(f".{folder.name}.partial-*"):
-        held = _held(left_over)  # None where the program that made it is still at work
-        if held is not None:
-            shutil.rmtree(left_over, ignore_errors=True)
-            os.close(held)
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
     except OSError as error:
         raise error_type(f"{folder}: cannot be made: {error.strerror}") from error
     mask = os.umask(0)
     os.umask(mask)
     partial.chmod(0o777 & ~mask)  # as any folder; mkdtemp's are the owner's alone
-    held = _held(partial)
+    before = partial.with_name(partial.name.replace(".partial-", ".before-"))
     try:
         yield partial
+        try:
+            if replaced:
+                os.rename(folder, before)
+            os.rename(partial, folder)
+        except OSError as error:
+            if before.exists():
+                os.rename(before, folder)
+            raise error_type(f"{folder}: cannot be written: {error.strerror}") from error
     finally:
-        if held is not None:
-            os.close(held)
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def _held(folder: Path) -> int | None:
-    """A lock on a folder, which ends with the program; None where another has it."""
-    try:
-        number = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(number)
-        return None
-    except OSError:
-        pass  # a file system without locks, such as some of networks
-    return number
+        shutil.rmtree(before, ignore_errors=True)
