@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import skew
 
 from us_sim.errors import CaseError
 from us_sim.geometry.pose import Placement, Pose
@@ -59,14 +61,12 @@ def with_proposal(settings: CaseSettings, volume: Volume) -> CaseSettings:
     """
     start, probe, slide = settings.start, settings.probe, settings.slide
     if start is None or start.proposed:
-        if settings.scanned:
-            start = _start(settings.scanned[len(settings.scanned) // 2].pose)
-            probe = probe or proposed_probe(volume, start)
-            start = _of_scanned(settings, volume, probe)
-        else:
-            start = proposed_start(volume)
-            probe = probe or proposed_probe(volume, start)
-            start = _at_structures(settings, volume, start, probe)
+        poses = [each.pose for each in settings.scanned]
+        start = _start(poses[len(poses) // 2]) if poses else proposed_start(volume)
+        probe = probe or proposed_probe(volume, start)
+        ends = len(poses) // 10  # beside which nothing was seen
+        candidates = poses[ends : len(poses) - ends] or _along_skin(volume, start.pose)
+        start = _start(_showing_most(settings, volume, start.pose, candidates, probe))
         slide = _slide(volume, start, probe)
     probe = probe or proposed_probe(volume, start)
     if probe.collider is None:
@@ -80,9 +80,9 @@ def proposed_start(volume: Volume) -> CaseStart:
     Raises:
         CaseError: nothing was scanned: all voxels are 0.
     """
-    points = _scanned(volume)
+    points, grey = _scanned(volume)
     middle = points.mean(axis=0)
-    along, _ = _beams(volume, points)
+    along, _ = _beams(volume, points, grey)
     aside = points - middle
     aside -= np.outer(aside @ along, along)
     across = np.linalg.eigh(aside.T @ aside)[1][:, -1]  # where the region is widest
@@ -103,24 +103,39 @@ def _start(pose: Pose) -> CaseStart:
     return CaseStart((x, y, z), (a, b, c, d), proposed=True)
 
 
-def _of_scanned(settings: CaseSettings, volume: Volume, probe: ProbeSettings) -> CaseStart:
-    """The pose of the sweep whose image and surroundings show most of the structures.
-
-    The middle one where there are none; none of those at the ends, beside which nothing was seen.
-    """
-    poses = settings.scanned
-    best, first = 0.0, len(poses) // 2
-    end = math.floor(0.1 * len(poses))
-    counted = _in_structures(settings, volume)
-    step = _step(volume)
-    structures = _points(volume, counted, step) if counted is not None else np.empty((0, 3))
-    for k in range(end, len(poses) - end):
-        pose = poses[k].pose
+def _showing_most(
+    settings: CaseSettings,
+    volume: Volume,
+    first: Pose,
+    candidates: Iterable[Pose],
+    probe: ProbeSettings,
+) -> Pose:
+    """The pose whose image and surroundings show most of the structures; else the first."""
+    labels = [
+        structure.label
+        for name, structure in settings.structures.items()
+        if kind_of(name) not in (*LAYERS, "bone")
+    ]
+    if volume.labels is None or not labels:
+        return first
+    (structures, _), best, most = _points(volume, np.isin(volume.labels, labels)), first, 0.0
+    for pose in candidates:
         seen = _in_image((structures - pose.position) @ pose.rotation, probe)
         shown = float((np.abs(seen[:, 1] - _SLID) < _SHOWN).sum())
-        if shown > best * _BETTER:
-            best, first = shown, k
-    return _start(poses[first].pose)
+        if shown > most * _BETTER:
+            best, most = pose, shown
+    return best
+
+
+def _along_skin(volume: Volume, pose: Pose) -> Iterator[Pose]:
+    """A pose moved along the probe's y, on the skin."""
+    scanned = (_points(volume, volume.intensities)[0] - pose.position) @ pose.rotation
+    beam = scanned[np.abs(scanned[:, 0]) < _beside(volume)]
+    for offset in np.arange(-_FARTHEST, _FARTHEST + 1e-3, 2e-3):
+        depths = beam[np.abs(beam[:, 1] - offset) < _beside(volume), 2]
+        skin = float(np.percentile(depths, 1.0)) if len(depths) else np.inf
+        if abs(skin) < 0.015:  # m, that the skin may be nearer or farther there
+            yield pose @ Pose(np.array([0.0, offset, skin]))
 
 
 def _slide(volume: Volume, start: CaseStart, probe: ProbeSettings) -> float:
@@ -149,23 +164,6 @@ def _slide(volume: Volume, start: CaseStart, probe: ProbeSettings) -> float:
     return 0.0
 
 
-def _in_structures(settings: CaseSettings, volume: Volume) -> NDArray[np.bool_] | None:
-    """Which of every so many voxels are in structures; None without structures to look at."""
-    labels = [
-        structure.label
-        for name, structure in settings.structures.items()
-        if kind_of(name) not in (*LAYERS, "bone")
-    ]
-    if volume.labels is None or not labels:
-        return None
-    return np.asarray(np.isin(volume.labels[(slice(None, None, _step(volume)),) * 3], labels))
-
-
-def _step(volume: Volume, most: float = 5 * _MOST_POINTS) -> int:
-    """Voxels from one that is looked at to the next, so that there are few enough of them."""
-    return max(1, math.ceil((volume.intensities.size / most) ** (1 / 3)))
-
-
 def _in_image(seen: NDArray[np.float64], probe: ProbeSettings) -> NDArray[np.float64]:
     """Of points (N, 3) m in the probe's frame, those in front of and behind its image."""
     array: Any = probe.array.settings(PROBES)
@@ -174,47 +172,14 @@ def _in_image(seen: NDArray[np.float64], probe: ProbeSettings) -> NDArray[np.flo
     return seen[inside]
 
 
-def _at_structures(
-    settings: CaseSettings, volume: Volume, start: CaseStart, probe: ProbeSettings
-) -> CaseStart:
-    """The start, moved along the probe's y to where most of the structures is in the image."""
-    counted = _in_structures(settings, volume)
-    if counted is None:
-        return start
-    pose, step = start.pose, _step(volume)
-
-    def placed(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-        return np.asarray((_points(volume, mask, step) - pose.position) @ pose.rotation)
-
-    seen = _in_image(placed(counted), probe)
-    scanned = placed(volume.intensities[(slice(None, None, step),) * 3] > 0)
-    beam = scanned[np.abs(scanned[:, 0]) < _beside(volume)]
-    best, moved = 0.0, pose
-    for offset in np.arange(-_FARTHEST, _FARTHEST + 1e-3, 2e-3):
-        shown = float((np.abs(seen[:, 1] - offset - _SLID) < _SHOWN).sum())
-        depths = beam[np.abs(beam[:, 1] - offset) < _beside(volume), 2]
-        if len(depths) == 0 or shown <= best * _BETTER:
-            continue
-        skin = float(np.percentile(depths, 1.0))
-        if abs(skin) < 0.015:  # m, that the skin may be nearer or farther there
-            best, moved = shown, pose @ Pose(np.array([0.0, offset, skin]))
-    return _start(moved)
-
-
-def _points(volume: Volume, mask: NDArray[np.generic], step: int) -> NDArray[np.float64]:
-    """(N, 3) m, in the volume's frame, voxels of a mask that has every ``step``-th of them."""
-    matrix = volume.index_to_patient
-    return np.asarray((np.argwhere(mask) * step) @ matrix[:3, :3].T + matrix[:3, 3])
-
-
 def proposed_probe(volume: Volume, start: Placement) -> ProbeSettings:
     """A curved array where the scanned region widens with depth, else a linear one; as deep as it.
 
     Raises:
         CaseError: nothing was scanned.
     """
-    points = _scanned(volume)
-    _, widens = _beams(volume, points)
+    points, grey = _scanned(volume)
+    _, widens = _beams(volume, points, grey)
     placed = (points - start.pose.position) @ start.pose.rotation
     depth = float(np.clip(np.percentile(placed[:, 2], 99.5), 0.01, 0.25))  # m
     width = 2 * float(np.percentile(np.abs(placed[:, 0]), 99.0))
@@ -247,35 +212,38 @@ def _beside(volume: Volume) -> float:
     return max(_BESIDE, float(np.linalg.norm(volume.index_to_patient[:3, :3], axis=0).max()))
 
 
-def _coarse(volume: Volume) -> tuple[NDArray[np.uint8], int]:
-    step = _step(volume, _MOST_POINTS)
-    return volume.intensities[::step, ::step, ::step], step
+def _points(
+    volume: Volume, values: NDArray[Any], most: int = 5 * _MOST_POINTS
+) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    """Centres (N, 3) m of voxels whose values (i, j, k) are not 0, and these values (N,).
+
+    Only every so many voxels are looked at, so that there are few enough of them.
+    """
+    step = max(1, math.ceil((values.size / most) ** (1 / 3)))
+    coarse = values[::step, ::step, ::step]
+    matrix = volume.index_to_patient
+    points = (np.argwhere(coarse) * step) @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.asarray(points), coarse[coarse != 0]
 
 
-def _scanned(volume: Volume) -> NDArray[np.float64]:
-    """(N, 3) m, centres of voxels that are not 0, of a grid coarse enough for a few of them."""
-    points = _points(volume, *_coarse(volume))
+def _scanned(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    points, grey = _points(volume, volume.intensities, _MOST_POINTS)
     if not len(points):
         raise CaseError("all voxels of the volume are 0, so there is nothing to scan")
-    return points
+    return points, grey
 
 
-def _beams(volume: Volume, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+def _beams(
+    volume: Volume, points: NDArray[np.float64], grey: NDArray[np.uint8]
+) -> tuple[NDArray[np.float64], bool]:
     """The unit direction (3,) of the beams, and whether the region widens along them."""
     aside = points - points.mean(axis=0)
-    coarse, _ = _coarse(volume)
-    brightness = coarse[coarse > 0].astype(np.float64)
-    brighter = brightness @ aside / brightness.sum()  # m, from the middle to the brighter side
-    few = aside
-    if len(aside) > _FEW_POINTS:  # at random, since every so many would lie on a few planes
-        few = aside[np.random.default_rng(0).choice(len(aside), _FEW_POINTS, replace=False)]
+    brighter = np.average(aside, axis=0, weights=grey)  # m, from the middle to the brighter side
+    # At random, since every so many would lie on a few planes.
+    few = np.random.default_rng(0).permutation(aside)[:_FEW_POINTS]
     directions = _spiral(_DIRECTIONS)
-    skewness = np.empty(_DIRECTIONS)
-    for first in range(0, _DIRECTIONS, 100):
-        distance = few @ directions[first : first + 100].T
-        squared = distance * distance
-        cubed = np.einsum("ij,ij->j", squared, distance) / len(few)
-        skewness[first : first + 100] = cubed / squared.mean(axis=0) ** 1.5
+    parts = np.array_split(directions, 20)
+    skewness = np.concatenate([skew(few @ part.T) for part in parts])
     likely = skewness <= _LIKELY * skewness.min()
     side = np.argmin(np.where(likely, skewness + directions @ brighter / aside.std(), np.inf))
     near = directions @ directions[side] > 0.9  # cosine of directions about the same corner
