@@ -51,70 +51,60 @@ def segment_as_asked(
         VolumeError: a file cannot be read or used, or nothing is found.
         CaseError: the case cannot be read or changed.
     """
+    _check_places(asked)
+    case = read_case(asked.case) if is_case(asked.case) else None
+    progress(0.0, "reading")
+    if case is None:
+        volume = read_volume(asked.case)
+    else:
+        volume = case.volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
+    labels, step = _labels(asked, volume, progress)
+    volume, remarks = labels.on(volume), list(labels.remarks)
+    settings = _with_structures(case.settings, labels, remarks) if case is not None else None
+    made = _surfaces(volume, surfaces, progress)
+    if settings is None:
+        assert asked.out is not None
+        with partial_folder(asked.out, VolumeError) as folder:
+            write_labels(folder / "labels.seg.nrrd", volume, labels.colours)
+            _write(folder, volume, labels, made, asked, remarks)
+    else:
+        with changed_case(asked.case) as folder:
+            if not _keeps_labels(asked):
+                write_labels(folder / LABELS, volume, labels.colours)
+                if (folder / TISSUE).exists():
+                    (folder / TISSUE).unlink()
+                    remarks.append(f"{TISSUE} was made of other labels and is removed")
+            write_case_settings(folder, settings)
+            _write(folder, volume, labels, made, asked, remarks)
+            triangles = {f"triangles of {one.name}": len(one.surface.triangles) for one in made}
+            add_step(folder, step)
+            add_step(folder, Step("surfaces made", document_of(surfaces), triangles))
+    progress(1.0, "")
+    return _summary(asked.out or asked.case, made, remarks)
+
+
+def _check_places(asked: SegmentRequest) -> None:
+    """Refuse what is no case and no volume file, and a place that cannot be written to."""
     if is_case(asked.case):
         if asked.out is not None:
             raise VolumeError(
                 f"--out: {asked.case} is a case, which is changed in its place; leave --out away"
             )
-        return _segment_case(asked, surfaces, progress)
+        return
     if asked.case.is_dir():
         raise CaseError(
             f"{asked.case}: is no case, as it has no case.yaml; `us-sim cases` lists some"
         )
-    return _segment_file(asked, surfaces, progress)
-
-
-def _segment_case(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Progress) -> str:
-    case = read_case(asked.case)
-    progress(0.0, "reading")
-    volume = case.volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
-    labels, step = _labels(asked, volume, progress)
-    _with_structures(case.settings, labels, [])  # refuses a name before the rest is made
-    made = _surfaces(labels.on(volume), surfaces, progress)
-    remarks = list(labels.remarks)
-    with changed_case(case.folder) as folder:
-        case = read_case(folder)
-        settings = _with_structures(case.settings, labels, remarks)
-        if not _keeps_labels(asked):
-            write_labels(folder / LABELS, labels.on(volume), labels.colours)
-            if (folder / TISSUE).exists():
-                (folder / TISSUE).unlink()
-                remarks.append(f"{TISSUE} was made of other labels and is removed")
-        write_case_settings(folder, settings)
-        _write(folder, volume, labels, made, asked, remarks)
-        triangles = {f"triangles of {one.name}": len(one.surface.triangles) for one in made}
-        for each in (step, Step("surfaces made", document_of(surfaces), triangles)):
-            add_step(folder, each)
-        progress(1.0, "")
-    return _summary(asked.case, made, remarks)
-
-
-def _segment_file(asked: SegmentRequest, surfaces: SurfaceSettings, progress: Progress) -> str:
-    out = asked.out
     if not asked.case.exists():
         raise VolumeError(
             f"{asked.case}: there is no such case or volume file; `us-sim cases` lists cases"
         )
-    if out is None:
+    if asked.out is None:
         raise VolumeError(
             f"{asked.case}: is a volume file, not a case: say with --out which folder to make"
         )
-    if _keeps_labels(asked):
-        raise VolumeError(
-            f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark"
-        )
-    if os.path.lexists(out):
-        raise VolumeError(f"{out}: exists already; choose another name, or remove it")
-    with partial_folder(out, VolumeError) as folder:
-        progress(0.0, "reading")
-        volume = read_volume(asked.case)
-        labels, _ = _labels(asked, volume, progress)
-        made = _surfaces(labels.on(volume), surfaces, progress)
-        remarks = list(labels.remarks)
-        write_labels(folder / "labels.seg.nrrd", labels.on(volume), labels.colours)
-        _write(folder, volume, labels, made, asked, remarks)
-        progress(1.0, "")
-    return _summary(out, made, remarks)
+    if os.path.lexists(asked.out):
+        raise VolumeError(f"{asked.out}: exists already; choose another name, or remove it")
 
 
 def _keeps_labels(asked: SegmentRequest) -> bool:
@@ -143,7 +133,8 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> tuple[
         names = {label: name for label, name in volume.label_names.items() if label}
         if volume.labels is None or not names:
             raise VolumeError(
-                "the case has no labels yet: give --labels, --seeds, or --vessels dark to make some"
+                f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark to "
+                f"make some"
             )
         return LabelMap(volume.labels, names), Step("labels kept")
     labels = segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))

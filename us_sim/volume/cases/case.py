@@ -95,19 +95,17 @@ class Case:
         self.check_grids()
         labels = read_volume(self.folder / LABELS).intensities
         names = self.settings.label_names
-        there = np.bincount(labels.reshape(-1), minlength=256) > 0
-        for label in np.flatnonzero(there):
-            if int(label) not in names:
-                raise CaseError(
-                    f"{self.folder / LABELS}: has the label {label}, which is no structure in "
-                    f"{CASE}: name it there"
-                )
-        for name, structure in self.settings.structures.items():
-            if not there[structure.label]:
-                raise CaseError(
-                    f"{self.folder / CASE}: structures.{name}: label {structure.label} occurs "
-                    f"nowhere in {LABELS}: segment it, or remove the structure"
-                )
+        there = {int(label) for label in np.unique(labels)}
+        for label in sorted(there - set(names)):
+            raise CaseError(
+                f"{self.folder / LABELS}: has the label {label}, which is no structure in {CASE}: "
+                f"name it there"
+            )
+        for label in sorted(set(names) - there - {0}):
+            raise CaseError(
+                f"{self.folder / CASE}: structures.{names[label]}: label {label} occurs nowhere in "
+                f"{LABELS}: segment it, or remove the structure"
+            )
         return dataclasses.replace(volume, labels=labels, label_names=names)
 
     def check_grids(self) -> None:

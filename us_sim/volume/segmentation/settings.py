@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from us_sim.errors import UsSimError, VolumeError
+from us_sim.errors import VolumeError
 from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import SEGMENTATIONS
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import read_yaml
 from us_sim.volume.structure_names import Colour, problem_with
 from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 
@@ -103,18 +103,8 @@ def read_seeds(path: Path) -> SegmentationSettings:
     Raises:
         VolumeError: it cannot be read, or a key or value will not do.
     """
-    try:
-        document = load_yaml(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise VolumeError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from error
-    except YamlError as error:
-        raise VolumeError(f"{path}: {error}") from error
-    try:
-        return Reader(str(path), None, VolumeError).read(SegmentationSettings, document)
-    except VolumeError:
-        raise
-    except UsSimError as error:
-        raise VolumeError(f"{path}: {error}") from error
+    document = read_yaml(path, VolumeError)
+    return Reader(str(path), None, VolumeError).read(SegmentationSettings, document)
 
 
 @dataclass(frozen=True)
