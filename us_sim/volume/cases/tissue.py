@@ -6,6 +6,7 @@ It says what it was made from, and is made anew when that has changed.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,12 @@ from us_sim.errors import CaseError, MeshError
 from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.partial_file import partial_file
+
+_DAMAGED = (
+    *(OSError, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError),
+    *(MemoryError, BadZipFile, zlib.error, MeshError),
+)
+"""Errors of zipfile and NumPy for files that are none or are changed."""
 
 _ARRAYS = ("nodes", "tetrahedra", "labels", "fractions", "made_from")
 _PLANES = ("planes_x", "planes_y", "planes_z")
@@ -79,5 +86,5 @@ def read_tissue(path: Path) -> CaseTissue:
             raise CaseError(f"{path}: its arrays do not go together; remove it")
         fractions /= fractions.sum(axis=1, keepdims=True)
         return CaseTissue(mesh, labels.astype(np.uint8), fractions, said)
-    except (OSError, EOFError, LookupError, ValueError, BadZipFile, MeshError) as error:
+    except _DAMAGED as error:
         raise CaseError(f"{path}: is no tissue that us_sim wrote, or damaged; remove it") from error
