@@ -62,9 +62,6 @@ class SweepSettings(Settings):
         "to add to the images' times to find their poses",
         default=0.0,
     )
-    smallest_box: bool = setting(
-        description="turn the volume's axes so that it has few voxels", default=False
-    )
     leave_one_out: int = setting(
         Quantity("number", 0, 1000),
         "predict so many frames from the others, and say how like they are",
@@ -132,7 +129,7 @@ def reconstruct_sweep(
     if settings.time_offset:
         sweep = shifted(sweep, settings.time_offset)
     rest = None if rest_of is None else rest_of(sweep, part)
-    planned = plan(sweep, compounding, part, smallest_box=settings.smallest_box, rest=rest)
+    planned = plan(sweep, compounding, part, rest)
     made = reconstruct(planned, progress=progress)
     scanner = None if settings.is_volume else scanning_probe(sweep, part, planned.used)
     prediction = None

@@ -135,18 +135,13 @@ def _track_marker() -> None:
 
 def _reconstruct() -> None:
     from us_sim.volume.reconstruction.grid import grid_around
-    from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
+    from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
 
     grid = grid_around(np.array([[0.0, 0.0, 0.0], [0.002, 0.002, 0.002]]), 0.001)
-    image, used = np.ones((2, 2), np.uint8), np.ones((2, 2), np.bool_)
-    place = np.diag([0.001, 0.001, 0.001, 1.0])
-    for method in ("nearest", "linear"):
-        insertion = Insertion(grid, method=method, compounding="mean")
-        insertion.insert(image, place, used)
-        insertion.insert_points(np.ones(1, np.uint8), np.zeros((1, 3)))
-        fill_holes(*insertion.result(), 1.0)
-    gathered = Collection(grid, method="nearest")
-    gathered.count(place, used)
-    gathered.reserve()
-    gathered.insert(image, place, used)
-    gathered.result()
+    pixels, indices = np.ones(1, np.uint8), np.zeros((1, 3))
+    for compounding in ("mean", "median"):
+        inserted = Insertion(grid, method="nearest", compounding=compounding)
+        if inserted.is_median:
+            inserted.count(indices)
+        inserted.insert(pixels, indices)
+        fill_holes(*inserted.result(), 1.0)

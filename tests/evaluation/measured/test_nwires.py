@@ -32,8 +32,8 @@ def test_the_study_reports_plus_errors_and_the_volume(folder, tmp_path):
     section = measure_nwires(folder, ReportFolder("measured", tmp_path, True))
     assert (tmp_path / "measured_nwires.png").exists()
     found = {(f.case, f.quantity): f.error for f in section.findings}
-    assert found["volume", "offset from that of Plus"] < 0.05  # mm, a tenth of a voxel
-    assert found["volume", "equal voxels"] > -1.0
+    assert found["volume", "offset from that of Plus"] < 0.06  # mm, of voxels of 0.5 mm
+    assert found["volume", "correlation with that of Plus"] > -0.02
     assert found["matrix of Plus", "3-D error, validation"] == pytest.approx(0.0, abs=1e-5)
 
 

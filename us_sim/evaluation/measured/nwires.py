@@ -156,7 +156,15 @@ def measure_nwires(folder: Path, report: ReportFolder) -> Section:
     volume = _volume(folder)
     findings += [
         Finding("nwires", "volume", "offset from that of Plus", "mm", error=volume.offset),
-        Finding("nwires", "volume", "equal voxels", "%", 100.0, volume.equal, volume.equal - 100.0),
+        Finding(
+            "nwires",
+            "volume",
+            "correlation with that of Plus",
+            "",
+            1.0,
+            volume.correlation,
+            volume.correlation - 1.0,
+        ),
     ]
     file = report.picture("nwires")
     _draw(file, recordings["validation"].to_middles(matrix), volume)
@@ -174,8 +182,7 @@ def measure_nwires(folder: Path, report: ReportFolder) -> Section:
 class _Volumes:
     """The project's volume and that of Plus, in the voxels that both have."""
 
-    ours: Array  # (i, j, k), by Plus' running mean
-    mean: Array  # by the project's own mean
+    ours: Array  # (i, j, k)
     plus: Array
     shapes: Sequence[tuple[int, ...]]
     seconds: float  # of processor time, with reading
@@ -186,9 +193,9 @@ class _Volumes:
         return np.asarray((self.ours > 0) | (self.plus > 0))
 
     @property
-    def equal(self) -> float:
-        """% of the voxels that are not black in both."""
-        return 100 * float((self.ours == self.plus)[self.seen].mean())
+    def correlation(self) -> float:
+        """Over the voxels that are not black in both."""
+        return float(np.corrcoef(self.ours[self.seen], self.plus[self.seen])[0, 1])
 
     @property
     def offset(self) -> float:
@@ -199,15 +206,14 @@ class _Volumes:
 
     def words(self) -> str:
         """For the report."""
-        levels = [np.abs(each - self.plus)[self.seen].mean() for each in (self.ours, self.mean)]
         sizes = " and ".join(" × ".join(map(str, shape)) for shape in self.shapes)
+        levels = np.abs(self.ours - self.plus)[self.seen].mean()
         return (
             f"Grids of {sizes} voxels of {1e3 * _SPACING:g} mm begin at the same place; the "
-            f"volumes are shifted against each other by {self.offset:.4f} mm. With Plus' running "
-            f"mean {self.equal:.1f} % of the voxels are equal that are not black in both, "
-            f"{self.seen.sum():,} of {self.seen.size:,}; the mean difference of their grey is "
-            f"{levels[0]:.2f} of 255 levels. With the project's own mean, which rounds once "
-            f"where Plus rounds down after every pixel, it is {levels[1]:.1f}. Reading and "
+            f"volumes are shifted against each other by {self.offset:.4f} mm. Over the voxels that "
+            f"are not black in both, {self.seen.sum():,} of {self.seen.size:,}, they correlate by "
+            f"{self.correlation:.4f} and differ by {levels:.1f} of 255 levels: Plus rounds its "
+            f"running mean after every pixel, the project once. Reading and "
             f"reconstructing took {self.seconds:.1f} s of processor time."
         )
 
@@ -219,17 +225,12 @@ def _volume(folder: Path) -> _Volumes:
     sequence = read_sequence(folder / "NwirePhantomFreehand.igs.mha")
     sweep = sweep_of(sequence, calibration=setup.transforms)
 
-    def made(compounding: str) -> NDArray[np.uint8]:
-        settings = Compounding(spacing=_SPACING, hole_radius=0.0, compounding=compounding)
-        return reconstruct(plan(sweep, settings, setup.part)).volume.intensities
-
-    ours = made("plus_mean")
+    settings = Compounding(spacing=_SPACING, hole_radius=0.0)
+    ours = reconstruct(plan(sweep, settings, setup.part)).volume.intensities
     seconds = time.process_time() - begun
     common = tuple(slice(min(pair)) for pair in zip(ours.shape, theirs.shape, strict=True))
-    running, mean, plus = (
-        np.asarray(each[common], np.float64) for each in (ours, made("mean"), theirs)
-    )
-    return _Volumes(running, mean, plus, (ours.shape, theirs.shape), seconds)
+    grey, plus = (np.asarray(each[common], np.float64) for each in (ours, theirs))
+    return _Volumes(grey, plus, (ours.shape, theirs.shape), seconds)
 
 
 def _draw(file: Path, errors: Array, volumes: _Volumes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -37,22 +36,17 @@ class Grid:
         return np.asarray(np.linalg.inv(self.index_to_reference), dtype=np.float64)
 
 
-def grid_around(
-    points: NDArray[np.float64], spacing: float, axes: NDArray[np.float64] | None = None
-) -> Grid:
+def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
     """The grid whose first and last voxels hold the outermost points.
 
     Args:
         points: (N, 3) m.
         spacing: m, of the voxels.
-        axes: (3, 3) orthonormal, the grid's axes as columns; those of the points' frame without it.
 
     Raises:
         VolumeError: it would have more voxels than are read from a file, or just one layer of them.
     """
-    axes = np.eye(3) if axes is None else axes
-    along = points @ axes
-    low, high = along.min(axis=0), along.max(axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
     # As Plus counts them, so that its grids come out: the last voxel may end before the last point.
     counts = np.floor((high - low) / spacing + 0.5) + 1.0
     if math.prod(counts) > LARGEST_VOLUME:
@@ -70,50 +64,17 @@ def grid_around(
             f"smaller --spacing, or a sweep that moves"
         )
     matrix = np.eye(4)
-    matrix[:3, :3] = axes * spacing
-    matrix[:3, 3] = axes @ low
+    matrix[:3, :3] *= spacing
+    matrix[:3, 3] = low
     i, j, k = (int(count) for count in counts)
     return Grid(matrix, (i, j, k))
 
 
-def proposed_spacing(
-    points: NDArray[np.float64], pixel: float, axes: NDArray[np.float64] | None = None
-) -> float:
+def proposed_spacing(points: NDArray[np.float64], pixel: float) -> float:
     """m: a pixel's size, or as much more as 134 million voxels around the points need."""
-    along = points if axes is None else points @ axes
-    size = np.maximum(np.ptp(along, axis=0), pixel)
+    size = np.maximum(np.ptp(points, axis=0), pixel)
     needed = (math.prod(size) / (1 << 27)) ** (1 / 3)
     return pixel if needed <= pixel else math.ceil(1e5 * needed * 1.01) / 1e5
-
-
-def axes_of_smallest_box(
-    points: NDArray[np.float64], image_to_reference: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(3, 3) axes, as columns, along which the box around the points is smallest.
-
-    Tried are the points' own frame, the images' mean orientation and the points' principal axes;
-    the axes are named so that each is nearest to that of the frame.
-
-    Args:
-        points: (N, 3) m.
-        image_to_reference: (K, 4, 4) m, of the images.
-    """
-    steps = image_to_reference[:, :3, :2]
-    steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    across, down = steps.mean(axis=0).T
-    left, _, right = np.linalg.svd(np.column_stack([across, down, np.cross(across, down)]))
-    _, _, principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    boxes = [np.eye(3), left @ right, principal.T]
-    sizes = [float(np.prod(np.maximum(np.ptp(points @ box, axis=0), 1e-6))) for box in boxes]
-    axes = boxes[int(np.argmin(sizes))]
-    # The same axes in the order and directions that turn the frame's least, right-handed.
-    orders = [
-        axes[:, order] * (1.0 - 2.0 * np.array(signs))
-        for order in itertools.permutations(range(3))
-        for signs in np.ndindex(2, 2, 2)
-    ]
-    right_handed = [ordered for ordered in orders if np.linalg.det(ordered) > 0]
-    return np.ascontiguousarray(max(right_handed, key=lambda each: float(np.trace(each))))
 
 
 def check_memory(needed: float, purpose: str) -> None:
@@ -162,18 +123,16 @@ def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:
 def outline(part: ImagePart, used: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(N, 4) column, row, 0, 1 of points around the used pixels (rows, columns).
 
-    The corners of the rectangle where there is one, else the first and last pixel of every row.
+    The corners of the rectangle where there is one, as Plus has them, else the first and last
+    pixel of every row.
     """
     if part.clip is not None:
         left, top, wide, high = part.clip
-        columns = np.clip([left, left + wide], 0, used.shape[1] - 1)
-        rows_of_it = np.clip([top, top + high], 0, used.shape[0] - 1)
-        return np.array([[c, r, 0.0, 1.0] for c in columns for r in rows_of_it])
-    rows = np.flatnonzero(used.any(axis=1))
-    first = used[rows].argmax(axis=1)
-    last = used.shape[1] - 1 - used[rows, ::-1].argmax(axis=1)
-    ends = np.zeros((2 * len(rows), 4))
-    ends[:, 0] = np.concatenate([first, last])
-    ends[:, 1] = np.tile(rows, 2)
-    ends[:, 3] = 1.0
-    return ends
+        columns = np.clip([left, left, left + wide, left + wide], 0, used.shape[1] - 1)
+        rows = np.clip([top, top + high] * 2, 0, used.shape[0] - 1)
+    else:
+        rows = np.tile(np.flatnonzero(used.any(axis=1)), 2)
+        half = used[rows[: len(rows) // 2]]
+        last = used.shape[1] - 1 - half[:, ::-1].argmax(axis=1)
+        columns = np.concatenate([half.argmax(axis=1), last])
+    return np.column_stack([columns, rows, np.zeros(len(rows)), np.ones(len(rows))])

@@ -1,4 +1,4 @@
-"""Volumes from tracked images: of a whole sweep, and live while a probe scans."""
+"""Volumes from the tracked images of a sweep."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.grid import (
     Grid,
-    axes_of_smallest_box,
     grid_around,
     image_mask,
     outline,
     proposed_spacing,
 )
-from us_sim.volume.reconstruction.insertion import Collection, Insertion, fill_holes
+from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
 from us_sim.volume.reconstruction.settings import Compounding, ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 from us_sim.volume.volume import Volume
@@ -27,6 +26,8 @@ Progress = Callable[[float, str], None]  # is told the fraction done, and the wo
 
 Rest = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Takes the index of a frame and points (N, 3) m of it; where these lie while nothing presses."""
+
+_LARGEST_PIXEL = 0.01  # m; a larger one is of a matrix that is no image's
 
 APART = 8
 """Frames from one that is left out to the next: the seven between are enough to predict it."""
@@ -50,12 +51,15 @@ class Plan:
         asked = self.compounding.hole_radius
         return 2.0 * self.grid.spacing if asked is None else asked
 
-    def points(self, k: int) -> NDArray[np.float64]:
-        """(N, 3) m of a frame's used pixels, at rest where that is known."""
+    def indices(self, k: int) -> NDArray[np.float64]:
+        """(N, 3) of a frame's used pixels in the grid, at rest where that is known."""
         rows, columns = np.nonzero(self.used)
-        matrix = self.sweep.image_to_reference[k]
+        to_index, matrix = self.grid.reference_to_index, self.sweep.image_to_reference[k]
+        if self.rest is None:
+            step = to_index @ matrix
+            return columns[:, None] * step[:3, 0] + rows[:, None] * step[:3, 1] + step[:3, 3]
         points = columns[:, None] * matrix[:3, 0] + rows[:, None] * matrix[:3, 1] + matrix[:3, 3]
-        return points if self.rest is None else self.rest(k, points)
+        return self.rest(k, points) @ to_index[:3, :3].T + to_index[:3, 3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +77,6 @@ def plan(
     sweep: Sweep,
     compounding: Compounding,
     part: ImagePart | None = None,
-    *,
-    smallest_box: bool = False,
     rest: Rest | None = None,
 ) -> Plan:
     """The grid around a sweep's images, and which of their pixels are used.
@@ -83,12 +85,18 @@ def plan(
         sweep: with poses.
         compounding: how; its spacing may be proposed.
         part: of each image; all without it.
-        smallest_box: turn the grid so that it has few voxels; else its axes are the sweep's.
         rest: undoes the deformation of a frame.
 
     Raises:
-        VolumeError: no pixel is used, or the grid would be too large or too flat.
+        VolumeError: the matrices are not an image's, no pixel is used, or the grid would be too
+            large or too flat.
     """
+    pixel = float(np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1).mean())
+    if pixel > _LARGEST_PIXEL:
+        raise VolumeError(
+            f"{sweep.path}: its transforms make pixels of {1e3 * pixel:g} mm, so they are not "
+            f"those of an image: name its frame by --image, or give the probe's --calibration"
+        )
     part = part or ImagePart()
     used = image_mask(part, sweep.columns, sweep.rows)
     points = np.einsum("kij,nj->kni", sweep.image_to_reference, outline(part, used))[..., :3]
@@ -98,12 +106,8 @@ def plan(
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise VolumeError(f"{sweep.path}: no pixel of its images lies in the tissue of the scene")
-    axes = axes_of_smallest_box(points, sweep.image_to_reference) if smallest_box else None
-    spacing = compounding.spacing
-    if spacing is None:
-        steps = np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1)
-        spacing = proposed_spacing(points, float(steps.mean()), axes)
-    return Plan(sweep, grid_around(points, spacing, axes), used, compounding, rest)
+    spacing = compounding.spacing or proposed_spacing(points, pixel)
+    return Plan(sweep, grid_around(points, spacing), used, compounding, rest)
 
 
 def reconstruct(
@@ -123,27 +127,13 @@ def reconstruct(
     sweep, settings, used = planned.sweep, planned.compounding, planned.used
     frames = list(range(len(sweep.numbers)) if which is None else which)
     tell = progress or (lambda *_: None)
-    inserted: Insertion | Collection
-    if settings.compounding == "median":
-        if planned.rest is not None:
-            raise VolumeError("compounding by the median cannot undo the pressure: use mean or max")
-        inserted = Collection(planned.grid, method=settings.method)
+    inserted = Insertion(planned.grid, method=settings.method, compounding=settings.compounding)
+    if inserted.is_median:
         for k in frames:
-            inserted.count(sweep.image_to_reference[k], used)
-        inserted.reserve()
-    else:
-        inserted = Insertion(
-            planned.grid,
-            method=settings.method,
-            compounding=settings.compounding,
-            plus_rounding=settings.plus_rounding,
-        )
+            inserted.count(planned.indices(k))
     for done, (k, image) in enumerate(zip(frames, sweep.images(frames), strict=True)):
         tell(_FILLING * done / len(frames), "inserting images")
-        if planned.rest is None or isinstance(inserted, Collection):
-            inserted.insert(image, sweep.image_to_reference[k], used)
-        else:
-            inserted.insert_points(image[used], planned.points(k))
+        inserted.insert(image[used], planned.indices(k))
     grey, covered = inserted.result()
     del inserted
     hit = int(np.count_nonzero(covered))
@@ -224,8 +214,7 @@ def _pair(
     """The used pixels of a frame whose eight voxels are covered, their prediction, and how many."""
     from scipy import ndimage
 
-    to_index = planned.grid.reference_to_index
-    index = (planned.points(k) @ to_index[:3, :3].T + to_index[:3, 3]).T
+    index = planned.indices(k).T
     size = np.array(planned.grid.shape)[:, None]
     inside = (np.isfinite(index) & (index >= -0.5) & (index < size - 0.5)).all(axis=0)
     index = np.where(inside, index, 0.0)

@@ -1,4 +1,4 @@
-"""Settings of freehand reconstructions: of a sweep, and live while a probe scans."""
+"""Settings of freehand reconstructions."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from us_sim.settings.setting import Settings, setting
 METHODS = ("nearest", "linear")
 """How a pixel is inserted: into the nearest voxel, or into the eight around it by their weights."""
 
-COMPOUNDINGS = ("mean", "median", "max", "latest", "plus_mean")
-"""Combinations of several pixels in one voxel; ``plus_mean`` is Plus' running mean, which is made
-a whole number after every pixel and so comes out 2 grey levels darker."""
+COMPOUNDINGS = ("mean", "median", "max")  # of several pixels in one voxel
 
 _PIXEL = Quantity("image distance", -1e5, 1e5)
 
@@ -32,11 +30,6 @@ class Compounding(Settings):
     method: str = setting(description="of insertion", choices=METHODS, default="linear")
     compounding: str = setting(
         description="of several pixels in one voxel", choices=COMPOUNDINGS, default="mean"
-    )
-    plus_rounding: bool = setting(
-        description="round the places of pixels as Plus does, to 1/16384 of a voxel: for "
-        "comparison with its volumes",
-        default=False,
     )
     hole_radius: float | None = setting(
         Quantity("length", 0.0, 0.05),
