@@ -55,7 +55,7 @@ def contents(folder):
 
 def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
     assert (
-        main(["segment", str(case), "--seeds", seeds, "--formats", "stl", "vtp", "--report"]) == 0
+        main(["segment", str(case), "--seeds", seeds, "--formats", "stl", "ply", "--report"]) == 0
     )
     said = capsys.readouterr().out
     opened = read_case(case)
@@ -63,7 +63,7 @@ def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
     assert volume.label_names == {0: "tissue", 1: "vein", 2: "body"}
     np.testing.assert_array_equal(volume.labels == 1, block().labels == 6)
     assert sorted(path.name for path in (case / "surfaces").iterdir()) == [
-        *("body.stl", "body.vtp", "vein.stl", "vein.vtp")
+        *("body.ply", "body.stl", "vein.ply", "vein.stl")
     ]
     assert (case / "segmentation.png").read_bytes()[:4] == b"\x89PNG"
     assert "![" in (case / "segmentation.md").read_text()

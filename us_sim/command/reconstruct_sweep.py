@@ -193,8 +193,8 @@ def _step(
     }
     if prediction is not None:
         counts["frames predicted"] = len(prediction.frames)
-        counts["correlation median"] = round(prediction.median, 4)
-        counts["correlation worst"] = round(prediction.worst, 4)
+        counts["correlation median"] = round(float(np.nanmedian(prediction.correlations)), 4)
+        counts["correlation worst"] = round(float(np.nanmin(prediction.correlations)), 4)
     more = {
         "method": planned.compounding.method,
         "compounding": planned.compounding.compounding,
@@ -207,13 +207,14 @@ def _step(
 
 
 def _prediction_said(prediction: Prediction, asked: int) -> str:
-    worst = int(prediction.frames[int(np.nanargmin(prediction.correlations))])
+    found = prediction.correlations
+    worst = int(np.nanargmin(found))
     between = f"{APART - 1} others or more stay between two of them"
-    why = f" (not {asked}: {between})" if len(prediction.frames) < asked else ""
+    why = f" (not {asked}: {between})" if len(found) < asked else ""
     return (
-        f"{counted(len(prediction.frames), 'frame')}{why} predicted from the others correlate with "
-        f"what was seen by {prediction.median:.3f} in the median and {prediction.worst:.3f} at "
-        f"worst (frame {worst}), over {100 * prediction.covered.mean():.0f} % of their pixels"
+        f"{counted(len(found), 'frame')}{why} predicted from the others correlate with what was "
+        f"seen by {np.nanmedian(found):.3f} in the median and {found[worst]:.3f} at worst (frame "
+        f"{prediction.frames[worst]})"
     )
 
 

@@ -183,7 +183,7 @@ def test_distances_are_vtks(flat_ring):
     points = np.random.default_rng(3).normal(scale=0.02, size=(200, 3)) + flat_ring.vertices.mean(
         axis=0
     )
-    ours = distances_to(points, flat_ring.vertices, flat_ring.triangles)
+    ours = distances_to(points, flat_ring, 0.4e-3)
     theirs = vtk_distances(points, flat_ring)
     assert (ours > theirs - 1e-7).all()
     np.testing.assert_allclose(ours, theirs, atol=2e-6)
@@ -270,7 +270,6 @@ def read_by_vtk(path):
         "stl": vtk.vtkSTLReader,
         "ply": vtk.vtkPLYReader,
         "obj": vtk.vtkOBJReader,
-        "vtp": vtk.vtkXMLPolyDataReader,
     }[path.suffix[1:]]()
     reader.SetFileName(str(path))
     reader.Update()
@@ -293,13 +292,10 @@ def test_vtk_reads_every_format_in_millimetres(tmp_path, kind):
     }
     assert len(triangles) == 4
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"vein.{kind}"]
-    if kind == "vtp":
-        assert read.GetFieldData().GetAbstractArray("SPACE").GetValue(0) == "LPS"
-    else:
-        assert b"SPACE=LPS" in path.read_bytes()[:200]
+    assert b"SPACE=LPS" in path.read_bytes()[:200]
 
 
-@pytest.mark.parametrize("kind", ["stl", "ply", "obj"])
+@pytest.mark.parametrize("kind", SURFACE_FORMATS)
 def test_meshio_and_the_scenes_reader_find_the_same_volume(tmp_path, kind):
     path = tmp_path / f"vein.{kind}"
     write_surface(path, SURFACE)
@@ -313,7 +309,7 @@ def test_meshio_and_the_scenes_reader_find_the_same_volume(tmp_path, kind):
 
 
 def test_another_ending_and_a_missing_folder_are_refused(tmp_path):
-    with pytest.raises(VolumeError, match=r"\.stl, \.ply, \.vtp, \.obj"):
+    with pytest.raises(VolumeError, match=r"\.stl, \.ply, \.obj"):
         write_surface(tmp_path / "vein.txt", SURFACE)
     with pytest.raises(VolumeError, match="be written"):
         write_surface(tmp_path / "nowhere" / "vein.stl", SURFACE)

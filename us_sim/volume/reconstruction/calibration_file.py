@@ -10,12 +10,14 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.settings.text_files import YamlError, load_yaml, read_bytes
+from us_sim.settings.spelling import counted
+from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.transforms import frame_matrix, in_metres
 
@@ -40,22 +42,26 @@ def read_calibration(path: Path, probe: str) -> SweepCalibration:
         VolumeError: the file cannot be read, or holds no calibration.
     """
     try:
-        data = read_bytes(path)
+        if path.suffix.lower() == ".xml":
+            return _plus(path, ElementTree.parse(path).getroot())
+        document = load_yaml(path.read_text("utf-8"))
     except OSError as error:
         raise VolumeError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if path.suffix.lower() == ".xml":
-        return _plus(path, data)
-    return SweepCalibration({f"ImageTo{probe}": _image_to_body(path, data)}, ImagePart())
-
-
-def _plus(path: Path, data: bytes) -> SweepCalibration:
-    # Entities that expand without end are a known attack; no configuration needs any.
-    if b"<!ENTITY" in data:
-        raise VolumeError(f"{path}: defines entities, which is not allowed; remove them")
+    except (ElementTree.ParseError, UnicodeDecodeError, YamlError) as error:
+        raise VolumeError(f"{path}: is neither XML nor YAML that can be read: {error}") from error
     try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise VolumeError(f"{path}: is not XML: {error}") from error
+        rows = document["image_to_body"]  # type: ignore[index,call-overload]
+        text = " ".join(str(float(number)) for row in rows for number in row)
+        matrix = frame_matrix({"image_to_body": text}, "image_to_body")
+    except (LookupError, TypeError, ValueError) as error:
+        raise VolumeError(
+            f"{path}: holds no image_to_body, a 4 × 4 matrix from pixels to metres on the tracked "
+            f"body"
+        ) from error
+    return SweepCalibration({f"ImageTo{probe}": matrix}, ImagePart())
+
+
+def _plus(path: Path, root: ElementTree.Element) -> SweepCalibration:
     transforms = {}
     for element in root.iter("Transform"):
         start, end = element.get("From", ""), element.get("To", "")
@@ -75,12 +81,16 @@ def _plus(path: Path, data: bytes) -> SweepCalibration:
     return SweepCalibration(transforms, _part(path, root.find(".//VolumeReconstruction")))
 
 
+_COUNTS = {"ClipRectangleOrigin": 2, "ClipRectangleSize": 2, "FanOriginPixel": 2}
+_COUNTS |= {"FanAnglesDeg": 2, "FanRadiusStartPixel": 1, "FanRadiusStopPixel": 1}
+
+
 def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
+    if element is None:
+        return ImagePart()
     said: dict[str, list[float]] = {}
-    counts = {"ClipRectangleOrigin": 2, "ClipRectangleSize": 2, "FanOriginPixel": 2}
-    counts |= {"FanAnglesDeg": 2, "FanRadiusStartPixel": 1, "FanRadiusStopPixel": 1}
-    for key, count in counts.items():
-        text = None if element is None else element.get(key)
+    for key, count in _COUNTS.items():
+        text = element.get(key)
         if text is None:
             continue
         try:
@@ -89,37 +99,20 @@ def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
             said[key] = []
         if len(said[key]) != count:
             raise VolumeError(
-                f"{path}: VolumeReconstruction: {key} is {text[:60]!r} where {count} number"
-                f"{'s belong' if count > 1 else ' belongs'}; correct it"
+                f"{path}: VolumeReconstruction: {key} is {text[:60]!r}; "
+                f"write {counted(count, 'number')}"
             )
-    given = {}
+    given: dict[str, Any] = {}
     size = said.get("ClipRectangleSize", [0.0])
     if min(size) > 0.0 and "ClipRectangleOrigin" in said:
         given["clip"] = [*said["ClipRectangleOrigin"], *size]
     angles = said.get("FanAnglesDeg", [0.0])
     if any(angles):  # Plus, too, takes two angles of 0 for no fan
-        given["fan_angles"] = [f"{angle!r} deg" for angle in sorted(angles)]  # type: ignore[misc]
+        given["fan_angles"] = [f"{angle!r} deg" for angle in sorted(angles)]
         given["fan_origin"] = said.get("FanOriginPixel", [0.0, 0.0])
         start, stop = said.get("FanRadiusStartPixel", [0.0]), said.get("FanRadiusStopPixel", [1e5])
         given["fan_radius"] = [*start, *stop]
     try:
-        return ImagePart(**given)  # type: ignore[arg-type]
+        return ImagePart(**given)
     except UsSimError as error:
         raise VolumeError(f"{path}: VolumeReconstruction: {error}") from error
-
-
-def _image_to_body(path: Path, data: bytes) -> NDArray[np.float64]:
-    """(4, 4) m, from (column, row, 0, 1)."""
-    try:
-        document = load_yaml(data.decode("utf-8"))
-    except (UnicodeDecodeError, YamlError) as error:
-        raise VolumeError(f"{path}: is neither XML nor YAML that can be read: {error}") from error
-    rows = document.get("image_to_body") if isinstance(document, dict) else None
-    try:
-        text = " ".join(str(float(number)) for row in rows or () for number in row)
-        return frame_matrix({"image_to_body": text}, "image_to_body")
-    except (TypeError, ValueError) as error:
-        raise VolumeError(
-            f"{path}: holds no image_to_body, a 4 × 4 matrix from pixels to metres on the tracked "
-            f"body"
-        ) from error

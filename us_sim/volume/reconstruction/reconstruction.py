@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from us_sim.errors import VolumeError
 from us_sim.volume.reconstruction.grid import (
@@ -152,17 +153,6 @@ class Prediction:
 
     frames: NDArray[np.int64]  # (N,) numbers of the frames in the file
     correlations: NDArray[np.float64]  # (N,) normalised cross-correlation; nan where not covered
-    covered: NDArray[np.float64]  # (N,) fraction of the used pixels that the others predict
-
-    @property
-    def median(self) -> float:
-        """The median correlation."""
-        return float(np.nanmedian(self.correlations))
-
-    @property
-    def worst(self) -> float:
-        """The lowest correlation."""
-        return float(np.nanmin(self.correlations))
 
 
 def leave_one_out(planned: Plan, count: int, progress: Progress | None = None) -> Prediction:
@@ -188,17 +178,18 @@ def leave_one_out(planned: Plan, count: int, progress: Progress | None = None) -
     chosen = np.unique(np.linspace(0, total - 1, count + 2).round().astype(int)[1:-1])
     others = np.setdiff1d(np.arange(total), chosen)
     made = reconstruct(planned, [int(k) for k in others], progress)
-    correlations, covered = [], []
-    for k, image in zip(chosen, sweep.images(chosen.tolist()), strict=True):
-        seen, predicted, fraction = _pair(planned, made, int(k), image)
-        covered.append(fraction)
-        correlations.append(correlation(seen, predicted) if len(seen) >= 100 else math.nan)
-    if np.isnan(correlations).all():
+    found = np.array(
+        [
+            _predicted(planned, made, int(k), image)
+            for k, image in zip(chosen, sweep.images(chosen.tolist()), strict=True)
+        ]
+    )
+    if np.isnan(found).all():
         raise VolumeError(
             f"{sweep.path}: the other frames predict nothing of the {len(chosen)} left out: the "
             f"frames are too far apart; give a larger --hole-radius or --spacing"
         )
-    return Prediction(sweep.numbers[chosen], np.array(correlations), np.array(covered))
+    return Prediction(sweep.numbers[chosen], found)
 
 
 def correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
@@ -208,20 +199,17 @@ def correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> fl
     return float(first @ second) / scale if scale else math.nan
 
 
-def _pair(
-    planned: Plan, made: Reconstruction, k: int, image: NDArray[np.uint8]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """The used pixels of a frame whose eight voxels are covered, their prediction, and how many."""
-    from scipy import ndimage
+def _predicted(planned: Plan, made: Reconstruction, k: int, image: NDArray[np.uint8]) -> float:
+    """The correlation of a frame with its prediction, where its pixels' eight voxels are covered.
 
+    It is nan for fewer than 100 such pixels.
+    """
     index = planned.indices(k).T
-    size = np.array(planned.grid.shape)[:, None]
-    inside = (np.isfinite(index) & (index >= -0.5) & (index < size - 0.5)).all(axis=0)
-    index = np.where(inside, index, 0.0)
-    covered = made.covered.view(np.uint8)
-    whole = ndimage.map_coordinates(covered, index, np.float32, order=1, mode="nearest")
-    used = inside & (whole > 1.0 - 1e-5)
+    whole = ndimage.map_coordinates(made.covered.view(np.uint8), index, np.float32, order=1)
+    used = np.isfinite(index[0]) & (whole > 1.0 - 1e-5)
+    if used.sum() < 100:
+        return math.nan
     predicted = ndimage.map_coordinates(
-        made.volume.intensities, index[:, used], np.float64, order=1, mode="nearest"
+        made.volume.intensities, index[:, used], np.float64, order=1
     )
-    return image[planned.used][used].astype(np.float64), predicted, float(used.mean())
+    return correlation(image[planned.used][used].astype(np.float64), predicted)

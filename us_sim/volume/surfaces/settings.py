@@ -8,7 +8,7 @@ from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-SURFACE_FORMATS = ("stl", "ply", "vtp", "obj")  # file formats of surfaces
+SURFACE_FORMATS = ("stl", "ply", "obj")  # file formats of surfaces
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Surfaces into files: STL, PLY, OBJ and VTK's VTP, in millimetres on DICOM's axes.
+"""Surfaces into files: STL, PLY and OBJ, in millimetres on DICOM's axes.
 
 Each says in its header that its axes are left, posterior and superior (``SPACE=LPS``), which
 3D Slicer looks for and other programs skip.
@@ -6,7 +6,6 @@ Each says in its header that its axes are left, posterior and superior (``SPACE=
 
 from __future__ import annotations
 
-import base64
 from pathlib import Path
 
 import numpy as np
@@ -67,33 +66,4 @@ def _obj(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _vtp(points: NDArray[np.float64], triangles: NDArray[np.int32]) -> bytes:
-    """VTK's XML polygons, their arrays in base64 (docs.vtk.org, "VTK XML Formats")."""
-    space = " ".join(str(byte) for byte in b"LPS\0")
-    ends = np.arange(3, 3 * len(triangles) + 1, 3)
-    return f"""<?xml version="1.0"?>
-<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
-<!-- {_SAID} -->
-<PolyData>
-<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{space}</Array>
-</FieldData>
-<Piece NumberOfPoints="{len(points)}" NumberOfPolys="{len(triangles)}">
-<Points>{_array("Float32", points.astype("<f4"), "Points", 3)}</Points>
-<Polys>{_array("Int64", triangles.astype("<i8"), "connectivity")}
-{_array("Int64", ends.astype("<i8"), "offsets")}</Polys>
-</Piece>
-</PolyData>
-</VTKFile>
-""".encode()
-
-
-def _array(kind: str, values: NDArray[np.generic], name: str, components: int = 1) -> str:
-    raw = values.tobytes()
-    packed = base64.b64encode(np.uint64(len(raw)).astype("<u8").tobytes() + raw).decode()
-    return (
-        f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" '
-        f'format="binary">{packed}</DataArray>'
-    )
-
-
-_WRITERS = {".stl": _stl, ".ply": _ply, ".vtp": _vtp, ".obj": _obj}
+_WRITERS = {".stl": _stl, ".ply": _ply, ".obj": _obj}
