@@ -39,6 +39,7 @@ def test_a_sweep_becomes_a_volume_and_a_picture(sweep, tmp_path, capsys):
     assert "14 × 10 × 12 voxels of 1 mm (100 % covered, 140 of them filled holes)" in said
     assert "from 11 frames" in said
     assert "left out are 1 with ImageStatus is not OK" in said
+    assert "pixels are 1 mm" in said
     with Image.open(out.with_suffix(".png")) as picture:
         assert picture.width > 800
 

@@ -157,6 +157,11 @@ def reconstruct_sweep(
     if left_out := sweep.left_out:
         why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
         sentences.append(f"left out are {why}")
+    steps = np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1)
+    if np.abs(steps - 1e-3).max() < 1e-9:
+        sentences.append(
+            "its pixels are 1 mm, as of an image that nobody calibrated: then give --calibration"
+        )
     if sweep.sequence.are_colours:
         sentences.append("its colour images were made grey")
     if prediction is not None:

@@ -250,20 +250,23 @@ def distances_to(
     samples' spacing, m, over the distance.
     """
     corners = surface.vertices[surface.triangles]  # (T, 3, 3)
+    edges = np.roll(corners, -1, axis=1) - corners
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    inwards = np.cross(normals[:, None], edges)
+    per_square = edges / (edges**2).sum(axis=2, keepdims=True)
     samples, owners = _samples(corners, spacing)
     _, near = cKDTree(samples).query(points, k=min(6, len(samples)))
     found = np.empty(len(points))
-    for some in np.array_split(np.arange(len(points)), 1 + len(points) // 20_000):
-        around = corners[owners[near[some]].reshape(len(some), -1)]  # (P, K, 3, 3)
-        edges = np.roll(around, -1, axis=2) - around
-        off = points[some, None, None] - around
-        along = np.clip((off * edges).sum(axis=-1) / (edges**2).sum(axis=-1), 0.0, 1.0)
-        nearest = np.linalg.norm(off - along[..., None] * edges, axis=-1).min(axis=-1)
-        normals = np.cross(edges[..., 0, :], edges[..., 1, :])
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        above = (np.cross(edges, off) * normals[..., None, :]).sum(axis=-1).min(axis=-1) >= 0.0
-        height = np.abs((off[..., 0, :] * normals).sum(axis=-1))
-        found[some] = np.where(above, height, nearest).min(axis=1)
+    for some in np.array_split(np.arange(len(points)), 1 + len(points) // 5000):
+        around = owners[near[some]].reshape(len(some), -1)  # (P, K)
+        off = points[some, None, None] - corners[around]  # (P, K, 3, 3)
+        along = np.clip(np.einsum("pkex,pkex->pke", off, per_square[around]), 0.0, 1.0)
+        off_edges = off - along[..., None] * edges[around]
+        squared = np.einsum("pkex,pkex->pke", off_edges, off_edges).min(axis=2)
+        above = (np.einsum("pkex,pkex->pke", off, inwards[around]) >= 0.0).all(axis=2)
+        height = np.einsum("pkx,pkx->pk", off[:, :, 0], normals[around])
+        found[some] = np.sqrt(np.where(above, height**2, squared).min(axis=1))
     return found
 
 
