@@ -100,6 +100,17 @@ def _insert(pixels, indices, shape, linear, mode, gathered, cursor, values):
             continue
         i, j, k = np.int64(math.floor(x)), np.int64(math.floor(y)), np.int64(math.floor(z))
         fx, fy, fz = x - i, y - j, z - k
+        inside = 0 <= i < shape[0] - 1 and 0 <= j < shape[1] - 1 and 0 <= k < shape[2] - 1
+        if inside and mode == _MEAN:  # as below, in a third of the time
+            for a in range(2):
+                for b in range(2):
+                    voxel = ((i + a) * shape[1] + j + b) * shape[2] + k
+                    flat = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
+                    for c in range(2):
+                        weight = np.float32(flat * (fz if c else 1.0 - fz))
+                        gathered[voxel + c, 0] += weight * np.float32(pixels[p])
+                        gathered[voxel + c, 1] += weight
+            continue
         for a in range(2):
             for b in range(2):
                 flat = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
@@ -119,7 +130,7 @@ def _insert(pixels, indices, shape, linear, mode, gathered, cursor, values):
                     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add(i, j, k, weight, pixel, shape, mode, gathered, cursor, values):
     """Give voxel (i, j, k), where there is one, a pixel of a weight."""
     if weight <= 0.0 or not (0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]):
