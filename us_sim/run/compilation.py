@@ -138,10 +138,10 @@ def _reconstruct() -> None:
     from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
 
     grid = grid_around(np.array([[0.0, 0.0, 0.0], [0.002, 0.002, 0.002]]), 0.001)
-    pixels, indices = np.ones(1, np.uint8), np.zeros((1, 3))
+    pixels, place = np.ones(1, np.uint8), (np.zeros((1, 3)), np.eye(3, 4))
     for compounding in ("mean", "median"):
         inserted = Insertion(grid, method="nearest", compounding=compounding)
         if inserted.is_median:
-            inserted.count(indices)
-        inserted.insert(pixels, indices)
+            inserted.count(*place)
+        inserted.insert(pixels, *place)
         fill_holes(*inserted.result(), 1.0)

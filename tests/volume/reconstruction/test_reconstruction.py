@@ -103,12 +103,12 @@ ONE_VOXEL = grid_around(np.array([[0.0, 0, 0], [1e-3, 1e-3, 1e-3]]), 1e-3)
 
 def compounded(values, compounding):
     insertion = Insertion(ONE_VOXEL, method="nearest", compounding=compounding)
-    place = np.zeros((1, 3))
+    place = np.zeros((1, 3)), np.eye(3, 4)
     if compounding == "median":
         for _ in values:
-            insertion.count(place)
+            insertion.count(*place)
     for value in values:
-        insertion.insert(np.full(1, value, np.uint8), place)
+        insertion.insert(np.full(1, value, np.uint8), *place)
     grey, covered = insertion.result()
     assert covered.sum() == 1
     return grey[0, 0, 0]

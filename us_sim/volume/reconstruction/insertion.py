@@ -54,12 +54,17 @@ class Insertion:
         self._cursor = np.zeros(1, dtype=np.int64)  # where the next value of a voxel goes
         self._values = np.zeros(0, dtype=np.uint8)  # of all voxels, one after another
 
-    def count(self, indices: NDArray[np.float64]) -> None:
-        """Count pixels at indices (P, 3) that will be inserted; only for medians."""
-        self._gather(np.zeros(len(indices), dtype=np.uint8), indices, _COUNT)
+    def count(self, points: NDArray[np.float64], to_index: NDArray[np.float64]) -> None:
+        """Count pixels that will be inserted; only for medians."""
+        self._gather(np.zeros(len(points), dtype=np.uint8), points, to_index, _COUNT)
 
-    def insert(self, pixels: NDArray[np.uint8], indices: NDArray[np.float64]) -> None:
-        """Insert pixels (P,) at indices (P, 3) of the grid; nan is left out.
+    def insert(
+        self,
+        pixels: NDArray[np.uint8],
+        points: NDArray[np.float64],
+        to_index: NDArray[np.float64],
+    ) -> None:
+        """Insert pixels (P,) at points (P, 3), which (3, 4) takes to the grid; nan is left out.
 
         Raises:
             VolumeError: the free memory does not hold all pixels for their medians.
@@ -69,7 +74,7 @@ class Insertion:
             check_memory(float(ends[-1]), f"keeping {ends[-1]} pixels for their medians")
             self._cursor = np.concatenate([[0], ends[:-1]])
             self._values = np.empty(max(int(ends[-1]), 1), dtype=np.uint8)
-        self._gather(pixels, indices, self._mode)
+        self._gather(pixels, points, to_index, self._mode)
 
     def result(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Grey values (i, j, k), 0 where no pixel came, and where some did."""
@@ -81,16 +86,26 @@ class Insertion:
         covered = self._gathered[:, 1] > 0.0
         return grey.reshape(self._shape), covered.reshape(self._shape)
 
-    def _gather(self, pixels: NDArray[np.uint8], indices: NDArray[np.float64], mode: int) -> None:
+    def _gather(
+        self,
+        pixels: NDArray[np.uint8],
+        points: NDArray[np.float64],
+        to_index: NDArray[np.float64],
+        mode: int,
+    ) -> None:
         places = self._linear, mode, self._gathered, self._cursor, self._values
-        _insert(pixels, np.ascontiguousarray(indices), self._shape, *places)
+        _insert(pixels, np.ascontiguousarray(points), to_index.copy(), self._shape, *places)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _insert(pixels, indices, shape, linear, mode, gathered, cursor, values):
-    """Insert pixels (P,) at indices (P, 3) into gathered (N, 2), or cursor (N,) and values."""
+def _insert(pixels, points, to_index, shape, linear, mode, gathered, cursor, values):
+    """Insert pixels (P,) at points (P, 3) into gathered (N, 2), or cursor (N,) and values."""
+    m = to_index
     for p in range(pixels.shape[0]):
-        x, y, z = indices[p, 0], indices[p, 1], indices[p, 2]
+        a, b, c = points[p, 0], points[p, 1], points[p, 2]
+        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
+        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c + m[1, 3]
+        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
         if math.isnan(x):
             continue
         if not linear:
@@ -102,14 +117,13 @@ def _insert(pixels, indices, shape, linear, mode, gathered, cursor, values):
         fx, fy, fz = x - i, y - j, z - k
         inside = 0 <= i < shape[0] - 1 and 0 <= j < shape[1] - 1 and 0 <= k < shape[2] - 1
         if inside and mode == _MEAN:  # as below, in a third of the time
-            for a in range(2):
-                for b in range(2):
-                    voxel = ((i + a) * shape[1] + j + b) * shape[2] + k
-                    flat = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
-                    for c in range(2):
-                        weight = np.float32(flat * (fz if c else 1.0 - fz))
-                        gathered[voxel + c, 0] += weight * np.float32(pixels[p])
-                        gathered[voxel + c, 1] += weight
+            voxel = (i * shape[1] + j) * shape[2] + k
+            value, next_row = np.float32(pixels[p]), shape[2]
+            _add_two(gathered, voxel, (1.0 - fx) * (1.0 - fy), fz, value)
+            _add_two(gathered, voxel + next_row, (1.0 - fx) * fy, fz, value)
+            voxel += shape[1] * next_row
+            _add_two(gathered, voxel, fx * (1.0 - fy), fz, value)
+            _add_two(gathered, voxel + next_row, fx * fy, fz, value)
             continue
         for a in range(2):
             for b in range(2):
@@ -128,6 +142,17 @@ def _insert(pixels, indices, shape, linear, mode, gathered, cursor, values):
                         cursor,
                         values,
                     )
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _add_two(gathered, voxel, weight, fraction, value):
+    """Add a value of a weight to a voxel and the next along the last axis."""
+    second = np.float32(weight * fraction)
+    first = np.float32(weight) - second
+    gathered[voxel, 0] += first * value
+    gathered[voxel, 1] += first
+    gathered[voxel + 1, 0] += second * value
+    gathered[voxel + 1, 1] += second
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ Progress = Callable[[float, str], None]  # is told the fraction done, and the wo
 Rest = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 """Takes the index of a frame and points (N, 3) m of it; where these lie while nothing presses."""
 
+_TILE = 32  # pixels along a side
 _LARGEST_PIXEL = 0.01  # m; a larger one is of a matrix that is no image's
 
 APART = 8
@@ -52,15 +54,31 @@ class Plan:
         asked = self.compounding.hole_radius
         return 2.0 * self.grid.spacing if asked is None else asked
 
-    def indices(self, k: int) -> NDArray[np.float64]:
-        """(N, 3) of a frame's used pixels in the grid, at rest where that is known."""
+    @cached_property
+    def _pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows (N,) and columns (N,) of the used pixels, tile by tile.
+
+        So voxels are in the cache when the next row of pixels comes to them.
+        """
         rows, columns = np.nonzero(self.used)
+        order = np.lexsort((columns, rows, columns // _TILE, rows // _TILE))
+        return rows[order], columns[order]
+
+    def values(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the used pixels (N,) of an image."""
+        return image[self._pixels]
+
+    def places(self, k: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return points (N, 3) of a frame's used pixels, and what takes them to the grid (3, 4).
+
+        They are at rest where that is known.
+        """
+        rows, columns = self._pixels
+        points = np.column_stack([columns, rows, np.zeros(len(rows))])
         to_index, matrix = self.grid.reference_to_index, self.sweep.image_to_reference[k]
         if self.rest is None:
-            step = to_index @ matrix
-            return columns[:, None] * step[:3, 0] + rows[:, None] * step[:3, 1] + step[:3, 3]
-        points = columns[:, None] * matrix[:3, 0] + rows[:, None] * matrix[:3, 1] + matrix[:3, 3]
-        return self.rest(k, points) @ to_index[:3, :3].T + to_index[:3, 3]
+            return points, (to_index @ matrix)[:3]
+        return self.rest(k, points @ matrix[:3, :3].T + matrix[:3, 3]), to_index[:3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +143,16 @@ def reconstruct(
         VolumeError: the images are damaged, the free memory does not hold the volume, or nothing
             of them lies in the grid.
     """
-    sweep, settings, used = planned.sweep, planned.compounding, planned.used
+    sweep, settings = planned.sweep, planned.compounding
     frames = list(range(len(sweep.numbers)) if which is None else which)
     tell = progress or (lambda *_: None)
     inserted = Insertion(planned.grid, method=settings.method, compounding=settings.compounding)
     if inserted.is_median:
         for k in frames:
-            inserted.count(planned.indices(k))
+            inserted.count(*planned.places(k))
     for done, (k, image) in enumerate(zip(frames, sweep.images(frames), strict=True)):
         tell(_FILLING * done / len(frames), "inserting images")
-        inserted.insert(image[used], planned.indices(k))
+        inserted.insert(planned.values(image), *planned.places(k))
     grey, covered = inserted.result()
     del inserted
     hit = int(np.count_nonzero(covered))
@@ -204,7 +222,8 @@ def _predicted(planned: Plan, made: Reconstruction, k: int, image: NDArray[np.ui
 
     It is nan for fewer than 100 such pixels.
     """
-    index = planned.indices(k).T
+    points, matrix = planned.places(k)
+    index = matrix[:, :3] @ points.T + matrix[:, 3:]
     whole = ndimage.map_coordinates(made.covered.view(np.uint8), index, np.float32, order=1)
     used = np.isfinite(index[0]) & (whole > 1.0 - 1e-5)
     if used.sum() < 100:
@@ -212,4 +231,4 @@ def _predicted(planned: Plan, made: Reconstruction, k: int, image: NDArray[np.ui
     predicted = ndimage.map_coordinates(
         made.volume.intensities, index[:, used], np.float64, order=1
     )
-    return correlation(image[planned.used][used].astype(np.float64), predicted)
+    return correlation(planned.values(image)[used].astype(np.float64), predicted)
