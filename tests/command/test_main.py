@@ -70,7 +70,7 @@ def test_bad_input_is_one_sentence(args, words, capsys):
         (["vew"], "view"),
         (["view", "--recrod", "a.mcap"], "--record"),
         (["view", "--recrod=a.mcap"], "--record"),
-        (["calibrate", "prob"], "probe"),
+        (["calibrate", "landmark"], "landmarks"),
         (["evaluate", "hand", "--sed", "1"], "--seed"),
     ],
 )
