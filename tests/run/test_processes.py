@@ -1,5 +1,6 @@
 """Node processes: parameters, signals and threads; one simulation on a ROS domain."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -46,7 +47,10 @@ def wait_until(condition):
 
 def files_of(pid):
     """Lock files of Fast DDS that a process holds."""
-    links = [os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()]
+    links = []
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # it has just been closed
+            links.append(os.readlink(link))
     return [Path(link) for link in links if link.startswith("/dev/shm/fastrtps_")]
 
 

@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from us_sim.errors import BagError, TrackingError
 from us_sim.geometry.pose import Pose
@@ -146,6 +145,8 @@ def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]
     They are made at the stamps of the link that moves least often, and the others interpolated
     there; without a pose where one of them is not known then.
     """
+    from scipy.spatial.transform import Rotation
+
     links: dict[str, list[Row]] = {}
     fixed: set[str] = set()
     static = f"{topic.name}_static"

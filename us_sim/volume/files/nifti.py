@@ -6,7 +6,6 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -69,6 +68,8 @@ def nifti_fields(path: Path) -> dict[str, bytes]:
 
 def _opened(path: Path) -> Any:
     """Open an image without its voxels."""
+    import nibabel  # which takes half a second
+
     try:
         image = nibabel.load(path)
         if not isinstance(image, nibabel.Nifti1Pair):  # type: ignore[attr-defined]

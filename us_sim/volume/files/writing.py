@@ -12,7 +12,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import nibabel
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
@@ -234,6 +233,8 @@ def _write_image(
     with partial_file(path, f"image{ending}") as partial:
         if ending.startswith(".nii"):  # ITK refuses axes that are rounded
             matrix = np.diag([-1e3, -1e3, 1e3, 1.0]) @ volume.index_to_patient
+            import nibabel  # which takes half a second
+
             nifti = nibabel.Nifti1Image(voxels, matrix)  # type: ignore[attr-defined,no-untyped-call]
             nifti.header.set_xyzt_units("mm")
             nifti.to_filename(partial)

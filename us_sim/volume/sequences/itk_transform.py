@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
@@ -25,6 +24,8 @@ def read_slicer_transform(path: str | Path) -> NDArray[np.float64]:
     Raises:
         VolumeError: it cannot be read, or holds none that is linear in 3D and has an inverse.
     """
+    import SimpleITK as sitk  # which takes a tenth of a second
+
     path = Path(path)
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file")
