@@ -122,7 +122,7 @@ def test_files_that_cannot_be_used_say_why_in_a_sentence(tmp_path):
         with pytest.raises(TrackingError, match=sentence):
             read_tracker_recording(path)
     for arguments, sentence in (
-        (([good], {"end": ""}), "ends within its header"),
+        (([good], {"end": ""}), "cut within its header"),
         (([good], {"size": "0 0 none"}), "DimSize"),
         (([{"Timestamp": "1"}], {}), "holds no transforms"),
         (([good | {"Timestamp": "nan"}], {}), "none of its 1 samples holds a time"),

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 Times = NDArray[np.int64]
 """ns, strictly increasing."""
@@ -40,6 +39,8 @@ def slerp(times: Times, poses: NDArray[np.float64], moments: Times) -> NDArray[n
     From one moment to the next a quaternion does not change its sign without need; the first has
     w of 0 or more.
     """
+    from scipy.spatial.transform import Rotation, Slerp  # players do without
+
     since, wanted = (times - moments[0]) * 1e-9, (moments - moments[0]) * 1e-9
     turns = Slerp(since, Rotation.from_quat(poses[:, 3:]))(wanted).as_quat()
     along = np.einsum("ij,ij->i", turns[1:], turns[:-1]) < 0
