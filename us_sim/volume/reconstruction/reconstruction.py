@@ -64,6 +64,12 @@ class Plan:
         order = np.lexsort((columns, rows, columns // _TILE, rows // _TILE))
         return rows[order], columns[order]
 
+    @cached_property
+    def _points(self) -> NDArray[np.float64]:
+        """(N, 3) of the used pixels in an image: column, row and 0."""
+        rows, columns = self._pixels
+        return np.column_stack([columns, rows, np.zeros(len(rows))])
+
     def values(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the used pixels (N,) of an image."""
         return image[self._pixels]
@@ -73,8 +79,7 @@ class Plan:
 
         They are at rest where that is known.
         """
-        rows, columns = self._pixels
-        points = np.column_stack([columns, rows, np.zeros(len(rows))])
+        points = self._points
         to_index, matrix = self.grid.reference_to_index, self.sweep.image_to_reference[k]
         if self.rest is None:
             return points, (to_index @ matrix)[:3]
