@@ -48,22 +48,16 @@ class Pose:
                 f"a pose needs 3 coordinates and 4 quaternion components, "
                 f"not {position.shape} and {orientation.shape}"
             )
-        if not (np.isfinite(position).all() and np.isfinite(orientation).all()):
-            raise PoseError(
-                f"the pose is not finite: position {position.tolist()}, "
-                f"orientation {orientation.tolist()}"
-            )
-        if np.abs(orientation).max() > _LONGEST:  # nor may the norm overflow
-            raise PoseError(
-                f"the pose's quaternion is {orientation.tolist()}, where one of length 1 is meant"
-            )
+        place, turn = position.tolist(), orientation.tolist()  # of few numbers faster than arrays
+        if not all(map(math.isfinite, (*place, *turn))):
+            raise PoseError(f"the pose is not finite: position {place}, orientation {turn}")
+        if max(map(abs, turn)) > _LONGEST:  # nor may the norm overflow
+            raise PoseError(f"the pose's quaternion is {turn}, where one of length 1 is meant")
         norm = float(np.linalg.norm(orientation))
         if norm < 1e-6:
             raise PoseError("the pose's quaternion is zero, so it has no orientation")
-        if np.abs(position).max() > _FARTHEST:
-            raise PoseError(
-                f"the pose is at {position.tolist()}, beyond any place: positions are in metres"
-            )
+        if max(map(abs, place)) > _FARTHEST:
+            raise PoseError(f"the pose is at {place}, beyond any place: positions are in metres")
         position.flags.writeable = False
         orientation /= norm
         orientation.flags.writeable = False

@@ -173,7 +173,8 @@ class Supervisor:
             self._processes[process.node] = process
             if process.node == RECORDER:
                 self.recordings.begin(process)
-        self._group.start(ready)
+        if ready:
+            self._group.start(ready)
 
     def end(self) -> None:
         """End all nodes; a recorder that had to be killed is lost."""
