@@ -34,20 +34,23 @@ _BESIDE = ("slicing", "evaluation", "tracking", "volume", "skin", "geometry")
 _RUNNING = ("graph/", "evaluation/latency")
 """Tests of whole graphs: sooner, their processes would compile what others just compile."""
 
+_PLAIN = "smoke or not (graph or browser or data or slow)"
+"""What a plain `pytest` runs."""
+
 _BY_GROUPS = pytest.StashKey[bool]()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Run everything in two processes, where nothing else was asked for."""
+    """Run the quick tests where nothing else was asked for, and all of a mark in two processes."""
     option = config.option
-    everything = config.args_source is pytest.Config.ArgsSource.TESTPATHS
-    chosen = option.keyword or option.markexpr or option.collectonly or option.usepdb
-    chosen = chosen or option.capture == "no"
+    if config.args_source is not pytest.Config.ArgsSource.TESTPATHS or _WORKER in os.environ:
+        return
+    if not (option.keyword or option.markexpr):
+        option.markexpr = _PLAIN
+    chosen = option.keyword or option.collectonly or option.usepdb or option.capture == "no"
     if (
-        everything
-        and not chosen
-        and _WORKER not in os.environ
+        not chosen
         and config.pluginmanager.hasplugin("xdist")
         and option.numprocesses is None
         and (os.cpu_count() or 1) > 1
@@ -74,9 +77,25 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Those that compile most come first; of them a process gets a whole group."""
+    """Mark the tests; those that compile most come first, and a process gets a whole group."""
+    for item in items:
+        if _file(item.nodeid).startswith(_RUNNING):
+            item.add_marker("graph")
+        names = getattr(item, "fixturenames", ())
+        if "browser" in names:
+            item.add_marker("browser")
+        if "shared_data" in names:
+            item.add_marker("data")
     if _WORKER in os.environ:
         items.sort(key=lambda item: _turn(item.nodeid))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Tell of a failure when it happens: a run of many minutes may be broken off."""
+    if report.failed and _WORKER not in os.environ:
+        crash = getattr(report.longrepr, "reprcrash", None)
+        reason = str(crash.message if crash else report.longrepr).partition("\n")[0]
+        print(f"\n{report.nodeid} ({report.when}): {reason[:200]}", flush=True)
 
 
 def _group(nodeid: str) -> str:
