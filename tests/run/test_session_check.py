@@ -12,6 +12,7 @@ from session_files import EPOCH, PERIOD, TYPES, press, write
 from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
+from us_sim.recording.schemas import stamped
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.write_behind import WriteBehind
@@ -189,6 +190,25 @@ def test_messages_that_were_exchanged_are_told(tmp_path):
     kind, text = broken(tmp_path, exchange)
     assert kind == "order"
     assert text.startswith(f"the numbers of {IMAGE} go back 1 time, first at 0.686 s")
+
+
+@pytest.mark.parametrize(
+    ("stamps", "logged", "is_told"),  # s
+    [
+        ([0.0, 20.0, 19.2], [0.0, 20.0, 19.2], False),
+        ([0.0, 20.0, 12.0], [0.0, 20.0, 20.1], False),
+        ([0.0, 20.0, 5.0], [0.0, 20.0, 20.1], True),
+    ],
+)
+def test_what_several_publish_may_come_in_another_order(tmp_path, stamps, logged, is_told):
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    with BagWriter(tmp_path / "several.mcap", sidecar=False) as bag:
+        bag.add_topic("/diagnostics", kind)
+        for number, (stamp, seconds) in enumerate(zip(stamps, logged, strict=True), 1):
+            came = EPOCH + round(1e9 * seconds)
+            report = stamped(kind, EPOCH + round(1e9 * stamp), "", status=[])
+            bag.write("/diagnostics", bytes(report), came, came, number)
+    assert bool(findings(tmp_path / "several.mcap")[1]) == is_told
 
 
 def test_stamps_that_go_back_are_told(tmp_path):

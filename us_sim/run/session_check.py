@@ -40,8 +40,8 @@ _REGULAR = 20  # messages of a topic, from which on its rate is known
 _APART = 1_000_000  # ns, by which two clocks may differ unnoticed
 _OTHER_TIME = 60 * 10**9  # ns of age, beyond which a stamp is of another recording
 _SHARED = ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray")
-"""Types of topics that many publish at once, each a little later than it stamps."""
-_SHARED_DELAY = 10**9  # ns, by which their stamps may go back
+"""Types of topics that many publish at once, each later than it stamps, and heard in any order."""
+_SHARED_DELAY = 10**10  # ns, by which their stamps may go back: a busy machine delays one for long
 _SEVERAL = 0.01  # of the numbers of a topic, that go back where several publishers count
 
 Times = NDArray[np.int64]
@@ -259,7 +259,7 @@ def _losses(each: TopicCheck, said: int, origin: int, one_counter: bool) -> Iter
         parts = np.split(numbers, np.flatnonzero(restarts))
         parts = [np.unique(part) for part in parts if len(part)]
         each.missing = sum(int(part[-1] - part[0]) + 1 - len(part) for part in parts)
-        if len(back):
+        if len(back) and each.topic.type_name not in _SHARED:
             yield Finding(
                 "order",
                 f"the numbers of {name} go back {counted(len(back), 'time')}, first at "
@@ -278,8 +278,8 @@ def _losses(each: TopicCheck, said: int, origin: int, one_counter: bool) -> Iter
             f"{name}{first}{also}: {remedy}",
         )
     elif said:
-        lost = counted(said, "message was", "messages were")
-        yield Finding("loss", f"{lost} of {name} lost, as the recorder says: {remedy}")
+        lost = f"{counted(said, 'message')} of {name} {'was' if said == 1 else 'were'} lost"
+        yield Finding("loss", f"{lost}, as the recorder says: {remedy}")
 
 
 def _gaps(each: TopicCheck, poses: TopicCheck | None, origin: int) -> Iterator[Finding]:
