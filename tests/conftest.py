@@ -72,6 +72,31 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         def _split_scope(self, nodeid: str) -> str:
             return _group(nodeid)
 
+        def remove_node(self, node: Any) -> str | None:
+            """Hand on what a process that crashed has not done, but for what it crashed with.
+
+            xdist 3.8 hands on what was done, too: a process that gets only that waits for ever.
+            """
+            units = self.assigned_work.pop(node)
+            left = [
+                test for unit in units.values() for test, is_done in unit.items() if not is_done
+            ]
+            for scope, unit in units.items():
+                open_tests = {test: False for test in unit if test in left[1:]}
+                if open_tests:
+                    self.workqueue[scope] = open_tests
+            for other in self.assigned_work:
+                self._reschedule(other)
+            return left[0] if left else None
+
+        def _reschedule(self, node: Any) -> None:
+            """Give a process work until two tests wait: it begins one when it knows the next."""
+            if node not in self.registered_collections:  # it has just been started
+                return
+            super()._reschedule(node)
+            while not node.shutting_down and self._pending_of(self.assigned_work[node]) < 2:
+                super()._reschedule(node)
+
     return Groups(config, log)
 
 
