@@ -56,7 +56,7 @@ def unknown(name: object, known: Iterable[str]) -> str:
     """That a name is not one of those known, and which was probably meant."""
     known = list(known)
     like = nearest(name, known)
-    if like and len(known) > _MANY:
-        return f"{shown(name)} is not known; did you mean '{like}'?"
     hint = f"; did you mean '{like}'?" if like else ""
+    if len(known) > _MANY:
+        return f"{shown(name)} is not known{hint}"
     return f"{shown(name)} is not one of {', '.join(known)}{hint}"

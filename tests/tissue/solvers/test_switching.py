@@ -3,6 +3,7 @@
 import importlib
 import itertools
 import os
+import pickle
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from us_sim.settings.registry import SOLVERS
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
 from us_sim.tissue.solvers import switching
-from us_sim.tissue.solvers.fem_cg import FemCgSettings
+from us_sim.tissue.solvers.fem_cg import FemCg, FemCgSettings
 from us_sim.tissue.solvers.solver import SolverSettings
 from us_sim.tissue.solvers.switching import (
     Failed,
@@ -241,6 +242,14 @@ def test_where_the_other_process_fails_this_one_compiles(slow, monkeypatch, capl
     monkeypatch.setenv("ALONE", str(os.getpid()))
     assert prepared(slow) == (SAID, 0)
     assert "no more memory" in caplog.text
+
+
+def test_the_other_process_ends_with_the_one_that_asked():
+    command = [sys.executable, "-m", switching.__name__]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as other:
+        pickle.dump((FemCg, block((3, 3, 3)), FemCgSettings()), other.stdin)
+        other.stdin.close()
+        assert other.wait(60) == 1
 
 
 def test_a_solver_that_no_other_process_can_import_is_compiled_here(slow):

@@ -424,8 +424,9 @@ def _make_elsewhere(
     assert process.stdout is not None
     said = ""
     with process:
-        with contextlib.suppress(BrokenPipeError), process.stdin:
+        with contextlib.suppress(BrokenPipeError):
             process.stdin.write(task)
+            process.stdin.flush()  # it stays open: where this process ends, so does the other
         for line in process.stdout:
             said = line.decode(errors="replace").strip() or said
             fraction, _, text = said.partition("\t")
@@ -441,13 +442,19 @@ def _main() -> None:
     if hasattr(os, "nice"):
         os.nice(5)  # it gives way to the process that deforms
     solver, model, settings = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with_asker, daemon=True).start()
 
     def show(fraction: float, text: str) -> None:
-        # When nobody reads any more, the pipe breaks, and this process ends.
         print(f"{fraction:.3f}\t{text}", flush=True)
 
     with contextlib.suppress(UsSimError):  # which the process that asked will find as well
         compiled_solver(solver, model, settings, show)
+
+
+def _end_with_asker() -> None:
+    """End this process, whatever it compiles, when nobody waits for it any more."""
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
 
 
 if __name__ == "__main__":
