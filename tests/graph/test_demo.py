@@ -38,6 +38,7 @@ def summary(demo):
     return json.loads((demo / "summary.json").read_text())
 
 
+@pytest.mark.smoke
 def test_every_topic_of_the_graph_is_recorded_with_type_and_stamps(demo):
     with AnyReader([demo]) as reader:
         types = {connection.topic: connection.msgtype for connection in reader.connections}

@@ -41,6 +41,7 @@ def feeds_of(simulator: Simulator) -> tuple[Feed, list[bool]]:
     return image, told
 
 
+@pytest.mark.smoke
 def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> None:
     image, _ = feeds_of(simulator)
     pixels = np.random.default_rng(1).integers(0, 256, (300, 512), dtype=np.uint8)
