@@ -98,7 +98,7 @@ def test_a_volume_file_is_segmented_into_a_folder(seeds, tmp_path, capsys):
     write_volume(tmp_path / "volume.mha", block())
     out = tmp_path / "made"
     words = ["segment", str(tmp_path / "volume.mha"), "--seeds", seeds, "--out", str(out)]
-    assert main([*words, "--decimation", "0.5 mm"]) == 0
+    assert main([*words, "--decimation", "0.5"]) == 0
     volume = read_volume(tmp_path / "volume.mha")
     assert read_labels(out / "labels.seg.nrrd", volume).voxels["vein"] == 240
     assert {path.name for path in out.iterdir()} == {

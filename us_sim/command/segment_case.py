@@ -37,7 +37,7 @@ from us_sim.volume.volume import LabelMap, Volume
 
 PICTURE = "segmentation.png"
 REPORT = "segmentation.md"
-_HEADING = ("structure", "volume", "triangles", "area", "parts", "handles", "volume kept", "moved")
+_HEADING = ("structure", "volume", "triangles", "area", "parts", "handles", "volume kept")
 
 Progress = Callable[[float, str], None]
 
@@ -231,8 +231,7 @@ def _report(made: Sequence[StructureSurface], remarks: Sequence[str]) -> str:
     lines += [
         "",
         "Volume is that of the labelled voxels; volume kept is what the surface encloses of it. "
-        "Handles count how often a surface has a hole right through. Moved is the largest distance "
-        "by which fewer triangles moved the surface.",
+        "Handles count how often a surface has a hole right through.",
         "",
         *(f"- {remark}" for remark in remarks),
     ]
@@ -249,5 +248,4 @@ def _cells(one: StructureSurface) -> tuple[str, ...]:
         str(surface.parts),
         str(surface.genus),
         f"{100 * one.volume_kept:.2f} %",
-        f"{one.moved * 1e3:.3f} mm",
     )

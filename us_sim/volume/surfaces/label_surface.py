@@ -69,7 +69,7 @@ def label_surface(
             f"allow more triangles"
         )
     wanted = np.count_nonzero(mask) / steps.prod()
-    one, other = (_enclosed(*marching_cubes(field, level)[:2]) for level in _LEVELS)
+    one, other = (abs(ClosedSurface(*marching_cubes(field, level)[:2]).volume) for level in _LEVELS)
     level = _LEVELS[0] + (wanted - one) / (other - one) * (_LEVELS[1] - _LEVELS[0])
     level = float(np.clip(level, 0.2, _LEVELS[0]))
     vertices, triangles = marching_cubes(field, level, gradient_direction="ascent")[:2]
@@ -125,11 +125,6 @@ def occurs(volume: Volume, label: int, within: NDArray[np.float64]) -> bool:
     return True
 
 
-def structure_name(volume: Volume, label: int) -> str:
-    """The name of a label, for a person."""
-    return volume.label_names.get(label, f"label {label}")
-
-
 def _numbered(volume: Volume, label: int) -> str:
     name = volume.label_names.get(label)
     return f"label {label} ({name})" if name else f"label {label}"
@@ -144,11 +139,6 @@ def _placed(
         triangles = triangles[:, ::-1]
     placed = indices @ matrix.T + volume.index_to_patient[:3, 3]
     return placed, np.ascontiguousarray(triangles, dtype=np.int32)
-
-
-def _enclosed(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> float:
-    a, b, c = vertices.astype(np.float64)[triangles.T]
-    return abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6
 
 
 def _voxels_of(

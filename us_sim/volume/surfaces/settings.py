@@ -25,7 +25,7 @@ class SurfaceSettings(Settings):
         default=None,
     )
     decimation: float = setting(
-        Quantity("length", 0.0, 0.05),
-        "triangles are joined as long as the surface stays within this distance, 0 for not",
+        Quantity("number", 0.0, 0.99),
+        "part of the triangles that is joined with others, 0 for none",
         default=0.0,
     )
