@@ -75,8 +75,8 @@ def test_a_broken_case_is_said_beside_the_good_ones(cases, capsys):
         (["cases", "--picture", "a.gif"], "must be a file that ends in .png"),
         (["run", "--dry-run"], "name a scene, or a case with --case"),
         (["run", "upper_arm", "--case", "arm", "--dry-run"], "the scene upper_arm is given too"),
-        (["demo", "--case", "amr"], "no case amr; cases are arm in"),
-        (["render", "--case", "", "--out", "x"], "there is no case"),
+        (["demo", "--case", "amr"], "did you mean 'arm'?"),
+        (["render", "--case", "", "--out", "x"], "there is no such case"),
     ],
 )
 @pytest.mark.usefixtures("cases")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.label_surface import voxel_surface
+from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
 from us_sim.volume.volume import LabelMap, Volume
 
 _AXES = ("i", "j", "k")
@@ -130,17 +128,26 @@ def _slice(panel: Any, volume: Volume, found: LabelMap, axis: int, index: int) -
 
 
 def _surfaces(panel: Any, volume: Volume, found: LabelMap) -> None:
-    """The surfaces on a grid so coarse that they have few triangles."""
-    shown = _coarse_surfaces(volume, found)
-    for label, surface in shown:
-        normals = surface.crosses
-        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        light = normals @ np.array([0.4, -0.5, 0.77])
-        shade = (0.45 + 0.55 * np.clip(light, 0.0, 1.0))[:, None]
-        corners = 1e3 * surface.vertices[surface.triangles]
-        panel.add_collection3d(Poly3DCollection(corners, facecolors=shade * found.colours[label]))
-    points = 1e3 * np.concatenate([surface.vertices for _, surface in shown])
-    low, high = points.min(axis=0), points.max(axis=0)
+    """Draw the surfaces on a grid so coarse that they have few triangles."""
+    labelled = found.on(volume)
+    there = [label for label, name in found.names.items() if label and found.voxels[name]]
+    spacing = spacing_for(labelled, there, _MOST_TRIANGLES)
+    points = []
+    for label in there:
+        try:
+            vertices, triangles = label_surface(labelled, label, spacing)
+        except VolumeError:  # it is too thin for this grid
+            continue
+        corners = 1e3 * vertices[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        shade = 0.45 + 0.55 * np.clip(normals @ np.array([0.4, -0.5, 0.77]), 0.0, 1.0)
+        colours = shade[:, None] * found.colours[label]
+        panel.add_collection3d(Poly3DCollection(corners, facecolors=colours))
+        points.append(1e3 * vertices)
+    low, high = 1e3 * labelled.extent
+    if points:
+        low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
     reach = (high - low).max() / 2.0
     middle = (high + low) / 2.0
     panel.set_xlim(middle[0] - reach, middle[0] + reach)
@@ -151,20 +158,3 @@ def _surfaces(panel: Any, volume: Volume, found: LabelMap) -> None:
     for name, set_label in zip("LPS", labels, strict=True):
         set_label(f"{name}, mm", fontsize=8)
     panel.tick_params(labelsize=7)
-
-
-def _coarse_surfaces(volume: Volume, found: LabelMap) -> Sequence[tuple[int, ClosedSurface]]:
-    shown: Sequence[tuple[int, ClosedSurface]] = ()
-    for step in range(1, 64):
-        placement = volume.index_to_patient.copy()
-        placement[:3, :3] *= step
-        labels = np.ascontiguousarray(found.labels[::step, ::step, ::step])
-        coarse = Volume(labels, placement, labels, found.names)
-        # Six faces a voxel at most; a quick look before surfaces are made.
-        if np.count_nonzero(labels) ** (2 / 3) * 12 > 8 * _MOST_TRIANGLES:
-            continue
-        there = [label for label in found.names if (labels == label).any()]
-        shown = [(label, voxel_surface(coarse, label)[0]) for label in there]
-        if sum(len(surface.triangles) for _, surface in shown) <= _MOST_TRIANGLES:
-            break
-    return shown

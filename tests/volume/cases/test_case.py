@@ -146,10 +146,10 @@ def test_a_path_is_a_case_too_and_goes_first(roots, tmp_path):
 
 @pytest.mark.usefixtures("roots")
 def test_an_unknown_name_is_told_those_that_are_known():
-    with pytest.raises(CaseError, match=r"livr.* arm, liver .*mean liver\?"):
+    with pytest.raises(CaseError, match=r"livr.* arm, liver; .*mean 'liver'"):
         find_case("livr")
     for name in ("../one/nothing", ""):
-        with pytest.raises(CaseError, match="no case"):
+        with pytest.raises(CaseError, match="there is no"):
             find_case(name)
 
 

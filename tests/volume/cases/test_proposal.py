@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CaseError
 from us_sim.geometry.pose import Placement, Pose
-from us_sim.volume.cases.proposal import proposed_probe, proposed_start, with_proposal
+from us_sim.volume.cases.proposal import ScannedRegion, with_proposal
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.volume import Volume
@@ -35,13 +35,12 @@ def test_the_probe_that_scanned_a_fan_is_found(turn):
     true = Pose(np.array([0.01, -0.02, 0.0]), Rotation.from_rotvec(turn).as_quat())
     true = true @ Pose(np.array([0.0, 0.0, -0.06]))  # so that the fan is inside
     volume = scanned_by(true)
-    start = proposed_start(volume)
-    off = true.inverse() @ start.pose
-    assert start.proposed
+    region = ScannedRegion(volume)
+    off = true.inverse() @ region.middle_pose()
     assert np.linalg.norm(off.position) < 9e-3  # three voxels
     assert np.degrees(np.arccos(off.rotation[2, 2])) < 6.0
     assert abs(off.rotation[0, 0]) > 0.98  # along the array, from whichever end
-    probe = proposed_probe(volume, start)
+    probe = region.probe_at(region.middle_pose())
     assert probe.geometry == "convex"
     assert probe.array.given.depth == pytest.approx(0.12, abs=9e-3)
 
@@ -49,10 +48,11 @@ def test_the_probe_that_scanned_a_fan_is_found(turn):
 def test_a_block_is_taken_for_a_linear_arrays_whose_rows_are_its_second_axis():
     grid = np.diag([1e-3, 5e-4, 2e-3, 1.0])
     volume = Volume(np.full((40, 60, 30), 9, np.uint8), grid)
-    start = proposed_start(volume)
-    np.testing.assert_allclose(start.pose.rotation[:, 2], [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(start.position, [0.0195, 0.0, 0.029], atol=2e-3)
-    probe = proposed_probe(volume, start)
+    region = ScannedRegion(volume)
+    pose = region.middle_pose()
+    np.testing.assert_allclose(pose.rotation[:, 2], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(pose.position, [0.0195, 0.0, 0.029], atol=2e-3)
+    probe = region.probe_at(pose)
     assert probe.geometry == "linear"
     assert probe.array.given.depth == pytest.approx(0.03, abs=2e-3)
 
@@ -82,17 +82,17 @@ def test_the_start_moves_to_the_structures_and_not_to_layers():
 def test_the_probe_of_a_real_sweep_is_found_from_its_volume_alone(shared_data):
     file = shared_data / "imfusion-liver-sweep" / "liver_sweep_compounded_1mm.mha"
     volume = read_volume(file)
-    start = proposed_start(volume)
+    region = ScannedRegion(volume)
     # The middle pose of the sweep that the volume was made of (config/scenes/liver_sweep.yaml).
     middle = Pose(
         np.array([49.435e-3, 92.014e-3, 127.456e-3]),
         np.array([-0.792792, 0.12626, -0.013698, -0.596113]),
     )
-    off = middle @ start.pose
+    off = middle @ region.middle_pose()
     assert np.linalg.norm(off.position) < 6e-3
     assert np.degrees(np.arccos(off.rotation[2, 2])) < 5.0
     assert np.degrees(np.arccos(off.rotation[0, 0])) < 12.0
-    probe = proposed_probe(volume, start)
+    probe = region.probe_at(region.middle_pose())
     assert probe.geometry == "convex"
     assert probe.array.given.depth == pytest.approx(0.177, abs=4e-3)
 
@@ -100,7 +100,7 @@ def test_the_probe_of_a_real_sweep_is_found_from_its_volume_alone(shared_data):
 def test_a_volume_of_nothing_is_refused():
     empty = Volume(np.zeros((9, 9, 9), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
     with pytest.raises(CaseError, match="nothing to scan"):
-        proposed_start(empty)
+        ScannedRegion(empty).middle_pose()
 
 
 def test_a_start_is_a_pose_that_was_scanned_where_these_are_known():

@@ -63,7 +63,7 @@ def test_a_phased_arrays_fan_begins_in_a_point():
     found = fitted_part(fan_mask(0.1, 2e-3, 0.0, 0.14, -38, 38), SIDE)
     assert isinstance(found, Fan)
     assert found.radius[0] < 2e-3
-    assert math.degrees(found.opening_angle) == pytest.approx(76.0, abs=1.0)
+    assert math.degrees(np.diff(found.angles)[0]) == pytest.approx(76.0, abs=1.0)
 
 
 def test_a_rectangle_is_a_linear_arrays_and_a_shadow_in_it_does_no_harm():

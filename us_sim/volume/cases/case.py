@@ -25,7 +25,7 @@ from us_sim.errors import CaseError, UsSimError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
-from us_sim.settings.spelling import aligned, nearest, unknown
+from us_sim.settings.spelling import aligned, unknown
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.provenance import Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
@@ -182,7 +182,7 @@ def cases_in(root: Path) -> list[Path]:
 
 
 def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Path:
-    """The folder of a case, by its path or by its name in one of `case_roots`.
+    """Find the folder of a case, by its path or by its name in one of `case_roots`.
 
     Args:
         name: of the case, or its folder.
@@ -193,27 +193,20 @@ def find_case(name: str | os.PathLike[str], folders: Sequence[Path] = ()) -> Pat
     """
     path = Path(os.path.expanduser(name))
     places = [folder / path for folder in (*folders, Path.cwd())] if str(name) else []
-    for place in places:
-        if is_case(place):
-            return place.resolve()
-    known: dict[str, Path] = {}
-    for root in (roots := case_roots()):
-        for case in cases_in(root) if root.is_dir() else []:
-            known.setdefault(case.name, case)
-    if str(name) in known:
-        return known[str(name)].resolve()
+    roots = [root for root in case_roots() if root.is_dir()]
+    named = {case.name: case for root in reversed(roots) for case in cases_in(root)}
+    for case in (*filter(is_case, places), *([named[str(name)]] if str(name) in named else [])):
+        return case.resolve()
     if any(place.exists() for place in places):
         raise CaseError(f"{name}: is no case, as it has no {CASE}; `us-sim cases` lists some")
-    for folder in {place.parent for place in places} if path.name != str(path) else ():
-        beside = [path.with_name(case.name) for case in cases_in(folder)] if folder.is_dir() else []
-        if beside:
-            raise CaseError(f"there is no such case: {unknown(str(path), map(str, beside))}")
-    like = nearest(name, known)
-    there = f"cases are {', '.join(known)}" if known else "there is none"
-    raise CaseError(
-        f"there is no case {name}; {there} in {', '.join(map(str, roots))}"
-        + (f"; did you mean {like}?" if like else "")
-    )
+    known = sorted(named)
+    if path.name != str(path):
+        beside = {place.parent for place in places if place.parent.is_dir()}
+        known = [str(path.with_name(case.name)) for one in beside for case in cases_in(one)]
+    if not known:
+        where = ", ".join(map(str, case_roots()))
+        raise CaseError(f"there is no case {name}, and none at all in {where}")
+    raise CaseError(f"there is no such case: {unknown(str(name), known)}")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-import tempfile
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,7 +41,7 @@ def new_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         raise CaseError(f"{folder}: {problem}")
     if os.path.lexists(place):
         raise CaseError(f"{place}: exists already; choose another name, or remove it")
-    with partial_folder(place, CaseError) as partial:
+    with _partial_folder(place) as partial:
         yield partial
         _finish(place, partial)
 
@@ -54,7 +54,7 @@ def changed_case(folder: str | os.PathLike[str]) -> Iterator[Path]:
         CaseError: there is no case, it cannot be copied, or what was written is none.
     """
     folder = read_case(folder).folder
-    with partial_folder(folder, CaseError, replaced=True) as partial:
+    with _partial_folder(folder, replaced=True) as partial:
         try:
             shutil.copytree(folder, partial, dirs_exist_ok=True)
         except (OSError, shutil.Error) as error:
@@ -131,22 +131,18 @@ def _finish(folder: Path, partial: Path) -> None:
 
 
 @contextmanager
-def partial_folder(
-    folder: Path, error_type: type[CaseError | VolumeError], *, replaced: bool = False
-) -> Iterator[Path]:
-    """A folder to fill beside another, whose place it takes at the end; on any error it is removed.
+def _partial_folder(folder: Path, *, replaced: bool = False) -> Iterator[Path]:
+    """Make a folder to fill, which takes another's place at the end; on any error it is removed.
 
     Raises:
-        CaseError, VolumeError: as asked for, it cannot be made.
+        CaseError: it cannot be made.
     """
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+        partial = folder.with_name(f".{folder.name}.partial-{uuid.uuid4().hex}")
+        partial.mkdir()
     except OSError as error:
-        raise error_type(f"{folder}: cannot be made: {error.strerror}") from error
-    mask = os.umask(0)
-    os.umask(mask)
-    partial.chmod(0o777 & ~mask)  # as any folder; mkdtemp's are the owner's alone
+        raise CaseError(f"{folder}: cannot be made: {error.strerror}") from error
     before = partial.with_name(partial.name.replace(".partial-", ".before-"))
     try:
         yield partial
@@ -157,7 +153,7 @@ def partial_folder(
         except OSError as error:
             if before.exists():
                 os.rename(before, folder)
-            raise error_type(f"{folder}: cannot be written: {error.strerror}") from error
+            raise CaseError(f"{folder}: cannot be written: {error.strerror}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(before, ignore_errors=True)

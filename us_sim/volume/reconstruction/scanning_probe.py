@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening
+from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes, binary_opening
 from scipy.ndimage import label as connected_parts
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -26,7 +26,7 @@ from us_sim.settings.registry import PROBES
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
-_COUNTED = 80.0  # percent of an edge's points that may not be farther off than is allowed
+_COUNTED = 80.0  # percent of the border's points that may not be farther off than is allowed
 _LEAST_POINTS = 16  # of an edge
 _NARROW = math.radians(4.0)  # opening angle below which it is no fan
 _POINT = 5e-3  # m: beams from a smaller arc are a phased array's, which all leave one place
@@ -40,13 +40,8 @@ class Fan:
     radius: tuple[float, float]  # where beams begin and end
     angles: tuple[float, float]  # of the first and last beam, from +z towards +x
 
-    @property
-    def opening_angle(self) -> float:
-        """Between the outermost beams."""
-        return self.angles[1] - self.angles[0]
-
     def holds(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points are in it."""
+        """Tell whether points are in it."""
         across, down = x - self.apex[0], z - self.apex[1]
         radius, angle = np.hypot(across, down), np.arctan2(across, down)
         held = (radius >= self.radius[0]) & (radius <= self.radius[1])
@@ -61,7 +56,7 @@ class Rectangle:
     z: tuple[float, float]
 
     def holds(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points are in it."""
+        """Tell whether points are in it."""
         held = (x >= self.x[0]) & (x <= self.x[1]) & (z >= self.z[0]) & (z <= self.z[1])
         return np.asarray(held)
 
@@ -75,7 +70,7 @@ class ScanningProbe:
 
 
 def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> ScanningProbe:
-    """The probe of a sweep, and where its face was.
+    """Find the probe of a sweep, and where its face was.
 
     It is the fan that the part names, or the shape that fits the images, or a linear array as wide
     as the rectangle that the part names. Where there is none of these, the middle of the pixels
@@ -105,7 +100,7 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
 
 
 def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
-    """(rows, columns) whether a pixel is not black in most of 32 frames all over a sweep.
+    """Tell (rows, columns) whether a pixel is not black in most of 32 frames all over a sweep.
 
     Raises:
         VolumeError: the images are damaged.
@@ -122,7 +117,7 @@ def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
 def fitted_part(
     seen: NDArray[np.bool_], pixel: NDArray[np.float64], used: NDArray[np.bool_] | None = None
 ) -> Fan | Rectangle | None:
-    """The fan or the rectangle that was scanned; None where neither fits.
+    """Fit the fan or the rectangle that was scanned; None where neither fits.
 
     Args:
         seen: (rows, columns) pixels that are not black.
@@ -133,18 +128,15 @@ def fitted_part(
     body = _body(seen & within)
     if body is None:
         return None
-    edges = _Edges(body, within, pixel)
-    rows, columns = np.indices(body.shape)
-    x, z = columns * pixel[0], rows * pixel[1]
+    z, x = np.indices(body.shape) * pixel[::-1, None, None]
     best: Fan | Rectangle | None = None
     least = 0.95  # intersection over union of the seen pixels with the shape
-    for part in (_rectangle(edges), _fan(edges)):
-        if part is None:
-            continue
-        inside = part.holds(x, z) & within
-        overlap = float((inside & body).sum() / max(1, (inside | body).sum()))
-        if overlap > least:
-            best, least = part, overlap
+    for part in (_rectangle(body, pixel), _fan(body, within, pixel)):
+        if part is not None:
+            inside = part.holds(x, z) & within
+            overlap = float((inside & body).sum() / max(1, (inside | body).sum()))
+            if overlap > least:
+                best, least = part, overlap
     return best
 
 
@@ -184,110 +176,81 @@ def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     return np.asarray(parts == int(np.argmax(np.bincount(parts.reshape(-1))[1:])) + 1)
 
 
-class _Edges:
-    """Points (N, 2) m, x and z, on the left, right, upper and lower border of a part.
-
-    Of the ``free`` ones those that the image cuts are left out.
-    """
-
-    def __init__(
-        self, body: NDArray[np.bool_], within: NDArray[np.bool_], pixel: NDArray[np.float64]
-    ) -> None:
-        around = np.pad(within, 1)
-        rows = np.flatnonzero(body.any(axis=1))
-        columns = np.flatnonzero(body.any(axis=0))
-        first = body[rows].argmax(axis=1)
-        last = body.shape[1] - 1 - body[rows, ::-1].argmax(axis=1)
-        top = body[:, columns].argmax(axis=0)
-        bottom = body.shape[0] - 1 - body[::-1, columns].argmax(axis=0)
-        self.pixel = pixel
-        self.height = len(rows) * float(pixel[1])
-        places = (
-            (first - 0.5, rows), (last + 0.5, rows), (columns, top - 0.5), (columns, bottom + 0.5)
-        )  # fmt: skip
-        self.all = [np.column_stack(place) * pixel for place in places]
-        left = around[rows + 1, first] & (np.arange(len(rows)) <= np.argmin(first))
-        right = around[rows + 1, last + 2] & (np.arange(len(rows)) <= np.argmax(last))
-        free = (left, right, around[top, columns + 1], around[bottom + 2, columns + 1])
-        self.free = [points[kept] for points, kept in zip(self.all, free, strict=True)]
-
-    def allowed(self, depth: float) -> float:
-        """m, by which most points of an edge may be off."""
-        return 0.01 * depth + 1.5 * float(self.pixel.max())
+def _rectangle(body: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
+    """The rectangle whose edges are the medians of a part's edges."""
+    sides = []
+    for lines, side in ((body, pixel[0]), (body.T, pixel[1])):
+        lines = lines[lines.any(axis=1)]
+        first = float(np.median(lines.argmax(axis=1))) - 0.5
+        last = lines.shape[1] - 0.5 - float(np.median(lines[:, ::-1].argmax(axis=1)))
+        sides.append((first * float(side), last * float(side)))
+    return Rectangle(*sides)
 
 
-def _rectangle(edges: _Edges) -> Rectangle | None:
-    places = [float(np.median(edges.all[k][:, k // 2])) for k in range(4)]
-    left, right, top, bottom = places
-    off = [np.percentile(np.abs(edges.all[k][:, k // 2] - places[k]), _COUNTED) for k in range(4)]
-    if max(off) > edges.allowed(bottom - top):
-        return None
-    return Rectangle((left, right), (top, bottom))
-
-
-def _fan(edges: _Edges) -> Fan | None:
-    """By its four edges together, with little weight on points that are far off."""
-    lines = _lines(edges)
+def _fan(
+    body: NDArray[np.bool_], within: NDArray[np.bool_], pixel: NDArray[np.float64]
+) -> Fan | None:
+    """The fan on whose edges the border of a part lies, but for where the image cuts it."""
+    border = body & ~binary_erosion(body) & binary_erosion(within)
+    lines = _lines(body, border, pixel)
     if lines is None:
         return None
-    left, right, over, under = _on_fan(edges.free, *lines)
-    apex, _, _ = lines
-    if len(over) < _LEAST_POINTS:
-        if len(_on_fan(edges.all, *lines)[2]) >= _LEAST_POINTS:
-            return None  # the image cuts off the face
-        over = edges.all[2][edges.all[2][:, 1].argmin()][None, :]  # the beams' common start
-    if len(under) < _LEAST_POINTS:
-        under = edges.all[3][edges.all[3][:, 1].argmax()][None, :]  # it cuts off the bottom
-    if min(len(left), len(right)) < _LEAST_POINTS:
-        return None
-    begins, ends = (float(np.median(np.hypot(*(each - apex).T))) for each in (over, under))
+    apex, *angles = lines
+    points = np.argwhere(border)[:, ::-1] * pixel  # (N, 2) m, x and z
+    radius, angle = np.hypot(*(points - apex).T), np.arctan2(*(points - apex).T)
+    everywhere = np.hypot(*(np.argwhere(body)[:, ::-1] * pixel - apex).T)
+    # Beside a corner a fan's top is its side rather than its face.
+    corner = 0.1 * (angles[1] - angles[0])
+    on_arc = (angle > angles[0] + corner) & (angle < angles[1] - corner)
+    half = 0.5 * (everywhere.min() + everywhere.max())
+    near, far = radius[on_arc & (radius < half)], radius[on_arc & (radius > half)]
+    if not len(near) and everywhere.min() > _POINT:
+        return None  # the image cuts off the face
+    # Where there is none of either, beams start in one place, or the image cuts off the bottom.
+    begins = float(np.median(near)) if len(near) else float(everywhere.min())
+    ends = float(np.median(far)) if len(far) else float(everywhere.max())
 
-    def off(shape: NDArray[np.float64] | list[float]) -> list[NDArray[np.float64]]:
+    def off(shape: NDArray[np.float64] | list[float]) -> NDArray[np.float64]:
+        """m, from points to the nearest of the fan's four edges."""
         x, z, first, last, begins, ends = shape
-        return [
-            (left - [x, z]) @ [math.cos(first), -math.sin(first)],
-            (right - [x, z]) @ [math.cos(last), -math.sin(last)],
-            np.hypot(*(over - [x, z]).T) - begins,
-            np.hypot(*(under - [x, z]).T) - ends,
-        ]
+        across, down = points[:, 0] - x, points[:, 1] - z
+        radius = np.hypot(across, down)
+        sides = [across * math.cos(each) - down * math.sin(each) for each in (first, last)]
+        return np.asarray(np.abs([*sides, radius - begins, radius - ends]).min(axis=0))
 
     fitted = least_squares(
-        lambda shape: np.concatenate(off(shape)),
-        [*apex, *lines[1:], begins, ends],
+        off,
+        [*apex, *angles, begins, ends],
         loss="soft_l1",
-        f_scale=float(edges.pixel.max()),
+        f_scale=float(pixel.max()),
         x_scale=[1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3],
     )
     x, z, first, last, begins, ends = map(float, fitted.x)
     if not (0.0 <= begins < ends and last - first > _NARROW):
         return None
-    worst = [np.percentile(np.abs(each), _COUNTED) for each in off(fitted.x) if len(each)]
-    if max(worst) > edges.allowed(ends - begins):
+    if np.percentile(off(fitted.x), _COUNTED) > 0.01 * (ends - begins) + 1.5 * pixel.max():
         return None
-    return Fan((x, z), (begins, ends), (first, last))
+    # From the centres of the outermost pixels to their border, which is half a pixel farther out.
+    side = 0.5 * float(pixel.mean())
+    back, middle = side / math.sin(0.5 * (last - first)), 0.5 * (first + last)
+    placed = (x - back * math.sin(middle), z - back * math.cos(middle))
+    return Fan(placed, (max(0.0, begins + back - side), ends + back + side), (first, last))
 
 
-def _on_fan(
-    edges: list[NDArray[np.float64]], apex: NDArray[np.float64], first: float, last: float
-) -> list[NDArray[np.float64]]:
-    """Of the points of four edges, those that lie where a fan's edges do."""
-    angles = [np.arctan2(*(points - apex).T) for points in edges]
-    # Beside a corner a fan's top is its side rather than its face.
-    middle, corner = 0.5 * (first + last), 0.1 * (last - first)
-    left, right, over, under = edges
-    across = (angles[2] > first + corner) & (angles[2] < last - corner)
-    below = (angles[3] > first) & (angles[3] < last)
-    return [left[angles[0] < middle], right[angles[1] > middle], over[across], under[below]]
-
-
-def _lines(edges: _Edges) -> tuple[NDArray[np.float64], float, float] | None:
+def _lines(
+    body: NDArray[np.bool_], border: NDArray[np.bool_], pixel: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float, float] | None:
     """A fan's apex (2,) m and the angles of its sides, at first."""
+    rows = np.flatnonzero(body.any(axis=1))
+    first = body[rows].argmax(axis=1)
+    last = body.shape[1] - 1 - body[rows, ::-1].argmax(axis=1)
     fits = []
-    for side in edges.free[:2]:
-        if len(side) < _LEAST_POINTS or np.ptp(side[:, 1]) < 0.25 * edges.height:
+    for side, widest in ((first, first.argmin()), (last, last.argmax())):
+        free = border[rows, side] & (np.arange(len(rows)) <= widest)
+        if free.sum() < max(_LEAST_POINTS, 0.25 * len(rows)):
             return None
-        some = side[:: 1 + len(side) // 200]
-        fits.append(theilslopes(some[:, 0], some[:, 1])[:2])
+        some = np.flatnonzero(free)[:: 1 + int(free.sum()) // 200]
+        fits.append(theilslopes(side[some] * pixel[0], rows[some] * pixel[1])[:2])
     (slope, base), (other, further) = fits
     if math.atan(other) - math.atan(slope) < _NARROW:
         return None
@@ -296,58 +259,58 @@ def _lines(edges: _Edges) -> tuple[NDArray[np.float64], float, float] | None:
 
 
 def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
+    """The transducer that scans a shape; None where it is none of the usual ones."""
+    values: dict[str, float] = {}
     if isinstance(shape, Rectangle):
-        kind, depth = "linear", shape.z[1] - shape.z[0]
-        values = {"aperture": round(shape.x[1] - shape.x[0], 5)}
+        kind, values["aperture"] = "linear", shape.x[1] - shape.x[0]
         if values["aperture"] > 0.08:  # m: a wider rectangle is something else
             return None
-    elif shape.radius[0] < _POINT:
-        kind, depth = "sector", shape.radius[1]
-        # Images do not show the aperture, m; this is that of usual phased arrays.
-        values = {"aperture": 0.02, "opening_angle": round(shape.opening_angle, 5)}
     else:
-        kind, depth = "convex", shape.radius[1] - shape.radius[0]
-        values = {"radius": round(shape.radius[0], 5)}
-        values["opening_angle"] = round(shape.opening_angle, 5)
+        values["opening_angle"] = shape.angles[1] - shape.angles[0]
+        # Images do not show the aperture, m; this is that of usual phased arrays.
+        is_point = shape.radius[0] < _POINT
+        kind = "sector" if is_point else "convex"
+        values |= {"aperture": 0.02} if is_point else {"radius": shape.radius[0]}
+    values["depth"] = _middle_beam(shape)[2]
     made: Any = PROBES.settings(kind)
     try:
-        array = Chosen(kind, made(**values, depth=round(depth, 5)))
+        array = Chosen(kind, made(**{key: round(value, 5) for key, value in values.items()}))
     except UsSimError:  # out of the range of probes
         return None
     return ProbeSettings(array=array, image=512)
+
+
+def _middle_beam(
+    shape: Fan | Rectangle,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Where it leaves the face (2,) m, its direction (2,), and its length, m."""
+    if isinstance(shape, Rectangle):
+        face = np.array([0.5 * sum(shape.x), shape.z[0]])
+        return face, np.array([0.0, 1.0]), shape.z[1] - shape.z[0]
+    angle = 0.5 * sum(shape.angles)
+    ahead = np.array([math.sin(angle), math.cos(angle)])
+    begins = shape.radius[0] if shape.radius[0] >= _POINT else 0.0
+    return shape.apex + begins * ahead, ahead, shape.radius[1] - begins
 
 
 def _poses(
     matrices: NDArray[np.float64], shape: Fan | Rectangle, pixel: NDArray[np.float64]
 ) -> tuple[Placement, ...]:
     """Of the middle of the probe's face at some frames, as far apart along the sweep as can be."""
-    if isinstance(shape, Rectangle):
-        face, ahead = np.array([0.5 * (shape.x[0] + shape.x[1]), shape.z[0]]), np.array([0.0, 1.0])
-        depth = shape.z[1] - shape.z[0]
-    else:
-        angle = 0.5 * (shape.angles[0] + shape.angles[1])
-        ahead = np.array([math.sin(angle), math.cos(angle)])
-        begins = shape.radius[0] if shape.radius[0] >= _POINT else 0.0
-        face, depth = shape.apex + begins * ahead, shape.radius[1] - begins
+    face, ahead, depth = _middle_beam(shape)
     middle = np.array([*((face + 0.5 * depth * ahead) / pixel), 0.0, 1.0])
     seen = (matrices @ middle)[:, :3]
     moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
     evenly = np.linspace(0.0, moved[-1], 33)
-    picked = np.unique(np.abs(moved[:, None] - evenly).argmin(axis=0))
-    return tuple(_pose(matrices[k], face / pixel, ahead) for k in picked)
-
-
-def _pose(
-    matrix: NDArray[np.float64], face: NDArray[np.float64], ahead: NDArray[np.float64]
-) -> Placement:
-    """Of the probe, from the place of its image (4, 4) and its middle beam in pixels."""
-    position = (matrix @ [*face, 0.0, 1.0])[:3]
-    across, down = (matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)).T
-    z = ahead[0] * across + ahead[1] * down
-    z /= np.linalg.norm(z)
-    x = across - (across @ z) * z
-    x /= np.linalg.norm(x)
-    orientation = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()
-    a, b, c = (round(float(value), 5) for value in position)
-    i, j, k, w = (round(float(value), 6) for value in orientation)
-    return Placement((a, b, c), (i, j, k, w))
+    poses = []
+    for matrix in matrices[np.unique(np.abs(moved[:, None] - evenly).argmin(axis=0))]:
+        across, down = (matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)).T
+        z = ahead[0] * across + ahead[1] * down
+        z /= np.linalg.norm(z)
+        x = across - (across @ z) * z
+        x /= np.linalg.norm(x)
+        turned = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()
+        a, b, c = (round(float(value), 5) for value in matrix[:3] @ [*(face / pixel), 0.0, 1.0])
+        i, j, k, w = (round(float(value), 6) for value in turned)
+        poses.append(Placement((a, b, c), (i, j, k, w)))
+    return tuple(poses)

@@ -109,7 +109,7 @@ def read_seeds(path: Path) -> SegmentationSettings:
 
 @dataclass(frozen=True)
 class SegmentRequest(Settings):
-    """Structures of a case or of a volume file, and their surfaces.
+    """Structures of a case, and their surfaces.
 
     They come from a file of labels, from seeds, or from a search for vessels; without any of these
     the surfaces of the labels that a case has are made anew.
@@ -117,7 +117,7 @@ class SegmentRequest(Settings):
 
     error = VolumeError
 
-    case: Path = setting(description="folder of a case, or a volume file")
+    case: Path = setting(description="folder of a case")
     labels: Path | None = setting(
         description="labels from this file: .seg.nrrd of 3D Slicer, NRRD, MHA or NIfTI",
         default=None,
@@ -141,12 +141,6 @@ class SegmentRequest(Settings):
     )
     formats: tuple[str, ...] = setting(
         description="of the surfaces", choices=SURFACE_FORMATS, default=("stl",)
-    )
-    report: bool = setting(
-        description="also write segmentation.md, with a table and what was remarked", default=False
-    )
-    out: Path | None = setting(
-        description="folder to make, where a volume file is segmented", default=None
     )
 
     def check(self) -> None:

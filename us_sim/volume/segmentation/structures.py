@@ -80,7 +80,7 @@ def _found(
         found &= image_of((distance <= asked.reach).astype(np.uint8), spacing)
     found = sitk.BinaryMorphologicalOpening(found, in_voxels(asked.open, found), sitk.sitkBall)
     found = sitk.BinaryMorphologicalClosing(found, in_voxels(asked.close, found), sitk.sitkBall)
-    mask = np.asarray(ndimage.binary_fill_holes(array_of(found)))
+    mask = array_of(sitk.BinaryFillhole(found)).astype(bool)
     if placed:
         parts, _ = ndimage.label(mask, np.ones((3, 3, 3)))
         mask = np.isin(parts, np.setdiff1d(parts[tuple(seeds.T)], 0))
