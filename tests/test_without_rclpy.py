@@ -55,7 +55,7 @@ print(json.dumps([main(words) for words in json.loads(sys.argv[1])]))
 
 SEEDS = """structures:
   vein: {method: growing, upper: 40, seeds_mm: [[0, 0, 19]]}
-  body: {method: growing, lower: 1, seeds_mm: [[0, 0, 40]], priority: -1}
+  body: {method: growing, lower: 1, seeds_mm: [[0, 0, 40]]}
 """
 
 

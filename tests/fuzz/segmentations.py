@@ -72,7 +72,7 @@ SEEDS = """structures:
     close: 1 mm
     colour: [0.2, 0.4, 1]
   muscle: {method: growing, lower: 50, seeds_voxel: [[0, 0, 0]], reach: 2 mm}
-  fat: {lower: 50, seeds_mm: [[6, 5, 5]], reach: 2 mm, priority: 2}
+  fat: {lower: 50, seeds_mm: [[6, 5, 5]], reach: 2 mm}
 """
 
 

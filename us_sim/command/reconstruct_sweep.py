@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
-from us_sim.volume.cases.provenance import Source, Step, add_step, settings_said
+from us_sim.volume.cases.provenance import Source, Step, add_step
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
@@ -33,7 +32,7 @@ from us_sim.volume.reconstruction.reconstruction import (
     plan,
     reconstruct,
 )
-from us_sim.volume.reconstruction.scanning_probe import ScanningProbe, scanning_probe
+from us_sim.volume.reconstruction.scanning_probe import scanning_probe
 from us_sim.volume.reconstruction.settings import VOLUME_ENDINGS, Compounding, ImagePart
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import Sweep, shifted, sweep_of
@@ -146,7 +145,10 @@ def reconstruct_sweep(
         picture = settings.out / "volume.png"
         with new_case(settings.out) as folder:
             write_volume(folder / "volume.nrrd", made.volume)
-            write_case_settings(folder, _case(settings, planned, scanner))
+            # Where the pressure is undone no pose is one that was scanned from.
+            scanned = () if planned.rest else scanner.poses
+            case = CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
+            write_case_settings(folder, case)
             add_step(folder, _step(settings, planned, made, prediction))
             draw_slices(folder / picture.name, made.volume, made.covered, size)
     sentences = [
@@ -173,15 +175,6 @@ def reconstruct_sweep(
     return "; ".join([*sentences, f"slices in {picture}"])
 
 
-def _case(settings: SweepSettings, planned: Plan, scanner: ScanningProbe) -> CaseSettings:
-    """The case's probe and its poses, as the sweep shows them.
-
-    The poses are those of a probe that pressed, so they are not said where that has been undone.
-    """
-    scanned = () if planned.rest else scanner.poses
-    return CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
-
-
 def _step(
     settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
 ) -> Step:
@@ -189,7 +182,6 @@ def _step(
     sources = [Source.of(settings.sweep, "tracked sequence")]
     if settings.calibration is not None:
         sources.append(Source.of(settings.calibration, "probe calibration"))
-    said = settings_said(dataclasses.replace(planned.compounding, spacing=planned.grid.spacing))
     counts: dict[str, int | float] = {
         "frames": made.frames,
         "frames left out": sum(planned.sweep.left_out.values()),
@@ -200,7 +192,8 @@ def _step(
         counts["frames predicted"] = len(prediction.frames)
         counts["correlation median"] = round(float(np.nanmedian(prediction.correlations)), 4)
         counts["correlation worst"] = round(float(np.nanmin(prediction.correlations)), 4)
-    more = {
+    said = {
+        "spacing": planned.grid.spacing,
         "method": planned.compounding.method,
         "compounding": planned.compounding.compounding,
         "hole_radius": planned.hole_radius,
@@ -208,7 +201,7 @@ def _step(
         "pressure undone": planned.rest is not None,
         "pixels used": int(planned.used.sum()),
     }
-    return Step("reconstructed", {**said, **more}, counts, tuple(sources))
+    return Step("reconstructed", said, counts, tuple(sources))
 
 
 def _prediction_said(prediction: Prediction, asked: int) -> str:

@@ -32,8 +32,8 @@ from us_sim.volume.segmentation.settings import (
 from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.structure_names import anatomical_colour
 from us_sim.volume.surfaces.settings import SurfaceSettings
+from us_sim.volume.surfaces.stl_file import write_stl
 from us_sim.volume.surfaces.structure_surface import StructureSurface, structure_surface
-from us_sim.volume.surfaces.surface_files import write_surface
 from us_sim.volume.volume import LabelMap, Volume
 
 PICTURE = "segmentation.png"
@@ -73,7 +73,7 @@ def segment_as_asked(
                 (folder / TISSUE).unlink()
                 remarks.append(f"{TISSUE} was made of other labels and is removed")
         write_case_settings(folder, settings)
-        _write(folder, volume, labels, made, asked.formats)
+        _write(folder, volume, labels, made)
         triangles = {f"triangles of {one.name}": len(one.surface.triangles) for one in made}
         add_step(folder, step)
         add_step(folder, Step("surfaces made", document_of(surfaces), triangles))
@@ -158,11 +158,7 @@ def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str
 
 
 def _write(
-    folder: Path,
-    volume: Volume,
-    labels: LabelMap,
-    made: Sequence[StructureSurface],
-    formats: Sequence[str],
+    folder: Path, volume: Volume, labels: LabelMap, made: Sequence[StructureSurface]
 ) -> None:
     """Write the surfaces and the picture into a folder."""
     from us_sim.command.volume_pictures import draw_segmentation
@@ -170,8 +166,7 @@ def _write(
     shutil.rmtree(folder / SURFACES, ignore_errors=True)
     (folder / SURFACES).mkdir()
     for one in made:
-        for kind in dict.fromkeys(formats):
-            write_surface(folder / SURFACES / f"{one.name}.{kind}", one.surface)
+        write_stl(folder / SURFACES / f"{one.name}.stl", one.surface)
     draw_segmentation(volume, labels, folder / PICTURE)
 
 

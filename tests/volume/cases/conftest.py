@@ -6,10 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.reading import Reader
+from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_labels, write_volume
 from us_sim.volume.volume import Volume
+
+PROBE = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
 
 
 @pytest.fixture(scope="session")
@@ -32,11 +36,12 @@ def make_case(tmp_path: Path, block: Volume) -> Callable[..., Path]:
         name: str = "block", settings: CaseSettings | None = None, *, labelled: bool = True
     ) -> Path:
         vein = {"vein": CaseStructure(6)} if labelled else {}
+        said = {"structures": vein, "start": CaseStart(), "probe": PROBE}  # to propose takes long
         with new_case(tmp_path / name) as folder:
             write_volume(folder / "volume.nrrd", block)
             if labelled:
                 write_labels(folder / "labels.nrrd", block)
-            write_case_settings(folder, settings or CaseSettings(name, structures=vein))
+            write_case_settings(folder, settings or CaseSettings(name, **said))
         return tmp_path / name
 
     return make

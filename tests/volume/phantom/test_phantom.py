@@ -178,14 +178,6 @@ def test_a_tilted_plane_is_one_sheet_of_the_given_thickness(angle):
     np.testing.assert_allclose(facing, np.cos(angle) ** 2, atol=1e-9)
 
 
-def test_a_round_tube_has_the_distance_of_a_circle():
-    tube = Tube((1e-3, 10e-3), (3e-3, 3e-3))
-    x, z = np.linspace(-5e-3, 7e-3, 25), np.linspace(4e-3, 16.3e-3, 24)
-    distance = tube.distance(x, 0.0, z)
-    radius = np.hypot(x[:, None] - 1e-3, z - 10e-3)
-    np.testing.assert_allclose(distance, radius - 3e-3, atol=1e-8)
-
-
 def test_an_elliptical_tube_follows_its_middle():
     tube = Tube((2e-3, 13e-3), (3.5e-3, 2.75e-3), swing=(1e-3, 0.5e-3), phase=0.3)
     for y in (-0.03, 0.0, 0.02):

@@ -72,14 +72,14 @@ def test_growing_takes_what_hangs_together_and_opening_parts_it(two_tubes):
     assert overlap(alone, other) == 0.0
 
 
-def test_of_structures_that_overlap_the_one_of_higher_priority_stays(two_tubes):
+def test_of_structures_that_overlap_the_first_stays(two_tubes):
     volume, tube, other = two_tubes
     all_dark = {"upper": 50, "seeds_voxel": [[42, 30, 15]]}
     left = {"method": "growing", "upper": 50, "seeds_voxel": [[20, 30, 15]], "open": "1.5 mm"}
-    made = found(volume, fluid=all_dark, vein=left | {"priority": 1})
-    assert made.names == {1: "fluid", 2: "vein"}
-    assert overlap(made.labels == 2, tube) > 0.95
-    assert (made.labels[other] == 1).mean() > 0.98
+    made = found(volume, vein=left, fluid=all_dark)
+    assert made.names == {1: "vein", 2: "fluid"}
+    assert overlap(made.labels == 1, tube) > 0.95
+    assert (made.labels[other] == 2).mean() > 0.98
     assert any("of fluid are in vein and stay there" in remark for remark in made.remarks)
     with pytest.raises(VolumeError, match="vein: all of it"):
         found(volume, fluid=all_dark, vein=left)

@@ -17,8 +17,6 @@ import yaml
 
 import us_sim
 from us_sim.errors import CaseError
-from us_sim.settings.reading import document_of
-from us_sim.settings.setting import Settings, rules_of
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.partial_file import partial_file
 
@@ -52,7 +50,7 @@ class Step:
 
     Args:
         what: in a word or a few, in the past: ``reconstructed``.
-        settings: numbers, truths, words, and lists and mappings of them; see `settings_said`.
+        settings: numbers, truths, words, and lists and mappings of them.
         counts: what there was to count: ``{"frames": 140, "frames left out": 3}``.
         sources: the files that went in.
         version: of us_sim.
@@ -63,13 +61,6 @@ class Step:
     counts: Mapping[str, int | float] = field(default_factory=dict)
     sources: tuple[Source, ...] = ()
     version: str = us_sim.__version__
-
-
-def settings_said(settings: Settings) -> dict[str, Any]:
-    """The settings that a step keeps: those not by default, without those that name files."""
-    files = {name for name, rule in rules_of(type(settings)).items() if rule.file}
-    said = {key: value for key, value in document_of(settings).items() if key not in files}
-    return {key: value for key, value in said.items() if not isinstance(value, Path)}
 
 
 def read_steps(folder: Path) -> tuple[Step, ...]:

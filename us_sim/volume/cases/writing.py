@@ -77,19 +77,22 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-Constants = Mapping[str, Mapping[str, float]]
-"""Constants of materials, such as ``young_modulus`` (Pa), by structure."""
+def write_constants_into(
+    folder: str | os.PathLike[str], constants: Mapping[str, Mapping[str, float]], step: Step
+) -> None:
+    """Write constants of materials into a case, and how they were found.
 
-
-def with_constants(settings: CaseSettings, constants: Constants) -> CaseSettings:
-    """A case with these constants by structure, `AROUND` for tissue outside of all.
+    Args:
+        folder: of the case.
+        constants: such as ``young_modulus`` (Pa), by structure, `AROUND` for tissue outside of all.
+        step: that found them.
 
     Raises:
-        CaseError: there is no such structure.
+        CaseError: there is no such case or structure, or it cannot be written.
         MaterialError: a constant is out of range.
     """
-    structures = dict(settings.structures)
-    around = settings.around
+    settings = read_case(folder).settings
+    structures, around = dict(settings.structures), settings.around
     for name, changed in constants.items():
         if name not in (AROUND, *structures):
             raise CaseError(f"{settings.name}: structure {unknown(name, (AROUND, *structures))}")
@@ -98,16 +101,7 @@ def with_constants(settings: CaseSettings, constants: Constants) -> CaseSettings
             around = material
         else:
             structures[name] = dataclasses.replace(structures[name], material=material)
-    return dataclasses.replace(settings, around=around, structures=structures)
-
-
-def write_constants_into(folder: str | os.PathLike[str], constants: Constants, step: Step) -> None:
-    """Write constants by structure into a case, and how they were found.
-
-    Raises:
-        CaseError: there is no such case or structure, or it cannot be written.
-    """
-    settings = with_constants(read_case(folder).settings, constants)
+    settings = dataclasses.replace(settings, around=around, structures=structures)
     with changed_case(folder) as partial:
         write_case_settings(partial, settings)
         add_step(partial, step)

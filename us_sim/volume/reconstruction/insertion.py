@@ -101,6 +101,7 @@ class Insertion:
 def _insert(pixels, points, to_index, shape, linear, mode, gathered, cursor, values):
     """Insert pixels (P,) at points (P, 3) into gathered (N, 2), or cursor (N,) and values."""
     m = to_index
+    around, half, fraction = (2, 0.0, 1.0) if linear else (1, 0.5, 0.0)
     for p in range(pixels.shape[0]):
         a, b, c = points[p, 0], points[p, 1], points[p, 2]
         x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c + m[0, 3]
@@ -108,71 +109,28 @@ def _insert(pixels, points, to_index, shape, linear, mode, gathered, cursor, val
         z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c + m[2, 3]
         if math.isnan(x):
             continue
-        if not linear:
-            i, j = np.int64(math.floor(x + 0.5)), np.int64(math.floor(y + 0.5))
-            k = np.int64(math.floor(z + 0.5))
-            _add(i, j, k, 1.0, pixels[p], shape, mode, gathered, cursor, values)
-            continue
-        i, j, k = np.int64(math.floor(x)), np.int64(math.floor(y)), np.int64(math.floor(z))
-        fx, fy, fz = x - i, y - j, z - k
-        inside = 0 <= i < shape[0] - 1 and 0 <= j < shape[1] - 1 and 0 <= k < shape[2] - 1
-        if inside and mode == _MEAN:  # as below, in a third of the time
-            voxel = (i * shape[1] + j) * shape[2] + k
-            value, next_row = np.float32(pixels[p]), shape[2]
-            _add_two(gathered, voxel, (1.0 - fx) * (1.0 - fy), fz, value)
-            _add_two(gathered, voxel + next_row, (1.0 - fx) * fy, fz, value)
-            voxel += shape[1] * next_row
-            _add_two(gathered, voxel, fx * (1.0 - fy), fz, value)
-            _add_two(gathered, voxel + next_row, fx * fy, fz, value)
-            continue
-        for a in range(2):
-            for b in range(2):
-                flat = (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
-                for c in range(2):
-                    weight = flat * (fz if c else 1.0 - fz)
-                    _add(
-                        i + a,
-                        j + b,
-                        k + c,
-                        weight,
-                        pixels[p],
-                        shape,
-                        mode,
-                        gathered,
-                        cursor,
-                        values,
-                    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _add_two(gathered, voxel, weight, fraction, value):
-    """Add a value of a weight to a voxel and the next along the last axis."""
-    second = np.float32(weight * fraction)
-    first = np.float32(weight) - second
-    gathered[voxel, 0] += first * value
-    gathered[voxel, 1] += first
-    gathered[voxel + 1, 0] += second * value
-    gathered[voxel + 1, 1] += second
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add(i, j, k, weight, pixel, shape, mode, gathered, cursor, values):
-    """Give voxel (i, j, k), where there is one, a pixel of a weight."""
-    if weight <= 0.0 or not (0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]):
-        return
-    voxel = (i * shape[1] + j) * shape[2] + k
-    if mode == _MEAN:
-        gathered[voxel, 0] += np.float32(weight * pixel)
-        gathered[voxel, 1] += np.float32(weight)
-    elif weight >= _LEAST_WEIGHT:
-        if mode == _MAX:
-            gathered[voxel, 0] = max(gathered[voxel, 0], np.float32(pixel))
-            gathered[voxel, 1] = 1.0
-        elif mode == _COUNT:
-            gathered[voxel, 1] += 1.0
-        else:
-            values[cursor[voxel]] = pixel
-            cursor[voxel] += 1
+        first_i, first_j = math.floor(x + half), math.floor(y + half)
+        first_k = math.floor(z + half)
+        fx, fy, fz = fraction * (x - first_i), fraction * (y - first_j), fraction * (z - first_k)
+        for i in range(max(first_i, 0), min(first_i + around, shape[0])):
+            for j in range(max(first_j, 0), min(first_j + around, shape[1])):
+                flat = (1.0 - fx if i == first_i else fx) * (1.0 - fy if j == first_j else fy)
+                for k in range(max(first_k, 0), min(first_k + around, shape[2])):
+                    weight = flat * (1.0 - fz if k == first_k else fz)
+                    voxel = (i * shape[1] + j) * shape[2] + k
+                    if mode == _MEAN:
+                        gathered[voxel, 0] += np.float32(weight * pixels[p])
+                        gathered[voxel, 1] += np.float32(weight)
+                    elif weight < _LEAST_WEIGHT:
+                        continue
+                    elif mode == _MAX:
+                        gathered[voxel, 0] = max(gathered[voxel, 0], np.float32(pixels[p]))
+                        gathered[voxel, 1] = 1.0
+                    elif mode == _COUNT:
+                        gathered[voxel, 1] += 1.0
+                    else:
+                        values[cursor[voxel]] = pixels[p]
+                        cursor[voxel] += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

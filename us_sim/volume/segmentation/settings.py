@@ -15,7 +15,6 @@ from us_sim.settings.registry import SEGMENTATIONS
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.structure_names import Colour, problem_with
-from us_sim.volume.surfaces.settings import SURFACE_FORMATS
 
 _MOST = 255
 _MILLIMETRES = Quantity("number", -1e5, 1e5)
@@ -60,11 +59,6 @@ class StructureSeeds(Settings):
     close: float = setting(
         _RADIUS, "gaps that a ball of this radius has no room in are filled", default=0
     )
-    priority: int = setting(
-        Quantity("number", -100, 100),
-        "where structures overlap the one of higher priority stays; of equal ones the first",
-        default=0,
-    )
     colour: Colour | None = setting(
         Quantity("number", 0.0, 1.0),
         "red, green, blue; not given: as the name suggests",
@@ -79,7 +73,7 @@ class StructureSeeds(Settings):
 
 @dataclass(frozen=True)
 class SegmentationSettings(Settings):
-    """The structures of a volume by name, in the order of their labels."""
+    """The structures of a volume by name, in the order of their labels; of two the first stays."""
 
     error = VolumeError
 
@@ -138,9 +132,6 @@ class SegmentRequest(Settings):
     )
     resample: bool = setting(
         description="take the nearest voxel of labels on another grid", default=False
-    )
-    formats: tuple[str, ...] = setting(
-        description="of the surfaces", choices=SURFACE_FORMATS, default=("stl",)
     )
 
     def check(self) -> None:

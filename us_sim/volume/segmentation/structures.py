@@ -25,13 +25,11 @@ def segment(
     """
     labels = np.zeros(volume.shape, np.uint8)
     names = dict(enumerate(settings.structures, start=1))
-    order = sorted(names, key=lambda number: -settings.structures[names[number]].priority)
     remarks: list[str] = []
-    for done, number in enumerate(order):
-        name = names[number]
+    for number, name in names.items():
 
-        def tell(part: float, work: str, done: int = done, name: str = name) -> None:
-            progress((done + part) / len(order), f"{name}: {work}" if work else name)
+        def tell(part: float, work: str, done: int = number - 1, name: str = name) -> None:
+            progress((done + part) / len(names), f"{name}: {work}" if work else name)
 
         tell(0.0, "")
         try:
@@ -45,8 +43,8 @@ def segment(
         free = mask & (there == 0)
         if not free.any():
             raise VolumeError(
-                f"structures.{name}: all of it is in structures that come before it: give it a "
-                f"higher priority, or leave it out"
+                f"structures.{name}: all of it is in structures that come before it: name it "
+                f"before them, or leave it out"
             )
         there[free] = number
     progress(1.0, "")

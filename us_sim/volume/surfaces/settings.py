@@ -1,4 +1,4 @@
-"""How surfaces are made of labels, and as which files."""
+"""How surfaces are made of labels."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-
-SURFACE_FORMATS = ("stl", "ply", "obj")  # file formats of surfaces
 
 
 @dataclass(frozen=True)
