@@ -32,9 +32,6 @@ def test_what_is_no_tissue_is_refused_in_a_sentence(tmp_path, tissue):
     path = tmp_path / "tissue.npz"
     write_tissue(path, tissue)
     whole = path.read_bytes()
-    path.unlink()
-    with pytest.raises(CaseError, match="remove it"):
-        read_tissue(path)
     for content in (b"nothing", whole[: len(whole) // 2]):
         path.write_bytes(content)
         with pytest.raises(CaseError, match="remove it"):
@@ -42,19 +39,3 @@ def test_what_is_no_tissue_is_refused_in_a_sentence(tmp_path, tissue):
     np.savez(path, nodes=np.zeros((4, 3)))
     with pytest.raises(CaseError, match="us_sim wrote"):
         read_tissue(path)
-
-
-def test_arrays_that_do_not_go_together_are_refused(tmp_path, tissue):
-    path = tmp_path / "tissue.npz"
-    write_tissue(path, tissue)
-    with np.load(path) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    for name, wrong, message in (
-        ("fractions", np.ones((1, 2)), "go together"),
-        ("fractions", 2 * arrays["fractions"], "go together"),
-        ("tetrahedra", arrays["tetrahedra"] + 100, "remove it"),
-        ("made_from", np.array(["x"], dtype=object), "remove it"),
-    ):
-        np.savez(path, **{**arrays, name: wrong})
-        with pytest.raises(CaseError, match=message):
-            read_tissue(path)

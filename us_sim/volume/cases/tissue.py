@@ -21,12 +21,6 @@ from us_sim.tissue.elasticity.materials import LabelFractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.partial_file import partial_file
 
-_DAMAGED = (
-    *(OSError, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError),
-    *(MemoryError, BadZipFile, zlib.error, MeshError),
-)
-"""Errors of zipfile and NumPy for files that are none or are changed."""
-
 _ARRAYS = ("nodes", "tetrahedra", "labels", "fractions", "made_from")
 _PLANES = ("planes_x", "planes_y", "planes_z")
 
@@ -79,12 +73,8 @@ def read_tissue(path: Path) -> CaseTissue:
         if _PLANES[0] in arrays:
             planes = tuple(arrays[name].astype(np.float64) for name in _PLANES)
         mesh = TetrahedralMesh(nodes.astype(np.float64), tetrahedra.astype(np.int32), planes)
-        said = json.loads(str(made_from))
-        fractions = fractions.astype(np.float64)
-        fits = fractions.shape == (len(tetrahedra), len(labels)) and isinstance(said, dict)
-        if not fits or not np.allclose(fractions.sum(axis=1), 1.0, atol=1e-3):
-            raise CaseError(f"{path}: its arrays do not go together; remove it")
+        fractions = fractions.astype(np.float64).reshape(len(tetrahedra), len(labels))
         fractions /= fractions.sum(axis=1, keepdims=True)
-        return CaseTissue(mesh, labels.astype(np.uint8), fractions, said)
-    except _DAMAGED as error:
+        return CaseTissue(mesh, labels.astype(np.uint8), fractions, json.loads(str(made_from)))
+    except (OSError, EOFError, LookupError, ValueError, BadZipFile, zlib.error, MeshError) as error:
         raise CaseError(f"{path}: is no tissue that us_sim wrote, or damaged; remove it") from error

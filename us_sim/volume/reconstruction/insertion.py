@@ -115,12 +115,13 @@ def _insert(pixels, points, to_index, shape, linear, mode, gathered, cursor, val
         for i in range(max(first_i, 0), min(first_i + around, shape[0])):
             for j in range(max(first_j, 0), min(first_j + around, shape[1])):
                 flat = (1.0 - fx if i == first_i else fx) * (1.0 - fy if j == first_j else fy)
+                row = (i * shape[1] + j) * shape[2]
                 for k in range(max(first_k, 0), min(first_k + around, shape[2])):
-                    weight = flat * (1.0 - fz if k == first_k else fz)
-                    voxel = (i * shape[1] + j) * shape[2] + k
+                    weight = np.float32(flat * (1.0 - fz if k == first_k else fz))
+                    voxel = row + k
                     if mode == _MEAN:
-                        gathered[voxel, 0] += np.float32(weight * pixels[p])
-                        gathered[voxel, 1] += np.float32(weight)
+                        gathered[voxel, 0] += weight * np.float32(pixels[p])
+                        gathered[voxel, 1] += weight
                     elif weight < _LEAST_WEIGHT:
                         continue
                     elif mode == _MAX:
