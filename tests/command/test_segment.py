@@ -5,8 +5,10 @@ import pytest
 import yaml
 
 from us_sim.command.main import main
+from us_sim.geometry.transducer import ProbeSettings
+from us_sim.settings.reading import Reader
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.cases.settings import CaseSettings, CaseStructure
+from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.writing import write_labels, write_volume
@@ -35,7 +37,10 @@ def case(tmp_path):
     structures = {"vein": CaseStructure(3, material="artery"), "bone": CaseStructure(1)}
     with new_case(tmp_path / "arm") as folder:
         write_volume(folder / "volume.nrrd", block())
-        settings = CaseSettings("arm", structures=structures, fixed=("bottom", "bone"))
+        probe = Reader("probe").read(ProbeSettings, {"aperture": "30 mm", "depth": "40 mm"})
+        start = CaseStart()  # to propose both takes long
+        fixed = ("bottom", "bone")
+        settings = CaseSettings("arm", "", "", probe, start, structures=structures, fixed=fixed)
         write_case_settings(folder, settings)
         (folder / "tissue.npz").write_bytes(b"of other labels")
     return tmp_path / "arm"
