@@ -236,7 +236,7 @@ MATRIX = "0.1 0 0 5 0 0.1 0 0 0 0 0.1 0 0 0 0 1"
             "a.xml",
             f'<a><Transform From="I" To="P" Matrix="{MATRIX}"/>'
             '<VolumeReconstruction FanAnglesDeg="4"/></a>',
-            "FanAnglesDeg",
+            "fan_angles",
         ),
         (
             "a.xml",

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError, VolumeError
-from us_sim.settings.spelling import counted
 from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.transforms import frame_matrix, in_metres
@@ -81,38 +80,27 @@ def _plus(path: Path, root: ElementTree.Element) -> SweepCalibration:
     return SweepCalibration(transforms, _part(path, root.find(".//VolumeReconstruction")))
 
 
-_COUNTS = {"ClipRectangleOrigin": 2, "ClipRectangleSize": 2, "FanOriginPixel": 2}
-_COUNTS |= {"FanAnglesDeg": 2, "FanRadiusStartPixel": 1, "FanRadiusStopPixel": 1}
-
-
 def _part(path: Path, element: ElementTree.Element | None) -> ImagePart:
+    """The clip rectangle and the fan of a ``<VolumeReconstruction>``."""
     if element is None:
         return ImagePart()
-    said: dict[str, list[float]] = {}
-    for key, count in _COUNTS.items():
-        text = element.get(key)
-        if text is None:
-            continue
-        try:
-            said[key] = [float(word) for word in text.split()]
-        except ValueError:
-            said[key] = []
-        if len(said[key]) != count:
-            raise VolumeError(
-                f"{path}: VolumeReconstruction: {key} is {text[:60]!r}; "
-                f"write {counted(count, 'number')}"
-            )
     given: dict[str, Any] = {}
-    size = said.get("ClipRectangleSize", [0.0])
-    if min(size) > 0.0 and "ClipRectangleOrigin" in said:
-        given["clip"] = [*said["ClipRectangleOrigin"], *size]
-    angles = said.get("FanAnglesDeg", [0.0])
-    if any(angles):  # Plus, too, takes two angles of 0 for no fan
-        given["fan_angles"] = [f"{angle!r} deg" for angle in sorted(angles)]
-        given["fan_origin"] = said.get("FanOriginPixel", [0.0, 0.0])
-        start, stop = said.get("FanRadiusStartPixel", [0.0]), said.get("FanRadiusStopPixel", [1e5])
-        given["fan_radius"] = [*start, *stop]
     try:
+        said = {
+            key: [float(word) for word in text.split()]
+            for key, text in element.items()
+            if key.startswith(("Clip", "Fan"))
+        }
+        size = said.get("ClipRectangleSize", [0.0])
+        if min(size) > 0.0 and "ClipRectangleOrigin" in said:
+            given["clip"] = [*said["ClipRectangleOrigin"], *size]
+        angles = said.get("FanAnglesDeg", [0.0])
+        if any(angles):  # Plus, too, takes two angles of 0 for no fan
+            given["fan_angles"] = [f"{angle!r} deg" for angle in sorted(angles)]
+            given["fan_origin"] = said.get("FanOriginPixel", [0.0, 0.0])
+            begins = said.get("FanRadiusStartPixel", [0.0])
+            given["fan_radius"] = [*begins, *said.get("FanRadiusStopPixel", [1e5])]
         return ImagePart(**given)
-    except UsSimError as error:
-        raise VolumeError(f"{path}: VolumeReconstruction: {error}") from error
+    except (ValueError, UsSimError) as error:
+        key = f"{error.key}: " if isinstance(error, UsSimError) and error.key else ""
+        raise VolumeError(f"{path}: VolumeReconstruction: {key}{error}") from error
