@@ -112,6 +112,20 @@ def _insert(pixels, points, to_index, shape, linear, mode, gathered, cursor, val
         first_i, first_j = math.floor(x + half), math.floor(y + half)
         first_k = math.floor(z + half)
         fx, fy, fz = fraction * (x - first_i), fraction * (y - first_j), fraction * (z - first_k)
+        fits = 0 <= first_i < shape[0] - 1 and 0 <= first_j < shape[1] - 1
+        if linear and mode == _MEAN and fits and 0 <= first_k < shape[2] - 1:
+            value = np.float32(pixels[p])  # as below, in less time
+            for corner in range(4):
+                i, j = corner // 2, corner % 2
+                flat = (fx if i else 1.0 - fx) * (fy if j else 1.0 - fy)
+                voxel = ((first_i + i) * shape[1] + first_j + j) * shape[2] + first_k
+                second = np.float32(flat * fz)
+                first = np.float32(flat) - second
+                gathered[voxel, 0] += first * value
+                gathered[voxel, 1] += first
+                gathered[voxel + 1, 0] += second * value
+                gathered[voxel + 1, 1] += second
+            continue
         for i in range(max(first_i, 0), min(first_i + around, shape[0])):
             for j in range(max(first_j, 0), min(first_j + around, shape[1])):
                 flat = (1.0 - fx if i == first_i else fx) * (1.0 - fy if j == first_j else fy)
