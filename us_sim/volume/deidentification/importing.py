@@ -24,7 +24,7 @@ from us_sim.volume.deidentification.source import (
     dicom_source,
     file_source,
 )
-from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
+from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
 from us_sim.volume.files.readers import ENDINGS
 from us_sim.volume.files.writing import write_image_sequence, write_volume
 from us_sim.volume.volume import Volume
@@ -189,11 +189,9 @@ def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> So
         return file_source(paths[0], settings.volume, spacing or None)
     strange = [*others, *(path for path in paths if path not in others and not is_dicom(path))]
     if strange:
-        if packed := packed_in(strange[0]):
-            raise VolumeError(f"{strange[0]}: is packed as {packed}; unpack it first")
-        raise VolumeError(
-            f"{strange[0]}: is no DICOM file; give the DICOM files of one series, or one MHA, NRRD "
-            f"or NIfTI volume"
+        raise refuse_other(
+            strange[0],
+            "is no DICOM file; give DICOM files of one series, or one MHA, NRRD or NIfTI volume",
         )
     return dicom_source(paths, settings.volume, spacing, needs_volume=needs_volume)
 

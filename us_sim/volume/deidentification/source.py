@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.deidentification.kept_values import dropped_names, kept_values
 from us_sim.volume.deidentification.settings import Rectangle
-from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, text, whole
+from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, text
 from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
 from us_sim.volume.files.dicom.planes import frame_times, is_cartesian
@@ -177,7 +177,7 @@ def _ultrasound_regions(file: DicomFile, rows: int, columns: int) -> Regions:
     kept, blanked = [], 0
     for region in listed:
         keys = ("MinX0", "MinY0", "MaxX1", "MaxY1")
-        edges = [whole(region, f"RegionLocation{key}") for key in keys]
+        edges = [number(region, f"RegionLocation{key}") for key in keys]
         if any(edge is None for edge in edges):
             return Regions(doubt="a region has no edges")
         left, top, right, bottom = (int(edge or 0) for edge in edges)
@@ -188,7 +188,7 @@ def _ultrasound_regions(file: DicomFile, rows: int, columns: int) -> Regions:
         part = Rectangle(left, top, min(right, columns - 1), min(bottom, rows - 1))
         if min(part.size) < 1:
             return Regions(doubt="a region holds no pixel")
-        kinds = whole(region, "RegionSpatialFormat"), whole(region, "RegionDataType")
+        kinds = number(region, "RegionSpatialFormat"), number(region, "RegionDataType")
         if kinds in ((1, 1), (1, 2)):  # two-dimensional, of tissue or of colour flow
             kept.append(Region(part, _region_scale(region)))
         else:
@@ -199,7 +199,7 @@ def _ultrasound_regions(file: DicomFile, rows: int, columns: int) -> Regions:
 
 
 def _region_scale(region: Any) -> Scale | None:
-    units = whole(region, "PhysicalUnitsXDirection"), whole(region, "PhysicalUnitsYDirection")
+    units = number(region, "PhysicalUnitsXDirection"), number(region, "PhysicalUnitsYDirection")
     x, y = number(region, "PhysicalDeltaX"), number(region, "PhysicalDeltaY")
     if units != (3, 3) or not x or not y:  # centimetres
         return None

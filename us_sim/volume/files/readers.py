@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import dicom_files, is_dicom, packed_in
+from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
 from us_sim.volume.files.metaimage import metaimage_header, metaimage_image
 from us_sim.volume.files.nifti import nifti_image
 from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
@@ -106,11 +106,8 @@ def open_image(
     if not path.is_file():
         raise VolumeError(f"{path}: is not a file; give one MHA, NRRD, NIfTI or DICOM volume")
     if not path.name.lower().endswith(ENDINGS):
-        if packed := packed_in(path):
-            raise VolumeError(f"{path}: is packed as {packed}; unpack it first")
-        raise VolumeError(
-            f"{path}: cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume, which "
-            f"3D Slicer makes of others"
+        raise refuse_other(
+            path, "cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume"
         )
     if use := sequence_use(path):
         raise VolumeError(f"{path}: is no volume but {use}")

@@ -117,7 +117,10 @@ def test_times_of_images(tmp_path):
     [
         (
             "FrameReferenceDateTime",
-            ["20061231235959.5+0100", "20061231230000", "20070101010000.25+0200", "20061231230001"],
+            [
+                f"200612312{t}"
+                for t in ("35959.5+0100", "30000+0000", "20000.25-0100", "30001+0000")
+            ],
             [0, 0.5, 0.75, 1.5],
         ),
         ("FrameAcquisitionDateTime", [f"2006121912{n:02d}00" for n in range(4)], [0, 60, 120, 180]),
@@ -144,9 +147,8 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
         ({"NumberOfFrames": -1}, "holds -1 images"),
         ({"Rows": 0}, "10 × 0 pixels"),
         ({"BitsAllocated": 1, "BitsStored": 1}, "its header says 60"),
-        ({"BitsStored": 77}, "77 of 8 bits"),
-        ({"SamplesPerPixel": 4}, "4 numbers as"),
-        ({"PhotometricInterpretation": "RGB"}, "1 numbers as 'RGB'"),
+        ({"BitsStored": 77}, "Bits Stored"),
+        ({"SamplesPerPixel": 4}, "header says 1920"),
         ({"PhotometricInterpretation": "PALETTE COLOR"}, "table of colours is missing"),
     ],
 )
@@ -163,7 +165,7 @@ def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize(
     ("values", "message"),
-    [({"NumberOfFrames": 5}, "damaged"), ({"Rows": 60000, "Columns": 60000}, "at most")],
+    [({"NumberOfFrames": 5}, "decoded"), ({"Rows": 60000, "Columns": 60000}, "at most")],
 )
 def test_compressed_images_are_as_many_and_as_large_as_the_header_says(tmp_path, values, message):
     made = compressed(header(CINE, US_MULTI_FRAME), RLELossless)
@@ -176,7 +178,7 @@ def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
     made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
     made.Rows = 13
     path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
-    refused(path, "damaged")
+    refused(path, "decoded")
 
 
 @pytest.mark.parametrize(

@@ -202,7 +202,7 @@ def test_affiniti_and_artemis_state_distances_in_their_own_ways(tmp_path):
     ("tag", "creator", "remedy"),
     [
         (0x7FE10011, "KRETZ_US", "SlicerHeart"),
-        (0x7FE10010, "GEMS_Ultrasound_MovieGroup_001", "the maker's loader"),
+        (0x7FE10010, "GEMS_Ultrasound_MovieGroup_001", "3D Slicer"),
         (0x200D0010, "Philips US Imaging DD 001", "Cartesian DICOM"),
         (0x01390010, "SIEMENS MED SMS USG S2000 3D VOLUME", "Enhanced US Volume"),
     ],
@@ -224,7 +224,7 @@ def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path, tag, creator, 
     ("change", "message"),
     [
         (lambda g: g.pop(2), "not a volume"),
-        (lambda g: place(g[2], 0, 0.7), "not even"),
+        (lambda g: place(g[2], 0, 0.7), "one may be missing"),
         (lambda g: place(g[2], 1, 3.0), "shifted"),
         (lambda g: g.__setitem__(2, g[1]), "every place"),
         (lambda g: place(g[4], 0, np.nan), "not a volume"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, MutableSequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,69 +35,47 @@ def quiet() -> Iterator[None]:
         config.settings.reading_validation_mode = before
 
 
-def value(header: Any, key: str | int) -> Any:
-    """The value of an element by its keyword or tag; None where there is none that can be read.
-
-    pydicom converts a value when it is first asked for, and then raises many kinds of errors.
-    """
+def values(header: Any, key: str | int) -> list[Any]:
+    """Return the values of an element; none where it is missing, empty or cannot be converted."""
     try:
-        if header is None or key not in header:
-            return None
         with quiet():
-            return header[key].value
-    except Exception:
-        return None
+            found = header[key].value if key in header else None
+    except Exception:  # pydicom converts a value when it is first asked for
+        return []
+    found = list(found) if isinstance(found, MutableSequence) else [found]
+    return [each for each in found if each is not None]
 
 
 def text(header: Any, key: str | int) -> str:
-    """A text without blanks around it; of several the first; empty where there is none."""
-    found = value(header, key)
-    if isinstance(found, Sequence) and not isinstance(found, str | bytes):
-        found = found[0] if len(found) else ""
-    if isinstance(found, bytes):
-        found = found.decode("latin-1")
-    return "" if found is None else str(found).strip(" \0")
+    """Return a text without blanks around it; of several the first; empty where there is none."""
+    found = next(iter(values(header, key)), "")
+    return str(found.decode("latin-1") if isinstance(found, bytes) else found).strip(" \0")
 
 
-def numbers(header: Any, key: str | int, count: int | None = None) -> tuple[float, ...] | None:
-    """Finite numbers, ``count`` of them where it is given; None where there are none such."""
-    found = value(header, key)
-    if found is None or isinstance(found, bytes):
-        return None
-    if isinstance(found, str):
-        found = found.split("\\")
+def numbers(header: Any, key: str | int, count: int | None = None) -> tuple[float, ...]:
+    """Return finite numbers, ``count`` of them where it is given; else none."""
     try:
-        made = tuple(float(each) for each in (found if isinstance(found, Sequence) else [found]))
-    except (TypeError, ValueError, OverflowError):
-        return None
-    fits = made and len(made) == (count or len(made)) and all(map(math.isfinite, made))
-    return made if fits else None
+        found = tuple(float(each) for each in values(header, key))
+    except (TypeError, ValueError):
+        return ()
+    return found if len(found) == (count or len(found)) and all(map(math.isfinite, found)) else ()
 
 
 def number(header: Any, key: str | int) -> float | None:
-    """A finite number; of several the first."""
-    found = numbers(header, key)
-    return found[0] if found else None
-
-
-def whole(header: Any, key: str | int) -> int | None:
-    """A whole number."""
-    found = number(header, key)
-    return int(found) if found is not None and found == int(found) else None
+    """Return a finite number; of several the first."""
+    return next(iter(numbers(header, key)), None)
 
 
 def items(header: Any, key: str | int) -> list[Any]:
-    """The items of a sequence; none where there is none."""
-    found = value(header, key)
-    return [] if found is None or isinstance(found, str | bytes) else list(found)
+    """Return the items of a sequence; none where there is none."""
+    return [each for each in values(header, key) if not isinstance(each, str | bytes)]
 
 
-def private(header: Any, group: int, creator: str, element: int) -> int | None:
-    """The tag of a private element, of which the creator's name says where it is (PS3.5, 7.8.1)."""
-    for block in range(0x10, 0x100):
-        if text(header, (group << 16) | block).casefold() == creator.casefold():
-            return (group << 16) | (block << 8) | element
-    return None
+def groups_of(header: Any, frames: int) -> list[tuple[Any, ...]]:
+    """Return the functional groups of each image (PS3.3, C.7.6.16): its own, then the shared."""
+    shared = items(header, "SharedFunctionalGroupsSequence")[:1]
+    own = items(header, "PerFrameFunctionalGroupsSequence")
+    return [(group, *shared) for group in own] if len(own) == frames else [()] * frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,32 +99,23 @@ class DicomFile:
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether a file says that it is DICOM, by its first bytes or its name."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(132)
-    except OSError:
-        return False
-    named = path.suffix.lower() in (".dcm", ".dicom", ".ima")
-    return start[128:] == b"DICM" or _has_no_preamble(start) or named
-
-
-def _has_no_preamble(start: bytes) -> bool:
-    """Whether a file begins with an element of the groups that come first, as older ones do."""
-    if len(start) < 8 or start[:2] not in (b"\x02\0", b"\x08\0") or start[3]:
-        return False
-    return (start[4:6].isalpha() and start[4:6].isupper()) or start[5:8] == b"\0\0\0"
-
-
-def packed_in(path: Path) -> str:
-    """The archive or compression that a file is, as a word for a person; empty of others."""
+    """Whether a file begins as DICOM does, or as older files do, without a preamble."""
     with path.open("rb") as file:
-        start = file.read(4)
-    return {b"\x1f\x8b": "gzip", b"PK": "zip", b"BZ": "bzip2"}.get(start[:2], "")
+        start = file.read(132)
+    return start[128:] == b"DICM" or (start[:2] in (b"\x02\0", b"\x08\0") and not any(start[3:4]))
+
+
+def refuse_other(path: Path, advice: str) -> VolumeError:
+    """Return the error of a file that is no image; a packed one is called so."""
+    with path.open("rb") as file:
+        packed = {b"\x1f\x8b": "gzip", b"PK": "zip", b"BZ": "bzip2"}.get(file.read(2))
+    return VolumeError(
+        f"{path}: is packed as {packed}; unpack it first" if packed else f"{path}: {advice}"
+    )
 
 
 def dicom_files(folder: Path) -> list[Path]:
-    """The DICOM files in a folder.
+    """Return the DICOM files in a folder.
 
     Raises:
         VolumeError: there are none.
@@ -172,9 +141,7 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
         from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
     except ImportError as error:
         raise VolumeError(f"{path}: reading DICOM needs an extra package: {EXTRA}") from error
-    with path.open("rb") as file:
-        start = file.read(132)
-    if start[128:] != b"DICM" and not _has_no_preamble(start):
+    if not is_dicom(path):
         raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
     try:
         with quiet():
@@ -182,31 +149,19 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
             syntax = text(header.file_meta, "TransferSyntaxUID")
             if syntax == _DEFLATED:
                 header = dcmread(path, force=True)
-    except OSError as error:
-        if error.errno is not None:
-            raise
-        raise _damaged(path) from error
-    except Exception as error:  # pydicom raises many kinds of errors
-        raise _damaged(path) from error
-    if not len(header):
-        raise VolumeError(f"{path}: is no DICOM file: it has no elements")
+    except Exception as error:  # of many kinds, which may show values
+        raise VolumeError(
+            f"{path}: cannot be read as DICOM: its header is damaged or cut; copy it again"
+        ) from error
     if not syntax:  # older files do not say it
         implicit = header.original_encoding[0] is not False
         syntax = str(ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian)
     made = DicomFile(path, header, syntax)
     length = getattr(made.pixels, "length", 0xFFFFFFFF)
-    if length != 0xFFFFFFFF and syntax != _DEFLATED:
-        there = path.stat().st_size - made.pixels.value_tell
-        if there < length:
-            raise VolumeError(
-                f"{path}: breaks off: it holds {max(there, 0)} of the {length} bytes of its "
-                f"images; copy or export it again"
-            )
+    there = path.stat().st_size - getattr(made.pixels, "value_tell", 0)
+    if length != 0xFFFFFFFF and there < length and not made.deflated:
+        raise VolumeError(
+            f"{path}: breaks off: it holds {there} of the {length} bytes of its images; copy it "
+            f"again"
+        )
     return made
-
-
-def _damaged(path: Path) -> VolumeError:
-    return VolumeError(
-        f"{path}: cannot be read as DICOM: its header is damaged or cut short; copy or export it "
-        f"again"
-    )

@@ -13,12 +13,9 @@ axes are those of the grid. All others are refused with a way out.
 from __future__ import annotations
 
 import copy
-import math
-import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -27,26 +24,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, private, text, whole
-from us_sim.volume.files.dicom.header import value as value_of
+from us_sim.volume.files.dicom.header import (
+    DicomFile,
+    groups_of,
+    items,
+    number,
+    numbers,
+    text,
+    values,
+)
 from us_sim.volume.files.placement import checked_placement
 
 _PARALLEL = 1e-4  # difference of the components of directions that are the same
 _EVEN = 0.02  # of the distance between images, by which one may be off
-_PLACES = 0.01  # mm, to which some scanners round positions
+_ROUNDED = 0.01  # mm, to which some scanners round positions
 _ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
+_SLICES, _DEPTH = 0x30011001, 0x30011003  # of the Cartesian export
+_ARTEMIS = ("Eigen", "Artemis")
 
-_SAVE = "and save the volume as .nrrd"
 _QLAB = "export it as Cartesian DICOM (3DDCM) from QLAB or Ultrasound Workspace"
-_IMAGE3D = f"export an Enhanced US Volume, or open it in 3D Slicer with the maker's loader {_SAVE}"
+_SLICER = "export an Enhanced US Volume, or save it as .nrrd in 3D Slicer with SlicerHeart"
 _HIDDEN = (
-    (0x7FE1, "KRETZ_US", "GE (Kretz)", f"open it in 3D Slicer with SlicerHeart {_SAVE}"),
-    (0x7FE1, "GEMS_Ultrasound_MovieGroup_001", "GE (movie group)", _IMAGE3D),
+    (0x7FE1, "KRETZ_US", "GE (Kretz)", _SLICER),
+    (0x7FE1, "GEMS_Ultrasound_MovieGroup_001", "GE (movie group)", _SLICER),
     (0x200D, "Philips US Imaging DD", "Philips", _QLAB),
     (0x200D, "Philips US Private 3D", "Philips", _QLAB),
-    (0x0039, "SIEMENS MED SMS USG ANTARES 3D VOLUME", "Siemens", _IMAGE3D),
-    (0x0139, "SIEMENS MED SMS USG S2000 3D VOLUME", "Siemens", _IMAGE3D),
+    (0x0039, "SIEMENS MED SMS USG ANTARES 3D VOLUME", "Siemens", _SLICER),
+    (0x0139, "SIEMENS MED SMS USG S2000 3D VOLUME", "Siemens", _SLICER),
 )
 """Group, beginning of the creator's name as in DCMTK's dictionary, maker, advice."""
 
@@ -60,95 +65,58 @@ class Plane:
     spacing: tuple[float, ...]  # (2,) mm, between rows, then between columns
 
 
-def grid_of(path: Path | str, planes: Sequence[Plane]) -> tuple[list[int], NDArray[np.float64]]:
-    """The order of images along their normal, and the (4, 4) m from (column, row, image).
-
-    Raises:
-        VolumeError: there is one image only, they are not parallel, are shifted against each
-            other, are not at even distances, or lie where no body does.
-    """
-    if len(planes) < 2:
-        raise VolumeError(
-            f"{path}: is one image; a volume needs two or more: give all files of the series"
-        )
-    axes, positions, depth = _along_normal(path, planes)
-    order = [int(n) for n in np.argsort(depth, kind="stable")]
-    positions = positions[order]
-    distance = float((positions[-1] - positions[0]) / (len(planes) - 1) @ axes[:, 2])
-    gaps = np.diff(depth[order])
-    if not np.isfinite(gaps).all() or gaps.min() < 1e-4:
-        raise VolumeError(
-            f"{path}: several of its images are at the same place, and not one volume after "
-            f"another; give the files of one volume"
-        )
-    if np.abs(gaps - distance).max() > max(_EVEN * distance, _PLACES):
-        raise VolumeError(
-            f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart, which is not even: "
-            f"one may be missing"
-        )
-    even = positions[0] + np.outer(np.arange(len(planes)), distance * axes[:, 2])
-    if (off := np.abs(positions - even).max()) > max(_EVEN * distance, _PLACES):
-        raise VolumeError(
-            f"{path}: its images are shifted against each other ({off:g} mm), so the grid is "
-            f"sheared; resample it on one with right angles"
-        )
-    rows, columns = planes[0].spacing
-    return order, checked_placement(path, (columns, rows, distance), axes, positions[0])
-
-
-def sparse_grid_of(
-    path: Path | str, planes: Sequence[Plane], step: float | None
+def grid_of(
+    path: Path | str, planes: Sequence[Plane], step: float | None = None, *, sparse: bool = False
 ) -> tuple[list[int], NDArray[np.float64]]:
-    """Which slice of a grid each image is, several of which may be the same and others missing,
-    and the (4, 4) m from (column, row, slice).
+    """Return which slice of an even grid each image is, and (4, 4) m from (column, row, slice).
 
-    ``step`` is the distance of slices in mm; None for the smallest that there is.
+    Args:
+        path: which errors name.
+        planes: of two images or more.
+        step: mm between slices; else their mean distance, or the smallest of sparse ones.
+        sparse: slices may be missing, and several images be of the same one.
 
     Raises:
-        VolumeError: they are not parallel, are shifted against each other, lie between the slices,
-            or where no body does.
+        VolumeError: they are not parallel, are shifted against each other, are not at even
+            distances, or lie where no body does.
     """
-    axes, positions, depth = _along_normal(path, planes)
-    gaps = np.diff(np.unique(np.round(depth / _PLACES) * _PLACES))
-    step = step or (float(gaps.min()) if len(gaps) else 1.0)
+    orientation, spacing, positions = (
+        np.array([getattr(plane, key) for plane in planes])
+        for key in ("orientation", "spacing", "position")
+    )
+    apart = np.ptp(orientation, axis=0).max(), np.ptp(spacing / spacing.max(), axis=0).max()
+    if max(apart) > _PARALLEL:
+        raise VolumeError(
+            f"{path}: its images are not parallel, or their pixels differ in size; export a volume "
+            f"with even slices"
+        )
+    axes = _image_axes(path, planes[0].orientation)
+    depth = positions @ axes[:, 2]
+    gaps = np.diff(np.sort(depth))
+    if sparse:
+        gaps = gaps[gaps > _ROUNDED]
+        step = step or float(gaps.min(initial=np.inf)) if len(gaps) else step or 1.0
+    else:
+        step = float(np.ptp(depth)) / (len(planes) - 1)
     slices = np.rint((depth - depth.min()) / step)
     first = positions[int(np.argmin(depth))]
-    apart = np.abs(positions - first - np.outer(slices * step, axes[:, 2])).max()
-    if not apart <= max(_EVEN * step, _PLACES) * max(slices.max(), 1.0):
+    step = float(np.ptp(depth) / slices.max()) if slices.any() else step
+    off = np.abs(positions - first - np.outer(slices * step, axes[:, 2])).max()
+    is_whole = sparse or np.array_equal(np.sort(slices), np.arange(len(planes)))
+    if not is_whole or not off <= max(_EVEN * step, _ROUNDED):
         raise VolumeError(
-            f"{path}: its images are {apart:g} mm off an even grid of {step:g} mm; export it again"
+            f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart, and shifted by up "
+            f"to {off:g} mm against an even grid with right angles: one may be missing"
         )
     rows, columns = planes[0].spacing
     return slices.astype(int).tolist(), checked_placement(path, (columns, rows, step), axes, first)
-
-
-def _along_normal(
-    path: Path | str, planes: Sequence[Plane]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Axes (3, 3) of parallel images, their positions (N, 3) mm and depths (N,) along it."""
-    orientation = np.array([plane.orientation for plane in planes])
-    spacing = np.array([plane.spacing for plane in planes])
-    if (
-        np.ptp(orientation, axis=0).max() > _PARALLEL
-        or np.ptp(spacing, axis=0).max() > _PARALLEL * np.abs(spacing).max()
-    ):
-        raise VolumeError(
-            f"{path}: its images are not parallel, or their pixels differ in size, so they are no "
-            f"grid; export a volume with even slices"
-        )
-    axes = _image_axes(path, planes[0].orientation)
-    positions = np.array([plane.position for plane in planes])
-    return axes, positions, positions @ axes[:, 2]
 
 
 def _image_axes(path: Path | str, orientation: Sequence[float]) -> NDArray[np.float64]:
     """(3, 3) with columns along a row of the image, along a column, and along the normal."""
     along = np.array(orientation, np.float64).reshape(2, 3).T
     if np.abs(along.T @ along - np.eye(2)).max() > 1e-3:
-        raise VolumeError(
-            f"{path}: the directions of its rows and columns are not at right angles; export it "
-            f"again"
-        )
+        raise VolumeError(f"{path}: its rows and columns are not at right angles; export it again")
     return np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
 
 
@@ -164,23 +132,31 @@ def stated_planes(file: DicomFile, frames: int, given: Sequence[float] = ()) -> 
       all (`SpacingBetweenSlices`).
     """
     header = file.header
-    if groups := _groups(header, frames):
-        return _planes_of_groups(groups)
+    if any(groups := groups_of(header, frames)):
+        planes = [
+            Plane(
+                _found(each, 3, "PlanePositionVolume ImagePositionVolume",
+                       "PlanePosition ImagePositionPatient"),
+                _found(each, 6, "PlaneOrientationVolume ImageOrientationVolume",
+                       "PlaneOrientation ImageOrientationPatient"),
+                _found(each, 2, "PixelMeasures PixelSpacing"),
+            )
+            for each in groups
+        ]  # fmt: skip
+        stated = (plane.position and plane.orientation and plane.spacing for plane in planes)
+        return planes if all(stated) else None
     position = numbers(header, "ImagePositionPatient", 3)
     orientation = numbers(header, "ImageOrientationPatient", 6)
     spacing = numbers(header, "PixelSpacing", 2) or tuple(given[1::-1])
     if position and orientation and spacing and frames == 1:
         return [Plane(position, orientation, spacing)]
-    pointer = value_of(header, "FrameIncrementPointer")
-    listed = [pointer] if isinstance(pointer, int) else list(pointer or ())
-    is_cine = any(each in (0x00181063, 0x00181065) for each in listed)  # FrameTime, FrameTimeVector
-    if not spacing or frames == 1 or is_cine:
-        return None
-    offsets = numbers(header, "GridFrameOffsetVector", frames)
+    # FrameTime, FrameTimeVector
+    is_cine = {0x00181063, 0x00181065} & set(values(header, "FrameIncrementPointer"))
     between = number(header, "SpacingBetweenSlices")
-    if offsets is None and between:
+    offsets = numbers(header, "GridFrameOffsetVector", frames)
+    if between and not offsets:
         offsets = tuple(n * between for n in range(frames))
-    if offsets is None:
+    if not (spacing and offsets) or frames == 1 or is_cine:
         return None
     orientation = orientation or _ALONG_AXES
     normal = _image_axes(file.path, orientation)[:, 2]
@@ -188,61 +164,29 @@ def stated_planes(file: DicomFile, frames: int, given: Sequence[float] = ()) -> 
     return [Plane(tuple(first + offset * normal), orientation, spacing) for offset in offsets]
 
 
+def _found(groups: tuple[Any, ...], count: int, *places: str) -> tuple[float, ...]:
+    """Read the numbers at the first of some places, a sequence and an element of its item."""
+    for group in groups:
+        for sequence, key in map(str.split, places):
+            for item in items(group, f"{sequence}Sequence")[:1]:
+                if found := numbers(item, key, count):
+                    return found
+    return ()
+
+
 def image_times(file: DicomFile, frames: int) -> list[float]:
-    """For each image the time of its volume, s, where there are several; else 0."""
-    times = []
-    for group in _groups(file.header, frames) or [()] * frames:
-        found = _found(group, ("TemporalPositionSequence TemporalPositionTimeOffset",), 1)
-        times.append(found[0] if found else 0.0)
-    return times
+    """Return for each image the time of its volume, s, where there are several; else 0."""
+    place = "TemporalPosition TemporalPositionTimeOffset"
+    return [(_found(each, 1, place) or (0.0,))[0] for each in groups_of(file.header, frames)]
 
 
 def image_kinds(file: DicomFile, frames: int) -> list[str]:
-    """For each image the kind of its values, such as TISSUE_INTENSITY; empty where none is said."""
-    kinds = []
-    for group in _groups(file.header, frames) or [()] * frames:
-        described = [each for part in group for each in items(part, "ImageDataTypeSequence")]
-        kinds.append(text(described[0], "DataType") if described else "")
-    return kinds
-
-
-def _groups(header: Any, frames: int) -> list[tuple[Any, ...]]:
-    """For each image its own group of values, then that shared by all."""
-    shared = items(header, "SharedFunctionalGroupsSequence")[:1]
-    own = items(header, "PerFrameFunctionalGroupsSequence")
-    return [(group, *shared) for group in own] if len(own) == frames else []
-
-
-def _planes_of_groups(groups: list[tuple[Any, ...]]) -> list[Plane] | None:
-    planes = []
-    for group in groups:
-        position = _found(
-            group,
-            ("PlanePositionVolumeSequence ImagePositionVolume",
-             "PlanePositionSequence ImagePositionPatient"), 3,
-        )  # fmt: skip
-        orientation = _found(
-            group,
-            ("PlaneOrientationVolumeSequence ImageOrientationVolume",
-             "PlaneOrientationSequence ImageOrientationPatient"), 6,
-        )  # fmt: skip
-        spacing = _found(group, ("PixelMeasuresSequence PixelSpacing",), 2)
-        if not (position and orientation and spacing):
-            return None
-        planes.append(Plane(position, orientation, spacing))
-    return planes
-
-
-def _found(
-    groups: tuple[Any, ...], places: tuple[str, ...], count: int
-) -> tuple[float, ...] | None:
-    """The numbers at the first of some places, each a sequence and an element of its first item."""
-    for group in groups:
-        for sequence, key in map(str.split, places):
-            for item in items(group, sequence)[:1]:
-                if (found := numbers(item, key, count)) is not None:
-                    return found
-    return None
+    """Return the kind of each image's values, such as TISSUE_INTENSITY; empty if none is said."""
+    every = [
+        [text(each, "DataType") for part in group for each in items(part, "ImageDataTypeSequence")]
+        for group in groups_of(file.header, frames)
+    ]
+    return [(*kinds, "")[0] for kinds in every]
 
 
 def is_cartesian(file: DicomFile) -> bool:
@@ -251,27 +195,22 @@ def is_cartesian(file: DicomFile) -> bool:
 
 
 def one_image_after_another(file: DicomFile) -> DicomFile:
-    """The file as if its header counted images; Philips' Cartesian export counts volumes.
+    """Return the file with a header that counts images; Philips' Cartesian export counts volumes.
 
     Raises:
         VolumeError: its number of slices is missing.
     """
     if not is_cartesian(file):
         return file
-    slices = _private_number(file.header, 0x30011001)
-    volumes = max(whole(file.header, "NumberOfFrames") or 1, 1)
-    if slices is None or slices != int(slices) or slices < 2:
-        raise VolumeError(
-            f"{file.path}: is a Cartesian export of Philips that does not say how many slices it "
-            f"has; {_QLAB} again"
-        )
+    if not (slices := int(_private_number(file.header, _SLICES))):
+        raise VolumeError(f"{file.path}: does not say how many slices it has; {_QLAB} again")
     header = copy.copy(file.header)
-    header.NumberOfFrames = int(min(volumes * slices, 1 << 30))
+    header.NumberOfFrames = int(number(header, "NumberOfFrames") or 1) * slices
     return replace(file, header=header)
 
 
 def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float]] | None:
-    """The places of images that a maker states in a way of its own, and their times in s.
+    """Return the places of images that a maker states in a way of its own, and their times in s.
 
     - Philips' Cartesian export: the number of slices and their distance in the private elements
       (3001,1001) and (3001,1003), the other distances in the standard's; all in cm.
@@ -282,101 +221,88 @@ def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float
     """
     header = file.header
     if is_cartesian(file):
-        x, y = number(header, "PhysicalDeltaX"), number(header, "PhysicalDeltaY")
-        z = _private_number(header, 0x30011003)
-        slices = int(_private_number(header, 0x30011001) or 0)
-        if not (x and y and z and slices):
+        x, y = (number(header, f"PhysicalDelta{axis}") or 0.0 for axis in "XY")
+        z, slices = _private_number(header, _DEPTH), int(_private_number(header, _SLICES))
+        if not x * y * z:
             return None
         step = (number(header, "FrameTime") or 1000.0) * 1e-3  # s
         grid = _stack((x * 10.0, y * 10.0, z * 10.0), slices)
         return grid * (frames // slices), [step * (n // slices) for n in range(frames)]
-    tag = private(header, 0x200D, "Philips US Imaging DD 036", 0x03)
-    spacing = numbers(header, tag, 3) if tag is not None else None
-    if spacing and frames > 1:
-        return _stack(spacing, frames), [0.0] * frames
-    maker = text(header, "Manufacturer"), text(header, "ManufacturerModelName")
-    if maker == ("Eigen", "Artemis") and frames > 1:
-        edge = (number(header, "PixelAspectRatio") or 0.0) / 1000
-        size = (whole(header, "Columns") or 0, whole(header, "Rows") or 0)
-        return _stack((edge, edge, edge), frames, about=size), [0.0] * frames
-    return None
+    spacing: tuple[float, ...] = ()
+    corner = np.zeros(3)
+    try:
+        private = header.private_block(0x200D, "Philips US Imaging DD 036")
+        spacing = numbers(header, private.get_tag(0x03), 3)
+    except KeyError:
+        if (text(header, "Manufacturer"), text(header, "ManufacturerModelName")) == _ARTEMIS:
+            spacing = ((number(header, "PixelAspectRatio") or 0.0) / 1000,) * 3
+            size = number(header, "Columns") or 1, number(header, "Rows") or 1, frames
+            corner = -(np.array(size) - 1) / 2 * spacing
+    if not spacing or frames < 2:
+        return None
+    return _stack(spacing, frames, corner), [0.0] * frames
 
 
 def _stack(
-    spacing: Sequence[float], count: int, about: tuple[int, int] | None = None
+    spacing: Sequence[float], count: int, corner: Sequence[float] | NDArray[np.float64] = (0, 0, 0)
 ) -> list[Plane]:
-    """Images one behind the other along the grid's axes, from 0 or about it; spacing x y z."""
+    """Place images one behind the other along the grid's axes, from a corner on; mm."""
     x, y, z = spacing
-    corner = [0.0, 0.0, 0.0]
-    if about is not None:
-        corner = [-(n - 1) / 2 * s for n, s in zip((*about, count), spacing, strict=True)]
-    return [
-        Plane((corner[0], corner[1], corner[2] + n * z), _ALONG_AXES, (y, x)) for n in range(count)
-    ]
+    left, top, front = map(float, corner)
+    return [Plane((left, top, front + n * z), _ALONG_AXES, (y, x)) for n in range(count)]
 
 
-def _private_number(header: Any, tag: int) -> float | None:
-    """A number whose type the file does not say: as text, whole, or in double precision."""
-    found = value_of(header, tag)
-    if not isinstance(found, bytes):
-        return number(header, tag)
-    try:
-        form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found))
-        made = float(struct.unpack(form, found)[0] if form else found.decode("ascii"))
-    except (ValueError, struct.error):
-        return None
-    return made if math.isfinite(made) else None
+def _private_number(header: Any, tag: int) -> float:
+    """Read a number whose type the file may not say: whole, or in double precision; else 0."""
+    found = next(iter(values(header, tag)), b"")
+    form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found)) if isinstance(found, bytes) else None
+    return float(struct.unpack(form, found)[0]) if form else number(header, tag) or 0.0
 
 
 def hidden_volume(file: DicomFile) -> str:
-    """Advice about a volume that is there, but in a form only its maker knows; or nothing."""
+    """Return advice about a volume that is there in a form only its maker knows; or nothing."""
     for group, creator, maker, remedy in _HIDDEN:
-        for block in range(0x10, 0x100):
-            if text(file.header, (group << 16) | block).startswith(creator):
-                return f"it has private data of {maker}, where a volume may be: {remedy}"
+        if any(
+            text(file.header, (group << 16) | n).startswith(creator) for n in range(0x10, 0x100)
+        ):
+            return f"it has private data of {maker}, where a volume may be: {remedy}"
     return ""
 
 
 def frame_times(file: DicomFile, frames: int) -> list[float] | None:
-    """Times of a cine's images in s, from the first on; None where the header does not state them.
+    """Return times of a cine's images in s, from the first on; None where none are stated.
 
     `FrameTimeVector` says how long after the one before it each image came, `FrameTime` and the
     rates say it of all (PS3.3, C.7.6.5). Without these, images of enhanced objects state their own
     times (PS3.3, C.7.6.16.2).
     """
     header = file.header
-    steps = numbers(header, "FrameTimeVector", frames)  # ms
-    if steps and all(0.0 <= step < 1e7 for step in steps[1:]):
-        return list(accumulate((step * 1e-3 for step in steps[1:]), initial=0.0))
-    step = number(header, "FrameTime")
-    if not step or not 0.0 < step < 1e7:
+    steps = numbers(header, "FrameTimeVector", frames)[1:]  # ms
+    if not steps:
         rate = number(header, "CineRate") or number(header, "RecommendedDisplayFrameRate")
-        step = 1.0 / rate / 1e-3 if rate and rate > 1e-3 else None
-    if step is None:
-        return [0.0] if frames == 1 else _own_times(file, frames)
-    return [frame * step * 1e-3 for frame in range(frames)]
+        step = number(header, "FrameTime") or (1e3 / rate if rate else None)
+        steps = (step,) * (frames - 1) if step else ()
+    if frames == 1 or (steps and all(0.0 <= step < 1e7 for step in steps)):
+        return list(accumulate((step * 1e-3 for step in steps), initial=0.0))
+    return _own_times(file, frames)
 
 
 def _own_times(file: DicomFile, frames: int) -> list[float] | None:
-    """Of the images' own times those in which each image is later than the one before it."""
-    groups = items(file.header, "PerFrameFunctionalGroupsSequence")
-    contents = [item for group in groups for item in items(group, "FrameContentSequence")[:1]]
-    keys = ("FrameReferenceDateTime", "FrameAcquisitionDateTime")
-    stamps = [list(_stamps(contents, key)) for key in keys]
-    since = [[(stamp - each[0]).total_seconds() for stamp in each] for each in stamps]
-    for times in (image_times(file, frames), *since):
+    """Return of the images' own times those in which each is later than the one before it."""
+    from pydicom.valuerep import DT
+
+    every = [image_times(file, frames)]
+    for key in ("FrameReferenceDateTime", "FrameAcquisitionDateTime"):
+        try:
+            stamps = [
+                DT(text(item, key))
+                for groups in groups_of(file.header, frames)
+                for item in items(next(iter(groups), {}), "FrameContentSequence")[:1]
+            ]
+            every.append([(stamp - stamps[0]).total_seconds() for stamp in stamps])
+        except (TypeError, ValueError):  # an image without one, or no such day
+            continue
+    for times in every:
         if len(times) == frames and all(a < b for a, b in pairwise(times)):
             return [time - times[0] for time in times]
     return None
-
-
-def _stamps(contents: list[Any], key: str) -> Iterator[datetime]:
-    """Dates and times of value representation DT (PS3.5, 6.2) of the items that state them."""
-    for item in contents:
-        if found := re.fullmatch(r"(\d{14})(\.\d{1,6})?([+-]\d{4})?", text(item, key)):
-            day, part, zone = found.groups("")
-            try:
-                stated = f"{day}{part or '.0'}{zone or '+0000'}"
-                yield datetime.strptime(stated, "%Y%m%d%H%M%S.%f%z")
-            except ValueError:  # no such day, hour or zone
-                continue

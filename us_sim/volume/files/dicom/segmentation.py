@@ -14,11 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, text, whole
+from us_sim.volume.files.dicom.header import (
+    DicomFile,
+    groups_of,
+    items,
+    number,
+    numbers,
+    text,
+)
 from us_sim.volume.files.dicom.pixels import ImageFormat, image_format, stored_frames
 from us_sim.volume.files.dicom.placed_images import SEGMENTATIONS
-from us_sim.volume.files.dicom.planes import sparse_grid_of, stated_planes
+from us_sim.volume.files.dicom.planes import grid_of, stated_planes
 from us_sim.volume.files.segments import Segment
+from us_sim.volume.files.stored_image import check_claim
 from us_sim.volume.structure_names import Colour
 
 
@@ -35,7 +43,7 @@ class DicomSegmentation:
     _least: int  # value from which on a voxel belongs to a segment; 0 in a label map
 
     def mask(self, segment: Segment) -> NDArray[np.bool_]:
-        """(i, j, k) the voxels in a segment.
+        """Return the voxels (i, j, k) in a segment.
 
         Raises:
             VolumeError: an image is damaged, or its decoder is missing.
@@ -49,7 +57,7 @@ class DicomSegmentation:
 
 
 def read_segmentation(file: DicomFile) -> DicomSegmentation:
-    """The segments of a file.
+    """Read the segments of a file.
 
     Raises:
         VolumeError: it is none, or does not say where its images lie or of which segment they are.
@@ -61,65 +69,52 @@ def read_segmentation(file: DicomFile) -> DicomSegmentation:
     planes = stated_planes(file, form.frames)
     if planes is None:
         raise VolumeError(f"{path}: does not state where its images lie; export it again")
-    shared = items(header, "SharedFunctionalGroupsSequence")[:1]
-    own = items(header, "PerFrameFunctionalGroupsSequence")
-    steps = [
-        number(each, "SpacingBetweenSlices")
-        for group in (*shared, *own[:1])
-        for each in items(group, "PixelMeasuresSequence")
-    ]
-    slices, placement = sparse_grid_of(
-        path, planes, next((s for s in steps if s and s > 0.0), None)
-    )
+    groups = groups_of(header, form.frames)
+    measures = (each for part in groups[0] for each in items(part, "PixelMeasuresSequence"))
+    steps = (number(each, "SpacingBetweenSlices") for each in measures)
+    slices, placement = grid_of(path, planes, next(filter(None, steps), None), sparse=True)
     is_map = text(header, "SegmentationType") == "LABELMAP"
-    of = [0] * form.frames if is_map else [_segment_of(group, shared) for group in own]
+    of = [0 if is_map else _segment_of(each) for each in groups]
     segments = [_segment(item) for item in items(header, "SegmentSequence")]
-    known = {segment.value for segment in segments}
-    if (not is_map and not set(of) <= known) or not segments:
+    if not segments or not set(of) <= {0, *(segment.value for segment in segments)}:
         raise VolumeError(f"{path}: has images of segments that it does not describe")
     shape = (form.columns, form.rows, max(slices) + 1)
-    if np.prod(shape, dtype=float) > 1 << 28:
-        raise VolumeError(f"{path}: spans {shape[2]} slices, more than can be read; export a part")
-    least = 0 if is_map else max(((whole(header, "MaximumFractionalValue") or 1) + 1) // 2, 1)
+    check_claim(path, shape, 1)
+    least = 0 if is_map else (int(number(header, "MaximumFractionalValue") or 1) + 1) // 2
     return DicomSegmentation(
         file, form, segments, shape, placement, list(zip(of, slices, strict=True)), least
     )
 
 
-def _segment_of(group: Any, shared: list[Any]) -> int:
-    for each in (group, *shared):
-        for item in items(each, "SegmentIdentificationSequence")[:1]:
-            return whole(item, "ReferencedSegmentNumber") or -1
-    return -1
+def _segment_of(groups: tuple[Any, ...]) -> int:
+    """Return the number of an image's segment; -1 where it is not stated."""
+    found = (each for part in groups for each in items(part, "SegmentIdentificationSequence"))
+    return int(number(next(found, {}), "ReferencedSegmentNumber") or -1)
 
 
 def _segment(item: Any) -> Segment:
-    codes = []
-    for kind in items(item, "SegmentedPropertyTypeCodeSequence")[:1]:
-        codes = [_code(kind)]
-        for modifier in items(kind, "SegmentedPropertyTypeModifierCodeSequence")[:1]:
-            codes.append(_code(modifier))
+    kinds = items(item, "SegmentedPropertyTypeCodeSequence")[:1]
+    for kind in kinds[:1]:
+        kinds += items(kind, "SegmentedPropertyTypeModifierCodeSequence")[:1]
+    codes = [
+        text(kind, "CodeValue") for kind in kinds if text(kind, "CodingSchemeDesignator") == "SCT"
+    ]
     return Segment(
         text(item, "SegmentLabel"),
-        whole(item, "SegmentNumber") or 0,
+        int(number(item, "SegmentNumber") or 0),
         0,
         _colour(item),
         None,
-        tuple(code for code in codes if code),
+        tuple(codes),
     )
 
 
-def _code(item: Any) -> str:
-    """A SNOMED code; empty where it is another scheme's."""
-    return text(item, "CodeValue") if text(item, "CodingSchemeDesignator") == "SCT" else ""
-
-
 def _colour(item: Any) -> Colour | None:
-    """Red, green and blue of the recommended CIELab value (PS3.3, C.10.7.1.1)."""
+    """Return red, green and blue of the recommended CIELab value (PS3.3, C.10.7.1.1)."""
     found = numbers(item, "RecommendedDisplayCIELabValue", 3)
-    if found is None:
+    if not found:
         return None
     light, a, b = (value / 65535.0 for value in found)
     lab = np.array([[[100.0 * light, 255.0 * a - 128.0, 255.0 * b - 128.0]]], np.float32)
-    red, green, blue = (float(part) for part in cv2.cvtColor(lab, cv2.COLOR_Lab2RGB)[0, 0])
-    return min(max(red, 0.0), 1.0), min(max(green, 0.0), 1.0), min(max(blue, 0.0), 1.0)
+    red, green, blue = np.clip(cv2.cvtColor(lab, cv2.COLOR_Lab2RGB)[0, 0], 0.0, 1.0).tolist()
+    return red, green, blue
