@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
-from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
+from us_sim.volume.files.stored_image import StoredImage, StoredVoxels
 
 _TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2",
@@ -44,8 +43,8 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
             if not equals:
                 break
     raise VolumeError(
-        f"{path}: cannot be read as an image: it is no MetaImage, or cut within its header, as no "
-        f"ElementDataFile ends that; give an MHA, NRRD or NIfTI volume"
+        f"{path}: cannot be read as an image: its header has no ElementDataFile at its end; give an "
+        f"MHA, NRRD or NIfTI volume"
     )
 
 
@@ -53,41 +52,34 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
     """Describe the numbers behind a header.
 
     Raises:
-        VolumeError: a field is missing or not made of the numbers that belong there, the data file
-            is missing, or they are stored in a way that is not read.
+        VolumeError: a field is missing or not made of the numbers that belong there, or they are
+            stored in a way that is not read.
     """
     channels = _whole_numbers(path, fields, "ElementNumberOfChannels", 1, "1")
     (count,) = _whole_numbers(path, fields, "NDims", 1)
     size = _whole_numbers(path, fields, "DimSize", count)
     element, name = fields.get("ElementType", ""), fields["ElementDataFile"]
-    if element not in _TYPES:
+    skip = fields.get("HeaderSize", "0")
+    is_packed = _is_true(fields.get("CompressedData", ""))
+    is_binary = _is_true(fields.get("BinaryData", "True"))
+    is_list = name.upper().startswith("LIST") or "%" in name
+    is_skip = skip.isdecimal() or (skip == "-1" and not is_packed)
+    if element not in _TYPES or not is_binary or is_list or not is_skip:
         raise VolumeError(
-            f"{path}: its ElementType is {element!r}; save it with one of {', '.join(_TYPES)}"
+            f"{path}: its ElementType is {element!r}, its ElementDataFile {name!r}, its HeaderSize "
+            f"{skip!r}; save it as one .mha file of binary numbers"
         )
-    if name.upper().startswith("LIST") or "%" in name:
-        raise VolumeError(f"{path}: keeps its voxels in several files; save it as one .mha file")
     data = path if name.upper() == "LOCAL" else path.parent / name
-    if not data.is_file():
-        raise VolumeError(f"{path}: names the data file {name}, which is not there")
-    start = header_bytes if data == path else 0
-    encoding: Encoding = "packed" if _is_true(fields.get("CompressedData", "")) else "raw"
-    if not _is_true(fields.get("BinaryData", "True")):
-        encoding = "text"
     order = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", ""))
-    stored = StoredVoxels(
+    return StoredVoxels(
         (*channels, *size) if channels != (1,) else size,
         np.dtype(f"{'>' if _is_true(order) else '<'}{_TYPES[element]}"),
         data,
         path,
-        start,
-        encoding=encoding,
+        header_bytes if data == path else 0,
+        int(skip),
+        "packed" if is_packed else "raw",
     )
-    before = fields.get("HeaderSize", "0")
-    if before == "-1" and encoding == "raw":  # the last bytes of the file
-        return replace(stored, start=max(data.stat().st_size - stored.expected, 0))
-    if not before.isdecimal():
-        raise VolumeError(f"{path}: its HeaderSize is {before!r}; export it again")
-    return replace(stored, start=start + int(before))
 
 
 def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
@@ -135,8 +127,7 @@ def _numbers(
         if len(numbers) == count and np.isfinite(numbers).all():
             return numbers
     raise VolumeError(
-        f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers belong: export it "
-        f"again"
+        f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers belong"
     )
 
 
@@ -148,7 +139,7 @@ def _whole_numbers(
     if len(words) != count or not all(word.isdecimal() and int(word) for word in words):
         raise VolumeError(
             f"{path}: cannot be read as an image: its {key} is {' '.join(words)[:80]!r} where "
-            f"{count} whole numbers above zero belong (NDims); export it again"
+            f"{count} whole numbers above zero belong"
         )
     return tuple(map(int, words))
 

@@ -13,9 +13,6 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, is_right_angled
 from us_sim.volume.files.stored_image import StoredImage, StoredVoxels
 
-NIFTI_TEXTS = ("data_type", "db_name", "descrip", "aux_file", "intent_name", "extension")
-"""Fields in which anything may be written, of the first version or of both."""
-
 _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # NIfTI's x goes to the right, its y to the front
 _OF_TWO_SIZES = 1e-2  # by which the sizes of voxels may differ that a header states twice
 
@@ -39,31 +36,16 @@ def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     while len(size) > 3 and size[-1] == 1:
         size = size[:-1]
     file = Path(image.file_map["image"].filename)
-    if not file.is_file():
-        raise VolumeError(f"{path}: belongs to {file.name}, which is not there")
-    with file.open("rb") as data:
-        packed = data.read(2) == b"\x1f\x8b"
     voxels = StoredVoxels(
         (components, *size) if components > 1 else size,
         np.dtype(np.uint8) if components > 1 else kind,
         file,
         path,
         skip=int(image.dataobj.offset),
-        encoding="packed" if packed else "raw",
+        encoding="packed" if file.suffix == ".gz" else "raw",
     )
     scaling = float(image.dataobj.slope), float(image.dataobj.inter)
     return StoredImage(voxels, components, lambda: _placement(path, image, given), scaling)
-
-
-def nifti_fields(path: Path) -> dict[str, bytes]:
-    """Read the fields in which anything may be written; ``extension`` where there is one.
-
-    Raises:
-        VolumeError: it cannot be read as NIfTI.
-    """
-    header = _opened(path).header
-    texts = {name: header[name].tobytes() for name in header if name in NIFTI_TEXTS}
-    return texts | ({"extension": b"1"} if header.extensions else {})
 
 
 def _opened(path: Path) -> Any:
@@ -73,22 +55,15 @@ def _opened(path: Path) -> Any:
     try:
         image = nibabel.load(path)
         if not isinstance(image, nibabel.Nifti1Pair):  # type: ignore[attr-defined]
-            raise VolumeError(
-                f"{path}: cannot be read as an image: it is of Analyze 7.5, which does not say "
-                f"which side is left; save it as NIfTI where that is known"
-            )
+            raise ValueError("Analyze 7.5, which does not say which side is left; save it as NIfTI")
         if image.header["qform_code"] > 0:
             image.get_qform()  # raises where its quaternion is none
         return image
-    except FileNotFoundError as error:
-        raise VolumeError(
-            f"{path}: belongs to {error.filename or error}, which is not there"
-        ) from error
     except (nibabel.filebasedimages.ImageFileError, nibabel.spatialimages.HeaderDataError,
             OSError, EOFError, zlib.error, ValueError, OverflowError) as error:  # fmt: skip
         raise VolumeError(
-            f"{path}: cannot be read as an image: nibabel says {' '.join(str(error).split())!r}; "
-            f"give an MHA, NRRD or NIfTI volume"
+            f"{path}: cannot be read as an image: {' '.join(str(error).split())}; give an MHA, NRRD "
+            f"or NIfTI volume"
         ) from error
 
 
@@ -97,22 +72,18 @@ def _placement(path: Path, image: Any, given: ArrayLike | None) -> NDArray[np.fl
 
     A matrix whose axes are not at right angles gives way to a quaternion, as in ITK.
     """
-    header = image.header
+    header, files = image.header, image.file_map
     # mm of metres, millimetres and micrometres; 0 is not stated, and millimetres by custom
     unit = {1: 1e3, 2: 1.0, 3: 1e-3}.get(int(header["xyzt_units"]) & 7, 1.0)
-    files = image.file_map
     with files.get("header", files["image"]).get_prepare_fileobj("rb") as file:
         # Unchecked, since nibabel's own header has 1 mm where the file has 0.
         pixdim = type(header).from_fileobj(file, check=False)["pixdim"][1:4].astype(float)
-    is_stated = np.isfinite(pixdim).all() and pixdim.all()
-    spacing = np.abs(pixdim) if is_stated else None
-    matrix = _TO_LPS  # no turn
-    sform = header.get_sform()
+    spacing = np.abs(pixdim) if np.isfinite(pixdim).all() and pixdim.all() else None
+    sform, matrix = header.get_sform(), _TO_LPS  # no turn
     steps = np.linalg.norm(sform[:3, :3], axis=0)
     is_square = is_right_angled(sform[:3, :3] / np.where(steps > 0.0, steps, 1.0))
     if header["sform_code"] > 0 and (is_square or header["qform_code"] <= 0):
-        matrix, stated = sform, spacing
-        spacing = steps
+        matrix, stated, spacing = sform, spacing, steps
         if is_square and stated is not None and not np.allclose(steps, stated, rtol=_OF_TWO_SIZES):
             spacing = None
             if given is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"longlong": "i8", "ulonglong": "u8", "float": "f4", "double": "f8"}
 _ENCODINGS: dict[str, Encoding] = {"raw": "raw", "gzip": "packed", "gz": "packed"}
-_ENCODINGS |= {"bzip2": "bzip2", "bz2": "bzip2", "ascii": "text", "text": "text", "txt": "text"}
+_ENCODINGS |= {"bzip2": "bzip2", "bz2": "bzip2"}
 _TO_LPS = {
     "left-posterior-superior": (1, 1, 1),
     "right-anterior-superior": (-1, -1, 1),
@@ -28,7 +27,6 @@ _TO_LPS = {
 _TO_LPS |= {"lps": (1, 1, 1), "ras": (-1, -1, 1), "las": (1, -1, 1)}
 """Signs that turn a space's axes to left-posterior-superior."""
 _DIRECTIONS = "space directions"
-_BY_AXIS = (_DIRECTIONS, "kinds", "spacings", "units", "axis mins")
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
@@ -53,8 +51,7 @@ def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxe
     """Describe the numbers behind a header that ends at byte ``start``.
 
     Raises:
-        VolumeError: a field is missing, the data file is missing, or they are stored in a way that
-            is not read.
+        VolumeError: a field is missing, or they are stored in a way that is not read.
     """
     size = tuple(int(length) for length in fields.get("sizes", ()))
     if len(size) != fields.get("dimension") or min(size, default=0) < 1:
@@ -66,31 +63,18 @@ def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxe
     name = kind.lower().removeprefix("signed ").replace("unsigned ", "u").removesuffix(" int")
     name = name.removesuffix("_t").replace(" ", "")
     name = _TYPES.get(name, name if re.fullmatch("u?int(8|16|32|64)", name) else "")
-    if not name or encoding not in _ENCODINGS:
-        raise VolumeError(
-            f"{path}: holds voxels of type {kind!r} in the encoding {encoding!r}; save it as whole "
-            f"or floating-point numbers: raw, gzip, bzip2 or ascii"
-        )
-    data = fields.get("data file", fields.get("datafile"))
-    if data is not None and (data.startswith("LIST") or "%" in data):
-        raise VolumeError(f"{path}: keeps its voxels in several files; save it as one .nrrd")
-    file = path if data is None else path.parent / data
-    if not file.is_file():
-        raise VolumeError(f"{path}: names the data file {data}, which is not there")
-    with file.open("rb") as opened:
-        opened.seek(start if data is None else 0)
-        for _ in range(fields.get("line skip", fields.get("lineskip", 0))):
-            if not opened.readline():
-                break
-        start = opened.tell()
     skip = fields.get("byte skip", fields.get("byteskip", 0))
+    data = fields.get("data file", fields.get("datafile", path.name))
+    is_odd = "line skip" in fields or "lineskip" in fields or (skip < 0 and encoding != "raw")
+    if not name or encoding not in _ENCODINGS or is_odd or data.startswith("LIST") or "%" in data:
+        raise VolumeError(
+            f"{path}: holds voxels of type {kind!r} in the encoding {encoding!r}, or in several "
+            f"files, or behind lines; save it as one .nrrd of numbers: raw, gzip or bzip2"
+        )
     number = np.dtype(name).newbyteorder(">" if fields.get("endian") == "big" else "<")
-    voxels = StoredVoxels(size, number, file, path, start, max(skip, 0), _ENCODINGS[encoding])
-    if skip == -1 and encoding == "raw":  # the last bytes of the file
-        return replace(voxels, start=max(file.stat().st_size - voxels.expected, start))
-    if skip < 0:
-        raise VolumeError(f"{path}: its byte skip is {skip}, which goes with raw data only")
-    return voxels
+    file = path.parent / data
+    start = start if file == path else 0
+    return StoredVoxels(size, number, file, path, start, skip, _ENCODINGS[encoding])
 
 
 def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
@@ -106,21 +90,18 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     fields, start = nrrd_header(path)
     voxels = nrrd_voxels(path, fields, start)
     count = len(voxels.size)
-    for key in _BY_AXIS:
-        if key in fields and len(fields[key]) != count:
+    for key in (_DIRECTIONS, "kinds", "spacings", "units", "axis mins"):
+        if len(entries := fields.get(key, voxels.size)) != count:
             raise VolumeError(
-                f"{path}: its {key} has {len(fields[key])} entries where the image has {count} "
-                f"axes; export it again"
+                f"{path}: its {key} has {len(entries)} entries where the image has {count} axes"
             )
     axes = _axes_of_space(fields, count)
-    first, last = (axes[0], axes[-1] + 1) if axes else (0, 0)
-    if len(axes) != last - first or count - last > 1 or first > 1:
+    if axes not in ([0, 1, 2], [1, 2, 3]) or count - axes[-1] > 2:
         raise VolumeError(
-            f"{path}: of its {count} axes these are of space: "
-            f"{', '.join(str(n + 1) for n in axes) or 'none'}; save it with three in a row"
+            f"{path}: is {len(axes)}-dimensional: of its {count} axes these are of space: "
+            f"{', '.join(str(n + 1) for n in axes) or 'none'}; a volume has three in a row"
         )
-    if last - first != 3:
-        raise VolumeError(f"{path}: is {last - first}-dimensional; a volume has three dimensions")
+    first = axes[0]
     remark = "the file names no anatomical space: left-posterior-superior is assumed"
     return StoredImage(
         voxels,
@@ -148,8 +129,7 @@ def _placement(
     if space not in _TO_LPS:
         raise VolumeError(
             f"{path}: its space is {space}, which does not say where the body's sides are; write "
-            f"the one that it is into its header: left-posterior-superior, left-anterior-superior "
-            f"or right-anterior-superior"
+            f"the right one into its header, such as left-posterior-superior"
         )
     if _DIRECTIONS not in fields:
         units = fields.get("units", [""] * (axes[-1] + 1))

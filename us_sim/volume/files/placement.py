@@ -77,31 +77,19 @@ def checked_placement(
     direction = np.asarray(direction, np.float64).reshape(3, 3)
     lengths = np.linalg.norm(direction, axis=0)
     along = direction / np.where(lengths > 0.0, lengths, 1.0)
-    sides = " × ".join(f"{side:g}" for side in spacing)
     if not (_SPACINGS[0] <= spacing.min() and spacing.max() <= _SPACINGS[1]):  # nan is not
-        problem = (
-            f"has the voxel spacing {sides} mm; that of a body is {_SPACINGS[0]:g} to "
-            f"{_SPACINGS[1]:g} mm: correct it"
-        )
-    elif not (np.isfinite(direction).all() and np.isfinite(origin).all()):
-        problem = "has an origin or a direction matrix that is not finite: correct it"
-    elif abs(np.linalg.det(along)) < 1e-6:
-        problem = "has a singular direction matrix, so its axes span no volume: correct it"
+        problem = f"the voxel spacing {' × '.join(f'{side:g}' for side in spacing)} mm"
+    elif not np.abs(origin).max() <= _FARTHEST:
+        problem = f"an origin that is {np.abs(origin).max() / 1e3:.3g} m away"
+    elif not abs(np.linalg.det(along)) > 1e-6:
+        problem = "a direction matrix that is singular or not finite"
     elif not is_right_angled(along):
-        problem = (
-            f"has axes that are {degrees_off(along):.2g}° off a right angle (sheared); resample it "
-            f"on a grid with right angles"
-        )
+        problem = f"axes that are {degrees_off(along):.2g}° off a right angle (sheared)"
     elif np.abs(lengths - 1.0).max() > _RIGHT_ANGLE:
-        problem = "has axes that are scaled by its direction matrix: give each the length 1"
-    elif np.abs(origin).max() > _FARTHEST:
-        problem = (
-            f"lies {np.abs(origin).max() / 1e3:.3g} m from its origin; {_FARTHEST / 1e3:g} m are "
-            f"possible at most: correct it"
-        )
+        problem = "axes that are scaled by its direction matrix"
     else:
         placement = np.eye(4)
         placement[:3, :3] = direction * spacing * 1e-3
         placement[:3, 3] = origin * 1e-3
         return placement
-    raise VolumeError(f"{path}: {problem}")
+    raise VolumeError(f"{path}: has {problem}: correct its header, or resample it")

@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,23 +45,16 @@ FRAME_KEY = re.compile(r"Seq_Frame([0-9]+)_(\w+)")
 
 
 def read_volume(path: str | os.PathLike[str]) -> Volume:
-    """A scalar three-dimensional image file, or a DICOM series' folder, as a volume without labels.
+    """Read a scalar 3D image file, or a DICOM series' file or folder, as a volume without labels.
 
-    Frame ``patient`` is the file's own: DICOM's left-posterior-superior axes, in metres. Spacing,
-    its unit, origin and direction matrix are all respected. uint8 is taken as it is; every other
-    type is mapped linearly so that its smallest finite value becomes 0 and its largest 255 (a
-    constant image becomes 0, and so does NaN, which some programs write where nothing was scanned).
-
-    DICOM needs the extra ``dicom``: an Enhanced US Volume, another file of several images that
-    states where they lie, or a folder with the files of one series; of several volumes in time the
-    first is taken. Colour becomes grey. The axes are those that the file states: for an Enhanced US
-    Volume its own frame of reference.
+    Frame ``patient`` is the file's own: DICOM's left-posterior-superior axes, in metres. uint8 is
+    taken as it is; every other type is mapped linearly so that its smallest finite value becomes 0
+    and its largest 255. Of several volumes in time in DICOM the first is taken.
 
     Raises:
         VolumeError: the file is missing or no image, holds fewer or more bytes than its header
-            says, is larger than `LARGEST_VOLUME` or the free memory, is not a scalar
-            three-dimensional image of two voxels or more along each axis, or has a spacing,
-            origin or direction that places no volume.
+            says, does not fit into memory, is not a scalar three-dimensional image of two voxels
+            or more along each axis, or has a spacing, origin or direction that places no volume.
     """
     path = Path(path)
     if files := _dicom_files(path):
@@ -101,17 +95,15 @@ def open_image(
     Raises:
         VolumeError: as `read_volume`, except for faults of the voxels and of where they lie.
     """
-    if not path.exists():
-        raise VolumeError(f"{path}: there is no such file")
     if not path.is_file():
-        raise VolumeError(f"{path}: is not a file; give one MHA, NRRD, NIfTI or DICOM volume")
+        raise VolumeError(f"{path}: there is no such file")
     if not path.name.lower().endswith(ENDINGS):
         raise refuse_other(
             path, "cannot be read as an image; give an MHA, NRRD, NIfTI or DICOM volume"
         )
-    if use := sequence_use(path):
-        raise VolumeError(f"{path}: is no volume but {use}")
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
+    if _READERS[ending] is not nifti_image and (use := sequence_use(path)):
+        raise VolumeError(f"{path}: is no volume but {use}")
     image = _READERS[ending](path, spacing)
     image.check(layers=layers)
     return image
@@ -133,8 +125,7 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
         said += levels.described(8 * image.voxels.type.itemsize)
     if image.volumes > 1:
         said.append(f"volume {volume} of {image.volumes}")
-    slices = (levels(plane) for plane in image.slices(volume))
-    return volume_of_slices(slices, image.shape[2]), tuple(said)
+    return volume_of_slices(map(levels, image.slices(volume)), image.shape[2]), tuple(said)
 
 
 def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:
@@ -162,28 +153,35 @@ def sequence_use(path: Path) -> str | None:
     Raises:
         VolumeError: it has no header of its format.
     """
-    name = path.name.lower()
-    if name.endswith((".nrrd", ".nhdr")):
-        keys, _ = nrrd_header(path)
-        kinds, sizes = keys.get("kinds", []), [str(length) for length in keys.get("sizes", ())]
-    elif name.endswith((".mha", ".mhd")):
-        keys, _ = metaimage_header(path)
-        kinds, sizes = keys.get("Kinds", "").split(), keys.get("DimSize", "").split()
-    else:
-        return None
-    if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != "1" and sizes[0] != "0"):
+    keys, kinds, sizes, _ = sequence_header(path)
+    if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != 1 and sizes[0]):
         return None  # several volumes in time are no sequence of flat images
     frames = [match for match in map(FRAME_KEY.match, keys) if match]
     if "time" not in kinds and len(sizes) == 3 and not frames:
         return None  # Plus also writes volumes with the axes of a sequence, but without frames
-    if "0" in sizes:
+    if 0 in sizes:
         return f"a recording of poses without images; play it with `--path {path.name}`"
     if not any(match[2].endswith("Transform") for match in frames):
         return "a sequence of images without poses; record it again with a tracked probe"
-    return (
-        f"a sequence of tracked frames; make a volume of it with `us-sim reconstruct {path.name} "
-        f"--out volume.nrrd`"
-    )
+    return f"a sequence of tracked frames; give it to `us-sim reconstruct {path.name}`"
+
+
+def sequence_header(path: Path) -> tuple[dict[str, Any], list[str], list[int], int]:
+    """Read a MetaImage or NRRD header: keys, kinds and lengths of axes, and its length in bytes.
+
+    Raises:
+        VolumeError: it is none.
+    """
+    if path.name.lower().endswith((".nrrd", ".nhdr")):
+        keys, start = nrrd_header(path)
+        kinds = [kind.lower() for kind in keys.get("kinds", ())]
+        return keys, kinds, [int(length) for length in keys.get("sizes", ())], start
+    keys, start = metaimage_header(path)
+    try:
+        sizes = [int(word) for word in keys.get("DimSize", "").split()]
+    except ValueError:
+        raise VolumeError(f"{path}: its DimSize is {keys['DimSize']!r}; export it again") from None
+    return keys, keys.get("Kinds", "").lower().split(), sizes, start
 
 
 def _placed(path: Path) -> tuple[StoredImage, NDArray[np.float64]]:

@@ -25,8 +25,8 @@ LARGEST_VOLUME = 1 << 29  # numbers in the largest image that is read: 1024 × 1
 
 _STEP = 1 << 20
 
-Encoding = Literal["raw", "packed", "bzip2", "text"]
-"""As they are; by zlib or gzip; by bzip2; as words."""
+Encoding = Literal["raw", "packed", "bzip2"]
+"""As they are; by zlib or gzip; by bzip2."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class StoredVoxels:
     file: Path
     header: Path  # the file with the header, which errors name
     start: int = 0  # byte of the file at which they, or the packed bytes, begin
-    skip: int = 0  # bytes before them, after unpacking
+    skip: int = 0  # bytes before them, after unpacking; -1 of raw ones: they end the file
     encoding: Encoding = "raw"
 
     @property
@@ -50,10 +50,13 @@ class StoredVoxels:
         """Compare the bytes of raw numbers with the header; packed ones are compared as read.
 
         Raises:
-            VolumeError: there are more or fewer.
+            VolumeError: there are more or fewer, or the file is not there.
         """
+        if not self.file.is_file():
+            raise VolumeError(f"{self.header}: belongs to {self.file.name}, which is not there")
         if self.encoding == "raw":
-            self._check_length(self.file.stat().st_size - self.start - self.skip)
+            there = self.file.stat().st_size - self.start - max(self.skip, 0)
+            self._check_length(min(there, self.expected) if self.skip < 0 else there)
 
     def pieces(self, size: int, wanted: Iterable[int] | None = None) -> Iterator[NDArray[Any]]:
         """Yield arrays of ``size`` numbers each, such as the slices of a volume.
@@ -66,10 +69,14 @@ class StoredVoxels:
             VolumeError: there are fewer or more than the header says, or they are damaged.
         """
         self.check_bytes()
-        step, at = size * self.type.itemsize, -self.skip
+        step, at = size * self.type.itemsize, 0
         with self._stream() as stream:
             for number in range(self.expected // step) if wanted is None else wanted:
-                at += _pass(stream, number * step - at)
+                if self.encoding == "raw":
+                    stream.seek(number * step - at, io.SEEK_CUR)
+                    at = number * step
+                while at < number * step and (passed := stream.read(step)):
+                    at += len(passed)
                 data = stream.read(step)
                 at += len(data)
                 if len(data) != step:
@@ -81,25 +88,20 @@ class StoredVoxels:
     @contextmanager
     def _stream(self) -> Iterator[Any]:
         """Open the bytes after unpacking, from those on that are skipped."""
+        unpack = {"packed": lambda file: io.BufferedReader(_Inflated(file)), "bzip2": bz2.BZ2File}
         try:
             with self.file.open("rb") as file:
                 file.seek(self.start)
-                match self.encoding:
-                    case "raw":
-                        yield file
-                    case "packed":
-                        yield _Inflated(file)
-                    case "bzip2":
-                        yield bz2.BZ2File(file)
-                    case "text":
-                        words = np.array(file.read().split())
-                        yield io.BytesIO(words.astype(self.type).tobytes())
-        except (zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
+                stream = unpack.get(self.encoding, lambda file: file)(file)
+                if self.skip < 0:
+                    file.seek(-self.expected, io.SEEK_END)
+                stream.read(max(self.skip, 0))
+                yield stream
+        except (zlib.error, EOFError, OSError) as error:
             if isinstance(error, OSError) and error.errno is not None:
                 raise  # the file cannot be read at all
             raise VolumeError(
-                f"{self.header}: its image data are broken or cut short ({error}); copy or export "
-                f"it again"
+                f"{self.header}: its image data are broken or cut ({error}); copy it again"
             ) from error
 
     def _check_length(self, there: int) -> None:
@@ -111,19 +113,8 @@ class StoredVoxels:
             )
 
 
-def _pass(stream: Any, count: int) -> int:
-    """Skip bytes; return ``count``, or fewer at the end."""
-    if isinstance(stream, io.BufferedReader):
-        stream.seek(count, io.SEEK_CUR)
-        return count
-    passed = 0
-    while passed < count and (data := stream.read(min(count - passed, _STEP))):
-        passed += len(data)
-    return passed
-
-
-class _Inflated:
-    """The plain bytes of a zlib or gzip stream in a file, a piece at a time.
+class _Inflated(io.RawIOBase):
+    """The plain bytes of a zlib or gzip stream in a file.
 
     MetaImage packs by zlib, for which the standard library has no file; IGSIO writes gzip in
     several members, of which pynrrd reads the first.
@@ -133,23 +124,24 @@ class _Inflated:
         self._file = file
         self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)
 
-    def read(self, count: int, /) -> bytes:
-        """Return the next bytes, fewer at the end; EOFError where the stream breaks off."""
-        pieces = []
-        while count:
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        piece = b""
+        while not piece:
             done = self._inflate.eof
             packed = self._inflate.unused_data if done else self._inflate.unconsumed_tail
             packed = packed or self._file.read(_STEP)
-            if done:  # the next member, if there is one
-                if not packed:
-                    break
+            if done and not packed:
+                return 0
+            if done:  # the next member
                 self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)
-            piece = self._inflate.decompress(packed, count)
-            if not packed and not piece and not self._inflate.eof:
+            piece = self._inflate.decompress(packed, len(buffer))
+            if not (packed or piece or self._inflate.eof):
                 raise EOFError("its compression ends too early")
-            pieces.append(piece)
-            count -= len(piece)
-        return b"".join(pieces)
+        buffer[: len(piece)] = piece
+        return len(piece)
 
 
 def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
@@ -158,23 +150,17 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
     Raises:
         VolumeError: it is larger than `LARGEST_VOLUME`, or than the memory that is free.
     """
-    numbers = math.prod(size)
-    shown = " × ".join(map(str, size))
-    if numbers > LARGEST_VOLUME:
+    count = math.prod(size)
+    needed, free = count * (value + 1), free_memory()  # as they are stored, and as grey values
+    if count > LARGEST_VOLUME or needed > free:
         raise VolumeError(
-            f"{path}: says it holds {shown} numbers; {LARGEST_VOLUME} are read at most: cut out "
-            f"the part that is needed, or resample it"
-        )
-    needed, free = numbers * (value + 1), free_memory()  # as they are stored, and as grey values
-    if needed > free:
-        raise VolumeError(
-            f"{path}: says it holds {shown} numbers, which take {needed / 1e9:.1f} GB of memory "
-            f"where {free / 1e9:.1f} GB are free: end other programs, or resample it"
+            f"{path}: says it holds {' × '.join(map(str, size))} numbers, {needed / 1e9:.3g} GB of "
+            f"memory; {LARGEST_VOLUME} numbers and {free / 1e9:.3g} GB are possible: cut out a part"
         )
 
 
 def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
-    """Refuse an image of radio-frequency data, which swing about zero along the beam.
+    """Refuse radio-frequency data, which swing about zero along the beam.
 
     Other signed images, such as CT, seldom change sign between neighbours.
 
@@ -183,19 +169,17 @@ def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
         image: (j, i) of a volume, or of a sequence; beams along either axis.
 
     Raises:
-        VolumeError: it is one.
+        VolumeError: they are.
     """
     if image.dtype.kind not in "if" or max(image.shape) < 64:
         return
     below = image < 0
-    turns = max(
-        float(np.mean(below[1:] != below[:-1])), float(np.mean(below[:, 1:] != below[:, :-1]))
-    )
+    turns = max(np.mean(below[1:] != below[:-1]), np.mean(below[:, 1:] != below[:, :-1]))
     share, mean, spread = below.mean(), image.mean(dtype=np.float64), image.std(dtype=np.float64)
     if 0.3 < share < 0.7 and turns > 0.2 and abs(mean) < 0.25 * spread:
         raise VolumeError(
-            f"{path}: looks like radio-frequency data ({100 * share:.0f} % of it is below zero and "
-            f"it swings about zero), not like a B-mode image: give the logarithm of its envelope"
+            f"{path}: looks like radio-frequency data ({100 * share:.0f} % of it is below zero), "
+            f"not like a B-mode image: give the logarithm of its envelope"
         )
 
 
@@ -237,21 +221,19 @@ class StoredImage:
         return self.axes[3] if len(self.axes) == 4 else 1
 
     def check(self, *, layers: bool = False) -> None:
-        """Refuse an image that is no volume, or none that can be read.
+        """Refuse an image that is no volume, or does not fit into memory.
 
         With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
 
         Raises:
             VolumeError: it is not of three dimensions, or of four as several volumes, has one voxel
-                only along an axis, several numbers a voxel, or is larger than what is read.
+                only along an axis, several numbers a voxel, or is too large.
         """
         path, axes = self.voxels.header, self.axes
-        if len(axes) not in (3, 4):
-            raise VolumeError(f"{path}: is {len(axes)}-dimensional; a volume has three dimensions")
-        if min(axes[:3]) < 2:
+        if len(axes) not in (3, 4) or min(axes[:3]) < 2:
             raise VolumeError(
-                f"{path}: has {' × '.join(map(str, axes))} voxels; a volume needs two or more "
-                f"along each axis"
+                f"{path}: is {len(axes)}-dimensional, {' × '.join(map(str, axes))}; a volume has "
+                f"three dimensions and two voxels or more along each axis"
             )
         if self.components != 1 and not layers:
             raise VolumeError(

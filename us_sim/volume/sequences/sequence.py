@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.metaimage import metaimage_header, metaimage_voxels
-from us_sim.volume.files.nrrd import nrrd_header, nrrd_voxels
-from us_sim.volume.files.readers import is_sequence
+from us_sim.volume.files.metaimage import metaimage_voxels
+from us_sim.volume.files.nrrd import nrrd_voxels
+from us_sim.volume.files.readers import is_sequence, sequence_header
 from us_sim.volume.files.stored_image import (
     GreyLevels,
     StoredVoxels,
@@ -159,7 +159,9 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
             header, or says no usable size.
     """
     path = Path(path)
-    keys, kinds, sizes, start = _header(path)
+    if not path.is_file():
+        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
+    keys, kinds, sizes, start = sequence_header(path)
     described = frame_fields(keys)
     if not described or (kinds and not is_sequence(kinds, keys)):
         axes = f" (its axes are {' '.join(kinds)})" if kinds else ""
@@ -201,22 +203,6 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         channels > 1,
         stored,
     )
-
-
-def _header(path: Path) -> tuple[dict[str, Any], list[str], list[int], int]:
-    """Read the keys of a sequence, the kinds and lengths of its axes, and the header's bytes."""
-    if not path.is_file():
-        raise VolumeError(f"{path}: there is no such file; {_GIVE}")
-    if path.name.lower().endswith((".nrrd", ".nhdr")):
-        keys, start = nrrd_header(path)
-        kinds = [kind.lower() for kind in keys.get("kinds", ())]
-        return keys, kinds, [int(length) for length in keys.get("sizes", ())], start
-    keys, start = metaimage_header(path)
-    try:
-        sizes = [int(word) for word in keys.get("DimSize", "").split()]
-    except ValueError:
-        raise VolumeError(f"{path}: its DimSize is {keys['DimSize']!r}; export it again") from None
-    return keys, keys.get("Kinds", "").lower().split(), sizes, start
 
 
 def _stored_images(
