@@ -57,12 +57,12 @@ def _import(args: argparse.Namespace) -> int:
         refuse_report(args.report)
     found = look_at(args.files, args.out, settings)
     if args.report is not None:  # before what is refused: its picture shows what to say
-        written = write_report(args.report, found.imported)
-        print(report_text(found.imported))
+        written = write_report(args.report, found)
+        print(report_text(found))
         print(f"{written[0]} and {written[1].name} beside it, which may show a name")
     if args.out is not None:
         found.write(late_progress("import"))
-        print(f"{args.out}: {summary(found.imported)}")
+        print(f"{args.out}: {summary(found)}")
     return 0
 
 

@@ -4,38 +4,20 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
 
-@dataclass(frozen=True)
-class Rectangle:
+class Rectangle(NamedTuple):
     """From a first column and row to last ones that belong to it, as in DICOM's regions."""
 
     left: int
     top: int
     right: int
     bottom: int
-
-    @classmethod
-    def read(cls, text: str) -> Rectangle:
-        """From ``X0,Y0,X1,Y1``.
-
-        Raises:
-            ValueError: it is written otherwise, or holds no pixel.
-        """
-        words = [word.strip() for word in text.split(",")]
-        if len(words) != 4 or not all(re.fullmatch(r"[0-9]{1,5}", word) for word in words):
-            raise ValueError(
-                f"{text[:80]!r} is no rectangle; write X0,Y0,X1,Y1: its first column and row and "
-                f"its last ones, counted from 0"
-            )
-        made = cls(*map(int, words))
-        if min(made.size) < 1:
-            raise ValueError(f"{text[:80]!r} holds no pixel: X1 and Y1 are the last ones")
-        return made
 
     @property
     def size(self) -> tuple[int, int]:
@@ -49,12 +31,12 @@ class Rectangle:
 
     def common(self, other: Rectangle) -> Rectangle | None:
         """Return the part that both have; None where they have none."""
-        left, top = max(self.left, other.left), max(self.top, other.top)
-        right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
-        return Rectangle(left, top, right, bottom) if left <= right and top <= bottom else None
+        first, last = map(max, self[:2], other[:2]), map(min, self[2:], other[2:])
+        made = Rectangle(*first, *last)
+        return made if min(made.size) > 0 else None
 
     def __str__(self) -> str:
-        return f"{self.left},{self.top},{self.right},{self.bottom}"
+        return ",".join(map(str, self))
 
 
 @dataclass(frozen=True)
@@ -86,11 +68,9 @@ class ImportSettings(Settings):
 
     def check(self) -> None:
         """Refuse a crop that is no rectangle, and a spacing that is none."""
-        if self.crop is not None:
-            try:
-                Rectangle.read(self.crop)
-            except ValueError as error:
-                raise self.refused("crop", str(error)) from error
+        if self.crop is not None and (self.part is None or min(self.part.size) < 1):
+            why = "is no rectangle with a pixel; write X0,Y0,X1,Y1, the last ones included"
+            raise self.refused("crop", why)
         if self.spacing is not None and not self.spacing_mm:
             raise self.refused("spacing", "is no two or three numbers of mm; write 0.3,0.3,1")
 
@@ -106,4 +86,5 @@ class ImportSettings(Settings):
     @property
     def part(self) -> Rectangle | None:
         """The rectangle that is kept."""
-        return None if self.crop is None else Rectangle.read(self.crop)
+        words = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*", self.crop or "")
+        return Rectangle(*map(int, words.groups())) if words else None

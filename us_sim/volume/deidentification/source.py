@@ -11,7 +11,7 @@ from __future__ import annotations
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.volume.deidentification.kept_values import dropped_names, kept_values
 from us_sim.volume.deidentification.settings import Rectangle
-from us_sim.volume.files.dicom.header import DicomFile, items, number, numbers, text
-from us_sim.volume.files.dicom.pixels import GreyImages
+from us_sim.volume.files.dicom.header import DicomFile, groups_of, items, number, numbers, text
+from us_sim.volume.files.dicom.pixels import ImageFormat
 from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
 from us_sim.volume.files.dicom.planes import frame_times, is_cartesian
 from us_sim.volume.files.readers import grey_voxels, open_image
@@ -42,15 +42,6 @@ class Region:
     pixel_mm: Scale | None  # None: its header does not state it
 
 
-@dataclass(frozen=True)
-class Regions:
-    """All regions of echoes."""
-
-    kept: tuple[Region, ...] = ()
-    blanked: int = 0  # regions of other kinds
-    doubt: str = ""  # why the header is not believed, or that it has none
-
-
 @dataclass(frozen=True, eq=False)
 class Source:
     """Images of one volume or of one recording, as they come."""
@@ -59,15 +50,16 @@ class Source:
     shape: tuple[int, int, int]  # columns, rows, images
     first: NDArray[np.uint8]  # (rows, columns) the first image as it is
     dropped: Mapping[str, int]  # elements of the header that do not go on, and how many of each
-    kept: Mapping[str, str]  # values that go on, by their fields
     conversions: tuple[str, ...]  # of the stored values
-    regions: Regions  # of echoes, as the header says
-    needs_part: bool  # images that may show a name outside the regions
     placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
-    times: list[float]  # s, of images that are no volume
-    pixel_mm: Scale | None  # of all of an image, where it is stated
     voxels: Callable[[Keep, Progress | None], NDArray[np.uint8]] | None  # reads (i, j, k)
-    images: Callable[[Keep], Iterator[NDArray[np.uint8]]] | None  # reads one after another
+    images: Callable[[Keep], Iterator[NDArray[np.uint8]]] | None = None  # reads one after another
+    kept: Mapping[str, str] = field(default_factory=dict)  # values that go on, by their fields
+    regions: tuple[Region, ...] = ()  # of echoes, as the header says
+    doubt: str = ""  # why it states none, or is not believed
+    needs_part: bool = False  # images that may show a name outside the regions
+    times: Sequence[float] = ()  # s, of images that are no volume
+    pixel_mm: Scale | None = None  # of all of an image, where it is stated
 
 
 def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> Source:
@@ -87,22 +79,15 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
     image.check(layers=False)
     placement = image.placement()
     voxels, conversions = grey_voxels(image, volume)
-    ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
-    kind = {"mha": "MetaImage", "mhd": "MetaImage", "nrrd": "NRRD", "nhdr": "NRRD"}
+    kind = {".mha": "MetaImage", ".mhd": "MetaImage", ".nrrd": "NRRD", ".nhdr": "NRRD"}
     return Source(
-        kind=f"{kind.get(ending, 'NIfTI')} volume",
-        shape=image.shape,
-        first=np.ascontiguousarray(voxels[:, :, 0].T),
-        dropped={"all of the header but the grid": 1},
-        kept={},
-        conversions=conversions,
-        regions=Regions(),
-        needs_part=False,
-        placement=placement,
-        times=[],
-        pixel_mm=None,
-        voxels=lambda *_: voxels,
-        images=None,
+        f"{kind.get(path.suffix.lower(), 'NIfTI')} volume",
+        image.shape,
+        np.ascontiguousarray(voxels[:, :, 0].T),
+        {"all of the header but the grid": 1},
+        conversions,
+        placement,
+        lambda *_: voxels,
     )
 
 
@@ -126,9 +111,8 @@ def dicom_source(
     placed = placed_images(images, volume, spacing) if is_volume else None
     which = placed.which if placed else images.all
     conversions = list(images.conversions)
-    times = None  # images of several files have none in common
-    if len(images.files) == 1:
-        times = frame_times(images.files[0], images.form.frames)
+    # Images of several files have no times in common.
+    times = frame_times(images.files[0], images.form.frames) if len(images.files) == 1 else None
     if placed is None and times is None:
         conversions.append("times of images are not stated: one every 40 ms is assumed")
     if placed is not None and placed.volumes > 1:
@@ -136,66 +120,48 @@ def dicom_source(
     scales = {_stated_scale(file) for file in images.files}
     if placed is None and len(scales) > 1:
         raise VolumeError(
-            f"{paths[0]}: and the other files have pixels of different sizes; import them one "
-            f"by one"
+            f"{paths[0]}: and the other files have pixels of different sizes; import each by itself"
         )
     kept = _agreed_values(images.files)
-    dropped: Counter[str] = Counter()
-    for file in images.files:
-        dropped.update(dropped_names(file.header, kept))
-    regions = _agreed_regions(images)
+    regions = {_ultrasound_regions(file, images.form) for file in images.files}
     burned = any(text(file.header, "BurnedInAnnotation") == "YES" for file in images.files)
+    echoes, doubt = regions.pop()
     return Source(
-        kind=_kind(images.files[0]),
-        shape=(images.form.columns, images.form.rows, len(which)),
-        first=next(images.images(which[:1])),
-        dropped=dict(dropped),
-        kept=kept,
-        conversions=tuple(conversions),
-        regions=regions,
-        needs_part=placed is None or burned,
-        placement=placed.placement if placed else None,
-        times=[n * 0.04 for n in range(len(which))] if times is None else times,
-        pixel_mm=next(iter(scales)),
-        voxels=placed.voxels if placed else None,
-        images=lambda keep: images.images(which, keep),
+        _kind(images.files[0]),
+        (images.form.columns, images.form.rows, len(which)),
+        next(images.images(which[:1])),
+        sum((Counter(dropped_names(file.header, kept)) for file in images.files), Counter()),
+        tuple(conversions),
+        placed.placement if placed else None,
+        placed.voxels if placed else None,
+        lambda keep: images.images(which, keep),
+        kept,
+        () if regions else echoes,
+        "the files have different ultrasound regions" if regions else doubt,
+        placed is None or burned,
+        [n * 0.04 for n in range(len(which))] if times is None else times,
+        next(iter(scales)),
     )
 
 
-def _agreed_regions(images: GreyImages) -> Regions:
-    """Return the regions on which all files agree."""
-    rows, columns = images.form.rows, images.form.columns
-    every = [_ultrasound_regions(file, rows, columns) for file in images.files]
-    if len({regions.kept for regions in every}) > 1:
-        return Regions(doubt="the files have different ultrasound regions")
-    return every[0]
-
-
-def _ultrasound_regions(file: DicomFile, rows: int, columns: int) -> Regions:
-    """Return the regions of echoes, if the sequence is there and can be true."""
-    listed = items(file.header, "SequenceOfUltrasoundRegions")
-    kept, blanked = [], 0
-    for region in listed:
+def _ultrasound_regions(file: DicomFile, form: ImageFormat) -> tuple[tuple[Region, ...], str]:
+    """Return the regions of echoes; none, with the reason, if one of the header's cannot be."""
+    kept = []
+    for region in items(file.header, "SequenceOfUltrasoundRegions"):
         keys = ("MinX0", "MinY0", "MaxX1", "MaxY1")
-        edges = [number(region, f"RegionLocation{key}") for key in keys]
-        if any(edge is None for edge in edges):
-            return Regions(doubt="a region has no edges")
-        left, top, right, bottom = (int(edge or 0) for edge in edges)
+        found = [number(region, f"RegionLocation{key}") for key in keys]
+        edges = [-1 if each is None else int(each) for each in found]
         # Some scanners write the first column beyond a region as its last.
-        if right > columns or bottom > rows or min(left, top) < 0:
-            doubt = f"a region reaches to {right},{bottom} in an image of {columns} × {rows} pixels"
-            return Regions(doubt=doubt)
-        part = Rectangle(left, top, min(right, columns - 1), min(bottom, rows - 1))
-        if min(part.size) < 1:
-            return Regions(doubt="a region holds no pixel")
+        ends = (form.columns - 1, form.rows - 1)
+        part = Rectangle(edges[0], edges[1], *map(min, edges[2:], ends))
+        is_within = edges[2] <= form.columns and edges[3] <= form.rows
+        if min(edges) < 0 or min(part.size) < 1 or not is_within:
+            doubt = f"a region is {edges} in an image of {form.columns} × {form.rows} pixels"
+            return (), doubt
         kinds = number(region, "RegionSpatialFormat"), number(region, "RegionDataType")
         if kinds in ((1, 1), (1, 2)):  # two-dimensional, of tissue or of colour flow
             kept.append(Region(part, _region_scale(region)))
-        else:
-            blanked += 1
-    doubt = "no region is a two-dimensional image of tissue or flow" if not kept else ""
-    doubt = doubt if listed else "there is no sequence of ultrasound regions"
-    return Regions(tuple(kept), blanked, doubt)
+    return tuple(kept), "" if kept else "there is no ultrasound region of tissue or flow"
 
 
 def _region_scale(region: Any) -> Scale | None:
@@ -208,30 +174,21 @@ def _region_scale(region: Any) -> Scale | None:
 
 def _stated_scale(file: DicomFile) -> Scale | None:
     """Read `PixelSpacing`, or its counterpart in secondary captures."""
-    header = file.header
-    measures = [
-        each
-        for key in ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence")
-        for group in items(header, key)[:1]
-        for each in items(group, "PixelMeasuresSequence")
-    ]
-    for source in (header, *measures):
+    groups = groups_of(file.header, int(number(file.header, "NumberOfFrames") or 1))[0]
+    measures = (each for group in groups for each in items(group, "PixelMeasuresSequence"))
+    for source in (file.header, *measures):
         # Between rows, then between columns (PS3.3, 10.7.1.3).
-        stated = numbers(source, "PixelSpacing", 2)
-        stated = stated or numbers(source, "NominalScannedPixelSpacing", 2)
-        if stated and all(1e-4 <= each <= 100.0 for each in stated):
-            return stated[1], stated[0]
+        for key in ("PixelSpacing", "NominalScannedPixelSpacing"):
+            stated = numbers(source, key, 2)
+            if stated and all(1e-4 <= each <= 100.0 for each in stated):
+                return stated[1], stated[0]
     return None
 
 
 def _agreed_values(files: Sequence[DicomFile]) -> dict[str, str]:
     """Return values on which all files agree, and a frame of reference that leads nowhere."""
-    first, *others = (kept_values(file.header) for file in files)
-    agreed = {
-        name: value
-        for name, value in first.items()
-        if all(other.get(name) == value for other in others)
-    }
+    first, *others = (kept_values(file.header).items() for file in files)
+    agreed = {name: word for name, word in first if all((name, word) in each for each in others)}
     header = files[0].header
     if text(header, "FrameOfReferenceUID") or text(header, "VolumeFrameOfReferenceUID"):
         # Of random numbers (PS3.5, B.2), and not of the original's digits by any function.

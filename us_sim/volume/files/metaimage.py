@@ -43,8 +43,8 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
             if not equals:
                 break
     raise VolumeError(
-        f"{path}: cannot be read as an image: its header has no ElementDataFile at its end; give an "
-        f"MHA, NRRD or NIfTI volume"
+        f"{path}: cannot be read as an image: no ElementDataFile ends its header; give an MHA, "
+        f"NRRD or NIfTI volume"
     )
 
 

@@ -62,8 +62,8 @@ def _opened(path: Path) -> Any:
     except (nibabel.filebasedimages.ImageFileError, nibabel.spatialimages.HeaderDataError,
             OSError, EOFError, zlib.error, ValueError, OverflowError) as error:  # fmt: skip
         raise VolumeError(
-            f"{path}: cannot be read as an image: {' '.join(str(error).split())}; give an MHA, NRRD "
-            f"or NIfTI volume"
+            f"{path}: cannot be read as an image: {' '.join(str(error).split())}; give an MHA, "
+            f"NRRD or NIfTI volume"
         ) from error
 
 

@@ -88,11 +88,14 @@ class StoredVoxels:
     @contextmanager
     def _stream(self) -> Iterator[Any]:
         """Open the bytes after unpacking, from those on that are skipped."""
-        unpack = {"packed": lambda file: io.BufferedReader(_Inflated(file)), "bzip2": bz2.BZ2File}
         try:
             with self.file.open("rb") as file:
                 file.seek(self.start)
-                stream = unpack.get(self.encoding, lambda file: file)(file)
+                stream: Any = file
+                if self.encoding == "packed":
+                    stream = io.BufferedReader(_Inflated(file))
+                elif self.encoding == "bzip2":
+                    stream = bz2.BZ2File(file)
                 if self.skip < 0:
                     file.seek(-self.expected, io.SEEK_END)
                 stream.read(max(self.skip, 0))

@@ -143,7 +143,7 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
     [
         ({"Rows": 13}, "480 bytes .* 520"),
         ({"NumberOfFrames": 3}, "480 bytes .* 360"),
-        ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "are read at most"),
+        ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "numbers and"),
         ({"NumberOfFrames": -1}, "holds -1 images"),
         ({"Rows": 0}, "10 × 0 pixels"),
         ({"BitsAllocated": 1, "BitsStored": 1}, "its header says 60"),
@@ -160,12 +160,12 @@ def test_headers_that_cannot_be_are_refused(tmp_path, values, message):
 def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
     monkeypatch.setattr(stored_image, "free_memory", lambda: 500.0)
-    refused(path, "of memory where")
+    refused(path, "GB of memory")
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
-    [({"NumberOfFrames": 5}, "decoded"), ({"Rows": 60000, "Columns": 60000}, "at most")],
+    [({"NumberOfFrames": 5}, "decoded"), ({"Rows": 60000, "Columns": 60000}, "GB of memory")],
 )
 def test_compressed_images_are_as_many_and_as_large_as_the_header_says(tmp_path, values, message):
     made = compressed(header(CINE, US_MULTI_FRAME), RLELossless)
