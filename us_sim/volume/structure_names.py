@@ -11,62 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 
-_TEXT = """
-    abdominal abdominis abscess achilles acromioclavicular acromion adductor adenohypophysis adipose
-    adrenal air amniotic amygdaloid and aneurysm annulus anterior anus aorta aortic aponeurosis
-    appendage appendix aqueduct arachnoid arch arcuate arm artefact arteria arterial arteries artery
-    articular ascending atrial atrium autochthon autonomic axilla axillary azygos background basilic
-    basilica biceps bicipital bifurcation bile biliary bladder bleeding blood body bone bones bowel
-    brachial brachialis brachiocephalic brachioradialis brain branch branches breast bronchi
-    bronchus bulb bundle bursa calcaneus calcification calcified calf callosum canal capillary
-    capitate capsule carcinoma cardiac carotid carpal carpi cartilage cartilages catheter caudate
-    cava caval cavity celiac central cephalic cephalica cerebellar cerebral cervical cervix chest
-    chiasm cingulum circulatory circumflex clavicle clavicula clot coccyx coeliac collateral colon
-    column commissural commissure common complex condyle connective coracoid cord coronary corpus
-    cortex cortical corticospinal costal cranial cruciate csf cuboid cuneiform cyst deep deferent
-    deltoid descending diaphragm diencephalon digastric digital digitorum disc dissection distal
-    dorsal dorsalis dorsi duct ductus duodenum dura ear edema elbow embolism endocrine endometrium
-    epicondyle epidermis epididymis epidural erector esophagus ethmoid extensor external eyeball
-    facet fallopian fascia fascicle fasciculus fat fatty feces femoral femoralis femoris femur fetal
-    fetus fibers fibroid fibrosus fibula finger flavum flexor fluid follicle foot foramen forearm
-    forehead foreign fornix fourth frontal gall gallbladder ganglion gas gastric gastrocnemius
-    gastroduodenal gland glands glenoid gluteus gonadal gracilis graft great groin haematoma hamate
-    hand head heart hematoma hepatic hepatica hilum hip humerus hyoid iliac iliopsoas ilium implant
-    inferior infraspinatus inguinal inner insular intercostal intermediate internal interosseous
-    intervertebral intestine invisible ischium jugular jugularis kidney kidneys knee labrum lacrimal
-    lamina larynx lateral lateralis latissimus left leg lemniscus lesion lienal ligament ligaments
-    ligamentum limb limbic lips liver lobe lobule longitudinal lower lumbar lumborum lumen lunate
-    lung lungs lymph lymphatic main major malleolus mandible margin mass masseter mater maxilla
-    maximus matter medial medialis median mediastinum medius medulla meninges meniscus mesenteric
-    metacarpal metastasis metatarsal midbrain middle minimus minor mitral multifidus muscle muscles
-    myocardium myoma myometrium nail navicular neck necrosis needle nerve nerves nervous
-    neurohypophysis neuroma nigra node nodes nodule nose nucleus object oblique obliquus occipital
-    oesophagus of olecranon omentum optic organ other outer ovary palate palatine pallidum pancreas
-    parathyroid paravertebral parenchyma parietal patella patellar patellaris pectoralis peduncle
-    pelvis penis perforator perforators pericardial pericardium peripheral peritendon peritoneum
-    peroneus phalanges phalanx pharynx pia pineal pisiform pituitary placenta placental plantar
-    plantaris plaque pleura plexus pollicis polyp poplitea popliteal portal posterior process
-    projection pronator prostate prostatic proximal psoas pterygoid pubis pulmonary pulposus putamen
-    quadratus quadriceps radial radialis radiation radius rectum rectus region renal retina
-    retinaculum retroperitoneal rib ribs right root round sac sacrum salivary saphena saphenous
-    sartorius scalene scalenus scaphoid scapula sciatic scrotum segment semimembranosus seminal
-    semitendinosus septum seroma serratus shadow sheath shoulder sinus skeleton skin skull small
-    soft soleus space sphenoid spinae spinal spine spinous spleen splenic splenica stenosis stent
-    sternocleidomastoid sternum stomach striatum structure subarachnoid subclavia subclavian
-    subcutaneous subdeltoid subscapularis substantia superficial superior supinator supraspinatus
-    sympathetic synovial synovium system systemic talus target tarsal teeth telencephalon temporal
-    tendon tendons teres testicle testis thalamus thenar thigh third thoracic thorax thrombus thymus
-    thyroid tibia tibial tibialis tissue toe tongue tooth trachea tract transition transverse
-    transversus trapezium trapezius trapezoid tree triceps tricuspid trigeminal triquetrum
-    trochanter trunk tube tumor tumour tunnel ulna ulnar ulnaris umbilical uncinate unknown upper
-    ureter urethra urinary urine uterus vagus valve varix vas vastus vein veins vena venous ventral
-    ventricle ventricular vertebra vertebrae vertebral vesicle vessel vessels vomer wall waste water
-    wrist yolk zone zygomatic
-"""
-_WORDS = frozenset(_TEXT.split())
-"""English and Latin words of anatomy, of its directions and sides, and of what is found or put in
-a body: those of 3D Slicer's and TotalSegmentator's names, and of muscles, bones and vessels of the
-limbs. Words that are many people's names stand in `_PHRASES` with what goes with them."""
+from us_sim.share import shared_path
 
 _PHRASES = re.compile(r"\b(?:gr[ae]y|white) (?=matter\b)")
 
@@ -77,8 +22,18 @@ _LONGEST = 60
 def is_anatomical(name: str) -> bool:
     """Whether a name is made of words of anatomy, sides and numbers up to two digits alone."""
     words = _PHRASES.sub("", readable(name).lower()).split()
-    known = [word in _WORDS or _NUMERAL.fullmatch(word) is not None for word in words]
-    return 0 < len(words) <= 8 and all(known) and any(word in _WORDS for word in words)
+    others = [word for word in words if word not in _words()]
+    return len(others) < len(words) <= 8 and all(map(_NUMERAL.fullmatch, others))
+
+
+@cache
+def _words() -> frozenset[str]:
+    """Read English and Latin words of anatomy, of its sides, and of what is found in a body.
+
+    They are those of 3D Slicer's and TotalSegmentator's names, and of muscles, bones and vessels
+    of the limbs. Words that are many people's names stand in `_PHRASES` with what goes with them.
+    """
+    return frozenset(shared_path("config/anatomy.txt").read_text(encoding="utf-8").split())
 
 
 def coded_name(codes: Sequence[str]) -> str:
@@ -109,12 +64,13 @@ def readable(name: str) -> str:
 
 
 def problem_with(name: str) -> str | None:
-    """The problem with a structure's name that a person wrote; None where there is none."""
-    if not name.strip() or len(name) > _LONGEST or not name.isprintable():
-        return f"must have 1 to {_LONGEST} printable characters"
-    if not re.fullmatch(r"[^\W_][\w \-']*", name):
-        return "must begin with a letter or digit, and hold letters, digits, blanks, - and _ only"
-    if re.search(r"\d{3}", name) or re.search(r"\d\W+\d", name):
+    """Return the problem with a structure's name that a person wrote; None where there is none."""
+    if not re.fullmatch(r"[^\W_][\w \-']*", name) or len(name) > _LONGEST:
+        return (
+            f"must begin with a letter or digit, and hold at most {_LONGEST} letters, digits, "
+            f"blanks, - and _"
+        )
+    if re.search(r"\d{3}|\d\W+\d", name):
         return (
             "has a number of three digits or more, or several, which may be a date or an identity"
         )
@@ -123,16 +79,17 @@ def problem_with(name: str) -> str | None:
 
 Colour = tuple[float, float, float]  # red, green and blue, 0 to 1
 
+_RED, _BLUE, _VIOLET, _BONE = (
+    (0.85, 0.15, 0.15),
+    (0.25, 0.4, 0.85),
+    (0.5, 0.3, 0.8),
+    (0.93, 0.9, 0.8),
+)
 _COLOURS: dict[str, Colour] = {
-    "artery": (0.85, 0.15, 0.15),
-    "aorta": (0.85, 0.15, 0.15),
-    "vein": (0.25, 0.4, 0.85),
-    "cava": (0.25, 0.4, 0.85),
-    "portal": (0.25, 0.4, 0.85),
-    "vessel": (0.5, 0.3, 0.8),
-    "vessels": (0.5, 0.3, 0.8),
-    "bone": (0.93, 0.9, 0.8),
-    "rib": (0.93, 0.9, 0.8),
+    **dict.fromkeys(("artery", "aorta"), _RED),
+    **dict.fromkeys(("vein", "cava", "portal"), _BLUE),
+    **dict.fromkeys(("vessel", "vessels"), _VIOLET),
+    **dict.fromkeys(("bone", "rib"), _BONE),
     "nerve": (0.95, 0.85, 0.3),
     "fat": (0.95, 0.85, 0.6),
     "muscle": (0.75, 0.35, 0.3),
@@ -146,7 +103,7 @@ _ANY_OTHER: Colour = (0.7, 0.6, 0.55)
 
 
 def anatomical_colour(name: str) -> Colour:
-    """Red, green and blue for a structure; of several known words in its name the last one."""
+    """Return red, green and blue of a structure, by the last known word in its name."""
     words = [word for word in re.split(r"[^a-z]+", name.lower()) if word in _COLOURS]
     return _COLOURS[words[-1]] if words else _ANY_OTHER
 
@@ -155,7 +112,7 @@ _SHADES = (0.0, 0.45, 0.25, 0.65)  # part of white in the first, second, ... of 
 
 
 def anatomical_colours(names: Iterable[str]) -> dict[str, Colour]:
-    """Colours of structures by their names; what has the same `anatomical_colour` gets shades.
+    """Return colours of structures by name; what has the same `anatomical_colour` gets shades.
 
     >>> anatomical_colours(["portal vein", "hepatic vein", "liver"])["hepatic vein"]
     (0.588, 0.67, 0.917)

@@ -87,26 +87,17 @@ def _read(path: Path, remarks: list[str]) -> tuple[NDArray[np.uint8], _Known, ND
         made = _from_segments(path, found.shape, found.segments, found.mask, remarks)
         return *made, found.placement
     image = open_image(path, layers=True)
-    placement = image.placement()
     segments, layers = segments_of(path, image.texts), _layers(path, image)
     if not segments:
-        return *_from_values(path, layers, remarks), placement
+        return *_from_values(path, layers, remarks), image.placement()
     deepest = max(segment.layer for segment in segments)
     if deepest >= len(layers):
-        raise VolumeError(
-            f"{path}: says that a segment is in layer {deepest} of {len(layers)}; save it again"
-        )
+        raise VolumeError(f"{path}: says that a segment is in layer {deepest} of {len(layers)}")
 
     def mask(segment: Segment) -> NDArray[np.bool_]:
-        inside = layers[segment.layer] == segment.value
-        if segment.extent is None:
-            return inside
-        ends = np.maximum(np.add(np.reshape(segment.extent, (3, 2)), (0, 1)), 0)
-        within = np.zeros_like(inside)
-        within[tuple(slice(a, b) for a, b in ends)] = True
-        return inside & within
+        return np.asarray(layers[segment.layer] == segment.value)
 
-    return *_from_segments(path, image.shape, segments, mask, remarks), placement
+    return *_from_segments(path, image.shape, segments, mask, remarks), image.placement()
 
 
 def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
@@ -115,14 +106,10 @@ def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
         raise VolumeError(f"{path}: holds {image.volumes} volumes; give one of labels")
     stored = np.stack(list(image.slices()))
     layers = (stored if image.components > 1 else stored[..., None]).transpose(3, 2, 1, 0)
-    if layers.dtype.kind == "f" and not all(
-        np.isfinite(plane).all() and (plane == np.rint(plane)).all() for plane in stored
-    ):
-        raise VolumeError(
-            f"{path}: its values are no labels but numbers with fractions; give a label image"
-        )
-    if layers.min() < 0:
-        raise VolumeError(f"{path}: its values go down to {layers.min():g}; labels are 0 or more")
+    is_whole = layers.dtype.kind != "f" or all((plane == np.rint(plane)).all() for plane in stored)
+    if not is_whole or not (least := layers.min()) >= 0:
+        has = f"go down to {least:g}" if is_whole else "have fractions"
+        raise VolumeError(f"{path}: its values {has}; labels are whole numbers from 0 on")
     return layers
 
 
@@ -158,27 +145,23 @@ def _from_values(
     path: Path, layers: NDArray[np.generic], remarks: list[str]
 ) -> tuple[NDArray[np.uint8], _Known]:
     """Labels (i, j, k) of a file without segments, whose values they are."""
-    if len(layers) > 1:
-        raise VolumeError(f"{path}: holds {len(layers)} numbers per voxel; labels are one")
     stored = layers[0]
     values = _values_in(stored)
     values = values[values != 0]  # and none is below
-    if len(values) > _MOST:
+    if len(layers) > 1 or len(values) > _MOST:
         raise VolumeError(
-            f"{path}: holds {len(values)} different values, so it is no label image; labels are "
-            f"{_MOST} at most"
+            f"{path}: holds {len(values)} different values and {counted(len(layers), 'number')} "
+            f"per voxel, so it is no label image; labels are one, and {_MOST} at most"
         )
+    labels = stored
     if len(values) and values[-1] > _MOST:
-        labels = np.zeros(stored.shape, np.uint8)
-        for label, value in enumerate(values, start=1):
-            labels[stored == value] = label
+        labels = np.searchsorted(values, stored, "right")
         remarks.append(
             f"labels up to {values[-1]:g} were numbered anew from 1 to {len(values)}, in order"
         )
         values = np.arange(1, len(values) + 1)
-    else:
-        labels = np.ascontiguousarray(stored).astype(np.uint8)
-    return labels, {int(value): (f"structure {int(value)}", None) for value in values}
+    known: _Known = {int(value): (f"structure {int(value)}", None) for value in values}
+    return np.ascontiguousarray(labels).astype(np.uint8), known
 
 
 def _values_in(stored: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -244,61 +227,34 @@ def on_grid(
             within the grid.
     """
     to_grid = np.linalg.inv(wanted) @ placement
-    turn, shift = np.rint(to_grid[:3, :3]), np.rint(to_grid[:3, 3])
+    whole = np.rint(to_grid)
     corners = np.stack(np.meshgrid(*[[0, n - 1] for n in labels.shape], indexing="ij"), axis=-1)
-    apart = corners.reshape(-1, 3) @ (to_grid[:3, :3] - turn).T + to_grid[:3, 3] - shift
-    is_turn = all((np.abs(turn).sum(axis=axis) == 1.0).all() for axis in (0, 1))
-    before = np.count_nonzero(labels)
-    remarks = []
+    apart = corners.reshape(-1, 3) @ (to_grid - whole)[:3, :3].T + (to_grid - whole)[:3, 3]
+    is_turn = all((np.abs(whole[:3, :3]).sum(axis=axis) == 1.0).all() for axis in (0, 1))
     # Voxels; single precision, which NIfTI has, makes equal grids differ by less.
-    if is_turn and np.abs(apart).max() <= 0.02:
-        made = _placed(labels, turn.astype(int), shift.astype(int), shape)
-    elif resample:
-        to_file = np.linalg.inv(to_grid)
-        made = ndimage.affine_transform(
-            labels, to_file[:3, :3], to_file[:3, 3], output_shape=shape, order=0, mode="constant"
-        )
-        remarks.append(
-            f"labels of {_words(labels.shape, placement)} were resampled to {_words(shape, wanted)}"
-            f" by the nearest voxel"
-        )
-    else:
+    is_same = is_turn and np.abs(apart).max() <= 0.02
+    if not (is_same or resample):
         raise VolumeError(
             f"{path}: its labels are on another grid ({_words(labels.shape, placement)}) than the "
-            f"volume ({_words(shape, wanted)}): segment this volume, or have them resampled with "
-            f"--resample"
+            f"volume ({_words(shape, wanted)}): have them resampled with --resample"
         )
-    if before and not made.any():
+    made = labels
+    if not is_same or labels.shape != shape or not np.array_equal(whole, np.eye(4)):
+        to_file = np.rint(np.linalg.inv(whole)) if is_same else np.linalg.inv(to_grid)
+        made = ndimage.affine_transform(labels, to_file, output_shape=shape, order=0)
+    before, after = np.count_nonzero(labels), np.count_nonzero(made)
+    if before and not after:
         raise VolumeError(
             f"{path}: its labels lie wholly outside the volume: they belong to another one, or "
             f"their axes were taken for others (left-posterior-superior is meant)"
         )
-    if not remarks and (lost := before - np.count_nonzero(made)):
-        remarks.append(
-            f"{lost} of {before} labelled voxels lie outside the volume and are left out"
-        )
-    return made, remarks
-
-
-def _placed(
-    labels: NDArray[np.uint8],
-    turn: NDArray[np.int64],
-    shift: NDArray[np.int64],
-    shape: tuple[int, int, int],
-) -> NDArray[np.uint8]:
-    """Labels whose index n is turn @ n + shift in an array of that shape."""
-    order = np.argmax(np.abs(turn), axis=1)  # the file's axis along each of the grid's
-    signs = turn[np.arange(3), order]
-    turned = labels.transpose(order)[tuple(slice(None, None, int(sign)) for sign in signs)]
-    first = np.where(signs > 0, shift, shift - np.array(turned.shape) + 1)
-    last = np.minimum(first + turned.shape, shape)
-    start = np.maximum(first, 0)
-    made = np.zeros(shape, np.uint8)
-    if (last > start).all():
-        there = tuple(slice(a, b) for a, b in zip(start, last, strict=True))
-        here = tuple(slice(a, b) for a, b in zip(start - first, last - first, strict=True))
-        made[there] = turned[here]
-    return made
+    if not is_same:
+        sizes = _words(labels.shape, placement), _words(shape, wanted)
+        return made, [f"labels of {sizes[0]} were resampled to {sizes[1]} by the nearest voxel"]
+    if before > after:
+        lost = f"{before - after} of {before} labelled voxels"
+        return made, [f"{lost} lie outside the volume and are left out"]
+    return made, []
 
 
 def _words(shape: tuple[int, ...], placement: NDArray[np.float64]) -> str:

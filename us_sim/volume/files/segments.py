@@ -27,7 +27,6 @@ class Segment:
     value: int  # of its voxels
     layer: int
     colour: Colour | None  # red, green, blue, 0 to 1
-    extent: tuple[int, ...] | None  # first and last index along i, j and k within which it is
     codes: tuple[str, ...] = ()  # of SNOMED CT: the structure, and which one of several
 
 
@@ -38,8 +37,7 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
         VolumeError: a value of one is none, or they are not stored as voxels in or out.
     """
     for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
-        said = pairs.get(key, "Binary labelmap")
-        if said.lower() != "binary labelmap":
+        if (said := pairs.get(key, "Binary labelmap")).lower() != "binary labelmap":
             raise VolumeError(
                 f"{path}: holds segments as {shown(said)}; save it with `Binary labelmap` as the "
                 f"source representation"
@@ -50,27 +48,25 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
             found.setdefault(int(match[1]), {})[match[2]] = value
     shared = any("LabelValue" in fields for fields in found.values())
     segments = []
-    for at, number in enumerate(sorted(found)):
-        fields = found[number]
-        extent = fields.get("Extent")
-        try:
-            segment = Segment(
+    for at, (number, fields) in enumerate(sorted(found.items())):
+        value, layer = (
+            fields.get("LabelValue", "1"),
+            fields.get("Layer", "0" if shared else f"{at}"),
+        )
+        if not (value.isdecimal() and int(value) and layer.isdecimal()):
+            raise VolumeError(
+                f"{path}: its Segment{number} has the LabelValue {shown(value)} and the Layer "
+                f"{shown(layer)}, where numbers belong, from 1 and 0 on; save it again"
+            )
+        segments.append(
+            Segment(
                 fields.get("Name", "").strip() or f"structure {number + 1}",
-                int(fields.get("LabelValue", 1)),
-                int(fields.get("Layer", 0 if shared else at)),
+                int(value),
+                int(layer),
                 _colour(fields.get("Color", "")),
-                None if extent is None else tuple(map(int, extent.split())),
                 _codes(fields.get("Tags", "")),
             )
-        except ValueError as error:
-            raise VolumeError(f"{path}: its Segment{number}: {error}; save it again") from None
-        if segment.value < 1 or segment.layer < 0 or len(segment.extent or range(6)) != 6:
-            raise VolumeError(
-                f"{path}: its Segment{number} has the LabelValue {segment.value}, the Layer "
-                f"{segment.layer} and the Extent {extent}, where a number from 1 on, one from 0 on "
-                f"and six numbers belong; save it again"
-            )
-        segments.append(segment)
+        )
     return segments
 
 

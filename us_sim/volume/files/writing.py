@@ -1,12 +1,13 @@
 """Volumes, labels and image sequences into files: NRRD, MetaImage and NIfTI.
 
-A file is written beside its place under another name and renamed, so it is whole or absent. Grey
-values go into NRRD files a slab at a time: SimpleITK and nibabel, which write the others, have the
-whole image a second time, turned to the files' order of axes.
+A file is written beside its place under another name and renamed, so it is whole or absent. NRRD
+files are written a slab at a time: SimpleITK and nibabel, which write the others, and pynrrd have
+the whole image a second time, turned to the files' order of axes.
 """
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,6 +26,7 @@ from us_sim.volume.volume import Volume
 
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
 _SLAB = 1 << 23  # bytes
+_LEVEL = 1  # of compression: speckle hardly becomes smaller with any other
 
 
 def write_volume(
@@ -47,16 +49,7 @@ def write_volume(
     path = Path(path)
     if path.name.lower().endswith(".seg.nrrd"):
         raise VolumeError(f"{path}: .seg.nrrd is for labels; name the volume .nrrd")
-    fields, voxels = dict(header or {}), volume.intensities
-    if not path.name.lower().endswith(".nrrd"):
-        _write_image(path, voxels, volume, fields, packed=False)
-        return
-    head = _nrrd_header(path, volume, fields)
-    with partial_file(path, "image.nrrd") as partial, partial.open("wb") as file:
-        file.write(head.encode("utf-8"))
-        step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
-        for k in range(0, voxels.shape[2], step):
-            file.write(file_order(voxels[:, :, k : k + step]).data)
+    _write_image(path, volume.intensities, volume, header or {}, packed=False)
 
 
 def write_labels(
@@ -135,60 +128,6 @@ def write_image_sequence(
             file.write(np.ascontiguousarray(image).tobytes())
 
 
-def _grid_in_mm(
-    path: Path, volume: Volume, fields: Mapping[str, str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return spacing (3,), direction (3, 3) and origin (3,) of a volume that can be written.
-
-    Raises:
-        VolumeError: it cannot, or one of the fields cannot stand in a header.
-    """
-    matrix = volume.index_to_patient[:3, :3] * 1e3
-    spacing = np.linalg.norm(matrix, axis=0)
-    direction = matrix / spacing
-    if not is_right_angled(direction):
-        raise VolumeError(
-            f"{path}: the volume's axes are {degrees_off(direction):.2g}° off a right angle, which "
-            f"image files cannot hold; resample it on a grid with right angles"
-        )
-    if min(volume.shape) < 2:
-        raise VolumeError(
-            f"{path}: the volume has {' × '.join(map(str, volume.shape))} voxels; two or more "
-            f"along each axis can be written"
-        )
-    for key, value in fields.items():
-        if not (key.isprintable() and value.isprintable()) or set(key) & set(":= ") or not key:
-            raise VolumeError(
-                f"{path}: the field {key!r} cannot stand in an image header: it must have a name "
-                f"without blanks, colons and equals signs, and one line of text"
-            )
-    return spacing, direction, volume.index_to_patient[:3, 3] * 1e3
-
-
-def _nrrd_header(path: Path, volume: Volume, fields: Mapping[str, str]) -> str:
-    """teem.sourceforge.net/nrrd/format.html, with pairs of keys and values behind the fields."""
-    spacing, direction, origin = _grid_in_mm(path, volume, fields)
-    lines = [
-        "NRRD0004",
-        "type: unsigned char",
-        "dimension: 3",
-        "space: left-posterior-superior",
-        f"sizes: {' '.join(map(str, volume.shape))}",
-        f"space directions: {' '.join(map(_vector, (direction * spacing).T))}",
-        "kinds: domain domain domain",
-        "endian: little",
-        "encoding: raw",
-        f"space origin: {_vector(origin)}",
-        *(f"{key}:={value}" for key, value in fields.items()),
-    ]
-    return "\n".join([*lines, "", ""])
-
-
-def _vector(numbers: NDArray[np.float64]) -> str:
-    """Numbers to their last digit; without -0, which says nothing."""
-    return f"({','.join(f'{number + 0.0:.17g}' for number in numbers)})"
-
-
 def _segment_fields(
     labels: NDArray[np.uint8], names: Mapping[int, str], colours: Mapping[int, Colour]
 ) -> dict[str, str]:
@@ -226,27 +165,72 @@ def _write_image(
     packed: bool,
 ) -> None:
     """Write voxels (i, j, k) where the volume places them."""
-    spacing, direction, origin = _grid_in_mm(path, volume, fields)
+    matrix = volume.index_to_patient * 1e3
+    spacing = np.linalg.norm(matrix[:3, :3], axis=0)
+    direction = matrix[:3, :3] / spacing
+    if not is_right_angled(direction):
+        raise VolumeError(
+            f"{path}: the volume's axes are {degrees_off(direction):.2g}° off a right angle, which "
+            f"image files cannot hold; resample it on a grid with right angles"
+        )
+    if not all(map(str.isprintable, (*fields, *fields.values()))):
+        raise VolumeError(f"{path}: a field of several lines cannot stand in an image's header")
     ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
     if ending is None:
         raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
     with partial_file(path, f"image{ending}") as partial:
-        if ending.startswith(".nii"):  # ITK refuses axes that are rounded
-            matrix = np.diag([-1e3, -1e3, 1e3, 1.0]) @ volume.index_to_patient
+        if ending.endswith(".nrrd"):
+            _write_nrrd(partial, voxels, matrix, fields, packed=packed)
+        elif ending.startswith(".nii"):  # ITK refuses axes that are rounded
             import nibabel  # which takes half a second
 
-            nifti = nibabel.Nifti1Image(voxels, matrix)  # type: ignore[attr-defined,no-untyped-call]
+            affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ matrix
+            affine[3] = (0.0, 0.0, 0.0, 1.0)
+            nifti = nibabel.Nifti1Image(voxels, affine)  # type: ignore[attr-defined,no-untyped-call]
             nifti.header.set_xyzt_units("mm")
             nifti.to_filename(partial)
-            return
-        image = sitk.GetImageFromArray(file_order(voxels))
-        image.SetSpacing(spacing.tolist())
-        image.SetOrigin(origin.tolist())
-        image.SetDirection(direction.ravel().tolist())
-        for key, value in fields.items():
-            image.SetMetaData(key, value)
-        try:
-            # zlib's fastest level; speckle hardly becomes smaller with any other
-            sitk.WriteImage(image, str(partial), packed, 1)
-        except RuntimeError as error:
-            raise VolumeError(f"{path}: cannot be written: the disk may be full") from error
+        else:
+            image = sitk.GetImageFromArray(file_order(voxels))
+            image.SetSpacing(spacing.tolist())
+            image.SetOrigin(matrix[:3, 3].tolist())
+            image.SetDirection(direction.ravel().tolist())
+            for key, value in fields.items():
+                image.SetMetaData(key, value)
+            try:
+                sitk.WriteImage(image, str(partial), packed, _LEVEL)
+            except RuntimeError as error:
+                raise VolumeError(f"{path}: cannot be written: the disk may be full") from error
+
+
+def _write_nrrd(
+    path: Path,
+    voxels: NDArray[np.uint8],
+    matrix: NDArray[np.float64],
+    fields: Mapping[str, str],
+    *,
+    packed: bool,
+) -> None:
+    """Write voxels (i, j, k) a slab at a time, placed by a matrix in mm, with keys and values."""
+    x, y, z, origin = (
+        f"({','.join(f'{each + 0.0:.17g}' for each in matrix[:3, n])})" for n in range(4)
+    )
+    lines = [
+        "NRRD0004",
+        "type: unsigned char",
+        "dimension: 3",
+        "space: left-posterior-superior",
+        f"sizes: {' '.join(map(str, voxels.shape))}",
+        f"space directions: {x} {y} {z}",
+        "kinds: domain domain domain",
+        "endian: little",
+        f"encoding: {'gzip' if packed else 'raw'}",
+        f"space origin: {origin}",
+        *(f"{key}:={value}" for key, value in fields.items()),
+    ]
+    with path.open("wb") as file:
+        file.write("\n".join([*lines, "", ""]).encode())
+        step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
+        out = gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) if packed else file
+        with out:
+            for k in range(0, voxels.shape[2], step):
+                out.write(file_order(voxels[:, :, k : k + step]).data)

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import interpolate
 from us_sim.volume.sequences.sequence import TrackedSequence, read_sequence
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
@@ -185,33 +183,23 @@ def poses_at(
         wanted: (N,) s.
         centre: (3,) the point, in the frame that the matrices take points of.
     """
+    from scipy.spatial.transform import Rotation, Slerp  # which takes a tenth of a second
+
     times, first = np.unique(times, return_index=True)
     matrices = matrices[first]
+    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+    is_there = times[after] == wanted
     placed = np.full((len(wanted), 4, 4), np.nan)
-    for k, time in enumerate(wanted):
-        after = int(np.searchsorted(times, time))
-        if after < len(times) and times[after] == time:
-            placed[k] = matrices[after]
-        elif 0 < after < len(times) and times[after] - times[after - 1] <= _LONGEST_GAP:
-            fraction = (time - times[after - 1]) / (times[after] - times[after - 1])
-            placed[k] = _between(matrices[after - 1], matrices[after], fraction, centre)
+    placed[is_there] = matrices[after[is_there]]
+    gap = times[after] - times[np.maximum(after - 1, 0)]
+    between = ~is_there & (times[0] < wanted) & (wanted < times[-1]) & (gap <= _LONGEST_GAP)
+    if between.any():
+        base = matrices[0, :3, :3]
+        turns = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3] @ np.linalg.inv(base)))
+        turned = turns(wanted[between]).as_matrix() @ base
+        centres = matrices[:, :3, :3] @ centre + matrices[:, :3, 3]
+        moved = np.stack([np.interp(wanted[between], times, each) for each in centres.T], axis=-1)
+        placed[between] = np.eye(4)
+        placed[between, :3, :3] = turned
+        placed[between, :3, 3] = moved - turned @ centre
     return placed
-
-
-def _between(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    fraction: float,
-    centre: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    start, end = (matrix[:3, :3] @ centre + matrix[:3, 3] for matrix in (first, second))
-    left, _, right = np.linalg.svd(second[:3, :3] @ np.linalg.inv(first[:3, :3]))
-    turn = np.eye(4)
-    turn[:3, :3] = left @ right  # the nearest rotation
-    turn[:3, 3] = end - start
-    moved = interpolate(Pose(), Pose.from_matrix(turn), fraction)
-    placed = first.copy()
-    placed[:3, 3] -= start
-    placed = moved.matrix @ placed
-    placed[:3, 3] += start
-    return np.asarray(placed, dtype=np.float64)

@@ -104,7 +104,6 @@ def _segment(item: Any) -> Segment:
         int(number(item, "SegmentNumber") or 0),
         0,
         _colour(item),
-        None,
         tuple(codes),
     )
 
