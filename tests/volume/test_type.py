@@ -74,8 +74,8 @@ def test_replacing_the_placement_replaces_its_inverse():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"intensities": GREY.astype(np.int16)}, "uint8 array, not 3-dimensional int16"),
-        ({"intensities": GREY[0]}, "not 2-dimensional"),
+        ({"intensities": GREY.astype(np.int16)}, "not int16"),
+        ({"intensities": GREY[0]}, "three-dimensional"),
         ({"intensities": GREY[:, :0]}, "a voxel or more along each axis"),
         ({"labels": GREY[:, :, :5]}, "must have the same shape"),
         ({"labels": GREY.astype(float)}, "the labels of a volume must be"),

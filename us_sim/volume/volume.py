@@ -83,14 +83,10 @@ def grid_extent(
 
 def _voxels(array: NDArray[np.uint8], what: str) -> NDArray[np.uint8]:
     array = np.asarray(array)
-    if array.ndim != 3 or array.dtype != np.uint8:
+    if array.ndim != 3 or array.dtype != np.uint8 or not array.size:
         raise VolumeError(
-            f"the {what} of a volume must be a three-dimensional uint8 array, "
-            f"not {array.ndim}-dimensional {array.dtype}"
-        )
-    if not array.size:
-        raise VolumeError(
-            f"the {what} have shape {array.shape}; a volume needs a voxel or more along each axis"
+            f"the {what} of a volume must be three-dimensional uint8 with a voxel or more along "
+            f"each axis, not {array.dtype} of the shape {array.shape}"
         )
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
@@ -99,28 +95,19 @@ def _voxels(array: NDArray[np.uint8], what: str) -> NDArray[np.uint8]:
 
 def _affine(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     matrix = np.array(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise VolumeError("index_to_patient must be a finite 4×4 matrix")
-    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-        raise VolumeError("the last row of index_to_patient must be 0 0 0 1")
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or list(matrix[3]) != [0, 0, 0, 1]:
+        raise VolumeError("index_to_patient must be a finite 4×4 matrix with the last row 0 0 0 1")
     steps = np.linalg.norm(matrix[:3, :3], axis=0)
     # Relative to the voxel's size, since a determinant in cubic metres is always tiny.
     if not steps.all() or abs(np.linalg.det(matrix[:3, :3] / steps)) < 1e-6:
-        raise VolumeError(
-            "index_to_patient is singular: a voxel has no size along an axis, or its axes lie in "
-            "one plane"
-        )
+        raise VolumeError("index_to_patient is singular: its axes span no volume")
     matrix.flags.writeable = False
     return matrix
 
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:
-    """Labels on the grid of some volume; 0 is in no structure.
-
-    Raises:
-        VolumeError: a label of the voxels has no name, or two have the same.
-    """
+    """Labels on the grid of some volume; 0 is in no structure."""
 
     labels: NDArray[np.uint8]  # (i, j, k)
     names: Mapping[int, str]

@@ -191,15 +191,6 @@ def test_a_segmentation_is_no_volume(tmp_path, layers):
         import_files([tmp_path / "a.seg.nrrd"], tmp_path / "o.nrrd")
 
 
-def test_of_several_volumes_the_one_of_that_number_is_imported(tmp_path):
-    path = tmp_path / "a.nii.gz"
-    sitk.WriteImage(
-        sitk.JoinSeries([sitk.Image([4, 5, 6], sitk.sitkUInt8) + n for n in (3, 7)]), path
-    )
-    import_files([path], tmp_path / "o.nrrd", ImportSettings(volume=2))
-    assert (read_volume(tmp_path / "o.nrrd").intensities == 7).all()
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [

@@ -1,6 +1,5 @@
 """Labels of other programs: names, colours, layers, grids; and what is no labels."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -256,12 +255,6 @@ def test_names_are_told_apart():
         assert problem_with(name) is None, name
     for name in ("../x", "a" * 90, "case 1961", "12/03", "12 03", " vein", "x@y"):
         assert problem_with(name), name
-
-
-def test_no_name_of_a_patient_is_in_the_sentences(tmp_path):
-    fields = segments(("Doe Jane", 1, 0), ("Roe Jim", 1, 0))
-    read = read_labels(written(tmp_path / "a.seg.nrrd", np.ones(SHAPE, np.uint8), fields), VOLUME)
-    assert not re.search("Doe|Roe|Jane|Jim", f"{read.names} {read.remarks}")
 
 
 def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_file):

@@ -223,19 +223,13 @@ UNUSABLE = "a transform that is singular or not finite"
     ("broken", "reason"),
     [
         ({"ImageToReferenceTransform": None}, "no ImageToReferenceTransform"),
-        ({"ImageToReferenceTransform": "1 0 0"}, "a transform that is not 16 numbers"),
         ({"ImageToReferenceTransform": "1 0 x " + "0 " * 13}, "a transform that is not 16 numbers"),
         ({"ImageToReferenceTransform": " ".join("0" * 16)}, UNUSABLE),
         ({"ImageToReferenceTransform": MATRIX.format(x="nan")}, UNUSABLE),
-        ({"ImageToReferenceTransform": MATRIX.format(x="inf")}, UNUSABLE),
         ({"ImageToReferenceTransform": "1 1 0 0 1 1 0 0 0 0 1 0 0 0 0 1"}, UNUSABLE),
-        (
-            {"ImageToReferenceTransformStatus": "INVALID"},
-            "ImageToReferenceTransformStatus is not OK",
-        ),
+        ({"ImageToReferenceTransformStatus": "BAD"}, "ImageToReferenceTransformStatus is not OK"),
         ({"ImageStatus": "INVALID"}, "ImageStatus is not OK"),
         ({"Timestamp": None}, "no Timestamp"),
-        ({"Timestamp": "nan"}, "no Timestamp"),
         ({"Timestamp": "soon"}, "no Timestamp"),
     ],
 )
@@ -245,12 +239,6 @@ def test_a_frame_that_cannot_be_used_is_left_out_and_counted(tmp_path, broken, r
     assert sweep.numbers.tolist() == [0, 2]
     np.testing.assert_array_equal(np.array(list(sweep.images())), GREY[[0, 2]])
     np.testing.assert_allclose(sweep.image_to_reference[:, 0, 3], [0.0, 2e-3])
-
-
-@pytest.mark.parametrize("missing", ["ImageStatus", "ImageToReferenceTransformStatus"])
-def test_a_status_that_is_not_written_is_good(tmp_path, missing):
-    sweep = read_sweep(metaimage(tmp_path / "a.mha", frames={0: {missing: None}}))
-    assert len(sweep.numbers) == FRAMES
 
 
 def test_frames_that_the_header_does_not_describe_are_counted(tmp_path):
@@ -263,19 +251,15 @@ def test_frames_that_the_header_does_not_describe_are_counted(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"DimSize": None}, "columns, rows"),
         ({"DimSize": "5 4"}, "columns, rows"),
         ({"DimSize": "5 four 3"}, "DimSize"),
         ({"DimSize": "5 4 4"}, "60 bytes .* 80"),
         ({"DimSize": "0 0 3"}, "without images"),
-        ({"DimSize": "5 -4 3"}, "without images"),
         ({"DimSize": "5 2 2 3"}, "flat images"),
-        ({"ElementType": "MET_SHORT"}, "60 bytes .* 120"),
         ({"ElementType": None}, "ElementType"),
         ({"ElementNumberOfChannels": "2"}, "2 numbers"),
         ({"UltrasoundImageOrientation": "AMF"}, "'AMF'"),
         ({"DimSize": "100000 100000 3", **PACKED}, "100000 × 100000"),
-        ({"DimSize": ":5 4 3", **PACKED}, "DimSize"),
     ],
 )
 def test_a_sequence_of_another_kind_is_refused(tmp_path, fields, message):
@@ -343,16 +327,10 @@ def test_real_files_of_other_kinds_are_refused(shared_file, name, message):
 
 def test_plus_rule_for_names():
     for name, ends in {
-        "ProbeToTracker": ("Probe", "Tracker"),
-        "ToolToTracker": ("Tool", "Tracker"),
-        "TestToolToTracker": ("TestTool", "Tracker"),
         "ToolTipToTorso": ("ToolTip", "Torso"),
         "ImageTo3DWorld": ("Image", "3DWorld"),
         "probeToTracker": ("Probe", "Tracker"),
-        "AToBToC": None,
-        "Torso": None,
-        "ToTracker": None,
-        "ProbeTo": None,
+        **dict.fromkeys(("AToBToC", "Torso", "ToTracker", "ProbeTo")),
     }.items():
         assert split_transform_name(name) == ends, name
 
@@ -384,25 +362,14 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
     ("change", "message"),
     [
         ({"kinds": "list domain domain domain"}, "is a volume"),
-        ({"kinds": "domain domain domain domain"}, "is a volume"),
         ({"sizes": "5 4 2 3"}, "flat images"),
         ({"sizes": "5 4 1 8"}, "60 bytes .* 160"),
         ({"sizes": "0 0 0 3"}, "poses without images"),
-        ({"sizes": "5 four 1 3"}, "four"),
     ],
 )
 def test_an_nrrd_file_of_another_kind_is_refused(tmp_path, change, message):
     path = nrrd(tmp_path / "a.nrrd", GREY, **change)
     refused(path, message)
-
-
-def test_the_shorter_of_several_ways_is_taken():
-    # A search in depth would come to the goal by the first or the last of these ways.
-    first = ["ProbeToMarker", "MarkerToCamera", "CameraToReference"]
-    last = ["ProbeToArm", "ArmToBase", "BaseToReference"]
-    chain = shortest_chain([*first, "ProbeToTool", "ReferenceToTool", *last], "Probe", "Reference")
-    assert chain.reference == "Reference"
-    assert chain.steps == (("ProbeToTool", True), ("ReferenceToTool", False))
 
 
 @given(edges=st.sets(st.tuples(st.integers(0, 7), st.integers(0, 7)), max_size=14))

@@ -68,11 +68,7 @@ def report_picture(planned: Import) -> NDArray[np.uint8]:
 
 
 def write_report(folder: Path, planned: Import) -> list[Path]:
-    """Write the report and its picture into a new folder, or one without a report.
-
-    Raises:
-        VolumeError: there is one already, or it cannot be written.
-    """
+    """Write the report and its picture into a new folder, or one without a report."""
     refuse_report(folder)
     picture = cv2.imencode(".png", report_picture(planned))[1].tobytes()
     try:
@@ -88,11 +84,7 @@ def write_report(folder: Path, planned: Import) -> list[Path]:
 
 
 def refuse_report(folder: Path) -> None:
-    """Refuse a place for a report where there is one, or a file.
-
-    Raises:
-        VolumeError: there is.
-    """
+    """Refuse a place for a report where there is one, or a file."""
     if (folder.exists() and not folder.is_dir()) or (folder / _REPORT).exists():
         raise VolumeError(
             f"--report {folder}: is a file or has a report already; name a new folder"

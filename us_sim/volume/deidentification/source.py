@@ -69,9 +69,6 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
         path: of the file.
         volume: which one where there are several.
         spacing: (3,) mm, of a file that does not state it.
-
-    Raises:
-        VolumeError: as `read_volume`, and of a segmentation of 3D Slicer.
     """
     image = open_image(path, layers=True, spacing=spacing)
     if holds_segments(image.texts):
@@ -102,9 +99,6 @@ def dicom_source(
         spacing: mm, width and height of pixels of images that do not state it, and for a volume
             the distance of images; or empty.
         needs_volume: refuse images that are no volume, and say why they are none.
-
-    Raises:
-        VolumeError: as `opened_images` and `placed_images`; or the spacing is not that of the file.
     """
     images = opened_images(paths)
     is_volume = needs_volume or not is_flat(images, spacing)

@@ -221,10 +221,6 @@ def on_grid(
         shape: of the grid that they shall be on.
         wanted: (4, 4) m, from its indices.
         resample: take the nearest voxel where the grids differ.
-
-    Raises:
-        VolumeError: the grids differ and ``resample`` is not given, or nothing of the labels lies
-            within the grid.
     """
     to_grid = np.linalg.inv(wanted) @ placement
     whole = np.rint(to_grid)
@@ -271,9 +267,6 @@ def read_label_table(path: Path) -> dict[int, tuple[str, Colour | None]]:
     ITK-SNAP's label descriptions (label, red, green, blue, three more numbers, the name in quotes),
     and comma-separated ones (label, name). Lines that begin with # are remarks, a first line of
     words a heading.
-
-    Raises:
-        VolumeError: the file cannot be read, or a line is none of these.
     """
     try:
         lines = read_text(path).lstrip("\ufeff").splitlines()

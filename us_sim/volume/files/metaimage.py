@@ -28,11 +28,7 @@ _TYPES = {
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
-    """Read the fields of a header, and the bytes it takes; ElementDataFile ends it.
-
-    Raises:
-        VolumeError: it has no such end.
-    """
+    """Read the fields of a header, and the bytes it takes; ElementDataFile ends it."""
     fields: dict[str, str] = {}
     with path.open("rb") as file:
         for line in iter(lambda: file.readline(1 << 16), b""):
@@ -49,15 +45,10 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
 
 
 def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -> StoredVoxels:
-    """Describe the numbers behind a header.
-
-    Raises:
-        VolumeError: a field is missing or not made of the numbers that belong there, or they are
-            stored in a way that is not read.
-    """
-    channels = _whole_numbers(path, fields, "ElementNumberOfChannels", 1, "1")
-    (count,) = _whole_numbers(path, fields, "NDims", 1)
-    size = _whole_numbers(path, fields, "DimSize", count)
+    """Describe the numbers behind a header."""
+    fields = {"ElementNumberOfChannels": "1", "NDims": "", "DimSize": "", **fields}
+    channels = _sizes(path, fields, "ElementNumberOfChannels", 1)
+    size = _sizes(path, fields, "DimSize", *_sizes(path, fields, "NDims", 1))
     element, name = fields.get("ElementType", ""), fields["ElementDataFile"]
     skip = fields.get("HeaderSize", "0")
     is_packed = _is_true(fields.get("CompressedData", ""))
@@ -88,9 +79,6 @@ def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     Args:
         path: of the header.
         given: (3,) mm, the spacing of a file that does not state it.
-
-    Raises:
-        VolumeError: as `metaimage_header` and `metaimage_voxels`.
     """
     fields, header_bytes = metaimage_header(path)
     voxels = metaimage_voxels(path, fields, header_bytes)
@@ -126,22 +114,21 @@ def _numbers(
         numbers = np.array([float(word) for word in fields[key].split()])
         if len(numbers) == count and np.isfinite(numbers).all():
             return numbers
-    raise VolumeError(
-        f"{path}: its {key} is {fields[key][:80]!r} where {count} finite numbers belong"
-    )
+    raise _refused(path, key, fields[key], f"{count} finite numbers belong")
 
 
-def _whole_numbers(
-    path: Path, fields: Mapping[str, str], key: str, count: int, default: str = ""
-) -> tuple[int, ...]:
+def _sizes(path: Path, fields: Mapping[str, str], key: str, count: int) -> tuple[int, ...]:
     """Read so many whole numbers above zero of a field."""
-    words = fields.get(key, default).split()
+    words = fields[key].split()
     if len(words) != count or not all(word.isdecimal() and int(word) for word in words):
-        raise VolumeError(
-            f"{path}: cannot be read as an image: its {key} is {' '.join(words)[:80]!r} where "
-            f"{count} whole numbers above zero belong"
-        )
+        raise _refused(path, key, fields[key], f"{count} whole numbers above zero belong")
     return tuple(map(int, words))
+
+
+def _refused(path: Path, key: str, value: str, why: str) -> VolumeError:
+    return VolumeError(
+        f"{path}: cannot be read as an image: its {key} is {value[:80]!r} where {why}"
+    )
 
 
 def _is_true(text: str) -> bool:

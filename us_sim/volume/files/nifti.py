@@ -23,9 +23,6 @@ def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     Args:
         path: of the file, or of one of the pair.
         given: (3,) mm, the spacing of a file that does not state it.
-
-    Raises:
-        VolumeError: it cannot be read as NIfTI.
     """
     image = _opened(path)
     kind = image.get_data_dtype()

@@ -30,11 +30,7 @@ _DIRECTIONS = "space directions"
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
-    """Parse a header: its fields and keys, as pynrrd has them, and the bytes up to its voxels.
-
-    Raises:
-        VolumeError: it is none.
-    """
+    """Parse a header: its fields and keys, as pynrrd has them, and the bytes up to its voxels."""
     try:
         with path.open("rb") as file:
             # UTF-8, which most programs write, and of which pynrrd itself keeps the ASCII alone.
@@ -48,11 +44,7 @@ def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxels:
-    """Describe the numbers behind a header that ends at byte ``start``.
-
-    Raises:
-        VolumeError: a field is missing, or they are stored in a way that is not read.
-    """
+    """Describe the numbers behind a header that ends at byte ``start``."""
     size = tuple(int(length) for length in fields.get("sizes", ()))
     if len(size) != fields.get("dimension") or min(size, default=0) < 1:
         raise VolumeError(
@@ -83,9 +75,6 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     Args:
         path: of the header.
         given: (3,) mm, the spacing of a file that does not state it.
-
-    Raises:
-        VolumeError: as `nrrd_header` and `nrrd_voxels`, or its axes are no volume's.
     """
     fields, start = nrrd_header(path)
     voxels = nrrd_voxels(path, fields, start)

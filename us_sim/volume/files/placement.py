@@ -19,11 +19,7 @@ _RIGHT_ANGLE = 1e-3  # cosine between axes, of files read and written; rounding 
 
 
 def millimetres(path: Path | str, unit: str) -> float:
-    """Return how many millimetres a unit has that a header names; an empty name means millimetres.
-
-    Raises:
-        VolumeError: it is no unit of length.
-    """
+    """Return the millimetres of a unit that a header names; an empty name means millimetres."""
     name = unit.strip().lower()
     for known in (name, name.removesuffix("s").replace("metre", "meter")):
         if known in MILLIMETRES:

@@ -67,11 +67,7 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
 
 
 def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Where a volume file's voxels are: (4, 4) from their indices to m, from its header alone.
-
-    Raises:
-        VolumeError: as `read_volume`, except for faults of the voxels.
-    """
+    """Where a volume file's voxels are: (4, 4) from their indices to m, from its header alone."""
     path = Path(path)
     if files := _dicom_files(path):
         from us_sim.volume.files.dicom.placed_images import placed_images
@@ -110,12 +106,7 @@ def open_image(
 
 
 def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
-    """Read the grey values (i, j, k) of one of an image's volumes; say how they came about.
-
-    Raises:
-        VolumeError: its data cannot be read, or are radio-frequency data, or there is no such
-            volume.
-    """
+    """Read the grey values (i, j, k) of one of an image's volumes; say how they came about."""
     path = image.voxels.header
     if not 1 <= volume <= image.volumes:
         raise VolumeError(f"{path}: holds {image.volumes} volumes; number {volume} is none of them")
@@ -148,11 +139,7 @@ def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:
 
 
 def sequence_use(path: Path) -> str | None:
-    """Say what a MetaImage or NRRD file of a sequence is, and its use; None of other files.
-
-    Raises:
-        VolumeError: it has no header of its format.
-    """
+    """Say what a MetaImage or NRRD file of a sequence is, and its use; None of other files."""
     keys, kinds, sizes, _ = sequence_header(path)
     if not is_sequence(kinds, keys) or (len(sizes) == 4 and sizes[2] != 1 and sizes[0]):
         return None  # several volumes in time are no sequence of flat images
@@ -167,11 +154,7 @@ def sequence_use(path: Path) -> str | None:
 
 
 def sequence_header(path: Path) -> tuple[dict[str, Any], list[str], list[int], int]:
-    """Read a MetaImage or NRRD header: keys, kinds and lengths of axes, and its length in bytes.
-
-    Raises:
-        VolumeError: it is none.
-    """
+    """Read a MetaImage or NRRD header: keys, kinds and lengths of axes, and its length in bytes."""
     if path.name.lower().endswith((".nrrd", ".nhdr")):
         keys, start = nrrd_header(path)
         kinds = [kind.lower() for kind in keys.get("kinds", ())]

@@ -31,11 +31,7 @@ class Segment:
 
 
 def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
-    """The segments that the keys and values of a header describe, in their order; often none.
-
-    Raises:
-        VolumeError: a value of one is none, or they are not stored as voxels in or out.
-    """
+    """The segments that the keys and values of a header describe, in their order; often none."""
     for key in ("Segmentation_MasterRepresentation", "Segmentation_SourceRepresentation"):
         if (said := pairs.get(key, "Binary labelmap")).lower() != "binary labelmap":
             raise VolumeError(

@@ -47,11 +47,7 @@ class StoredVoxels:
         return math.prod(self.size) * self.type.itemsize
 
     def check_bytes(self) -> None:
-        """Compare the bytes of raw numbers with the header; packed ones are compared as read.
-
-        Raises:
-            VolumeError: there are more or fewer, or the file is not there.
-        """
+        """Compare the bytes of raw numbers with the header; packed ones are compared as read."""
         if not self.file.is_file():
             raise VolumeError(f"{self.header}: belongs to {self.file.name}, which is not there")
         if self.encoding == "raw":
@@ -64,9 +60,6 @@ class StoredVoxels:
         Args:
             size: numbers of a piece.
             wanted: which pieces, ascending from 0; all without it, and then there must be no more.
-
-        Raises:
-            VolumeError: there are fewer or more than the header says, or they are damaged.
         """
         self.check_bytes()
         step, at = size * self.type.itemsize, 0
@@ -170,9 +163,6 @@ def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
     Args:
         path: which errors name.
         image: (j, i) of a volume, or of a sequence; beams along either axis.
-
-    Raises:
-        VolumeError: they are.
     """
     if image.dtype.kind not in "if" or max(image.shape) < 64:
         return
@@ -227,10 +217,6 @@ class StoredImage:
         """Refuse an image that is no volume, or does not fit into memory.
 
         With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
-
-        Raises:
-            VolumeError: it is not of three dimensions, or of four as several volumes, has one voxel
-                only along an axis, several numbers a voxel, or is too large.
         """
         path, axes = self.voxels.header, self.axes
         if len(axes) not in (3, 4) or min(axes[:3]) < 2:
@@ -245,11 +231,7 @@ class StoredImage:
         check_claim(path, (*self.shape, self.components), self.voxels.type.itemsize)
 
     def slices(self, volume: int = 1) -> Iterator[NDArray[Any]]:
-        """Yield the slices (j, i) of one of the volumes, or (j, i, component), scaled.
-
-        Raises:
-            VolumeError: the file holds more or fewer numbers, or is damaged.
-        """
+        """Yield the slices (j, i) of one of the volumes, or (j, i, component), scaled."""
         i, j, k = self.shape
         slope, offset = self.scaling
         wanted = range(k * (volume - 1), k * volume) if self.volumes > 1 else None
@@ -273,11 +255,7 @@ class GreyLevels:
 
     @classmethod
     def over(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
-        """Find the levels of images (rows, columns), read once; errors name the path.
-
-        Raises:
-            VolumeError: there is no finite value, or they are radio-frequency data.
-        """
+        """Find the levels of images (rows, columns), read once; errors name the path."""
         low, high, missing, infinite = math.inf, -math.inf, 0, 0
         for number, image in enumerate(images):
             if number % 16 == 0:

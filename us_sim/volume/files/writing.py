@@ -65,9 +65,6 @@ def write_labels(
         path: ends in .seg.nrrd, .nrrd, .mha, .nii or .nii.gz.
         volume: with labels; a label without a name is called by its number.
         colours: red, green and blue from 0 to 1 by label; `anatomical_colour` where not given.
-
-    Raises:
-        VolumeError: as `write_volume`, or the volume has no labels.
     """
     path = Path(path)
     if volume.labels is None:

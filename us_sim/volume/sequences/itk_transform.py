@@ -19,11 +19,7 @@ _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def read_slicer_transform(path: str | Path) -> NDArray[np.float64]:
-    """Read the transform (4, 4) of a file, m, to the parent in RAS; named by its file.
-
-    Raises:
-        VolumeError: it cannot be read, or holds none that is linear in 3D and has an inverse.
-    """
+    """Read the transform (4, 4) of a file, m, to the parent in RAS; named by its file."""
     import SimpleITK as sitk  # which takes a tenth of a second
 
     path = Path(path)

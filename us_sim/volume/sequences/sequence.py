@@ -63,9 +63,6 @@ class StoredImages:
     def read(self, wanted: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
         """Grey images (rows, columns) turned to ``MF``, one in memory at a time, of frames whose
         numbers ascend.
-
-        Raises:
-            VolumeError: there are fewer than promised, or they are damaged.
         """
         import cv2  # which a node that plays poses alone does not need
 
@@ -109,11 +106,7 @@ class TrackedSequence:
         return len(self.numbers)
 
     def require_images(self) -> StoredImages:
-        """The images in the file.
-
-        Raises:
-            VolumeError: there are none, or none that can be read.
-        """
+        """The images in the file."""
         if isinstance(self._stored, VolumeError):
             raise self._stored
         return self._stored
@@ -123,9 +116,6 @@ class TrackedSequence:
 
         Args:
             which: indices into `numbers`; they come in ascending order. All without it.
-
-        Raises:
-            VolumeError: there are no images, or they cannot be read or are damaged.
         """
         indices = range(len(self)) if which is None else which
         return self.require_images().read(sorted({int(self.numbers[i]) for i in indices}))
@@ -189,7 +179,7 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
         stored = _stored_images(path, keys, start, (columns, rows, channels, count), code)
     except VolumeError as error:  # for whoever asks for them
         stored, columns, rows = error, max(columns, 0), max(rows, 0)
-    if code[0] in "FN":
+    if code[:1] in ("F", "N"):
         columns, rows = rows, columns
     return TrackedSequence(
         path,
@@ -208,36 +198,24 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
 def _stored_images(
     path: Path, keys: Mapping[str, Any], start: int, size: tuple[int, int, int, int], code: str
 ) -> StoredImages:
-    """Describe the images, as (columns, rows, channels, frames).
-
-    Raises:
-        VolumeError: there are none, or none that can be read.
-    """
+    """Describe the images, as (columns, rows, channels, frames)."""
     columns, rows, channels, count = size
-    if min(columns, rows) < 1:
-        raise VolumeError(
-            f"{path}: holds poses without images ({count} frames); record the images too"
-        )
-    check_claim(path, (columns, rows, channels), 1)
-    if channels not in (1, 3):
-        raise VolumeError(
-            f"{path}: holds {channels} numbers per pixel; save it as grey values or colours"
-        )
-    if not re.fullmatch(r"([UM][FN]|[FN][UM])[AD]?", code):
-        raise VolumeError(
-            f"{path}: its images are stored in the orientation {code!r}; save it with "
-            f"UltrasoundImageOrientation MF, UF, MN, UN, FM, FU, NM or NU"
-        )
     kind = keys.get("UltrasoundImageType", keys.get("ultrasound image type", "BRIGHTNESS")).upper()
-    if kind not in ("BRIGHTNESS", "RGB_COLOR"):
-        raise VolumeError(
-            f"{path}: its images are of the type {kind}, no B-mode: give the logarithm of their "
-            f"envelopes (BRIGHTNESS)"
-        )
-    read = nrrd_voxels if path.name.lower().endswith((".nrrd", ".nhdr")) else metaimage_voxels
-    voxels = read(path, keys, start)
-    voxels.check_bytes()
-    return StoredImages(voxels, columns, rows, channels, code)
+    if min(columns, rows) < 1:
+        problem = f"holds poses without images ({count} frames); record the images too"
+    elif channels not in (1, 3):
+        problem = f"holds {channels} numbers per pixel; save it as grey values or colours"
+    elif not re.fullmatch(r"([UM][FN]|[FN][UM])[AD]?", code):
+        problem = f"its images are stored in the orientation {code!r}, and not as MF or UN are"
+    elif kind not in ("BRIGHTNESS", "RGB_COLOR"):
+        problem = f"its images are {kind}, no B-mode: give the logarithm of their envelopes"
+    else:
+        check_claim(path, (columns, rows, channels), 1)
+        read = nrrd_voxels if path.name.lower().endswith((".nrrd", ".nhdr")) else metaimage_voxels
+        voxels = read(path, keys, start)
+        voxels.check_bytes()
+        return StoredImages(voxels, columns, rows, channels, code)
+    raise VolumeError(f"{path}: {problem}")
 
 
 def turned(image: NDArray[np.uint8], code: str) -> NDArray[np.uint8]:

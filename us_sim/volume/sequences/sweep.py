@@ -44,9 +44,6 @@ class Sweep:
         """The images (rows, columns), ascending, one in memory at a time.
 
         They are all, or those at these indices into `numbers`.
-
-        Raises:
-            VolumeError: the compressed data are damaged.
         """
         numbers = self.numbers if which is None else self.numbers[sorted(set(which))]
         return self.sequence.require_images().read(int(number) for number in numbers)
@@ -61,10 +58,6 @@ def read_sweep(path: str | os.PathLike[str], *, tracked: bool = True) -> Sweep:
     Args:
         path: of the file.
         tracked: False takes images without a pose too; the sweep's poses are then all nan.
-
-    Raises:
-        VolumeError: the file is missing, is no sequence of images that can be read, is cut, or no
-            frame of it can be used.
     """
     sequence = read_sequence(path)
     return sweep_of(sequence) if tracked else _sweep(sequence, None, TransformChain("", ()))
@@ -143,9 +136,6 @@ def shifted(sweep: Sweep, offset: float) -> Sweep:
     Args:
         sweep: with poses.
         offset: s, to add to the images' times to find their poses.
-
-    Raises:
-        VolumeError: no image has a pose at its time.
     """
     centre = np.array([0.5 * (sweep.columns - 1), 0.5 * (sweep.rows - 1), 0.0])
     placed = poses_at(sweep.times, sweep.image_to_reference, sweep.times + offset, centre)

@@ -6,12 +6,10 @@ import numpy as np
 import pydicom
 import pytest
 from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
-from pydicom.data import get_testdata_file
 from pydicom.pixels import apply_color_lut, get_decoder, pixel_array
 from pydicom.uid import ExplicitVRBigEndian, JPEG2000Lossless, JPEGBaseline8Bit, RLELossless
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files import stored_image
 from us_sim.volume.files.dicom.header import open_dicom
 from us_sim.volume.files.dicom.pixels import GreyImages, image_format, stored_frames
 from us_sim.volume.files.dicom.planes import frame_times
@@ -143,42 +141,31 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
     [
         ({"Rows": 13}, "480 bytes .* 520"),
         ({"NumberOfFrames": 3}, "480 bytes .* 360"),
-        ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "numbers and"),
+        ({"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000}, "GB of memory"),
         ({"NumberOfFrames": -1}, "holds -1 images"),
-        ({"Rows": 0}, "10 × 0 pixels"),
+        ({"Rows": None}, "describe"),
         ({"BitsAllocated": 1, "BitsStored": 1}, "its header says 60"),
         ({"BitsStored": 77}, "Bits Stored"),
-        ({"SamplesPerPixel": 4}, "header says 1920"),
         ({"PhotometricInterpretation": "PALETTE COLOR"}, "table of colours is missing"),
     ],
 )
 def test_headers_that_cannot_be_are_refused(tmp_path, values, message):
-    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values))
-    refused(path, message)
-
-
-def test_images_that_the_memory_does_not_hold_are_refused(tmp_path, monkeypatch):
-    path = write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME))
-    monkeypatch.setattr(stored_image, "free_memory", lambda: 500.0)
-    refused(path, "GB of memory")
+    refused(write(tmp_path / "a.dcm", header(CINE, US_MULTI_FRAME, **values)), message)
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
-    [({"NumberOfFrames": 5}, "decoded"), ({"Rows": 60000, "Columns": 60000}, "GB of memory")],
+    ("syntax", "values", "message"),
+    [
+        (RLELossless, {"NumberOfFrames": 5}, "decoded"),
+        (RLELossless, {"Rows": 60000, "Columns": 60000}, "GB of memory"),
+        (JPEG2000Lossless, {"Rows": 13}, "decoded"),
+    ],
 )
-def test_compressed_images_are_as_many_and_as_large_as_the_header_says(tmp_path, values, message):
-    made = compressed(header(CINE, US_MULTI_FRAME), RLELossless)
+def test_compressed_images_are_as_the_header_says(tmp_path, syntax, values, message):
+    made = compressed(header(CINE, US_MULTI_FRAME), syntax)
     for key, value in values.items():
         setattr(made, key, value)
-    refused(write(tmp_path / "a.dcm", made, RLELossless), message)
-
-
-def test_an_image_of_another_size_than_the_header_says_is_refused(tmp_path):
-    made = compressed(header(CINE, US_MULTI_FRAME), JPEG2000Lossless)
-    made.Rows = 13
-    path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
-    refused(path, "decoded")
+    refused(write(tmp_path / "a.dcm", made, syntax), message)
 
 
 @pytest.mark.parametrize(
@@ -195,12 +182,6 @@ def test_jpeg_of_12_bits_and_htj2k_are_decoded(shared_file, name, at, value):
     file = open_dicom(path)
     (stored,) = stored_frames(file, image_format(file), [0])
     np.testing.assert_array_equal(stored[at], value)
-
-
-def test_jpeg_of_12_bits_that_comes_with_pydicom_is_decoded():
-    file = open_dicom(get_testdata_file("JPGExtended.dcm"))
-    (stored,) = stored_frames(file, image_format(file), [0])
-    assert (stored[420, 140], stored[230, 120]) == (244, 95)
 
 
 def test_a_decoder_that_is_missing_names_the_extra(tmp_path, monkeypatch):

@@ -1,7 +1,5 @@
 """DICOM volumes: where their voxels are, by every way in which a header states it."""
 
-import bz2
-import dataclasses
 import gzip
 from pathlib import Path
 
@@ -9,8 +7,6 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from made_dicom import US_IMAGE, US_MULTI_FRAME, enhanced, header, item, turned, write
 from pydicom.data import get_testdata_file
 from pydicom.uid import ImplicitVRLittleEndian
@@ -20,7 +16,6 @@ from us_sim.volume.deidentification.importing import import_files
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.dicom.placed_images import placed_images
 from us_sim.volume.files.readers import read_placement, read_volume
-from us_sim.volume.files.writing import write_volume
 from us_sim.volume.sequences.sweep import read_sweep
 
 CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
@@ -29,45 +24,20 @@ VOXELS = np.random.default_rng(5).integers(0, 256, (7, 6, 5), dtype=np.uint8)
 PLACED = turned()
 
 
-def voxel_at(volume, point):
-    """The grey value at a point in m."""
-    index = np.rint(volume.patient_to_index @ [*point, 1.0]).astype(int)[:3]
-    return volume.intensities[tuple(index)]
-
-
-@pytest.mark.parametrize("order", [None, [3, 0, 4, 1, 2], [4, 3, 2, 1, 0]])
-@pytest.mark.parametrize("syntax", [None, ImplicitVRLittleEndian, "deflated"])
-def test_an_enhanced_volume_lies_where_its_groups_say(tmp_path, order, syntax):
-    made = enhanced(VOXELS, PLACED, order=order)
-    path = tmp_path / "volume.dcm"
-    if syntax == "deflated":
-        write(path, made, deflated=True)
-    else:
-        write(path, made, *filter(None, [syntax]))
+@pytest.mark.parametrize(
+    ("order", "how"),
+    [
+        (None, {}),
+        ([3, 0, 4, 1, 2], {"syntax": ImplicitVRLittleEndian}),
+        ([4, 3, 2, 1, 0], {"deflated": True}),
+    ],
+)
+def test_an_enhanced_volume_lies_where_its_groups_say(tmp_path, order, how):
+    path = write(tmp_path / "volume.dcm", enhanced(VOXELS, PLACED, order=order), **how)
     volume = read_volume(path)
     np.testing.assert_array_equal(volume.intensities, VOXELS)
     np.testing.assert_allclose(volume.index_to_patient[:3], PLACED[:3] * 1e-3, atol=1e-12)
     np.testing.assert_array_equal(read_placement(path), volume.index_to_patient)
-
-
-@given(
-    angle=st.floats(-3.0, 3.0),
-    spacing=st.tuples(*[st.sampled_from([0.125, 0.5, 0.75, 2.0])] * 3),
-    order=st.permutations(range(5)),
-)
-@settings(max_examples=15, deadline=None)
-def test_any_grid_is_the_same_from_every_format(tmp_path_factory, angle, spacing, order):
-    folder = tmp_path_factory.mktemp("formats")
-    placed = turned(angle, spacing)
-    first = read_volume(write(folder / "a.dcm", enhanced(VOXELS, placed, order=order)))
-    inner = (first.index_to_patient @ np.array([[2, 1, 3, 1], [6, 5, 4, 1]]).T).T[:, :3]
-    for ending in (".nrrd", ".mha", ".nii.gz"):
-        write_volume(folder / f"a{ending}", first)
-        again = read_volume(folder / f"a{ending}")
-        atol = 1e-9 if ending != ".nii.gz" else 1e-8  # NIfTI holds float32
-        np.testing.assert_allclose(again.index_to_patient, first.index_to_patient, atol=atol)
-        assert voxel_at(again, inner[0]) == VOXELS[2, 1, 3]
-        assert voxel_at(again, inner[1]) == VOXELS[6, 5, 4]
 
 
 def test_each_volume_in_time_can_be_had(tmp_path):
@@ -280,13 +250,6 @@ def test_a_real_file_that_is_no_volume_is_called_what_it_is(shared_file, name, m
         read_volume(path)
 
 
-def test_a_scene_takes_a_dicom_volume(tmp_path):
-    from us_sim.volume.settings import VolumeSettings
-
-    path = write(tmp_path / "a.dcm", enhanced(VOXELS, PLACED))
-    assert dataclasses.asdict(VolumeSettings(file=str(path)))["file"] == str(path)
-
-
 def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
     times = 5
     made = enhanced(VOXELS[:, :, :1], turned(), times=times)
@@ -319,11 +282,10 @@ def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
     np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, placed[:3, 3])
 
 
-@pytest.mark.parametrize(("pack", "word"), [(gzip.compress, "gzip"), (bz2.compress, "bzip2")])
-def test_a_packed_file_is_called_packed(tmp_path, pack, word):
+def test_a_packed_file_is_called_packed(tmp_path):
     path = write(tmp_path / "a.dcm", enhanced(VOXELS, turned()))
     packed = tmp_path / "a.dcm.gz"
-    packed.write_bytes(pack(path.read_bytes()))
+    packed.write_bytes(gzip.compress(path.read_bytes()))
     for read in (read_volume, lambda path: import_files([path], tmp_path / "o.nrrd")):
-        with pytest.raises(VolumeError, match=f"packed as {word}"):
+        with pytest.raises(VolumeError, match="packed as gzip"):
             read(packed)

@@ -115,11 +115,7 @@ def refuse_other(path: Path, advice: str) -> VolumeError:
 
 
 def dicom_files(folder: Path) -> list[Path]:
-    """Return the DICOM files in a folder.
-
-    Raises:
-        VolumeError: there are none.
-    """
+    """Return the DICOM files in a folder."""
     found = [path for path in sorted(folder.iterdir()) if path.is_file() and is_dicom(path)]
     found = [path for path in found if path.name.upper() != "DICOMDIR"]
     if not found:
@@ -128,11 +124,7 @@ def dicom_files(folder: Path) -> list[Path]:
 
 
 def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
-    """Read the header of a DICOM file.
-
-    Raises:
-        VolumeError: there is no such file, it is none, it breaks off, or pydicom is not installed.
-    """
+    """Read the header of a DICOM file."""
     path = Path(path)
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file")

@@ -47,12 +47,7 @@ class ImageFormat:
 
 
 def image_format(file: DicomFile) -> ImageFormat:
-    """Read the format that a header states, and compare it with the bytes that there are.
-
-    Raises:
-        VolumeError: there are no images, they are not described, the file holds fewer or more bytes
-            than they take, or they do not fit into memory.
-    """
+    """Read the format that a header states, and compare it with the bytes that there are."""
     from pydicom.pixels.utils import get_expected_length, get_nr_frames
     from pydicom.uid import UID
 
@@ -95,11 +90,7 @@ def image_format(file: DicomFile) -> ImageFormat:
 def stored_frames(
     file: DicomFile, form: ImageFormat, frames: Sequence[int]
 ) -> Iterator[NDArray[Any]]:
-    """Yield images of a file, (rows, columns) or (rows, columns, RGB), by their numbers.
-
-    Raises:
-        VolumeError: an image is damaged, or its decoder is missing.
-    """
+    """Yield images of a file, (rows, columns) or (rows, columns, RGB), by their numbers."""
     from pydicom.pixels import iter_pixels, pixel_array
 
     from us_sim.volume.files.dicom import twelve_bit_jpeg
@@ -130,11 +121,7 @@ def stored_frames(
 
 
 def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
-    """Return the stored value that a colour table begins with, and the grey value of each.
-
-    Raises:
-        VolumeError: a table is missing or damaged.
-    """
+    """Return the stored value that a colour table begins with, and the grey value of each."""
     from pydicom.pixels import apply_color_lut
 
     try:
@@ -152,11 +139,7 @@ def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
 
 
 class GreyImages:
-    """The images of files that belong together, by (number of the file, number of the image).
-
-    Raises:
-        VolumeError: as `image_format`, or the files differ.
-    """
+    """The images of files that belong together, by (number of the file, number of the image)."""
 
     def __init__(self, files: Sequence[DicomFile]) -> None:
         self.files = list(files)
@@ -196,9 +179,6 @@ class GreyImages:
         Args:
             which: of which file, and which of its images; all without it.
             keep: (rows, columns) the pixels of each that are kept; the rest becomes 0.
-
-        Raises:
-            VolumeError: an image is damaged, or its decoder is missing.
         """
         which = self.all if which is None else which
         levels = GreyLevels()

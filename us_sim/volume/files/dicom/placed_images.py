@@ -50,19 +50,12 @@ class PlacedImages:
         Args:
             keep: (rows, columns) the pixels of each image that are kept; the rest becomes 0.
             progress: told the fraction that is read.
-
-        Raises:
-            VolumeError: an image is damaged, or its decoder is missing.
         """
         return volume_of_slices(self.images.images(self.which, keep), len(self.which), progress)
 
 
 def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
-    """Open the images of one or several DICOM files.
-
-    Raises:
-        VolumeError: as `open_dicom` and `GreyImages`.
-    """
+    """Open the images of one or several DICOM files."""
     files = [one_image_after_another(open_dicom(path)) for path in paths]
     for file in files:
         if text(file.header, "SOPClassUID") in SEGMENTATIONS:

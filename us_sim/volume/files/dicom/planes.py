@@ -75,10 +75,6 @@ def grid_of(
         planes: of two images or more.
         step: mm between slices; else their mean distance, or the smallest of sparse ones.
         sparse: slices may be missing, and several images be of the same one.
-
-    Raises:
-        VolumeError: they are not parallel, are shifted against each other, are not at even
-            distances, or lie where no body does.
     """
     orientation, spacing, positions = (
         np.array([getattr(plane, key) for plane in planes])
@@ -195,11 +191,7 @@ def is_cartesian(file: DicomFile) -> bool:
 
 
 def one_image_after_another(file: DicomFile) -> DicomFile:
-    """Return the file with a header that counts images; Philips' Cartesian export counts volumes.
-
-    Raises:
-        VolumeError: its number of slices is missing.
-    """
+    """Return the file with a header that counts images, where Philips' export counts volumes."""
     if not is_cartesian(file):
         return file
     if not (slices := int(_private_number(file.header, _SLICES))):

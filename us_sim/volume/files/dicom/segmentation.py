@@ -43,11 +43,7 @@ class DicomSegmentation:
     _least: int  # value from which on a voxel belongs to a segment; 0 in a label map
 
     def mask(self, segment: Segment) -> NDArray[np.bool_]:
-        """Return the voxels (i, j, k) in a segment.
-
-        Raises:
-            VolumeError: an image is damaged, or its decoder is missing.
-        """
+        """Return the voxels (i, j, k) in a segment."""
         found = np.zeros(self.shape, bool)
         wanted = [n for n, (of, _) in enumerate(self._frames) if of in (0, segment.value)]
         for n, image in zip(wanted, stored_frames(self.file, self.form, wanted), strict=True):
