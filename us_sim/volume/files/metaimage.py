@@ -76,9 +76,7 @@ def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -
 def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """Describe the image of a header.
 
-    Args:
-        path: of the header.
-        given: (3,) mm, the spacing of a file that does not state it.
+    ``given`` is the spacing (3,) in mm of a file that does not state it.
     """
     fields, header_bytes = metaimage_header(path)
     voxels = metaimage_voxels(path, fields, header_bytes)

@@ -20,9 +20,7 @@ _OF_TWO_SIZES = 1e-2  # by which the sizes of voxels may differ that a header st
 def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """Describe the image of a file, or of a pair of ``.hdr`` and ``.img``, each packed or not.
 
-    Args:
-        path: of the file, or of one of the pair.
-        given: (3,) mm, the spacing of a file that does not state it.
+    ``given`` is the spacing (3,) in mm of a file that does not state it.
     """
     image = _opened(path)
     kind = image.get_data_dtype()

@@ -72,9 +72,7 @@ def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxe
 def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     """Describe an image, whose first axis may be numbers of a voxel and whose last one volumes.
 
-    Args:
-        path: of the header.
-        given: (3,) mm, the spacing of a file that does not state it.
+    ``given`` is the spacing (3,) in mm of a file that does not state it.
     """
     fields, start = nrrd_header(path)
     voxels = nrrd_voxels(path, fields, start)

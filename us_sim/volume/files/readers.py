@@ -67,7 +67,7 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
 
 
 def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Where a volume file's voxels are: (4, 4) from their indices to m, from its header alone."""
+    """Read where a volume file's voxels are: (4, 4) from indices to m, from its header alone."""
     path = Path(path)
     if files := _dicom_files(path):
         from us_sim.volume.files.dicom.placed_images import placed_images
@@ -122,14 +122,9 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
 def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:
     """Whether a header is that of a sequence of frames, not of one volume.
 
-    Plus leaves ``Seq_Frame0000_ImageStatus`` in the header of volumes that it has reconstructed, so
-    that a field of a frame alone says nothing.
-
-    Args:
-        kinds: of its axes, as NRRD and Plus write them (``domain domain list``), of which the last
-            one counts: a list that comes first is the layers of a segmentation. They may be empty,
-            and then transforms of frames, or fields of several frames, make a sequence.
-        keys: of the header.
+    The last kind of an axis says it (``domain domain list``); a list that comes first is the layers
+    of a segmentation. Without kinds, transforms of frames or fields of several frames say it: Plus
+    leaves ``Seq_Frame0000_ImageStatus`` in the header of volumes that it has reconstructed.
     """
     if words := [kind.lower() for kind in kinds]:
         return words[-1] in ("list", "time")

@@ -168,25 +168,15 @@ def test_affiniti_and_artemis_state_distances_in_their_own_ways(tmp_path):
     np.testing.assert_allclose(volume.extent.sum(axis=0), 0.0, atol=1e-12)  # about its centre
 
 
-@pytest.mark.parametrize(
-    ("tag", "creator", "remedy"),
-    [
-        (0x7FE10011, "KRETZ_US", "SlicerHeart"),
-        (0x7FE10010, "GEMS_Ultrasound_MovieGroup_001", "3D Slicer"),
-        (0x200D0010, "Philips US Imaging DD 001", "Cartesian DICOM"),
-        (0x01390010, "SIEMENS MED SMS USG S2000 3D VOLUME", "Enhanced US Volume"),
-    ],
-)
-def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path, tag, creator, remedy):
+def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path):
     made = header(VOXELS[:, :, :1].transpose(2, 1, 0).copy(), US_IMAGE)
-    made.add_new(tag, "LO", creator)
+    made.add_new(0x7FE10011, "LO", "KRETZ_US")
     path = write(tmp_path / "a.dcm", made)
-    with pytest.raises(VolumeError, match=remedy):
+    with pytest.raises(VolumeError, match="SlicerHeart"):
         read_volume(path)
     del made.PixelData
-    path = tmp_path / "b.dcm"
     made.save_as(path, enforce_file_format=True)
-    with pytest.raises(VolumeError, match=f"no image.*{remedy}"):
+    with pytest.raises(VolumeError, match=r"no image.*SlicerHeart"):
         read_volume(path)
 
 

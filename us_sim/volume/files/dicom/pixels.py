@@ -24,8 +24,8 @@ from us_sim.volume.files.dicom.header import (
     number,
     numbers,
     quiet,
-    text,
 )
+from us_sim.volume.files.dicom.planes import EXPORT
 from us_sim.volume.files.stored_image import GreyLevels, check_claim
 
 _WEIGHTS = np.array([77, 150, 29])
@@ -49,12 +49,10 @@ class ImageFormat:
 def image_format(file: DicomFile) -> ImageFormat:
     """Read the format that a header states, and compare it with the bytes that there are."""
     from pydicom.pixels.utils import get_expected_length, get_nr_frames
-    from pydicom.uid import UID
 
     header, path = file.header, file.path
     if file.pixels is None:
-        kind = UID(text(header, "SOPClassUID")).name
-        raise VolumeError(f"{path}: holds no image ({kind}); give the DICOM file of an image")
+        raise VolumeError(f"{path}: holds no image; {EXPORT}")
     try:
         with quiet():
             form = ImageFormat(

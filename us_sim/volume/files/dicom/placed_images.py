@@ -15,9 +15,9 @@ from us_sim.errors import VolumeError
 from us_sim.volume.files.dicom.header import numbers, open_dicom, text
 from us_sim.volume.files.dicom.pixels import GreyImages
 from us_sim.volume.files.dicom.planes import (
+    EXPORT,
     Plane,
     grid_of,
-    hidden_volume,
     image_kinds,
     image_times,
     one_image_after_another,
@@ -60,9 +60,6 @@ def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     for file in files:
         if text(file.header, "SOPClassUID") in SEGMENTATIONS:
             raise no_grey_values(file.path)
-        # A maker's own volume may have a picture of no use beside it, or none at all.
-        if file.pixels is None and (remedy := hidden_volume(file)):
-            raise VolumeError(f"{file.path}: holds no image, but {remedy}")
     return GreyImages(files)
 
 
@@ -174,5 +171,4 @@ def _why_flat(images: GreyImages, planes: Sequence[Plane]) -> str:
             "--spacing X,Y,Z` (mm)"
         )
     kind = "a 2D image" if count == 1 else f"2D, with {count} images"
-    remedy = next(filter(None, map(hidden_volume, images.files)), as_images)
-    return f"is {kind}, not a volume: nothing in it says where its images lie; {remedy}"
+    return f"is {kind}, not a volume: nothing says where its images lie; {as_images}; {EXPORT}"

@@ -43,17 +43,11 @@ _CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
 _SLICES, _DEPTH = 0x30011001, 0x30011003  # of the Cartesian export
 _ARTEMIS = ("Eigen", "Artemis")
 
-_QLAB = "export it as Cartesian DICOM (3DDCM) from QLAB or Ultrasound Workspace"
-_SLICER = "export an Enhanced US Volume, or save it as .nrrd in 3D Slicer with SlicerHeart"
-_HIDDEN = (
-    (0x7FE1, "KRETZ_US", "GE (Kretz)", _SLICER),
-    (0x7FE1, "GEMS_Ultrasound_MovieGroup_001", "GE (movie group)", _SLICER),
-    (0x200D, "Philips US Imaging DD", "Philips", _QLAB),
-    (0x200D, "Philips US Private 3D", "Philips", _QLAB),
-    (0x0039, "SIEMENS MED SMS USG ANTARES 3D VOLUME", "Siemens", _SLICER),
-    (0x0139, "SIEMENS MED SMS USG S2000 3D VOLUME", "Siemens", _SLICER),
+EXPORT = (
+    "export a maker's own 3D data as Enhanced US Volume or Cartesian DICOM (QLAB), or save it as "
+    ".nrrd in 3D Slicer with SlicerHeart"
 )
-"""Group, beginning of the creator's name as in DCMTK's dictionary, maker, advice."""
+"""Advice for GE's Kretz and movie groups, Philips' native 3D and Siemens' volumes."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +189,7 @@ def one_image_after_another(file: DicomFile) -> DicomFile:
     if not is_cartesian(file):
         return file
     if not (slices := int(_private_number(file.header, _SLICES))):
-        raise VolumeError(f"{file.path}: does not say how many slices it has; {_QLAB} again")
+        raise VolumeError(f"{file.path}: does not say how many slices it has; export it again")
     header = copy.copy(file.header)
     header.NumberOfFrames = int(number(header, "NumberOfFrames") or 1) * slices
     return replace(file, header=header)
@@ -249,16 +243,6 @@ def _private_number(header: Any, tag: int) -> float:
     found = next(iter(values(header, tag)), b"")
     form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found)) if isinstance(found, bytes) else None
     return float(struct.unpack(form, found)[0]) if form else number(header, tag) or 0.0
-
-
-def hidden_volume(file: DicomFile) -> str:
-    """Return advice about a volume that is there in a form only its maker knows; or nothing."""
-    for group, creator, maker, remedy in _HIDDEN:
-        if any(
-            text(file.header, (group << 16) | n).startswith(creator) for n in range(0x10, 0x100)
-        ):
-            return f"it has private data of {maker}, where a volume may be: {remedy}"
-    return ""
 
 
 def frame_times(file: DicomFile, frames: int) -> list[float] | None:
