@@ -57,7 +57,7 @@ def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxe
     name = _TYPES.get(name, name if re.fullmatch("u?int(8|16|32|64)", name) else "")
     skip = fields.get("byte skip", fields.get("byteskip", 0))
     data = fields.get("data file", fields.get("datafile", path.name))
-    is_odd = "line skip" in fields or "lineskip" in fields or (skip < 0 and encoding != "raw")
+    is_odd = {"line skip", "lineskip"} & fields.keys() or (skip < 0 and encoding != "raw")
     if not name or encoding not in _ENCODINGS or is_odd or data.startswith("LIST") or "%" in data:
         raise VolumeError(
             f"{path}: holds voxels of type {kind!r} in the encoding {encoding!r}, or in several "
