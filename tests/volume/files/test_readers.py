@@ -81,25 +81,14 @@ def refused(path, message):
     assert "\n" not in str(error.value)
 
 
-def test_axis_0_is_the_files_fastest_axis(tmp_path):
-    volume = read_volume(_metaimage(tmp_path / "a.mha"))
-    assert volume.labels is None
-    assert volume.intensities.flags.c_contiguous
-    np.testing.assert_array_equal(volume.intensities, GREY)
-
-
-def test_direction_spacing_and_offset_place_the_voxels(tmp_path):
+def test_axis_0_is_the_files_fastest_and_the_header_places_the_voxels(tmp_path):
     # MetaImage gives one axis after another: i along y, j along z, k along x.
-    path = _metaimage(
-        tmp_path / "a.mha",
-        TransformMatrix="0 1 0 0 0 1 1 0 0",
-        ElementSpacing="0.5 2 3",
-        Offset="10 20 -30",
-    )
-    volume = read_volume(path)
-    index = np.array([2, 3, 4, 1])
+    turn = {"TransformMatrix": "0 1 0 0 0 1 1 0 0", "ElementSpacing": "0.5 2 3"}
+    volume = read_volume(_metaimage(tmp_path / "a.mha", **turn, Offset="10 20 -30"))
+    np.testing.assert_array_equal(volume.intensities, GREY)
+    assert volume.intensities.flags.c_contiguous
     expected = [0.010 + 4 * 3e-3, 0.020 + 2 * 0.5e-3, -0.030 + 3 * 2e-3, 1.0]
-    np.testing.assert_allclose(volume.index_to_patient @ index, expected, atol=1e-12)
+    np.testing.assert_allclose(volume.index_to_patient @ [2, 3, 4, 1], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz"])
@@ -150,33 +139,26 @@ def test_a_constant_image_is_dark_and_one_without_a_number_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "shape", "origin"),
+    ("name", "origin"),
     [
         (
-            "imfusion-liver-sweep/liver_sweep_compounded_1mm.mha",
-            (237, 192, 154),
-            [-157.46105809698449, -95.903891754215408, 19.731770208955197],
+            "imfusion-liver-sweep/liver_sweep_compounded_1mm",
+            (-157.461058097, -95.903891754, 19.73177),
         ),
         # With the status of a frame in its header, and with the axes of a sequence.
+        ("plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef", (-74.5217, 165.573, 29.072)),
         (
-            "plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef.mha",
-            (147, 106, 105),
-            [-74.5217, 165.573, 29.072],
-        ),
-        (
-            "plus-nwire-calibration/NwirePhantomFreehandReconstructed.mha",
-            None,
-            [-22.2573, -137.793, -58.5829],
+            "plus-nwire-calibration/NwirePhantomFreehandReconstructed",
+            (-22.2573, -137.793, -58.5829),
         ),
     ],
 )
-def test_real_volumes_are_what_simpleitk_reads(shared_file, name, shape, origin):
-    path = shared_file(name)
+def test_real_volumes_are_what_simpleitk_reads(shared_file, name, origin):
+    path = shared_file(f"{name}.mha")
     volume = read_volume(path)
     stored = sitk.GetArrayFromImage(sitk.ReadImage(str(path))).transpose(2, 1, 0)
-    assert volume.shape == (shape or stored.shape)
     np.testing.assert_array_equal(volume.intensities, stored)
-    np.testing.assert_allclose(volume.index_to_patient[:3, 3] * 1e3, origin, atol=1e-9)
+    np.testing.assert_allclose(volume.index_to_patient[:3, 3] * 1e3, origin, atol=1e-5)
 
 
 def test_a_real_sweep_of_frames_is_not_taken_for_a_volume(shared_file):
@@ -309,11 +291,10 @@ def test_a_cut_file_is_refused(tmp_path, suffix, compressed):
 
 
 @pytest.mark.parametrize("name", ["note.txt", "note.mha", "note.nii", "note.nrrd", "note"])
-@pytest.mark.parametrize("content", [b"", b"no image at all\n" * 40])
-def test_what_is_no_image_is_refused(tmp_path, name, content):
-    path = tmp_path / name
-    path.write_bytes(content)
-    refused(path, "an image")
+def test_what_is_no_image_is_refused(tmp_path, name):
+    for content in (b"", b"no image at all\n" * 40):
+        (tmp_path / name).write_bytes(content)
+        refused(tmp_path / name, "an image")
 
 
 def test_what_is_not_there_is_named(tmp_path):

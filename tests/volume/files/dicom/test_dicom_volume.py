@@ -254,22 +254,13 @@ def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
 
 
 def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
-    placed = turned()
-    for k in range(VOXELS.shape[2]):
-        made = header(VOXELS[:, :, k].T[None].copy(), CT_IMAGE, SeriesInstanceUID="1.2.3")
-        made.FrameOfReferenceUID = "1.2.4"
-        made.ImagePositionPatient = (placed[:3, 3] + k * placed[:3, 2]).tolist()
-        along = placed[:3, :2] / np.linalg.norm(placed[:3, :2], axis=0)
-        made.ImageOrientationPatient = along.T.ravel().tolist()
-        made.PixelSpacing = np.linalg.norm(placed[:3, :2], axis=0)[::-1].tolist()
-        made.SpecificCharacterSet = "ISO_IR 100"
-        path = write(tmp_path / f"{9 - k}", made, ImplicitVRLittleEndian)
+    for path in single_files(tmp_path, SpecificCharacterSet="ISO_IR 100"):
+        write(path, pydicom.dcmread(path), ImplicitVRLittleEndian)
         content = path.read_bytes()
         path.write_bytes(content[content.index(b"\x08\0\5\0") :])  # the first element of its data
     (tmp_path / "note.txt").write_text("hello")
-    volume = read_volume(tmp_path)
-    np.testing.assert_array_equal(volume.intensities, VOXELS)
-    np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, placed[:3, 3])
+    np.testing.assert_array_equal(read_volume(tmp_path).intensities, VOXELS)
+    np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, PLACED[:3, 3])
 
 
 def test_a_packed_file_is_called_packed(tmp_path):

@@ -52,7 +52,7 @@ def image_format(file: DicomFile) -> ImageFormat:
 
     header, path = file.header, file.path
     if file.pixels is None:
-        raise VolumeError(f"{path}: holds no image; {EXPORT}")
+        raise VolumeError(f"{path}: holds no image; give another DICOM file, or {EXPORT}")
     try:
         with quiet():
             form = ImageFormat(
@@ -67,7 +67,9 @@ def image_format(file: DicomFile) -> ImageFormat:
             )
             expected = get_expected_length(header)
     except (AttributeError, TypeError, ValueError) as error:
-        raise VolumeError(f"{path}: does not describe its images ({error})") from error
+        raise VolumeError(
+            f"{path}: does not describe its images ({error}); export it again"
+        ) from error
     size = form.frames, form.rows, form.columns, form.samples
     if min(size) < 1:
         raise VolumeError(
