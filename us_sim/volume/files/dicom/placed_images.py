@@ -93,7 +93,7 @@ def placed_images(
                 f"{path}: and the other files are of several series; give the files of one"
             )
     planes, times = _planes(images, spacing)
-    if is_flat(images, spacing):
+    if len({plane.position for plane in planes}) < 2:
         raise VolumeError(f"{path}: {_why_flat(images, planes)}")
     kinds: list[str] = []
     for file, form in zip(images.files, images.formats, strict=True):

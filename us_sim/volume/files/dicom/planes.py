@@ -85,9 +85,9 @@ def grid_of(
     gaps = np.diff(np.sort(depth))
     if sparse:
         gaps = gaps[gaps > _ROUNDED]
-        step = step or float(gaps.min(initial=np.inf)) if len(gaps) else step or 1.0
+        step = step or (float(gaps.min()) if len(gaps) else 1.0)
     else:
-        step = float(np.ptp(depth)) / (len(planes) - 1)
+        step = float(np.ptp(depth)) / (len(planes) - 1) or 1.0
     slices = np.rint((depth - depth.min()) / step)
     first = positions[int(np.argmin(depth))]
     step = float(np.ptp(depth) / slices.max()) if slices.any() else step
@@ -95,8 +95,8 @@ def grid_of(
     is_whole = sparse or np.array_equal(np.sort(slices), np.arange(len(planes)))
     if not is_whole or not off <= max(_EVEN * step, _ROUNDED):
         raise VolumeError(
-            f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart, and shifted by up "
-            f"to {off:g} mm against an even grid with right angles: one may be missing"
+            f"{path}: its images are {gaps.min(initial=step):g} to {gaps.max(initial=0):g} mm apart"
+            f" and shifted by up to {off:g} mm against an even grid: one may be missing"
         )
     rows, columns = planes[0].spacing
     return slices.astype(int).tolist(), checked_placement(path, (columns, rows, step), axes, first)
