@@ -12,9 +12,9 @@ from rosbags.rosbag2 import Reader
 
 from us_sim.command.main import main
 from us_sim.errors import BagError
-from us_sim.recording.mcap_records import HEADER
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
+from us_sim.recording.salvage import HEADER
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 

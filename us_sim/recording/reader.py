@@ -35,7 +35,6 @@ from us_sim.recording.storage import (
     open_storage,
 )
 from us_sim.recording.topic import LOST, MARKER, BagAttachment, BagMessage, BagNote, BagTopic, Fault
-from us_sim.recording.unpacking import LARGEST_CHUNK, unpack
 from us_sim.settings.spelling import aligned
 
 
@@ -226,14 +225,9 @@ class Bag:
         if not (self._decompress_messages or (is_frame and is_cdr)):
             return message
         try:
-            data = unpack(message.data, "zstd", LARGEST_CHUNK)
+            data = zstandard.decompress(message.data)
         except zstandard.ZstdError as error:
             raise BagError(f"{self.path} is damaged: {error}") from None
-        if len(data) > LARGEST_CHUNK:
-            raise BagError(
-                f"{self.path} cannot be read: a message on {message.topic} has more than "
-                f"{LARGEST_CHUNK} bytes when it is unpacked"
-            )
         return message._replace(data=data)
 
     def deserialize(self, message: BagMessage) -> Any:

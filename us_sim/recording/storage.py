@@ -15,12 +15,15 @@ import weakref
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path, PurePosixPath
+from typing import Any
 
+import zstandard
 from mcap.writer import MCAP0_MAGIC
 
 from us_sim.errors import BagError
-from us_sim.recording.mcap_file import McapFile
+from us_sim.recording.mcap_storage import McapStorage
 from us_sim.recording.metadata import BagMetadata, read_metadata
+from us_sim.recording.salvage import unpacked_pieces
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import (
     BagAttachment,
@@ -30,7 +33,6 @@ from us_sim.recording.topic import (
     Fault,
     qos_from_yaml,
 )
-from us_sim.recording.unpacking import unpack_file
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
 
@@ -47,24 +49,15 @@ class SqliteFile:
     def __init__(self, path: Path, label: str) -> None:
         self._label = label
         self._uri, unread = _address(path)
+        (self.start, self.end, rows, last), *_ = self._rows(
+            "SELECT MIN(timestamp), MAX(timestamp), COUNT(*), MAX(id) FROM messages"
+        )
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
                 self.topics = tuple(_topics(database, self._label))
-                self.start, self.end, rows, last = database.execute(
-                    "SELECT MIN(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
-                    "MAX(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
-                    "COUNT(*), MAX(id) FROM messages"
-                ).fetchone()
-        except _DAMAGE as error:
-            raise BagError(f"{self._label} cannot be read as a rosbag2 database: {error}") from None
-        usable = sum(topic.message_count for topic in self.topics)
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            raise self._damaged(error) from None
         self.faults = [Fault(unread)] if unread else []
-        if usable < rows:
-            text = (
-                f"{rows - usable} of the {rows} messages of {self._label} have no whole number as "
-                f"their time, no data or no topic, and are left out"
-            )
-            self.faults.append(Fault(text, rows - usable))
         if last is not None and last > rows:  # rosbag2 numbers them from 1
             text = (
                 f"{self._label} holds {rows} messages, and the last one has the number {last}: "
@@ -97,18 +90,11 @@ class SqliteFile:
         types = {topic.name: topic.type_name for topic in self.topics if topic.name in topics}
         marks = ",".join("?" * len(types))
         query = (
-            "SELECT topics.name, timestamp, data FROM messages "
-            "JOIN topics ON topics.id = messages.topic_id "
-            f"WHERE topics.name IN ({marks}) AND {_USABLE} AND timestamp >= ? "
-            "ORDER BY timestamp, messages.id"
+            f"SELECT topics.name, timestamp, data {_JOINED} WHERE topics.name IN ({marks}) "
+            "AND timestamp >= ? ORDER BY timestamp, messages.id"
         )
-        first = -(2**63) if since is None else max(min(since, 2**63 - 1), -(2**63))
-        try:
-            with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                for name, time, data in database.execute(query, (*types, first)):
-                    yield BagMessage(name, types[name], time, time, data)
-        except _DAMAGE as error:
-            raise BagError(f"{self._label} is damaged: {error}") from None
+        for name, time, data in self._rows(query, *types, -(2**63) if since is None else since):
+            yield BagMessage(name, types[name], time, time, data)
 
     def latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
         """The last messages of each of these topics before a log time, ns.
@@ -117,27 +103,29 @@ class SqliteFile:
             BagError: the database is damaged.
         """
         query = (
-            "SELECT timestamp, data FROM messages JOIN topics ON topics.id = messages.topic_id "
-            f"WHERE topics.name = ? AND {_USABLE} AND timestamp < ? "
+            f"SELECT timestamp, data {_JOINED} WHERE topics.name = ? AND timestamp < ? "
             "ORDER BY timestamp DESC, messages.id DESC LIMIT ?"
         )
-        found = []
-        try:
-            with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                for topic in self.topics:
-                    if topic.name in topics:
-                        asked = (topic.name, max(min(before, 2**63 - 1), -(2**63)), count)
-                        for time, data in database.execute(query, asked):
-                            found.append(BagMessage(topic.name, topic.type_name, time, time, data))
-        except _DAMAGE as error:
-            raise BagError(f"{self._label} is damaged: {error}") from None
+        found = [
+            BagMessage(topic.name, topic.type_name, time, time, data)
+            for topic in self.topics
+            if topic.name in topics
+            for time, data in self._rows(query, topic.name, before, count)
+        ]
         return found[::-1]
 
+    def _rows(self, query: str, *values: object) -> Iterator[tuple[Any, ...]]:
+        try:
+            with closing(sqlite3.connect(self._uri, uri=True)) as database:
+                yield from database.execute(query, values)
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            raise self._damaged(error) from None
 
-_DAMAGE = (sqlite3.Error, UnicodeDecodeError, TypeError, AttributeError, MemoryError)
-"""Errors that a damaged database gives."""
+    def _damaged(self, error: Exception) -> BagError:
+        return BagError(f"{self._label} is damaged, or no rosbag2 database: {error}")
 
-_USABLE = "typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
+
+_JOINED = "FROM messages JOIN topics ON topics.id = messages.topic_id"
 
 
 def _address(path: Path) -> tuple[str, str]:
@@ -177,12 +165,10 @@ def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
         )
     rows = database.execute(
         f"SELECT name, type, serialization_format, {qos}, {type_hash}, COUNT(messages.id) "
-        f"FROM topics LEFT JOIN messages ON messages.topic_id = topics.id AND {_USABLE} "
+        "FROM topics LEFT JOIN messages ON messages.topic_id = topics.id "
         "GROUP BY topics.id ORDER BY topics.id"
     )
     for name, type_name, encoding, profiles, digest, count in rows:
-        if not all(isinstance(text, str) for text in (name, type_name, encoding)):
-            raise sqlite3.DatabaseError(f"topic {name!r} has no name, type or encoding")
         yield BagTopic(
             name=name,
             type_name=normalized_type(type_name),
@@ -205,7 +191,7 @@ _DATED_PART = re.compile(
 """A file as the rosbag2 of ROS 2 Lyrical calls it: 0_FOLDER_2026_06_24-10_00_00.mcap."""
 
 
-Storage = McapFile | SqliteFile
+Storage = McapStorage | SqliteFile
 
 
 class NoBagError(BagError):
@@ -219,16 +205,20 @@ class Scratch:
         self._folder: str | None = None
 
     def unpack(self, file: Path) -> Path:
-        """A decompressed copy of a zstd file.
+        """A decompressed copy of a zstd file; of one that is cut off, of the bytes before the cut.
 
         Raises:
-            BagError: the file is damaged, or too large for this disk.
+            BagError: the file is damaged.
         """
         if self._folder is None:
             self._folder = tempfile.mkdtemp(prefix="us_sim_bag_")
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         copy = Path(self._folder, file.name.removesuffix(".zstd"))
-        unpack_file(file, copy)
+        try:
+            with file.open("rb") as packed, copy.open("wb") as unpacked:
+                unpacked.writelines(unpacked_pieces(packed))
+        except zstandard.ZstdError as error:
+            raise BagError(f"{file} cannot be decompressed: {error}") from None
         return copy
 
 
@@ -272,7 +262,7 @@ def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
     if not start:
         raise BagError(f"{label} is empty: its recorder was ended before it wrote anything")
     if start.startswith(MCAP0_MAGIC):
-        return McapFile(file, label)
+        return McapStorage(file, label)
     if start == _SQLITE_MAGIC:
         return SqliteFile(file, label)
     if start.startswith(_ZSTD_MAGIC):
