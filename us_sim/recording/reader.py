@@ -17,6 +17,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError, printable
 from us_sim.recording.metadata import BagMetadata
-from us_sim.recording.schemas import definitions, jazzy_definitions, normalized_type
+from us_sim.recording.schemas import definitions, jazzy_definitions
 from us_sim.recording.storage import (
     Scratch,
     Storage,
@@ -54,9 +55,7 @@ class Bag:
             earlier = topics.get(topic.name)
             topics[topic.name] = earlier.joined(topic, str(path)) if earlier else topic
         for entry in metadata.topics if metadata else ():
-            type_name = normalized_type(entry.type_name)
-            silent = BagTopic(entry.name, type_name, 0, entry.qos, entry.type_hash, entry.encoding)
-            topics.setdefault(entry.name, silent)
+            topics.setdefault(entry.name, replace(entry, message_count=0))
         self.topics = tuple(topics.values())
         self._topics = topics
 
@@ -278,7 +277,7 @@ class Bag:
                     "message_count": topic.message_count,
                     "encoding": topic.encoding,
                     "type_hash": topic.type_hash,
-                    "qos": [" ".join(profile.lines()[:4]) for profile in topic.qos],
+                    "qos": [profile.summary for profile in topic.qos],
                 }
                 for topic in sorted(self.topics, key=lambda topic: topic.name)
             ],

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import yaml
+
 from us_sim.errors import BagError
 from us_sim.settings.text_files import YamlError, load_yaml
 
@@ -93,24 +95,29 @@ class QosProfile:
             raise BagError(f"QoS depth is no whole number: {values['depth']!r}") from None
         return cls(**values)
 
-    def lines(self) -> list[str]:
-        """The lines of this profile as a YAML mapping, as rosbag2 0.26 writes it."""
-        lines = []
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if name in _DURATIONS:
-                lines += [f"{name}:", f"  sec: {value // 10**9}", f"  nsec: {value % 10**9}"]
-            else:
-                lines.append(f"{name}: {str(value).lower() if isinstance(value, bool) else value}")
-        return lines
+    @property
+    def summary(self) -> str:
+        """Its first four policies, for a person."""
+        names = ("history", "depth", "reliability", "durability")
+        return " ".join(f"{name}: {getattr(self, name)}" for name in names)
+
+    def document(self) -> dict[str, Any]:
+        """This profile as rosbag2 0.26 writes it."""
+        values = dict(vars(self))
+        for name in _DURATIONS:
+            seconds, rest = divmod(values[name], 10**9)
+            values[name] = {"sec": seconds, "nsec": rest}
+        return values
+
+
+def as_yaml(document: object) -> str:
+    """A document as YAML, its keys in their order."""
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
 
 
 def qos_to_yaml(profiles: Sequence[QosProfile]) -> str:
     """The YAML list that rosbag2 puts in a channel's ``offered_qos_profiles``."""
-    if not profiles:
-        return "[]"
-    items = ["- " + "\n  ".join(profile.lines()) for profile in profiles]
-    return "\n".join(items)
+    return as_yaml([profile.document() for profile in profiles]).rstrip()
 
 
 def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tuple[QosProfile, ...]:

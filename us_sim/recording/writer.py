@@ -27,9 +27,9 @@ from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from us_sim.errors import BagError
-from us_sim.recording.metadata import BagMetadata, FileEntry, TopicEntry
+from us_sim.recording.metadata import BagMetadata, FileEntry
 from us_sim.recording.schemas import definitions, schema_text
-from us_sim.recording.topic import QosProfile, qos_to_yaml
+from us_sim.recording.topic import BagTopic, QosProfile, as_yaml, qos_to_yaml
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
@@ -516,7 +516,7 @@ class BagWriter:
 
     def _add_metadata(self, part: _Part) -> None:
         information = self._metadata([*self._files, part.entry], self._counts + part.kept)
-        part.add_metadata("rosbag2", {"serialized_metadata": "\n".join(information.lines())})
+        part.add_metadata("rosbag2", {"serialized_metadata": as_yaml(information.information())})
 
     def _metadata(self, files: Sequence[FileEntry], counts: Mapping[str, int]) -> BagMetadata:
         filled = [file for file in files if file.message_count]
@@ -525,7 +525,7 @@ class BagWriter:
         return BagMetadata(
             files=tuple(files),
             topics=tuple(
-                TopicEntry(name, known.type_name, known.qos, known.type_hash, counts[name])
+                BagTopic(name, known.type_name, counts[name], known.qos, known.type_hash)
                 for name, known in self._topics.items()
             ),
             start=start,
