@@ -7,6 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from session_files import EPOCH, PERIOD, TYPES, press, write
 
 from us_sim.command.main import main
@@ -301,11 +302,11 @@ def test_an_index_with_wrong_times_is_told(tmp_path):
     content = bytearray(file.read_bytes())
     # The CRC of the summary is left away (0), as the format allows; then a chunk's end is moved.
     content[-12:-8] = bytes(4)
-    bag = read_bag(file)
-    run = bag._storages[0]._runs[3]
-    times = struct.pack("<QQ", run.start, run.end)
+    with file.open("rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[3]
+    times = struct.pack("<QQ", chunk.message_start_time, chunk.message_end_time)
     at = content.rindex(times)
-    content[at : at + 16] = struct.pack("<QQ", run.start, run.start)
+    content[at : at + 16] = 2 * times[:8]
     file.write_bytes(content)
     ((kind, text),) = findings(file)[1]
     assert kind == "index"

@@ -26,6 +26,20 @@ def test_a_wrong_time_or_packing_is_one_finding(shared_file, case, words):
     assert words in text
 
 
+def test_log_times_that_go_back_are_said_with_their_place(shared_file):
+    said = found(shared_file("cases/bag-time-back/log_time_back_too.mcap"))
+    assert any("go back by 29.983 s, from 29.983 s on" in text for text in said)
+
+
+def test_a_bag_of_every_type_is_read_to_the_end(shared_file):
+    checked = check(
+        read_bag(shared_file("cases/bag-every-type/test_bag_mcap/metadata.yaml").parent)
+    )
+    assert len(checked.topics) == 94
+    assert all(len(each.logged) == each.topic.message_count == 2 for each in checked.topics)
+    assert not any("too short" in finding.text for finding in checked.findings)
+
+
 def test_all_stamps_zero_is_said_of_each_topic(shared_file):
     """The images, and the poses of a PoseArray; those of the others rise."""
     said = found(shared_file("cases/bag-stamps-zero/zed_like.mcap"))

@@ -259,6 +259,17 @@ def _losses(each: TopicCheck, said: int, origin: int, one_counter: bool) -> Iter
         parts = np.split(numbers, np.flatnonzero(restarts))
         parts = [np.unique(part) for part in parts if len(part)]
         each.missing = sum(int(part[-1] - part[0]) + 1 - len(part) for part in parts)
+        edges = [0, *np.flatnonzero(restarts).tolist(), len(numbers)]
+        for begin, at, end in zip(edges, edges[1:], edges[2:], strict=False):
+            # Who begins anew counts from 1 again; this one went on where the later times end.
+            if 0 < numbers[begin] - numbers[at:end].max() <= 1 + _SEVERAL * len(numbers):
+                seconds = (each.logged[end - 1] - each.logged[begin]) * 1e-9
+                yield Finding(
+                    "order",
+                    f"the times at which {name} was recorded go back by {seconds:.3f} s, from "
+                    f"{_at(each.logged[end - 1], origin)} on: the recorder's clock was set "
+                    f"meanwhile, so that what came first is last; let it be set before",
+                )
         if len(back) and each.topic.type_name not in _SHARED:
             yield Finding(
                 "order",
