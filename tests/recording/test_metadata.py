@@ -175,7 +175,6 @@ def test_no_profiles(empty):
             "reliability cannot be 'rather'",
         ),
         (qos_to_yaml([QosProfile()]).replace("keep_last", "9"), "history cannot be 9"),
-        (qos_to_yaml([QosProfile()]).replace("depth: 10", "depth: -1"), "depth cannot be negative"),
         (qos_to_yaml([QosProfile()]).replace("nsec:", "ns:"), "not a duration"),
     ],
 )

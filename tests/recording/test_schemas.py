@@ -148,17 +148,3 @@ def test_unknown_types(name, message):
 def test_text_that_defines_nothing(text):
     with pytest.raises(BagError, match="definition of my_msgs/msg/Thing cannot be understood"):
         definitions("my_msgs/msg/Thing", text)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("string[100000000] x\n", "make more than 20000 parts"),
-        (f"Y[1000] x\n{'=' * 80}\nMSG: x_msgs/Y\nstring[1000] a\n", "make more than 20000 parts"),
-        ("X x\n", "x_msgs/msg/X is within itself"),
-        ("int32 " + "a" * 300_000 + "\n", "has more than 262144 characters"),
-    ],
-)
-def test_a_definition_that_no_decoder_can_be_made_of_is_refused(text, words):
-    with pytest.raises(BagError, match=words):
-        definitions("x_msgs/msg/X", text)

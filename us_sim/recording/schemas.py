@@ -8,20 +8,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError
 
 _RULE = "=" * 80
-_LARGEST_TEXT = 1 << 18
-_MOST_PARTS = 20_000  # rosbags writes code for each of them
 _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
@@ -76,38 +72,13 @@ def definitions(type_name: str, text: str) -> Typestore:
     """
     store = get_typestore(Stores.EMPTY)
     try:
-        if len(text) > _LARGEST_TEXT:
-            raise ValueError(f"it has more than {_LARGEST_TEXT} characters")
-        types = get_types_from_msg(text, type_name)
-        if _parts(type_name, types, ()) > _MOST_PARTS:
-            raise ValueError(f"its arrays of fixed lengths make more than {_MOST_PARTS} parts")
-        store.register(types)
+        store.register(get_types_from_msg(text, type_name))
         store.get_msgdef(type_name)
     except Exception as error:
         # The parser and the code generator raise whatever they stumble over.
         reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(":")
         raise BagError(f"the definition of {type_name} cannot be understood: {reason}") from None
     return store
-
-
-def _parts(name: str, types: Mapping[str, Any], within: tuple[str, ...]) -> int:
-    """How many values a message has that a decoder reads one by one; more only in sequences."""
-    if name in within:
-        raise ValueError(f"{name} is within itself")
-    total = 0
-    for _, field in types[name][1] if name in types else ():
-        kind, content = field
-        count = 1
-        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            (inner, content), size = content
-            is_text = inner == Nodetype.NAME or content[0] in ("string", "wstring")
-            count = size if kind == Nodetype.ARRAY and is_text else 1
-            kind = inner
-        inside = _parts(content, types, (*within, name)) if kind == Nodetype.NAME else 1
-        total += count * inside
-        if total > _MOST_PARTS:
-            break
-    return max(total, 1)
 
 
 @cache

@@ -50,12 +50,14 @@ class SqliteFile:
         self._label = label
         self._uri, unread = _address(path)
         (self.start, self.end, rows, last), *_ = self._rows(
-            "SELECT MIN(timestamp), MAX(timestamp), COUNT(*), MAX(id) FROM messages"
+            "SELECT MIN(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
+            "MAX(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
+            "COUNT(*), MAX(id) FROM messages"
         )
         try:
             with closing(sqlite3.connect(self._uri, uri=True)) as database:
                 self.topics = tuple(_topics(database, self._label))
-        except (sqlite3.Error, UnicodeDecodeError) as error:
+        except (sqlite3.Error, UnicodeDecodeError, TypeError, AttributeError) as error:
             raise self._damaged(error) from None
         self.faults = [Fault(unread)] if unread else []
         if last is not None and last > rows:  # rosbag2 numbers them from 1
@@ -94,7 +96,7 @@ class SqliteFile:
             "AND timestamp >= ? ORDER BY timestamp, messages.id"
         )
         for name, time, data in self._rows(query, *types, -(2**63) if since is None else since):
-            yield BagMessage(name, types[name], time, time, data)
+            yield self._message(name, types[name], time, data)
 
     def latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
         """The last messages of each of these topics before a log time, ns.
@@ -107,7 +109,7 @@ class SqliteFile:
             "ORDER BY timestamp DESC, messages.id DESC LIMIT ?"
         )
         found = [
-            BagMessage(topic.name, topic.type_name, time, time, data)
+            self._message(topic.name, topic.type_name, time, data)
             for topic in self.topics
             if topic.name in topics
             for time, data in self._rows(query, topic.name, before, count)
@@ -121,7 +123,12 @@ class SqliteFile:
         except (sqlite3.Error, UnicodeDecodeError) as error:
             raise self._damaged(error) from None
 
-    def _damaged(self, error: Exception) -> BagError:
+    def _message(self, topic: str, type_name: str, time: object, data: object) -> BagMessage:
+        if not (isinstance(time, int) and isinstance(data, bytes)):  # SQLite has no checksums
+            raise self._damaged(f"a message on {topic} has the time {time!r:.20}, or no data")
+        return BagMessage(topic, type_name, time, time, data)
+
+    def _damaged(self, error: object) -> BagError:
         return BagError(f"{self._label} is damaged, or no rosbag2 database: {error}")
 
 

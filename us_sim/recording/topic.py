@@ -41,7 +41,7 @@ class QosProfile:
     Policies are named as rmw names them in lower case.
 
     Raises:
-        BagError: a policy has no such name, or a depth or duration is negative.
+        BagError: a policy has no such name.
     """
 
     history: str = "keep_last"
@@ -61,9 +61,6 @@ class QosProfile:
                     f"QoS {policy} cannot be {getattr(self, policy)!r}: use one of "
                     f"{', '.join(names)}"
                 )
-        for number in ("depth", *_DURATIONS):
-            if getattr(self, number) < 0:
-                raise BagError(f"QoS {number} cannot be negative, as {getattr(self, number)} is")
 
     @classmethod
     def of(cls, profile: object) -> QosProfile:
