@@ -46,6 +46,7 @@ from us_sim.recording.topic import (
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _RUN = struct.Struct("<QQQQI")  # start, end, offset, length, bytes of the table of channels
 _CHANNEL = struct.Struct("<H8x")  # and the place of its message index
+_LAST = 2**63 - 1  # ns
 _PLACES_TOLD = 3
 
 _Ordered = tuple[int, int, int, BagMessage]  # log time, offset of the run, place in it, message
@@ -226,6 +227,8 @@ def _messages(stream: BinaryIO, run: Run, wanted: dict[int, tuple[str, str]]) ->
         if opcode == Opcode.MESSAGE:
             channel, sequence, time, sent = MESSAGE.unpack_from(content)
             if channel in wanted:
+                if time > _LAST or sent > _LAST:
+                    raise ValueError("a message is of a time after the year 2262")
                 data = bytes(content[MESSAGE.size :])
                 message = BagMessage(*wanted[channel], time, sent, data, sequence)
                 yield time, run.offset, place, message

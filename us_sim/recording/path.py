@@ -125,11 +125,15 @@ def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[Row, _Found]]:
     """Every pose of a topic's messages, with the body that it is of."""
     poses = _POSES[topic.type_name]
     for raw in bag.messages([topic.name]):
-        for found in poses(bag.deserialize(raw)):
-            _, header, p, q = found
-            stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
-            pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-            yield Row(raw.log_time, stamp, header.frame_id, pose), found
+        message = bag.deserialize(raw)
+        try:
+            for found in poses(message):
+                _, header, p, q = found
+                stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
+                pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+                yield Row(raw.log_time, stamp, header.frame_id, pose), found
+        except (AttributeError, TypeError) as error:  # the bag's own definitions are damaged
+            raise BagError(f"{bag.path}: no {topic.type_name} of ROS 2: {error}") from None
 
 
 def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]:

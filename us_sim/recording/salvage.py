@@ -404,7 +404,8 @@ def _take_chunk(
             channel, _, time, _ = MESSAGE.unpack_from(content)
             messages.append((channel, time))
         else:
-            found.learn(opcode, content)
+            with contextlib.suppress(*DAMAGE):  # of a chunk without a checksum
+                found.learn(opcode, content)
     found.add_messages(offset, length, messages)
     tables: dict[int, tuple[int, int]] = {}
     for channel, time in messages:
