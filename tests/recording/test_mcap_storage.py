@@ -56,17 +56,27 @@ def file(request, tmp_path):
     return FILES[request.param](tmp_path / "s.mcap")
 
 
+def by_mcap(path):
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, m.log_time, m.publish_time, m.data, m.sequence)
+            for _, channel, m in make_reader(stream).iter_messages()
+        ]
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_everything_is_as_mcap_reads_it(tmp_path, name):
     path = FILES[name](tmp_path / "s.mcap")
     bag = read_bag(path)
     assert bag.is_indexed == (name != "without chunks")
-    with path.open("rb") as stream:
-        expected = [
-            (channel.topic, m.log_time, m.publish_time, m.data, m.sequence)
-            for _, channel, m in make_reader(stream).iter_messages()
-        ]
-    assert [(m.topic, *m[2:]) for m in bag.messages()] == expected
+    assert [(m.topic, *m[2:]) for m in bag.messages()] == by_mcap(path)
+
+
+def test_real_files_are_as_mcap_reads_them(shared_data):
+    for path in shared_data.glob("ros2-jazzy/bags/probe_path_[cm]*/*.mcap"):
+        bag = read_bag(path)
+        assert bag.is_indexed
+        assert [(m.topic, *m[2:]) for m in bag.messages()] == by_mcap(path) != []
 
 
 def test_messages_since_a_time_are_those_of_all_from_there_on(file):
