@@ -184,8 +184,10 @@ def records_in(record: memoryview) -> list[tuple[int, memoryview]]:
     (said,) = _LENGTH.unpack_from(record, begin - _LENGTH.size)
     is_cut = len(record) < min(begin + said, HEADER.size + length)
     compression, packed = bytes(record[_CHUNK.size :][:name]), record[begin:]
-    if compression == b"zstd":
+    if compression == b"zstd" and is_cut:
         content = memoryview(b"".join(unpacked_pieces(BytesIO(packed))))
+    elif compression == b"zstd":
+        content = memoryview(zstandard.decompress(packed, size))
     elif compression == b"lz4":
         content = memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed))
     elif compression == b"":
