@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata, FileEntry, read_metadata
-from us_sim.recording.topic import INFINITE, BagTopic, QosProfile, qos_from_yaml, qos_to_yaml
+from us_sim.recording.topic import INFINITE, QosProfile, qos_from_yaml, qos_to_yaml
 
 
 @pytest.mark.parametrize("bag", ["chunkzstd", "mcap", "sqlite3", "zstd"])
@@ -39,24 +39,6 @@ def test_every_older_version_is_read(shared_data):
             (topic["topic_metadata"]["name"], topic["message_count"])
             for topic in information["topics_with_message_count"]
         ]
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), min_size=1, max_size=12),
-    st.dictionaries(st.text("ab: #'\"é{}[]~", min_size=1), st.text("xy: -\\\"'%@0"), max_size=3),
-)
-def test_any_name_survives_yaml(name, custom_data):
-    entry = FileEntry(f"{name}.mcap", 5, 7, 1)
-    topic = BagTopic("/a", "std_msgs/msg/String", 1, (QosProfile(), QosProfile(depth=1)))
-    document = BagMetadata((entry,), (topic,), 5, 7, 1, custom_data=custom_data).document()
-    information = yaml.safe_load(document)["rosbag2_bagfile_information"]
-    assert information["relative_file_paths"] == [entry.path]
-    assert (information["custom_data"] or {}) == custom_data
-    assert (
-        len(information["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"])
-        == 2
-    )
 
 
 @pytest.mark.parametrize(

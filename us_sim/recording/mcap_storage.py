@@ -242,7 +242,7 @@ def _index(stream: BinaryIO) -> Contents | None:
     if len(tail) != _FOOTER.size + len(MCAP0_MAGIC) or not tail.endswith(MCAP0_MAGIC):
         return None
     opcode, _, start, _, crc = _FOOTER.unpack_from(tail)
-    if opcode != Opcode.FOOTER or not 0 < start < size:
+    if opcode != Opcode.FOOTER or not 0 < start < size - len(tail):
         return None
     stream.seek(start)
     summary = stream.read(size - start - len(tail))

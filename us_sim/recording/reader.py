@@ -251,38 +251,6 @@ class Bag:
                 f"{topic.type_name}: {error}"
             ) from None
 
-    def summary(self) -> dict[str, Any]:
-        """The content of ``us-sim bag info`` in JSON's types; times in ns since the epoch.
-
-        All of the bag is read, for ``faults``.
-        """
-        start, end = self.start, self.end
-        return {
-            "path": str(self.path),
-            "faults": [fault._asdict() for fault in self.faults()],
-            "start": start,
-            "end": end,
-            "duration": end - start if start is not None and end is not None else 0,
-            "message_count": self.message_count,
-            "lost": dict(self.lost()),
-            "markers": [{"time": time, "text": text} for time, text in self.markers()],
-            "attachments": [
-                {"name": each.name, "media_type": each.media_type, "size": len(each.data)}
-                for each in self.attachments([]).values()
-            ],
-            "topics": [
-                {
-                    "name": topic.name,
-                    "type": topic.type_name,
-                    "message_count": topic.message_count,
-                    "encoding": topic.encoding,
-                    "type_hash": topic.type_hash,
-                    "qos": [profile.summary for profile in topic.qos],
-                }
-                for topic in sorted(self.topics, key=lambda topic: topic.name)
-            ],
-        }
-
     def definitions(self, topic: BagTopic) -> Typestore:
         """The definition of a topic's type: the bag's own, else that of Jazzy.
 
@@ -332,31 +300,28 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
 def describe(bag: Bag) -> str:
     """Path, times, topics with type, count, rate and offered quality; then losses, marks, files.
 
-    The times of marks are those since the start.
+    The times of marks are those since the start. All of the bag is read, for its faults.
     """
-    summary = bag.summary()
-    seconds = summary["duration"] * 1e-9
-    lines = [f"file      {summary['path']}"]
-    lines += [f"note      {fault['text']}" for fault in summary["faults"]]
-    if summary["start"] is not None:
-        lines.append(f"start     {_date(summary['start'])}")
-    lines += [f"duration  {seconds:.3f} s", f"messages  {summary['message_count']}", ""]
+    start = bag.start
+    seconds = (bag.end - start) * 1e-9 if start is not None and bag.end is not None else 0.0
+    lines = [f"file      {bag.path}"]
+    lines += [f"note      {fault.text}" for fault in bag.faults()]
+    if start is not None:
+        lines.append(f"start     {_date(start)}")
+    lines += [f"duration  {seconds:.3f} s", f"messages  {bag.message_count}", ""]
     table = [("topic", "type", "count", "Hz", "quality of service")]
-    for topic in summary["topics"]:
-        count = topic["message_count"]
+    for topic in sorted(bag.topics, key=lambda topic: topic.name):
+        count = topic.message_count
         rate = f"{(count - 1) / seconds:.1f}" if seconds and count > 1 else "-"
-        quality = "; ".join(dict.fromkeys(topic["qos"])) or "-"
-        encoding = "" if topic["encoding"] == "cdr" else f" ({topic['encoding']})"
-        table.append((topic["name"], topic["type"] + encoding, str(count), rate, quality))
+        quality = "; ".join(dict.fromkeys(profile.summary for profile in topic.qos)) or "-"
+        encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
+        table.append((topic.name, topic.type_name + encoding, str(count), rate, quality))
     lines += aligned(table, left=(0, 1, 4))
-    lines += _section("lost", [f"{count} of {topic}" for topic, count in summary["lost"].items()])
-    marked = [
-        f"{(mark['time'] - (summary['start'] or mark['time'])) * 1e-9:.3f} s  {mark['text']}"
-        for mark in summary["markers"]
-    ]
-    lines += _section("marked", marked)
-    attached = [f"{each['name']} ({each['size']} bytes)" for each in summary["attachments"]]
-    lines += _section("attached", attached)
+    lines += _section("lost", [f"{count} of {topic}" for topic, count in bag.lost().items()])
+    marks = [f"{(time - (start or time)) * 1e-9:.3f} s  {text}" for time, text in bag.markers()]
+    lines += _section("marked", marks)
+    attached = bag.attachments([]).values()
+    lines += _section("attached", [f"{each.name} ({len(each.data)} bytes)" for each in attached])
     return "\n".join(printable(line) for line in lines)
 
 
