@@ -1,8 +1,8 @@
 """Reading one MCAP file: by the index in its summary, else by what `salvage` finds of it.
 
 The records are mcap's. Its ``SeekingReader`` is not used: it ends at the first damaged chunk, takes
-3.4 times as long as this for small messages, and 1 s to open an hour's session, which takes 0.2 s
-here.
+3.4 times as long as this for small messages, and 1 s to open an hour's session, which takes a
+quarter of that here.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ from us_sim.recording.topic import (
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
 _RUN = struct.Struct("<QQQQI")  # start, end, offset, length, bytes of the table of channels
-_CHANNEL = struct.Struct("<H8x")  # and the place of its message index
 _LAST = 2**63 - 1  # ns
 _PLACES_TOLD = 3
 
@@ -254,9 +253,9 @@ def _index(stream: BinaryIO) -> Contents | None:
         for opcode, record, _ in split(memoryview(summary)):
             if opcode == Opcode.CHUNK_INDEX:
                 first, last, offset, length, table = _RUN.unpack_from(record)
-                channels = _CHANNEL.iter_unpack(record[_RUN.size : _RUN.size + table])
-                run = Run(first, offset, last, length, tuple(id for (id,) in channels))
-                found.runs.append(run)
+                # Of each channel its number, and the place of its message index.
+                channels = struct.unpack_from("<" + "H8x" * (table // 10), record, _RUN.size)
+                found.runs.append(Run(first, offset, last, length, channels))
             elif opcode == Opcode.STATISTICS:
                 statistics = parsed(Statistics, record)
             elif opcode == Opcode.ATTACHMENT_INDEX:
