@@ -124,6 +124,7 @@ def test_distance_to_a_convex_array_is_that_to_the_nearest_of_its_points(collide
         assert distance(collider, where)[0] == pytest.approx(nearest - rounding, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("collider", [BENT, MICRO])
 def test_inside_its_core_a_convex_array_is_as_deep_as_the_nearest_side_of_it(collider):
     """Against 30,000 points on the core's outline in the image plane, and its two sides."""

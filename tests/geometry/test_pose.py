@@ -25,6 +25,7 @@ def test_rotation_is_scipys(pose):
     np.testing.assert_allclose(pose.rotation, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @quick
 @given(poses, poses, poses)
 def test_composition_is_associative_and_is_the_matrix_product(a, b, c):

@@ -35,6 +35,7 @@ def test_its_vein_is_a_lumen_at_the_pressure_of_veins_and_nothing_else_is(arm):
     assert (lumen[vessels["vein"] > 0] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_press_of_12_mm_closes_it_and_it_opens_again(arm):
     model, vessels = arm
     solver = FemNonlinear(model)

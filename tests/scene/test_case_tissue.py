@@ -108,6 +108,7 @@ def test_a_case_alone_is_a_whole_scene(cases):
     assert colour_of(scene, "vein") == (0.25, 0.4, 0.85)
 
 
+@pytest.mark.slow
 def test_a_thrombus_in_a_cases_vein_keeps_it_open_and_an_exercise_knows_of_it(tmp_path):
     """A structure of a case that is called after its vein is a thrombus, with no word more."""
     numbers = {"vein": 6, "vein thrombus": 8, "rib": 2}
@@ -186,6 +187,7 @@ def test_planes_lie_close_where_the_vein_is():
     assert np.diff(x)[np.abs((x[1:] + x[:-1]) / 2) < 4e-3].max() < 0.6 * np.diff(x).max()
 
 
+@pytest.mark.slow
 def test_tissue_is_made_once_and_made_anew_when_what_it_is_made_from_changes(cases, tmp_path):
     shutil.copytree(cases / "block", tmp_path / "block")
     scene = load_scene(f"case:{tmp_path / 'block'}")
@@ -366,6 +368,7 @@ def conforming(volume, folder):
         return conforming_tissue(scene(1000, "conforming"), volume)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("conforming")
 def test_it_leaves_no_files_where_it_is_called(folder):
     assert not list(folder.iterdir())
@@ -394,6 +397,7 @@ def test_its_interface_is_on_the_ball(conforming):
     assert np.abs(radius - RADIUS).max() < 0.6e-3
 
 
+@pytest.mark.slow
 def test_it_gives_way_as_a_grid_does(conforming, volume, monkeypatch):
     moved = []
     for kind, nodes in (("conforming", 1000), ("grid", 1000)):

@@ -109,6 +109,7 @@ def test_a_scene_without_tissue_is_refused(pressed):
         rest_placement(dataclasses.replace(scene, tissue=None), sweep, ImagePart())
 
 
+@pytest.mark.slow
 def test_the_command_places_images_at_rest(pressed, small_scene, tmp_path, capsys):
     scene, _, sweep = pressed
     out = tmp_path / "rest.nrrd"

@@ -120,6 +120,7 @@ def test_the_laws_are_tried_on_nearly_all_settings():
     assert len(KINDS) >= 35
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 @given(data=st.data())

@@ -136,6 +136,7 @@ def test_the_error_of_a_smooth_strain_falls_with_the_square_of_the_meshs_width()
     assert errors[-1] < 2e-4
 
 
+@pytest.mark.slow
 @ALL_PROBES
 def test_it_is_the_mean_of_what_vtk_says_of_the_tetrahedra(probe):
     vtk = pytest.importorskip("vtk")

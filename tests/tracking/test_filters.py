@@ -135,6 +135,7 @@ def test_behind_a_sway_as_exponential_smoothing_is(rate, frequency):
         assert measured == pytest.approx(one_euro.lag, rel=0.02)
 
 
+@pytest.mark.slow
 def test_at_rest_noise_shrinks_as_that_of_exponential_smoothing():
     """Its variance by a / (2 - a), with the share a = 1 / (1 + 1 / (2 pi fc T))."""
     rng = np.random.default_rng(3)
@@ -262,6 +263,7 @@ def difference(pose, other):
     return np.r_[other.position - pose.position, turn]
 
 
+@pytest.mark.slow
 def test_it_errs_as_much_as_it_says():
     """NEES over runs and NIS over all steps, in the chi-square's middle 99.8 per cent."""
     rng = np.random.default_rng(11)

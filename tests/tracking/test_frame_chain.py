@@ -1,6 +1,7 @@
 """Chains of frames at one time, against the motion that was sampled."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,6 +34,7 @@ def true(stamp):
     return pose
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     periods=st.tuples(*[st.integers(5, 60)] * 3),

@@ -437,6 +437,7 @@ def test_no_energy_comes_out_of_a_closed_path(name, seed):
     assert bench.most_given < 1e-3 * bench.largest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_nor_with_scales_frames_limits_noise_and_fewer_poses(seed):
     random = np.random.default_rng(seed)

@@ -127,6 +127,7 @@ COVARIANCE = np.diag([1e-8, 4e-8, 9e-8, 1e-6, 1e-6, 4e-6])
 COVARIANCE[0, 4] = COVARIANCE[4, 0] = 5e-8
 
 
+@pytest.mark.slow
 def test_with_covariances_right_poses_are_refused_as_rarely_as_was_asked():
     """Two looks at a probe at rest: of d² with six degrees of freedom a share is beyond."""
     rng = np.random.default_rng(7)

@@ -293,6 +293,7 @@ class Raising(FemCg):
         raise np.linalg.LinAlgError("Singular matrix")
 
 
+@pytest.mark.slow
 def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monkeypatch, capsys):
     for name in {*TISSUE_METHODS} - {"fem", "fem_cg", "fem_nonlinear"}:
         monkeypatch.delitem(TISSUE_METHODS, name)
@@ -321,6 +322,7 @@ def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monk
     assert "failed: fem_cg" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_without_a_converged_answer_every_row_says_so(tmp_path, monkeypatch):
     def broken(*_):
         raise np.linalg.LinAlgError("Singular matrix")

@@ -63,6 +63,7 @@ def test_the_report_says_what_every_artefact_simplifies():
 TIMED, RATIO = ["run_time"], " over the plain slice"  # what others do on the machine decides, too
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "artefact",
     [one for one in measure.ARTEFACTS if one.name not in TIMED],

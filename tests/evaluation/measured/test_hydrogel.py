@@ -41,6 +41,7 @@ def test_beads_of_a_large_homogeneous_deformation_are_predicted_exactly():
     assert _length(noise_floor(beads, random)) < 1e-9 * _SIZE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.3, 0.48])
 def test_an_inhomogeneous_deformation_is_that_of_quadratic_elements_of_another_program(ratio):
     elements = pytest.importorskip("us_sim.evaluation.tissue.finite_elements")
@@ -100,6 +101,7 @@ def beads(real_file):
     return read_beads(real_file)
 
 
+@pytest.mark.slow
 def test_beads_of_the_real_gel_are_predicted(beads):
     """Fitted on one side of the axis, judged on the other, by the noise of the measurement."""
     floor = noise_floor(beads, np.random.default_rng(1))

@@ -124,6 +124,7 @@ def write_test(file, forces):
     file.write_text("A title;\nTime (s),Compression (mm),Load (N)\n" + "\n".join(rows) + "\n")
 
 
+@pytest.mark.slow
 def test_constants_of_a_made_up_silicone_are_found_and_its_forces_predicted(tmp_path):
     for specimen in "AB":
         for test in (1, 2):

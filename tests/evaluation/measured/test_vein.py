@@ -39,6 +39,7 @@ def lying():
     return press(VENOUS["lying"], 10)
 
 
+@pytest.mark.slow
 def test_a_vein_of_higher_pressure_closes_at_a_higher_one(lying):
     low, high = lying, press(VENOUS["standing"], 10)
     assert low.area[0] == high.area[0] == 1.0

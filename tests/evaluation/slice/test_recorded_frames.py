@@ -34,6 +34,7 @@ def liver(shared_data):
     return files
 
 
+@pytest.mark.slow
 def test_real_frames_are_found_again_in_the_volume(liver, tmp_path):
     found = compare_with_recorded(*liver, tmp_path, quick=True)
     with (tmp_path / "recorded_frames.csv").open() as file:
@@ -145,6 +146,7 @@ def test_frames_cut_from_the_volume_correlate_fully(tmp_path):
     np.testing.assert_array_equal(found.shifts, 0.0)
 
 
+@pytest.mark.slow
 def test_a_wrong_pose_shows_as_a_shift(tmp_path):
     files = _made_up(tmp_path, shift=1.0)
     found = compare_with_recorded(*files, tmp_path / "out", quick=False, fan=SMALL)

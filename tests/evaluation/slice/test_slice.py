@@ -69,6 +69,7 @@ def point(method, ms, size=512, nodes=8192, threads=1, **fields):
     )
 
 
+@pytest.mark.slow
 def test_the_reference_of_an_affine_deformation_is_its_inverse():
     mesh, plane = SMALL.mesh(), replace(SMALL, plane="corner").frames(1)[0].plane
     stretch = np.array([[1.1, 0.05, 0.0], [0.0, 0.9, 0.1], [-0.05, 0.0, 0.8]])
@@ -174,6 +175,7 @@ def test_methods_take_turns():
     assert other["sampling_ms"] == np.median([range(6, 11), range(16, 21), range(26, 31)])
 
 
+@pytest.mark.slow
 def test_no_dent_turns_a_tetrahedron_inside_out():
     for counts in (*MESHES, LARGEST_MESH):
         mesh = Case(64, counts, "rest", "straight").mesh()
@@ -241,6 +243,7 @@ def small(monkeypatch):
     monkeypatch.setattr("us_sim.evaluation.slice.report.SHOWN", (SMALL,))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_rows_plots_and_report_are_written(tmp_path, capsys):
     out = tmp_path / "slices"
@@ -263,6 +266,7 @@ def test_rows_plots_and_report_are_written(tmp_path, capsys):
     assert slice_vtk.HOW_TO_GET not in report + capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_without_vtk_the_rest_is_measured_and_it_is_said(monkeypatch, tmp_path, capsys):
     find = importlib.util.find_spec
@@ -276,6 +280,7 @@ def test_without_vtk_the_rest_is_measured_and_it_is_said(monkeypatch, tmp_path, 
     assert "VTK's two parts" not in report
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_method_that_fails_says_so_and_leaves_the_others(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(SLICERS.options, "per_pixel", Option("us_sim.slicing.nothing:Nothing"))
@@ -302,6 +307,7 @@ def test_bad_input_is_refused_in_a_sentence_before_the_run(options, words, tmp_p
     assert words in error
 
 
+@pytest.mark.slow
 def test_processes_of_their_own_tell_memory_and_publishing():
     peak_memory(64)  # compiling holds memory too, once
     small, large = peak_memory(64), peak_memory(256)
@@ -313,6 +319,7 @@ def test_processes_of_their_own_tell_memory_and_publishing():
     assert 0.0 < sent < 100.0
 
 
+@pytest.mark.slow
 def test_nothing_but_vtk_is_needed_beyond_what_is_always_installed():
     code = (
         "import sys; sys.modules['skfem'] = sys.modules['vtkmodules'] = None;"

@@ -149,6 +149,7 @@ def test_broken_solvers_are_caught():
 HELD = StabilityCase("held", depth=0.2, contrast=10.0, held=HOLD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "number", "why"),
     [
@@ -365,6 +366,7 @@ def test_a_process_keeps_by_itself_all_but_the_kernels(tmp_path, monkeypatch):
     assert kernel_folder() == kernels
 
 
+@pytest.mark.slow
 def test_the_report_has_a_row_for_each_case_and_a_map_for_each_method(
     tmp_path, monkeypatch, capsys
 ):

@@ -69,6 +69,7 @@ def test_a_cubic_displacement_without_change_of_volume_costs_only_shear_energy()
     assert block.energy(displacement) == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_shallow_press_has_hertz_force():
     depth = 0.0004
     planes = (
@@ -82,6 +83,7 @@ def test_a_shallow_press_has_hertz_force():
     assert solution.penetration < 2e-5
 
 
+@pytest.mark.slow
 def test_a_tilted_capsule_pushes_everything_out_and_is_mirrored():
     half = np.radians(8) / 2
     pose = Pose([0.0, 0.0, 0.006], [0.0, np.sin(half), 0.0, np.cos(half)])
@@ -98,6 +100,7 @@ def test_a_tilted_capsule_pushes_everything_out_and_is_mirrored():
         solve_contact(planes, SOFT, probe, [Pose([0.0, 0.001, 0.0])])
 
 
+@pytest.mark.slow
 def test_nearly_incompressible_tissue_is_found_at_once_where_it_is_found_in_steps():
     scene = SCENES["press_12mm_nu0.4999"]
     planes = scene.reference_planes(0.03)

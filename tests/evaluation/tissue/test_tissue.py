@@ -116,6 +116,7 @@ def small(monkeypatch, tmp_path):
     return tmp_path / "out"
 
 
+@pytest.mark.slow
 def test_rows_pictures_and_report_are_there_and_a_failure_is_named(small, capsys, monkeypatch):
     assert evaluate_tissue(small, quick=True) == 1
     said = capsys.readouterr().out
@@ -146,6 +147,7 @@ def test_rows_pictures_and_report_are_there_and_a_failure_is_named(small, capsys
     assert evaluate_tissue(small.with_name("again"), quick=True) == 1
 
 
+@pytest.mark.slow
 def test_a_damaged_reference_is_made_again(small, caplog):
     kept_reference.kept_reference(PRESS, (0.03, 0.03))
     (file,) = (small.parent / "cache").glob("reference-*/displacement.npy")

@@ -103,6 +103,7 @@ def test_the_delay_of_a_delayed_path_is_found(lag):
     assert delay(times, path(times - lag), path) == pytest.approx(lag, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_filters_trade_lag_for_jitter():
     assert {method for method, *_ in filter_trials(quick=False)} == set(FILTER_METHODS)
     assert set(FILTER_METHODS) == set(FILTERS)
@@ -121,6 +122,7 @@ def test_filters_trade_lag_for_jitter():
     assert best.jitter < none.jitter
 
 
+@pytest.mark.slow
 def test_the_report_and_its_rows_are_written(tmp_path, monkeypatch, capsys):
     few = [Case(name, "640x480", 0.4, 30.0) for name in (SINGLE, RIGID_BODY)]
     few += [Case(RIGID_BODY, "1920x1080", 0.4, 30.0)]

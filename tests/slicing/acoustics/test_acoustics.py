@@ -39,6 +39,7 @@ def ball(label, radius=4e-3, centre=(0.0, 0.0, 0.012)):
     return Volume(np.full(labels.shape, 150, np.uint8), placed, labels, NAMES)
 
 
+@pytest.mark.slow
 def test_off_imports_nothing_and_changes_nothing():
     baked = BMode(ball(3), PROBE, acoustics=Acoustics()).image(Pose())
     np.testing.assert_array_equal(baked, BMode(ball(3), PROBE).image(Pose()))

@@ -194,6 +194,7 @@ def test_a_vessel_pressed_more_near_the_skin_loses_the_area_that_the_map_takes(m
 # --- symmetry -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every_method
 @settings(max_examples=15, deadline=None, derandomize=True)  # a case may overlap itself unseen
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(["box", "cloud", "through_nodes"]))
@@ -224,6 +225,7 @@ def test_the_order_of_nodes_and_tetrahedra_does_not_matter(method, kind, seed):
         assert np.abs(shuffled.image(nodes, plane).astype(int) - image).max() <= 1
 
 
+@pytest.mark.slow
 @every_method
 @pytest.mark.parametrize("kind", KINDS)
 def test_threads_do_not_change_a_byte(method, kind):
@@ -491,6 +493,7 @@ def _free_memory():
         return 1 << 40
 
 
+@pytest.mark.slow
 @every_method
 def test_a_volume_of_512_voxels_a_side_takes_its_own_size_and_300_megabytes(method):
     if not Path("/proc/self/status").exists():

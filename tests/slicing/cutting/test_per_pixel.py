@@ -68,6 +68,7 @@ def test_only_spans_are_shown():
     np.testing.assert_array_equal(image, [[100, 110, 0, 0, 0, 150, 160, 170], [0] * 8])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
@@ -106,6 +107,7 @@ _CLOSE = 0.1
 """Voxels by which a place at rest may be off."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("method", CASES)
 def test_a_method_equals_the_location_of_every_pixel(method, kind):

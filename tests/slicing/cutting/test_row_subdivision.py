@@ -55,6 +55,7 @@ def pressed(mesh, depth=0.008, width=0.012):
     return mesh.nodes + np.column_stack([0 * dent, 0 * dent, dent])
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -194,6 +194,7 @@ def test_letters_are_as_high_as_asked_on_a_dark_halo(height):
     assert picture.min() < 80  # letters on white stand out
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(1, 400),

@@ -90,6 +90,7 @@ def shapes(draw):
     return lumen
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(shapes(), st.floats(0.2, 5.0), st.floats(0.2, 5.0))
 def test_any_shape_is_a_tube_or_is_refused(lumen, one, other):

@@ -185,6 +185,7 @@ def test_beams_of_a_phased_array_leave_the_middle_of_its_face_or_spread_over_it(
     assert probe.width == pytest.approx(0.02 + 0.16 * math.sqrt(2))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(probe)
 def test_beams_start_on_the_face_and_are_spread_evenly_about_the_middle(probe):

@@ -60,6 +60,7 @@ def forces_around(contact, positions, step):
     return forces, normals
 
 
+@pytest.mark.slow
 @EXAMPLES
 @given(shapes, places)
 def test_the_push_is_the_slope_of_the_energy(probe, where):
@@ -104,6 +105,7 @@ def test_the_push_rises_faster_and_faster_up_to_the_greatest(gap, stiff, strong)
     np.testing.assert_array_equal(contact.normal_force_at(contact.gap), contact.normal_force)
 
 
+@pytest.mark.slow
 @EXAMPLES
 @given(moduli, moduli)
 def test_the_energy_goes_on_at_the_greatest_push(stiff, strong):

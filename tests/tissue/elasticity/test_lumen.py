@@ -133,6 +133,7 @@ def test_forces_are_the_slope_of_the_energy_and_the_tangent_theirs(mesh, size):
     assert abs(blocks - blocks.transpose(2, 3, 0, 1)).max() < 1e-12 * abs(blocks).max()
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(0.0, 0.02))
 @settings(max_examples=25, deadline=None)
 def test_cells_tetrahedra_and_the_formulas_written_again_agree(seed, size):
@@ -265,6 +266,7 @@ def lame(inwards):
     return ratio, -outer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inwards", [0.02e-3, 0.05e-3, 0.1e-3])
 def test_a_tube_in_tissue_narrows_as_lame_says(inwards):
     ratio, outside = tube(inwards, 0.4)
@@ -273,6 +275,7 @@ def test_a_tube_in_tissue_narrows_as_lame_says(inwards):
     assert outside == pytest.approx(expected_outside, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inwards", [0.1e-3, 0.2e-3, 0.25e-3])
 def test_a_tube_in_incompressible_tissue_closes_at_the_pressure_of_the_blood_and_of_the_tissue(
     inwards,
@@ -302,6 +305,7 @@ def test_a_model_that_is_lumen_everywhere_is_refused():
     require_solid(mesh, uniform_material(mesh, MUSCLE))
 
 
+@pytest.mark.slow
 def test_a_pressed_lumen_in_a_block_empties_and_fills_again():
     nodes = (13, 7, 9)
     mesh = block_mesh(nodes)

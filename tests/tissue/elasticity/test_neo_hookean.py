@@ -180,6 +180,7 @@ def test_tangent_is_symmetric_and_at_rest_has_no_negative_eigenvalue(seed, size,
     assert abs(exact - exact.T).max() < 1e-13 * abs(exact).max()
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("size", [1e-8, 1e-5, 1e-3, 1e-2])
 def test_single_precision_keeps_the_forces_to_a_millionth(mesh, size):
@@ -274,6 +275,7 @@ def test_one_tetrahedron_pulled_by_one_corner():
     assert tissue.inverted(displacement) == 1
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_field_that_is_not_finite_is_seen_and_leaves_nothing_behind(mesh):
     tissue = NeoHookean(mesh, uniform(0.49))

@@ -165,6 +165,7 @@ def test_the_stiffening_is_elliptic_at_any_deformation(entries, seed, constant):
     assert curvature[1] - curvature[0] >= -1e-9 * (abs(curvature[0]) + abs(curvature[1]))
 
 
+@pytest.mark.slow
 def test_a_pressed_block_pushes_back_harder_the_deeper_the_more():
     soft, stiff = (
         FemNonlinear(block((17, 9, 9), materials=uniform_material(block_mesh((17, 9, 9)), each)))

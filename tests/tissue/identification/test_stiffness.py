@@ -23,6 +23,7 @@ from us_sim.tissue.model import TissueModel, face_nodes
 FEW = StiffnessSettings(poses=16)
 
 
+@pytest.mark.slow
 def test_moduli_are_within_5_percent_with_1_percent_noise_and_within_their_intervals(press, random):
     inside = 0
     for _ in range(3):
@@ -34,6 +35,7 @@ def test_moduli_are_within_5_percent_with_1_percent_noise_and_within_their_inter
     assert inside >= 5  # of 6
 
 
+@pytest.mark.slow
 def test_a_sensor_without_torque_will_do(press, random):
     felt = press.noisy(0.01, random)
     felt[:, 3:] = 0.0
@@ -43,6 +45,7 @@ def test_a_sensor_without_torque_will_do(press, random):
     assert any("no torque" in remark for remark in found.remarks)
 
 
+@pytest.mark.slow
 def test_a_stiffening_is_found_beside_the_moduli(random):
     plain = layered_block()
 
@@ -66,6 +69,7 @@ def test_a_stiffening_is_found_beside_the_moduli(random):
     assert "kept" not in table(found)
 
 
+@pytest.mark.slow
 def test_two_springs_in_series_are_told_as_one_and_either_from_the_other():
     """A column of two layers under a plate: F = A d / (h1 / E1 + h2 / E2)."""
     side, height = 0.04, 0.06
@@ -99,6 +103,7 @@ def test_two_springs_in_series_are_told_as_one_and_either_from_the_other():
         fit_stiffness(column, record, StiffnessSettings(poses=14))
 
 
+@pytest.mark.slow
 def test_a_structure_that_no_force_reaches_is_refused_by_name(press, random):
     tissue = press.tissue
 
@@ -117,6 +122,7 @@ def test_a_structure_that_no_force_reaches_is_refused_by_name(press, random):
     assert "bone" not in found.intervals
 
 
+@pytest.mark.slow
 def test_another_mesh_than_the_one_that_made_the_forces_is_said_in_the_residual(press, random):
     record = press.record(press.noisy(0.001, random))
     own = fit_stiffness(press.tissue, record, FEW)
@@ -146,6 +152,7 @@ def seen_by(press: KnownPress) -> Landmarks:
     )
 
 
+@pytest.mark.slow
 def test_landmarks_alone_tell_ratios_and_refuse_the_scale(press):
     path = press.path
     record = without_wrench((path.stamps, path.positions, path.orientations))

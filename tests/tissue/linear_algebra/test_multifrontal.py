@@ -35,6 +35,7 @@ def mixed(mesh):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 0.45, 0.499, None])
 def test_agrees_with_a_sparse_solver(ratio):
     mesh = block_mesh((9, 6, 7))

@@ -84,6 +84,7 @@ CASES = {  # none of which the estimate was made with: probe, poses, Poisson's r
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_estimate_is_within_a_factor_of_two_of_the_error_to_a_fine_mesh(case):
     probe, poses, ratio, nodes = CASES[case]

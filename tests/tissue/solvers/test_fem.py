@@ -66,6 +66,7 @@ def test_the_field_agrees_with_an_independent_sparse_solve(monkeypatch, double):
     assert np.linalg.norm(error) <= 1e-6 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "collider", [Sphere(0.03), Capsule(0.05, 0.03), RoundedBox(0.04, 0.03, 0.03, 0.003)]
 )
@@ -121,6 +122,7 @@ def test_a_jump_and_a_walk_end_alike():
     np.testing.assert_array_equal(walked.deform(None).nodes, model.mesh.nodes)
 
 
+@pytest.mark.slow
 def test_force_grows_with_depth_as_hertz_says():
     """The exponent 3/2 within 3 %; so coarse a mesh makes the force itself 11 to 14 % too large."""
     side = np.cumsum(np.append(np.full(5, 1e-3), 1e-3 * 1.6 ** np.arange(1, 9)))
@@ -146,6 +148,7 @@ def test_force_grows_with_depth_as_hertz_says():
     assert (forces < 1.15 * hertz).all()
 
 
+@pytest.mark.slow
 def test_a_cantilever_bends_as_timoshenko_says():
     """Linear tetrahedra are stiff in bending: from two meshes, what a fine one would give."""
     deflections = []
@@ -186,6 +189,7 @@ def test_what_rounding_leaves_unbalanced_is_known_without_a_product(monkeypatch,
         assert deformation.residual >= known
 
 
+@pytest.mark.slow
 def test_compressed_fields_of_large_meshes_agree_with_a_sparse_solve(monkeypatch):
     """A press far finer than the mesh's own error of some per cent."""
     monkeypatch.setattr(compliance_module, "_COMPRESSED", 0)
@@ -300,6 +304,7 @@ def test_one_node_sticks_and_slips_as_coulomb_says():
     np.testing.assert_allclose(contact.forces, [[0.25 - 0.4, 0.0, 0.5]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_forces_stay_in_the_friction_cone_and_the_wrench_with_them():
     model = block((17, 9, 9))
     solver = Fem(model, FemSettings(contact="coulomb", friction=0.3))
@@ -358,6 +363,7 @@ def settled_reaction(name, ratio):
     return -deformation.force[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "reference"), [(0.45, 3.905), (0.49, 4.035), (0.499, 4.106)])
 def test_nearly_incompressible_tissue_is_no_stiffer_than_27_node_hexahedra(ratio, reference):
     """References: `evaluation.tissue.kept_reference`, its sizes 10 and 6.5 mm under the sphere."""
@@ -365,6 +371,7 @@ def test_nearly_incompressible_tissue_is_no_stiffer_than_27_node_hexahedra(ratio
     assert settled_reaction("fem_nonlinear", ratio) == pytest.approx(1.05 * reference, rel=0.015)
 
 
+@pytest.mark.slow
 def test_only_plain_linear_tetrahedra_lock():
     def growth(name):
         return settled_reaction(name, 0.499) / settled_reaction(name, 0.45)

@@ -75,6 +75,7 @@ def checker(model):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.3, 0.48])
 def test_a_press_by_a_plate_is_what_another_minimiser_finds(ratio):
     model = block((5, 4, 4), PLATE, materials=made_of(ratio, (5, 4, 4)))
@@ -164,6 +165,7 @@ def test_action_is_reaction():
     require_reaction(model, pose, deformation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.45, 0.49])
 def test_while_sliding_the_nodes_stay_within_a_percent_of_the_balanced_ones(ratio):
     model = block((20, 10, 10), materials=made_of(ratio, (20, 10, 10)))
@@ -183,6 +185,7 @@ def test_while_sliding_the_nodes_stay_within_a_percent_of_the_balanced_ones(rati
     assert max(errors) < 0.02
 
 
+@pytest.mark.slow
 def test_a_frame_ends_with_an_error_as_great_as_its_tolerance():
     model = block((20, 10, 10), Sphere(0.03), materials=made_of(0.45, (20, 10, 10)))
     solver = FemNonlinear(model, FemNonlinearSettings(frame_tolerance=1e-6))
@@ -195,6 +198,7 @@ def test_a_frame_ends_with_an_error_as_great_as_its_tolerance():
             assert error < 1.2 * tolerance * np.linalg.norm(exact)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.45, 0.49])
 def test_after_a_jump_and_a_sudden_change_the_nodes_are_right_within_five_frames(ratio):
     model = block(FINE, Sphere(0.05), materials=made_of(ratio))
@@ -247,6 +251,7 @@ violent = st.lists(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("collider", "ratio"),
     [(Sphere(0.06), 0.45), (RoundedBox(0.05, 0.03, 0.1, 0.004), 0.49), (Sphere(0.06), 0.4999)],
@@ -285,6 +290,7 @@ def test_nothing_turns_inside_out_whatever_the_probe_does(collider, ratio):
     handle()
 
 
+@pytest.mark.slow
 def test_a_closing_vein_is_followed_as_a_box_slides_over_it():
     nodes = (21, 11, 11)
     mesh = block_mesh(nodes)
@@ -312,6 +318,7 @@ def test_a_closing_vein_is_followed_as_a_box_slides_over_it():
     np.testing.assert_array_equal(solver.deform(None).nodes, mesh.nodes)
 
 
+@pytest.mark.slow
 def test_stiff_bone_in_soft_tissue_hardly_deforms():
     mesh = block_mesh((20, 10, 10))
     centre = mesh.nodes[mesh.tetrahedra].mean(axis=1)
@@ -389,6 +396,7 @@ def hand_motion(seed, seconds, speed=0.05, depth=0.02):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("collider", "ratio"),
     [
@@ -415,6 +423,7 @@ def test_a_hands_motion_is_followed_to_a_hundredth_in_every_frame(collider, rati
         assert moved < 1.5e-3  # m, what the held probe still gives way to
 
 
+@pytest.mark.slow
 def test_a_frame_whose_time_is_up_is_gone_on_with_in_the_next_and_ends_the_same(
     nearly_incompressible,
 ):
@@ -467,6 +476,7 @@ def nearly_incompressible():
     return FemNonlinear(block(nodes, Sphere(0.05), materials=made_of(0.49, nodes)))
 
 
+@pytest.mark.slow
 def test_a_starved_solver_says_which_forces_are_not_in_balance(nearly_incompressible):
     """A force that is not marked is right within a tenth, however little a frame may compute."""
     poses = [at(x=0.001 * k, z=0.0025 * min(k, 8 - k)) for k in range(9)]
@@ -501,6 +511,7 @@ def test_tissue_inside_out_is_begun_anew_at_once_only_where_time_is_short(
     assert solver.deform(at(z=0.01)).residual < 0.01
 
 
+@pytest.mark.slow
 def test_a_probe_that_leaps_deep_into_an_arm_is_followed_step_by_step(small_scene):
     scene = load_scene(str(small_scene))
     solver = FemNonlinear(

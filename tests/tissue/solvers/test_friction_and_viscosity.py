@@ -45,6 +45,7 @@ def press(solver, depth=0.01, frames=5):
     return settle(solver, at(z=depth))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.07, 0.3])
 def test_a_dragged_block_sticks_and_then_slides_at_coulombs_force(friction):
     solver = rubbing(friction=friction)
@@ -88,6 +89,7 @@ def test_sticking_nodes_go_where_the_probe_goes():
     assert second.force[0] < first.force[0] - 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("contact", "friction"), [("coulomb", 0.07), ("coulomb", 0.3), ("sticking", 0.3)]
 )
@@ -108,6 +110,7 @@ def test_a_small_press_and_drag_is_that_of_linear_elasticity(contact, friction):
     assert error < 0.04  # the plate sinks in
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(
     seed=st.integers(0, 1000),
@@ -134,6 +137,7 @@ def test_a_held_probe_keeps_the_law_and_does_not_creep(seed, friction, collider)
     np.testing.assert_allclose(later.nodes, deformation.nodes, atol=5e-5)
 
 
+@pytest.mark.slow
 def test_the_wrench_is_what_holds_the_block():
     solver = rubbing(LINEAR, (13, 7, 6), friction=0.5, tolerance=1e-8)
     press(solver)
@@ -258,6 +262,7 @@ def test_a_ramp_meets_the_force_of_a_standard_linear_solid(sunk):
     np.testing.assert_allclose(forces[10:], expected[10:], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_what_is_let_go_creeps_back_to_rest(sunk):
     solver = column()
     for _ in range(1500):
@@ -323,6 +328,7 @@ def test_no_step_raises_the_energy_of_viscous_tissue():
             assert newton.energy <= before * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_state_that_is_taken_over_is_relaxed(sunk):
     first, second = column(), column()
     for _ in range(300):

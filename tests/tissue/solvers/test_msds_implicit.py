@@ -82,6 +82,7 @@ def test_explicit_and_implicit_steps_end_at_the_same_rest(chosen):
     np.testing.assert_allclose(ours.force, theirs.force, atol=0.01)
 
 
+@pytest.mark.slow
 def test_fitted_springs_that_keep_volume_come_near_the_finite_elements():
     model = block((20, 10, 10))
     pose = at(z=0.012)

@@ -77,6 +77,7 @@ def test_unbalanced_forces_are_the_slope_of_the_energy(name, size):
     assert np.vdot(slope, change) == pytest.approx(expected, abs=1e-5 * scale)
 
 
+@pytest.mark.slow
 @EVERY
 def test_every_step_lowers_the_energy_from_any_start_also_inside_out(name):
     inverted = 0

@@ -205,6 +205,7 @@ for model, method, settings in (
 """
 
 
+@pytest.mark.slow
 def test_no_frame_meets_a_kernel_that_is_not_compiled(tmp_path, monkeypatch):
     # What is kept of a tissue is not there, so that it is made; kernels are those of all tests.
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernel_folder()))
@@ -233,6 +234,7 @@ def prepared(slow):
     return said, sum(slow.kernel.stats.cache_hits.values())
 
 
+@pytest.mark.slow
 def test_another_process_compiles_and_this_one_loads(slow):
     assert prepared(slow) == (SAID, 2)
     assert prepared(slow) == ([], 2)  # nothing is left to do

@@ -60,6 +60,7 @@ def test_errors_are_as_large_as_the_deviations_say():
     assert np.mean(rms) == pytest.approx(0.2 * np.sqrt(2), rel=0.06)
 
 
+@pytest.mark.slow
 def test_the_grid_boards_photos_give_a_smaller_residual_than_was_known(shared_data):
     board = RigidBody.grid("DICT_6X6_1000", 4, 5, 0.0375, 0.005)
     files = [shared_data / "marker-aruco-gridboard" / f"{k}.jpg" for k in range(42)]

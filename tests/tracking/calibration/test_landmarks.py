@@ -48,6 +48,7 @@ def test_it_is_scipys_rotation_and_moves_with_the_frames(pose, seed):
     assert moved.fre == pytest.approx(found.fre)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_deviations_and_the_fre_say():
     rng = np.random.default_rng(3)
     noise, pose = 0.4e-3, Pose([0.2, -0.1, 0.7], [0.1, 0.5, -0.2, 0.8])

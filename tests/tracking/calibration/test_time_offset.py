@@ -28,6 +28,7 @@ def recorded(rate, seconds, offset=0.0, noise=0.0, seed=0, start=0.0):
     return PositionSignal(times + offset, strokes(times) + noise * rng.standard_normal(len(times)))
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(offset=st.floats(-0.4, 0.4), scale=st.sampled_from([-400.0, 0.3, 7.0]))
 def test_a_shift_is_found_whatever_the_scale_and_direction(offset, scale):
@@ -40,6 +41,7 @@ def test_a_shift_is_found_whatever_the_scale_and_direction(offset, scale):
     assert find_time_offset(fixed, moving).offset == pytest.approx(-offset, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_deviation_says():
     errors, deviations = [], []
     for seed in range(40):
@@ -112,6 +114,7 @@ def test_the_water_tanks_lines_are_where_plus_found_them(shared_data):
     np.testing.assert_allclose(found, expected, atol=2.5)
 
 
+@pytest.mark.slow
 def test_the_water_tanks_offset_is_the_one_that_plus_published(shared_data):
     folder = shared_data / "plus-tracker-recordings"
     tracker = read_signal(

@@ -91,6 +91,7 @@ def test_a_marker_out_of_place_pulls_little():
         assert np.linalg.norm(pose.position - true.position) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
     # Mahalanobis lengths of errors have the mean of chi squared with 6 degrees: 6. Half a pixel
     # of noise, as assumed.

@@ -53,6 +53,7 @@ def test_a_slope_of_the_light_moves_no_corner():
     assert error(fitted_corners(lit.astype(np.uint8), CORNERS + 0.7, CELLS)) < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "edge"), [("APRILTAG_36h11", 18.0), ("APRILTAG_36h11", 26.0)])
 def test_no_small_marker_that_opencv_finds_is_lost(name, edge):
     point = small_marker_point(name, edge, 30)

@@ -21,6 +21,7 @@ def dots_per_metre(path):
     return across
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [

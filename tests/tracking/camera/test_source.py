@@ -48,6 +48,7 @@ def errors(body, views, conditions=ORDINARY):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_four_markers_of_30_mm_at_40_cm():
     found = errors(faceted_grip(), random_views(60, 0.4, (0.0, 50.0), seed=1))
     assert len(found) == 60
@@ -56,6 +57,7 @@ def test_four_markers_of_30_mm_at_40_cm():
     assert found[:, 1].max() < 5.0
 
 
+@pytest.mark.slow
 def test_one_marker_of_40_mm_does_not_flip():
     found = errors(MARKER, random_views(120, 0.4, (0.0, 65.0), seed=2))
     assert len(found) >= 115
@@ -126,6 +128,7 @@ def test_a_jump_back_in_time_forgets_the_last_pose(scene, image):
     assert np.linalg.norm(seen.pose.position - other.position) < 1.5e-3
 
 
+@pytest.mark.slow
 def test_a_large_image_is_searched_at_its_full_resolution_where_need_be():
     camera = CameraModel(1920, 1080, [[1800, 0, 960], [0, 1800, 540], [0, 0, 1]])
     scene = RenderedView(camera, MARKER)
@@ -207,6 +210,7 @@ def test_corners_are_exact_to_a_tenth_of_a_pixel(scene):
         assert np.abs(pixels - WEBCAM.project(true.apply(points))).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("board", "photos", "count", "corners", "residual"),
     [
@@ -272,6 +276,7 @@ def test_a_chessboard_is_measured_where_its_markers_are_too_small():
     assert np.sum(np.array(off) < 1.0) >= 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("video", "body", "least"),
     [
@@ -325,6 +330,7 @@ def tag_poses(folder):
     return found
 
 
+@pytest.mark.slow
 def test_one_tag_is_at_one_place_by_every_name_of_one_lens(shared_file):
     found = tag_poses(shared_file("cases/camera-info"))
     for one, other, depth in (("02", "03", 1.320), ("06", "07", 1.21), ("09", "10", 1.21)):
