@@ -151,6 +151,15 @@ def test_any_other_end_is(session, status):
     assert monitor.told[-1] == [str(loss)]
 
 
+def test_a_node_that_is_not_back_in_the_end_is_said(session):
+    supervisor, group, _ = session
+    supervisor.update()
+    group.ended = {"slice_interpolator": -9}
+    supervisor.update()
+    supervisor.end()
+    assert "was not back" in supervisor.outcome(1.0).sentence()
+
+
 def test_what_was_set_is_given_back_unless_a_node_ends_of_it(session):
     supervisor, group, monitor = session
     supervisor.update()

@@ -177,7 +177,9 @@ class Supervisor:
             self._group.start(ready)
 
     def end(self) -> None:
-        """End all nodes; a recorder that had to be killed is lost."""
+        """End all nodes; a recorder that had to be killed is lost, as is a node that is not back."""
+        for loss, _ in self._away.values():
+            loss.given_up = "was not back when the run ended"
         if RECORDER in self._group.stop():
             self._note_killed_recorder()
 
