@@ -1,21 +1,18 @@
 """Imports: their results, their refusals, their ends, and text that is burned in."""
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from made_dicom import US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
-from pydicom.uid import JPEG2000Lossless
+from made_dicom import US_MULTI_FRAME, enhanced, header, item, turned, write
 
 from us_sim.command.main import main
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.deidentification.importing import import_files, look_at
+from us_sim.volume.deidentification.importing import import_files
 from us_sim.volume.deidentification.kept_values import NUMBERS, kept_values
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.readers import read_volume
@@ -31,11 +28,15 @@ def volume(tmp_path):
     return write(tmp_path / "DOE_JANE.dcm", enhanced(VOXELS, turned()))
 
 
-@pytest.fixture
-def cine(tmp_path):
+def write_cine(path):
     made = header(CINE, US_MULTI_FRAME, FrameTime=40.0, FrameIncrementPointer=0x00181063)
     made.PixelSpacing = [0.2, 0.2]
-    return write(tmp_path / "DOE_JANE.dcm", made)
+    return write(path, made)
+
+
+@pytest.fixture
+def cine(tmp_path):
+    return write_cine(tmp_path / "DOE_JANE.dcm")
 
 
 def test_a_volume_becomes_a_case_that_can_be_opened(volume, tmp_path, capsys):
@@ -130,28 +131,25 @@ REGIONS["second_without_units"] = {"184,75,491,554": 0.0616}
 
 
 @pytest.mark.parametrize("name", REGIONS)
-def test_a_crop_has_the_scale_of_its_region(shared_file, tmp_path, name):
-    path = shared_file(f"cases/dicom-two-scales/{name}.dcm")
-    for refused in (ImportSettings(), WHOLE, ImportSettings(crop="400,75,600,554")):
-        with pytest.raises(VolumeError, match="--crop 184,75,491,554"):
-            import_files([path], tmp_path / "o.mha", refused)
+def test_a_crop_has_the_scale_of_its_region_and_shows_nothing_outside(shared_file, tmp_path, name):
+    path, out = shared_file(f"cases/dicom-two-scales/{name}.dcm"), tmp_path / "o.mha"
+    for crop, message in (
+        ("", "--crop 184,75,491,554"),
+        ("400,75,600,554", "--crop 184,75,491,554"),
+        ("0,0,100,60", "nothing of the ultrasound regions"),
+        ("492,75,799,554", "--spacing"),
+    ):
+        if crop not in REGIONS[name]:
+            with pytest.raises(VolumeError, match=message):
+                import_files([path], out, ImportSettings(crop=crop) if crop else ImportSettings())
+    with pytest.raises(VolumeError, match="--crop 184,75,491,554"):
+        import_files([path], out, WHOLE)
     for crop, scale in REGIONS[name].items():
         out = tmp_path / f"{crop}.mha"
         import_files([path], out, ImportSettings(crop=crop))
         assert sitk.ReadImage(str(out)).GetSpacing()[:2] == pytest.approx((scale, scale), rel=1e-4)
-    second = ImportSettings(crop="492,75,799,554")
-    if name == "second_without_units":
-        with pytest.raises(VolumeError, match="--spacing"):
-            import_files([path], tmp_path / "o.mha", second)
-    with pytest.raises(VolumeError, match="nothing of the ultrasound regions"):
-        import_files([path], tmp_path / "o.mha", ImportSettings(crop="0,0,100,60"))
-
-
-def test_a_crop_shows_nothing_outside_the_regions(shared_file, tmp_path):
-    path = shared_file("cases/dicom-two-scales/two_scales.dcm")
-    out = tmp_path / "o.mha"
-    import_files([path], out, ImportSettings(crop="100,0,450,500"))
-    (image,) = read_sweep(out, tracked=False).images()
+    import_files([path], tmp_path / "o.mha", ImportSettings(crop="100,0,450,500"))
+    (image,) = read_sweep(tmp_path / "o.mha", tracked=False).images()
     assert not image[:75].any()
     assert not image[:, :84].any()
     assert image[75:, 84:].any()
@@ -159,14 +157,17 @@ def test_a_crop_shows_nothing_outside_the_regions(shared_file, tmp_path):
 
 def test_images_with_places_and_a_persons_spacing_are_a_volume(shared_file, tmp_path):
     folder = shared_file("cases/dicom-single-images") / "slicer_us_without_pixel_spacing"
-    with pytest.raises(VolumeError, match=r"states where its images lie.*--spacing"):
-        import_files([folder], tmp_path / "o.nrrd")
-    with pytest.raises(VolumeError, match=r"0\.21239 mm apart"):
-        import_files([folder], tmp_path / "o.nrrd", ImportSettings(spacing="0.21239,0.21239,1"))
+    for spacing, message in (
+        (None, r"states where its images lie.*--spacing"),
+        ("0.21239,0.21239,1", r"0\.21239 mm apart"),
+    ):
+        with pytest.raises(VolumeError, match=message):
+            import_files([folder], tmp_path / "o.nrrd", ImportSettings(spacing=spacing))
     given = ImportSettings(spacing="0.21239,0.21239,0.21239")
-    made = import_files([folder], tmp_path / "o.nrrd", given)
-    assert "64 × 128 × 16" in made.what
-    steps = np.linalg.norm(read_volume(tmp_path / "o.nrrd").index_to_patient[:3, :3], axis=0)
+    import_files([folder], tmp_path / "o.nrrd", given)
+    made = read_volume(tmp_path / "o.nrrd")
+    assert made.shape == (64, 128, 16)
+    steps = np.linalg.norm(made.index_to_patient[:3, :3], axis=0)
     np.testing.assert_allclose(steps, 0.21239e-3, rtol=1e-6)
 
 
@@ -179,16 +180,6 @@ def test_a_volume_without_spacing_is_imported_with_that_of_a_person(tmp_path):
     import_files([path], tmp_path / "o.nrrd", ImportSettings(spacing="0.5,0.25,2"))
     there = read_volume(tmp_path / "o.nrrd").index_to_patient
     np.testing.assert_allclose(np.diag(there)[:3] * 1e3, (0.5, 0.25, 2))
-
-
-@pytest.mark.parametrize("layers", [1, 2])
-def test_a_segmentation_is_no_volume(tmp_path, layers):
-    image = sitk.Image([4, 5, 6], sitk.sitkVectorUInt8 if layers > 1 else sitk.sitkUInt8, layers)
-    image.SetMetaData("Segment0_ID", "Segment_1")
-    image.SetMetaData("Segment0_LabelValue", "none")
-    sitk.WriteImage(image, tmp_path / "a.seg.nrrd")
-    with pytest.raises(VolumeError, match=r"--labels a\.seg\.nrrd"):
-        import_files([tmp_path / "a.seg.nrrd"], tmp_path / "o.nrrd")
 
 
 @pytest.mark.parametrize(
@@ -210,84 +201,48 @@ def test_wrong_options_are_refused(cine, tmp_path, more, message, capsys):
     assert list(tmp_path.iterdir()) == [cine]
 
 
-@pytest.mark.parametrize("name", ["case", "a.nrrd", "a.nii.gz"])
-def test_a_cine_is_no_volume(cine, tmp_path, name):
-    with pytest.raises(VolumeError, match="4 images"):
-        import_files([cine], tmp_path / name, WHOLE)
-    assert list(tmp_path.iterdir()) == [cine]
-
-
-def test_what_is_there_is_not_replaced_and_names_must_fit(volume, tmp_path):
-    (tmp_path / "a.nrrd").write_text("mine")
-    with pytest.raises(VolumeError, match=r"a\.nrrd"):
-        import_files([volume], tmp_path / "a.nrrd")
-    assert (tmp_path / "a.nrrd").read_text() == "mine"
-    with pytest.raises(VolumeError, match=r"a\.stl"):
-        import_files([volume], tmp_path / "a.stl")
-    with pytest.raises(UsSimError, match=r"cannot be (written|made)"):
-        import_files([volume], Path("/proc/nowhere/a.nrrd"))
-
-
-def test_files_that_do_not_go_together_are_refused(volume, tmp_path):
+def test_files_and_outputs_that_do_not_fit_are_refused(volume, tmp_path):
+    cine_too = write_cine(tmp_path / "cine.dcm")
     other = tmp_path / "a.nrrd"
     sitk.WriteImage(sitk.Image([4, 4, 4], sitk.sitkUInt8), str(other))
-    (tmp_path / "note.txt").write_text("hello")
+    before = other.read_bytes()
     (tmp_path / "empty").mkdir()
-    for files, message in (
-        ([volume, other], "no DICOM"),
-        ([tmp_path / "note.txt"], "no DICOM"),
-        ([tmp_path / "empty"], "no DICOM"),
-        ([tmp_path / "nowhere.dcm"], "no such file"),
+    for files, out, message in (
+        ([volume, other], "o.nrrd", "no DICOM"),
+        ([tmp_path / "empty"], "o.nrrd", "no DICOM"),
+        ([tmp_path / "nowhere.dcm"], "o.nrrd", "no such file"),
+        ([volume], "a.nrrd", r"a\.nrrd"),
+        ([volume], "a.stl", r"a\.stl"),
+        ([volume], "/proc/nowhere/a.nrrd", r"cannot be (written|made)"),
+        ([cine_too], "case", "4 images"),
+        ([cine_too], "o.nii.gz", "4 images"),
     ):
-        with pytest.raises(VolumeError, match=message):
-            look_at(files, None, ImportSettings())
-
-
-def test_a_damaged_image_leaves_nothing_behind(tmp_path):
-    made = compressed(header(CINE, US_MULTI_FRAME, PixelSpacing=[1, 1]), JPEG2000Lossless)
-    data = bytearray(made.PixelData)
-    last = bytes(data).rindex(b"\xff\x4f\xff\x51")  # the beginning of the last code stream
-    data[last + 4 : last + 60] = bytes(56)
-    made.PixelData = bytes(data)
-    path = write(tmp_path / "a.dcm", made, JPEG2000Lossless)
-    with pytest.raises(VolumeError, match="decoded"):
-        import_files([path], tmp_path / "a.igs.mha", ImportSettings(crop="0,0,9,9"))
-    assert list(tmp_path.iterdir()) == [path]
+        with pytest.raises(UsSimError, match=message):
+            import_files(files, tmp_path / out, WHOLE)
+    assert other.read_bytes() == before
+    names = ["DOE_JANE.dcm", "a.nrrd", "cine.dcm", "empty"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
 
 
 def test_the_report_is_printed_and_written_with_its_picture(cine, tmp_path, capsys):
     folder = tmp_path / "report"
     assert main(["import", str(cine), "--report", str(folder)]) == 0
     said = capsys.readouterr().out
-    assert "**Nothing can be written yet**" in said
     assert "- PatientName\n" in said
-    assert "Jane" not in said
-    text = (folder / "report.md").read_text()
-    assert "![The first image](first_image.png)" in text
-    assert "Jane" not in text
-    picture = cv2.imread(str(folder / "first_image.png"))
-    assert picture.shape == (60, 80, 3)
+    assert "Jane" not in said + (folder / "report.md").read_text()
+    assert cv2.imread(str(folder / "first_image.png")).shape == (60, 80, 3)
     assert main(["import", str(cine), "--report", str(folder)]) == 1
-    assert "a report already" in capsys.readouterr().err
     assert main(["import", str(cine)]) == 1
-    assert "say where to" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("\n") == 2
 
 
 def test_only_numbers_in_their_ranges_and_words_of_closed_lists_go_on():
-    good = {"FrameTime": 33.3, "MechanicalIndex": 1.2, "ApexPosition": [0.0, 1.0, -2.0]}
-    named = {"TransducerType": "CURVED LINEAR"}
-    kept = kept_values(item(**good, **named))
-    assert kept == {
-        "frame_time_ms": "33.3",
-        "mechanical_index": "1.2",
-        "apex_position_mm": "0 1 -2",
-        "transducer_type": "CURVED LINEAR",
-    }
+    good = item(FrameTime=33.3, ApexPosition=[0.0, 1.0, -2.0], TransducerType="CURVED LINEAR")
+    kept = {"frame_time_ms": "33.3", "apex_position_mm": "0 1 -2"}
+    assert kept_values(good) == kept | {"transducer_type": "CURVED LINEAR"}
     for number in NUMBERS:
-        count = number.length or 1
         for wrong in (int(number.low) - 1, int(number.high) + 1):
-            values = [wrong] * count
-            made = item(**{number.keyword: values if count > 1 else wrong})
+            made = item(**{number.keyword: [wrong] * number.length if number.length else wrong})
             if number.within:
                 made = item(**{number.within: [made]})
             assert not kept_values(made), number.keyword
@@ -309,11 +264,5 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 def test_an_import_takes_no_more_than_three_times_its_size(tmp_path):
     voxels = np.zeros((256, 256, 256), np.uint8)
     path = write(tmp_path / "a.dcm", enhanced(voxels, np.diag([0.5, 0.5, 0.5, 1.0])))
-    ran = subprocess.run(
-        [sys.executable, "-c", MEASURED, str(path), str(tmp_path / "o.nrrd")],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ,
-    )
-    assert int(ran.stdout) < 3 * voxels.size
+    command = [sys.executable, "-c", MEASURED, str(path), str(tmp_path / "o.nrrd")]
+    assert int(subprocess.check_output(command, text=True)) < 3 * voxels.size

@@ -49,26 +49,23 @@ def test_fans_are_found_to_a_pixel(begins, half, tilt, unlike, noise):
     np.testing.assert_allclose(np.degrees(found.angles), [tilt - half, tilt + half], atol=0.8)
 
 
-def test_a_fan_that_the_image_cuts_at_its_sides_and_its_bottom_is_found():
-    mask = fan_mask(0.1, -0.03, 0.05, 0.2, -40, 40)
-    assert mask[:, 0].any()
-    assert mask[-1].any()
-    found = fitted_part(mask, SIDE)
-    assert isinstance(found, Fan)
-    np.testing.assert_allclose(np.degrees(found.angles), [-40, 40], atol=0.8)
-    assert found.radius[0] == pytest.approx(0.05, abs=1e-3)
+def test_a_fan_may_be_cut_by_the_image_or_begin_in_a_point():
+    for mask, begins, half in (
+        (fan_mask(0.1, -0.03, 0.05, 0.2, -40, 40), 0.05, 40.0),  # cut at its sides and bottom
+        (fan_mask(0.1, 2e-3, 0.0, 0.14, -38, 38), 0.001, 38.0),  # of a phased array
+    ):
+        found = fitted_part(mask, SIDE)
+        assert isinstance(found, Fan)
+        np.testing.assert_allclose(np.degrees(found.angles), [-half, half], atol=0.8)
+        assert found.radius[0] == pytest.approx(begins, abs=1e-3)
 
 
-def test_a_phased_arrays_fan_begins_in_a_point():
-    found = fitted_part(fan_mask(0.1, 2e-3, 0.0, 0.14, -38, 38), SIDE)
-    assert isinstance(found, Fan)
-    assert found.radius[0] < 2e-3
-    assert math.degrees(np.diff(found.angles)[0]) == pytest.approx(76.0, abs=1.0)
+BOX = np.zeros((ROWS, COLUMNS), bool)
+BOX[10:250, 100:200] = True
 
 
 def test_a_rectangle_is_a_linear_arrays_and_a_shadow_in_it_does_no_harm():
-    mask = np.zeros((ROWS, COLUMNS), bool)
-    mask[10:250, 100:200] = True
+    mask = BOX.copy()
     mask[150:200, 130:160] = False
     found = fitted_part(mask, SIDE)
     assert isinstance(found, Rectangle)
@@ -76,34 +73,31 @@ def test_a_rectangle_is_a_linear_arrays_and_a_shadow_in_it_does_no_harm():
     np.testing.assert_allclose(found.z, [0.00475, 0.12475], atol=1e-9)
 
 
-def shapes_of_no_probe():
-    row, column = np.indices((ROWS, COLUMNS))
-    disc = np.hypot(row - 150, column - 200) < 120
-    flat = (abs(column - 200) < 50 + 0.5 * row) & (row > 20) & (row < 260)
-    parallelogram = (abs(column - 150 - 0.4 * row) < 60) & (row > 20) & (row < 260)
-    return {
-        "nothing": np.zeros((ROWS, COLUMNS), bool),
-        "a disc": disc,
-        "a trapezoid": flat,
-        "a parallelogram": parallelogram,
-        "a fan without its face": fan_mask(0.1, -0.06, 0.03, 0.19, -25, 25),
-        "half a fan": fan_mask(0.1, 0.0, 0.04, 0.14, -30, 30) & (row < 140),
-    }
+ROW, COLUMN = np.indices((ROWS, COLUMNS))
+SHAPES = {
+    "nothing": np.zeros((ROWS, COLUMNS), bool),
+    "a disc": np.hypot(ROW - 150, COLUMN - 200) < 120,
+    "a trapezoid": (abs(COLUMN - 200) < 50 + 0.5 * ROW) & (ROW > 20) & (ROW < 260),
+    "a parallelogram": (abs(COLUMN - 150 - 0.4 * ROW) < 60) & (ROW > 20) & (ROW < 260),
+    "a fan without its face": fan_mask(0.1, -0.06, 0.03, 0.19, -25, 25),
+    "half a fan": fan_mask(0.1, 0.0, 0.04, 0.14, -30, 30) & (ROW < 140),
+}
 
 
-@pytest.mark.parametrize("name", shapes_of_no_probe())
+@pytest.mark.parametrize("name", SHAPES)
 def test_of_what_fits_badly_nothing_is_said(name):
-    assert fitted_part(shapes_of_no_probe()[name], SIDE) is None
+    assert fitted_part(SHAPES[name], SIDE) is None
 
 
-def swept(tmp_path, mask, step=2e-3):
-    """A sweep along +y of images with a mask, columns along -x and rows along z."""
-    matrices = np.zeros((9, 4, 4))
-    matrices[:, 0, 0] = -SIDE[0]
-    matrices[:, 2, 1] = matrices[:, 1, 2] = SIDE[1]
-    matrices[:, 1, 3] = step * np.arange(9)
-    matrices[:, 3, 3] = 1.0
-    images = np.broadcast_to((mask * 90).astype(np.uint8), (9, ROWS, COLUMNS))
+def swept(tmp_path, mask, matrices=None):
+    """A sweep of images with a mask; without others along +y, columns along -x, rows along z."""
+    if matrices is None:
+        matrices = np.zeros((9, 4, 4))
+        matrices[:, 0, 0] = -SIDE[0]
+        matrices[:, 2, 1] = matrices[:, 1, 2] = SIDE[1]
+        matrices[:, 1, 3] = 2e-3 * np.arange(9)
+        matrices[:, 3, 3] = 1.0
+    images = np.broadcast_to((mask * 90).astype(np.uint8), (len(matrices), ROWS, COLUMNS))
     return read_sweep(write_sweep(tmp_path / "s.igs.mha", images, matrices))
 
 
@@ -125,34 +119,18 @@ def test_the_poses_are_of_the_middle_of_the_face(tmp_path):
 
 
 def test_the_poses_are_evenly_spread_along_the_way_of_the_middle_of_the_image(tmp_path):
-    mask = np.zeros((ROWS, COLUMNS), bool)
-    mask[10:250, 100:200] = True
     sliding, turning = np.linspace(0.0, 0.03, 41), np.linspace(0.0, 0.5, 41)[1:]  # m, rad
     angles = np.concatenate([np.zeros(41), turning])  # about the face, 0.06 m above the middle
     places = np.tile(np.eye(4), (81, 1, 1))
     places[:, 0, 0], places[:, 1, 1], places[:, 2, 2] = -1.0, -np.cos(angles), np.cos(angles)
     places[:, 1, 2] = places[:, 2, 1] = np.sin(angles)
     places[:, 1, 3] = np.concatenate([sliding, np.full(40, sliding[-1])])
-    into_image = np.array(
-        [[SIDE[0], 0, 0, 0], [0, 0, 1, 0], [0, SIDE[1], 0, -0.00475], [0, 0, 0, 1]]
-    )
-    images = np.broadcast_to((mask * 90).astype(np.uint8), (81, ROWS, COLUMNS))
-    sweep = read_sweep(write_sweep(tmp_path / "s.igs.mha", images, places @ into_image))
-    found = scanning_probe(sweep, ImagePart(), np.ones_like(mask))
+    into_image = np.eye(4)[[0, 2, 1, 3]] * [SIDE[0], SIDE[1], 1.0, 1.0]
+    into_image[2, 3] = -0.00475
+    sweep = swept(tmp_path, BOX, places @ into_image)
+    found = scanning_probe(sweep, ImagePart(), np.ones_like(BOX))
     turned = [abs(each.pose.rotation[1, 2]) > 1e-6 for each in found.poses]
-    assert len(turned) == 33
-    assert sum(turned) == 16
-
-
-def test_a_fan_that_is_named_is_the_probes(tmp_path):
-    fan = {"fan_origin": [200, -60], "fan_radius": [80, 220], "fan_angles": ["-30 deg", "30 deg"]}
-    part = ImagePart(**fan)
-    mask = np.ones((ROWS, COLUMNS), bool)
-    found = scanning_probe(swept(tmp_path, mask), part, image_mask(part, COLUMNS, ROWS))
-    array = found.probe.array.given
-    assert (array.radius, array.depth) == (0.04, 0.07)
-    assert math.degrees(array.opening_angle) == pytest.approx(60.0, abs=1e-3)
-    np.testing.assert_allclose(found.poses[0].position, [-0.1, 0.0, 0.01], atol=1e-5)
+    assert (len(turned), sum(turned)) == (33, 16)
 
 
 def test_a_wide_picture_is_no_linear_array_but_says_where_it_was_seen_from(tmp_path):
@@ -165,40 +143,63 @@ def test_a_wide_picture_is_no_linear_array_but_says_where_it_was_seen_from(tmp_p
     np.testing.assert_allclose(pose.rotation[:, 2], [0, 0, 1], atol=1e-6)
 
 
-def test_a_rectangle_that_is_named_is_a_linear_arrays(tmp_path):
-    part = ImagePart(clip=(100, 40, 79, 119))
+def test_a_part_that_is_named_is_the_probes(tmp_path):
     mask = np.random.default_rng(0).random((ROWS, COLUMNS)) < 0.3  # proves nothing
-    used = image_mask(part, COLUMNS, ROWS)
-    found = scanning_probe(swept(tmp_path, mask), part, used)
+    sweep = swept(tmp_path, mask)
+    part = ImagePart(clip=(100, 40, 79, 119))
+    found = scanning_probe(sweep, part, image_mask(part, COLUMNS, ROWS))
     assert found.probe.geometry == "linear"
     assert found.probe.array.given.aperture == pytest.approx(80 * SIDE[0])
     assert found.probe.array.given.depth == pytest.approx(120 * SIDE[1])
     np.testing.assert_allclose(found.poses[0].position, [-139.5 * SIDE[0], 0, 39.5 * SIDE[1]])
+    angles = ["-30 deg", "30 deg"]
+    part = ImagePart(fan_origin=[200, -60], fan_radius=[80, 220], fan_angles=angles)
+    found = scanning_probe(sweep, part, image_mask(part, COLUMNS, ROWS))
+    array = found.probe.array.given
+    assert (array.radius, array.depth) == (0.04, 0.07)
+    assert math.degrees(array.opening_angle) == pytest.approx(60.0, abs=1e-3)
+    np.testing.assert_allclose(found.poses[0].position, [-0.1, 0.0, 0.01], atol=1e-5)
 
 
-def found_by_plus_configuration(folder, configuration, recording):
-    """A real sweep and its probe, in the part of the images that a configuration of Plus names."""
-    calibration = read_calibration(folder / configuration, "Probe")
-    sweep = sweep_of(read_sequence(folder / recording), calibration=calibration.transforms)
+@pytest.mark.parametrize(
+    ("folder", "configuration", "recording", "begin", "size", "within"),
+    [
+        (
+            "plus-nwire-calibration",
+            "PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml",
+            "NwirePhantomFreehand.igs.mha",
+            (167, 62),
+            (495, 488),  # as the configuration says
+            2,
+        ),
+        (
+            "plus-spine-freehand",
+            "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml",
+            "SpinePhantomFreehand.igs.mha",
+            (185, 11),
+            (445, 590),  # as one sees them in its pictures
+            13,
+        ),
+    ],
+)
+def test_the_linear_array_of_a_real_sweep_is_found(
+    shared_file, folder, configuration, recording, begin, size, within
+):
+    calibration = read_calibration(shared_file(folder) / configuration, "Probe")
+    sequence = read_sequence(shared_file(folder) / recording)
+    sweep = sweep_of(sequence, calibration=calibration.transforms)
     used = image_mask(calibration.part, sweep.columns, sweep.rows)
-    return sweep, scanning_probe(sweep, calibration.part, used)
-
-
-def test_a_case_of_a_real_sweep_starts_where_its_probe_was(shared_data):
-    sweep, found = found_by_plus_configuration(
-        shared_data / "plus-nwire-calibration",
-        "PlusDeviceSet_NwirePhantomFreehand_vtkVolumeReconstructorTest2.xml",
-        "NwirePhantomFreehand.igs.mha",
-    )
-    rows, columns = np.linalg.norm(sweep.image_to_reference[0][:3, 1::-1], axis=0)
-    assert found.probe.array.given.aperture == pytest.approx(495 * columns, abs=2 * columns)
-    assert found.probe.array.given.depth == pytest.approx(488 * rows, abs=2 * rows)
-    faces = (sweep.image_to_reference @ [167 + 495 / 2, 62, 0, 1])[:, :3]
+    found = scanning_probe(sweep, calibration.part, used)
+    assert found.probe.geometry == "linear"
+    column, row = np.linalg.norm(sweep.image_to_reference[0][:3, :2], axis=0)
+    array = found.probe.array.given
+    assert array.aperture == pytest.approx(size[0] * column, abs=within * column)
+    assert array.depth == pytest.approx(size[1] * row, abs=within * row)
+    faces = (sweep.image_to_reference @ [begin[0] + size[0] / 2, begin[1], 0, 1])[:, :3]
     for pose in found.poses:
         off = np.linalg.norm(faces - pose.position, axis=1)
-        k = off.argmin()  # its frame
-        assert off[k] < 0.1e-3
-        down = sweep.image_to_reference[k][:3, 1] / rows
+        assert off.min() < 1.3 * within * column
+        down = sweep.image_to_reference[off.argmin()][:3, 1] / row
         assert pose.pose.rotation[:, 2] @ down > np.cos(np.radians(0.1))
 
 
@@ -217,16 +218,3 @@ def test_the_curved_array_of_a_real_sweep_is_found_in_its_images(shared_data):
     middle = sweep.image_to_reference[len(sweep.numbers) // 2] @ [369, 22.01, 0, 1]
     places = np.array([pose.position for pose in found.poses])
     assert np.linalg.norm(places - middle[:3], axis=1).min() < 2e-3
-
-
-def test_the_linear_array_of_a_real_sweep_is_found_in_its_images(shared_file):
-    sweep, found = found_by_plus_configuration(
-        shared_file("plus-spine-freehand"),
-        "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml",
-        "SpinePhantomFreehand.igs.mha",
-    )
-    assert found.probe.geometry == "linear"
-    # Columns 185 to 630 and rows 11 to 600, as one sees them in its pictures.
-    columns, rows = np.linalg.norm(sweep.image_to_reference[0][:3, :2], axis=0)
-    assert found.probe.array.given.aperture == pytest.approx(445 * columns, abs=1e-3)
-    assert found.probe.array.given.depth == pytest.approx(590 * rows, abs=1e-3)
