@@ -80,27 +80,16 @@ def test_what_a_case_cannot_say_is_refused_in_a_sentence(make_case, text, senten
     assert str(folder) in str(refused.value)
 
 
-def test_a_place_without_a_case_is_refused(tmp_path, make_case):
-    with pytest.raises(CaseError, match="nothing"):
-        read_case(tmp_path / "nothing")
-    with pytest.raises(CaseError, match=r"case\.yaml"):
-        read_case(tmp_path)
-    folder = make_case()
-    (folder / "volume.nrrd").unlink()
-    with pytest.raises(CaseError, match=r"volume\.nrrd"):
-        read_case(folder)
-
-
-def test_labels_must_be_on_the_volumes_grid(make_case, block):
-    folder = make_case()
-    shifted = block.index_to_patient.copy()
-    shifted[0, 3] += 1e-4
-    write_labels(folder / "labels.nrrd", Volume(block.intensities, shifted, block.labels))
-    with pytest.raises(CaseError, match=r"another grid.* 0\.1 mm"):
-        read_case(folder).volume()
-    fewer = block.labels[:, :, :-1]
-    write_labels(folder / "labels.nrrd", Volume(fewer, block.index_to_patient, fewer))
-    with pytest.raises(CaseError, match=r"30 × 20 × 24 .*30 × 20 × 25"):
+@pytest.mark.parametrize(
+    ("shift", "end", "message"),
+    [(1e-4, None, r"another grid.* 0\.1 mm"), (0.0, -1, r"30 × 20 × 24 .*30 × 20 × 25")],
+)
+def test_labels_must_be_on_the_volumes_grid(make_case, block, shift, end, message):
+    folder, placed = make_case(), block.index_to_patient.copy()
+    placed[0, 3] += shift
+    labels = block.labels[:, :, :end]
+    write_labels(folder / "labels.nrrd", Volume(labels, placed, labels))
+    with pytest.raises(CaseError, match=message):
         read_case(folder).volume()
 
 
@@ -132,41 +121,34 @@ def roots(tmp_path, make_case, monkeypatch):
     return folders
 
 
-def test_a_name_is_looked_up_in_each_root_in_order(roots):
+def test_a_name_is_looked_up_in_each_root_in_order_and_a_path_goes_first(roots, monkeypatch):
     assert case_roots() == roots
-    assert find_case("arm") == roots[0] / "arm"
+    for name, case in (("arm", 0), ("two/arm", 1), (roots[1] / "arm", 1)):
+        assert find_case(name) == roots[case] / "arm"
     assert find_case("liver") == roots[1] / "liver"
-
-
-def test_a_path_is_a_case_too_and_goes_first(roots, tmp_path):
-    assert find_case("two/arm") == roots[1] / "arm"
-    assert find_case(roots[1] / "arm") == roots[1] / "arm"
-    assert find_case("arm", [tmp_path / "two"]) == roots[1] / "arm"
-
-
-@pytest.mark.usefixtures("roots")
-def test_an_unknown_name_is_told_those_that_are_known():
-    with pytest.raises(CaseError, match=r"livr.* arm, liver; .*mean 'liver'"):
-        find_case("livr")
-    for name in ("../one/nothing", ""):
-        with pytest.raises(CaseError, match="there is no"):
-            find_case(name)
-
-
-@pytest.mark.usefixtures("roots")
-def test_what_is_there_but_no_case_is_said(tmp_path):
-    (tmp_path / "plain").mkdir()
-    (tmp_path / "file.nrrd").touch()
-    with pytest.raises(CaseError, match=r"plain: .*case\.yaml"):
-        find_case(tmp_path / "plain")
-    with pytest.raises(CaseError, match=r"file\.nrrd:"):
-        find_case(tmp_path / "file.nrrd")
-
-
-def test_without_the_variable_cases_are_in_the_users_data(monkeypatch):
-    monkeypatch.delenv("US_SIM_CASES", raising=False)
+    assert find_case("arm", [roots[1]]) == roots[1] / "arm"
+    monkeypatch.delenv("US_SIM_CASES")
     monkeypatch.setenv("XDG_DATA_HOME", "/home/me/data")
     assert case_roots() == [Path("/home/me/data/us_sim/cases")]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("livr", r"livr.* arm, liver; .*mean 'liver'"),
+        ("../one/nothing", "there is no"),
+        ("", "there is no"),
+        ("./one", r"one: .*case\.yaml"),
+        ("./file.nrrd", r"file\.nrrd:"),
+        ("./bare", r"volume\.nrrd"),
+    ],
+)
+def test_what_is_no_case_is_said(roots, name, message):
+    Path("file.nrrd").touch()
+    shutil.copytree(roots[0] / "arm", "bare")
+    Path("bare/volume.nrrd").unlink()
+    with pytest.raises(CaseError, match=message):
+        read_case(find_case(name))
 
 
 def test_a_listing_passes_by_what_is_no_case(roots):

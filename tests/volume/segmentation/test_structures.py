@@ -72,26 +72,20 @@ def test_growing_takes_what_hangs_together_and_opening_parts_it(two_tubes):
     assert overlap(alone, other) == 0.0
 
 
-def test_of_structures_that_overlap_the_first_stays(two_tubes):
+def test_of_structures_that_overlap_the_first_stays_and_a_reach_ends_one(two_tubes):
     volume, tube, other = two_tubes
     all_dark = {"upper": 50, "seeds_voxel": [[42, 30, 15]]}
-    left = {"method": "growing", "upper": 50, "seeds_voxel": [[20, 30, 15]], "open": "1.5 mm"}
+    left = DARK | {"seeds_voxel": [[20, 30, 15]], "open": "1.5 mm"}
     made = found(volume, vein=left, fluid=all_dark)
     assert made.names == {1: "vein", 2: "fluid"}
     assert overlap(made.labels == 1, tube) > 0.95
     assert (made.labels[other] == 2).mean() > 0.98
-    assert any("of fluid are in vein and stay there" in remark for remark in made.remarks)
+    assert any("of fluid are in vein" in remark for remark in made.remarks)
     with pytest.raises(VolumeError, match="vein: all of it"):
         found(volume, fluid=all_dark, vein=left)
-
-
-def test_a_reach_ends_a_structure(two_tubes):
-    volume, *_ = two_tubes
-    dark = {"method": "growing", "upper": 50, "seeds_voxel": [[20, 30, 15]]}
-    near = found(volume, vein=dark | {"reach": "6 mm"}).labels == 1
-    assert near.any()
+    near = found(volume, vein=left | {"reach": "6 mm"}).labels == 1
     away = (np.argwhere(near) - (20, 30, 15)) * STEPS
-    assert np.linalg.norm(away, axis=1).max() <= 0.006
+    assert 0.005 < np.linalg.norm(away, axis=1).max() <= 0.006
 
 
 @given(
@@ -154,11 +148,6 @@ def test_a_file_of_seeds_that_will_not_do_is_refused(tmp_path, text, sentence):
 SEEDS = Path(__file__).resolve().parents[3] / "config" / "seeds"
 
 
-def test_the_seeds_that_come_with_the_package_can_be_read():
-    names = {path.name: set(read_seeds(path).structures) for path in SEEDS.iterdir()}
-    assert names["liver_sweep.yaml"] == {"vena cava", "portal vein"}
-
-
 VESSEL_SHAPE = (64, 64, 48)
 
 
@@ -185,17 +174,11 @@ def proposed(grey, size=1e-3, settings=None):
 def test_tubes_are_found_and_a_shadow_is_not(fan, finer):
     grey, tubes, shadow = (np.kron(each, np.ones((finer,) * 3)) for each in fan)
     found = proposed(grey, 1e-3 / finer, DarkVessels(thickest=12e-3))
-    inner = np.zeros(VESSEL_SHAPE, bool)
-    inner[:, :, 6:-6] = True  # the proposal keeps off the border of the data
-    inner = np.kron(inner, np.ones((finer,) * 3)).astype(bool)
-    assert overlap(found & inner, (tubes > 0) & inner) > 0.8
+    inner = slice(6 * finer, -6 * finer)  # the proposal keeps off the border of the data
+    assert overlap(found[..., inner], tubes[..., inner] > 0) > 0.8
     assert np.count_nonzero(found & (shadow > 0)) < 0.02 * np.count_nonzero(shadow)
-
-
-def test_nothing_is_proposed_where_there_is_nothing():
     assert not proposed(np.zeros((12, 12, 12))).any()
-    speckle = np.random.default_rng(1).integers(80, 120, (30, 30, 30))
-    assert not proposed(speckle).any()
+    assert not proposed(np.random.default_rng(1).integers(80, 120, (30, 30, 30))).any()
 
 
 def test_seeds_and_proposal_find_the_same_vessels_in_a_real_liver(shared_file):
