@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.encaps import encapsulate
-from pydicom.pixels.encoders import RLELosslessEncoder
 from pydicom.pixels.utils import pack_bits
 from pydicom.uid import UID, ExplicitVRLittleEndian, JPEG2000Lossless, RLELossless, generate_uid
 
@@ -73,27 +72,14 @@ def write(
 def compressed(made: Dataset, syntax: str) -> Dataset:
     """A copy of 8-bit grey images, each compressed: by run lengths, JPEG 2000, or JPEG."""
     made = copy.deepcopy(made)
-    pixels = np.frombuffer(made.PixelData, np.uint8)[
-        : made.NumberOfFrames * made.Rows * made.Columns
-    ]
+    if syntax == RLELossless:
+        made.file_meta = FileMetaDataset()
+        made.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        made.compress(RLELossless, generate_instance_uid=False)
+        return made
+    size = (made.NumberOfFrames, made.Rows, made.Columns)
     frames = []
-    for image in pixels.reshape(-1, made.Rows, made.Columns):
-        if syntax == RLELossless:
-            frames.append(
-                RLELosslessEncoder.encode(
-                    image,
-                    encoding_plugin="pydicom",
-                    rows=made.Rows,
-                    columns=made.Columns,
-                    samples_per_pixel=1,
-                    bits_allocated=8,
-                    bits_stored=8,
-                    pixel_representation=0,
-                    photometric_interpretation="MONOCHROME2",
-                    number_of_frames=1,
-                )
-            )
-            continue
+    for image in np.frombuffer(made.PixelData, np.uint8)[: np.prod(size)].reshape(size):
         data = io.BytesIO()
         if syntax == JPEG2000Lossless:
             Image.fromarray(image).save(data, "JPEG2000", irreversible=False, no_jp2=True)
