@@ -100,7 +100,7 @@ def test_what_is_no_press_is_one_sentence(press, small_scene, tmp_path, capsys, 
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("lung", "--stiffening lung: there is no such structure; there are "),
+        ("lung", "--stiffening: 'lung' is not one of "),
         ("muscle", "leave muscle out of --stiffening"),  # this press is not deep enough
     ],
 )

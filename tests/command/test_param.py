@@ -77,7 +77,7 @@ DUMPED = """\
     - 2
     'on': true
     rate: 30.0
-    small: 0.000001
+    small: 1.0e-06
     start_type_description_service: true
     use_sim_time: false
     word: x

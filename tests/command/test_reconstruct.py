@@ -91,14 +91,11 @@ def test_what_cannot_be_is_one_sentence_and_leaves_nothing(
     assert sorted(tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize(("asked", "said"), [(1, "1 frame predicted"), (8, "1 frame (not 8")])
-def test_why_fewer_frames_are_predicted_than_was_asked_is_said(
-    sweep, tmp_path, capsys, asked, said
-):
-    options = ["--spacing", "1 mm", "--leave-one-out", str(asked)]
+def test_fewer_frames_may_be_predicted_than_were_asked_for(sweep, tmp_path, capsys):
+    options = ["--spacing", "1 mm", "--leave-one-out", "8"]
     out = str(tmp_path / "volume.nrrd")
     assert main(["reconstruct", str(sweep[0]), "--out", out, *options]) == 0
-    assert said in capsys.readouterr().out
+    assert "1 frame of 8" in capsys.readouterr().out
 
 
 def test_nothing_is_written_over(sweep, tmp_path, capsys):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import math
 import os
-import re
 from collections.abc import Callable, Iterator, Sequence
 from itertools import compress
 from pathlib import Path
@@ -29,7 +28,6 @@ from us_sim.settings.spelling import counted
 from us_sim.tracking.calibration.camera import (
     INTRINSICS,
     BoardView,
-    CameraCalibration,
     calibrate_camera,
     find_board,
 )
@@ -50,9 +48,9 @@ from us_sim.tracking.calibration.transform_file import (
     write_transform,
 )
 from us_sim.tracking.camera.model import write_camera_info
-from us_sim.tracking.camera.rigid_body import RigidBody, printed_board
+from us_sim.tracking.camera.rigid_body import printed_board
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
-from us_sim.volume.sequences.sweep import Sweep, read_sweep
+from us_sim.volume.sequences.sweep import read_sweep
 from us_sim.volume.sequences.transforms import split_transform_name
 
 
@@ -76,8 +74,7 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
         if len(bodies) != 1:
             raise CalibrationError(
                 f"{path}: holds several transforms; name one with --pose: "
-                f"{', '.join(recording.transforms)}, or one to Reference such as "
-                f"{_body(sorted(bodies)[-1]) if bodies else 'Stylus'}ToReference"
+                f"{', '.join(recording.transforms)}, or one such as StylusToReference"
             )
         name = bodies[0]
     if name in recording.transforms:
@@ -107,7 +104,14 @@ def read_signal(
     of_plus = path.suffix.lower() in SEQUENCE_SUFFIXES
     if of_plus and (images or not read_sequence(path).transforms):
         sweep = read_sweep(path, tracked=False)
-        return signal_of_images(sweep.times, _with_progress(sweep, progress))
+
+        def images_shown() -> Iterator[NDArray[np.uint8]]:
+            for k, image in enumerate(sweep.images()):
+                yield image
+                if progress is not None:
+                    progress((k + 1) / len(sweep.times), "the line in each image")
+
+        return signal_of_images(sweep.times, images_shown())
     if images:
         raise CalibrationError(f"{path}: is a bag; images are read from recordings of Plus only")
     motion = read_motion(path, name)
@@ -117,19 +121,6 @@ def read_signal(
 def seconds_of(motion: ProbePath) -> NDArray[np.float64]:
     """(K,) s, its stamps."""
     return np.asarray(1e-9 * motion.stamps, np.float64)
-
-
-def _body(name: str) -> str:
-    return (split_transform_name(name) or (name, ""))[0]
-
-
-def _with_progress(
-    sweep: Sweep, progress: Callable[[float, str], None] | None
-) -> Iterator[NDArray[np.uint8]]:
-    for k, image in enumerate(sweep.images()):
-        yield image
-        if progress is not None:
-            progress((k + 1) / len(sweep.times), "the line in each image")
 
 
 _IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
@@ -157,17 +148,47 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
         legacy=settings.legacy,
     )
     photos = find_photos(settings.photos)
-    names, views, blank, size = _views(photos, board, progress)
+    if not photos:
+        raise CalibrationError("no photo is given; name files, a folder or a pattern")
+    names: list[str] = []
+    blank: list[str] = []
+    views: list[BoardView] = []
+    size = _read(photos[0]).shape  # rows, columns
+    for k, photo in enumerate(photos):
+        image = _read(photo)
+        if image.shape != size:
+            raise CalibrationError(
+                f"{photo}: has {image.shape[1]} × {image.shape[0]} pixels and the photos before "
+                f"it {size[1]} × {size[0]}: all must come from one camera at one size"
+            )
+        view = find_board(image, board)
+        (blank if view is None else names).append(photo.name)
+        if view is not None:
+            views.append(view)
+        if progress is not None:
+            progress((k + 1) / len(photos), f"{len(views)} with the board")
     if not views:
         raise CalibrationError(
             f"none of the {len(photos)} photos shows the board: check --board, --size and "
             f"--dictionary, and try --legacy with an old ChArUco board"
         )
-    found = calibrate_camera(views, *size)
+    found = calibrate_camera(views, size[1], size[0])
     far_off = list(compress(names, ~found.used))
     names, views = list(compress(names, found.used)), list(compress(views, found.used))
-    notes = _notes(found, f"{settings.board} board {settings.size}", names, views)
-    notes |= {"photos_without_board": blank, "photos_left_out": far_off}
+    notes = {  # further keys, which ROS' readers ignore
+        "method": f"{settings.board} board {settings.size}, Zhang",
+        "residuals": {
+            "rms": found.rms,  # pixels
+            "photos": dict(zip(names, found.residuals.tolist(), strict=True)),  # RMS, pixels
+            "corners": sum(len(view) for view in views),
+        },
+        "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
+        "largest_tilt": found.tilt,  # rad, between two boards
+        "reach": found.reach,  # fraction of the distance from the image's middle to its corners
+        "note": found.note,
+        "photos_without_board": blank,
+        "photos_left_out": far_off,
+    }
     write_camera_info(out, found.camera, settings.name, notes)
     focal = " and ".join(
         f"{intrinsic} {found.camera.matrix[k, k]:.1f} ± {found.deviations[k]:.1f}"
@@ -183,7 +204,7 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
 
 
 def find_photos(patterns: Sequence[str]) -> list[Path]:
-    """The files that are named, lie in named folders or match patterns, in natural order.
+    """The files that are named, lie in named folders or match patterns.
 
     Raises:
         CalibrationError: a name stands for no photo.
@@ -201,42 +222,8 @@ def find_photos(patterns: Sequence[str]) -> list[Path]:
         matches = [file for file in candidates if file.suffix.lower() in _IMAGES]
         if not matches:
             raise CalibrationError(f"{text}: there is no such photo, and no folder with any")
-        photos.update(dict.fromkeys(sorted(matches, key=_natural)))
+        photos.update(dict.fromkeys(sorted(matches)))
     return list(photos)
-
-
-def _natural(path: Path) -> list[tuple[bool, int, str]]:
-    """A sort key that puts 2.jpg before 10.jpg."""
-    parts = re.findall(r"\d+|\D+", str(path))
-    return [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
-
-
-def _views(
-    photos: Sequence[Path], board: RigidBody, progress: Progress | None
-) -> tuple[list[str], list[BoardView], list[str], tuple[int, int]]:
-    """Names and views of the photos that show the board, names of those that do not, the size."""
-    names, views, blank = [], [], []
-    size: tuple[int, int] | None = None
-    for k, photo in enumerate(photos):
-        image = _read(photo)
-        columns_rows = (image.shape[1], image.shape[0])
-        if size is not None and columns_rows != size:
-            raise CalibrationError(
-                f"{photo}: has {columns_rows[0]} × {columns_rows[1]} pixels and the photos "
-                f"before it {size[0]} × {size[1]}: all must come from one camera at one size"
-            )
-        size = columns_rows
-        view = find_board(image, board)
-        if view is None:
-            blank.append(photo.name)
-        else:
-            names.append(photo.name)
-            views.append(view)
-        if progress is not None:
-            progress((k + 1) / len(photos), f"{len(views)} with the board")
-    if size is None:
-        raise CalibrationError("no photo is given; name files, a folder or a pattern")
-    return names, views, blank, size
 
 
 def _read(photo: Path) -> NDArray[np.uint8]:
@@ -247,24 +234,6 @@ def _read(photo: Path) -> NDArray[np.uint8]:
     if image is None:
         raise CalibrationError(f"{photo}: is no image that can be read")
     return np.asarray(image, np.uint8)
-
-
-def _notes(
-    found: CameraCalibration, board: str, names: Sequence[str], views: Sequence[BoardView]
-) -> dict[str, object]:
-    """Further keys of the camera info, which ROS' readers ignore."""
-    return {
-        "method": f"{board}, Zhang",
-        "residuals": {
-            "rms": found.rms,  # pixels
-            "photos": dict(zip(names, found.residuals.tolist(), strict=True)),  # RMS, pixels
-            "corners": sum(len(view) for view in views),
-        },
-        "standard_deviations": dict(zip(INTRINSICS, found.deviations.tolist(), strict=True)),
-        "largest_tilt": found.tilt,  # rad, between two boards
-        "reach": found.reach,  # fraction of the distance from the image's middle to its corners
-        "note": found.note,
-    }
 
 
 _TABLES = {".csv", ".txt", ".xml"}
@@ -309,15 +278,14 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
     Raises:
         UsSimError: the files cannot be read or do not determine the registration.
     """
-    known_file, measured_file = settings.known, settings.measured
-    to, out = settings.to, settings.out
-    known = read_landmarks(known_file)
+    measured_file, to, out = settings.measured, settings.to, settings.out
+    known = read_landmarks(settings.known)
     if measured_file.suffix.lower() in _TABLES:
         measured, frame = read_landmarks(measured_file), "tracker"
         names = [landmark for landmark in known if landmark in measured]
         if not names:
             raise CalibrationError(
-                f"{measured_file} and {known_file} share no landmark's name: name the same "
+                f"{measured_file} and {settings.known} share no landmark's name: name the same "
                 f"landmarks alike"
             )
     else:
@@ -329,28 +297,28 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
     if settings.invert:
         found, frame, to = register_landmarks(ours, theirs, names), to, frame
     moved, turned = found.deviations[:3], found.deviations[3:]  # m and rad
-    left_out = [None if math.isnan(error) else error for error in found.left_out.tolist()]
+    tre, *left_out = (None if math.isnan(m) else m for m in (found.tre, *found.left_out.tolist()))
     write_transform(
         out,
         found.pose,
         from_frame=frame,
         to_frame=to,
-        method=f"point registration, {measured_file.name} on {known_file.name}",
+        method=f"point registration, {measured_file.name} on {settings.known.name}",
         residuals={
             "fre": found.fre,  # m
-            "tre_leave_one_out": None if math.isnan(found.tre) else found.tre,  # m
+            "tre_leave_one_out": tre,  # m
             "landmarks": dict(zip(names, found.residuals, strict=True)),  # m
             "left_out": dict(zip(names, left_out, strict=True)),  # m
         },
         more={"standard_deviations": {"position": moved, "rotation": turned}},
     )
     worst = int(found.residuals.argmax())
-    tre = "" if math.isnan(found.tre) else f", leave-one-out TRE {1e3 * found.tre:.2f} mm"
+    told = "" if tre is None else f", leave-one-out TRE {1e3 * tre:.2f} mm"
     alone = sorted(set(known) ^ set(measured))
     unused = f"; in one file only: {', '.join(alone)}" if alone else ""
     return (
         f"{out}: FRE {1e3 * found.fre:.2f} mm over {len(names)} landmarks (worst "
-        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){tre}{unused}"
+        f"{1e3 * found.residuals[worst]:.2f} mm at {names[worst]}){told}{unused}"
     )
 
 
@@ -401,8 +369,8 @@ def _touched(
     dwells = find_dwells(seconds_of(motion), tips, rotations)
     if len(dwells) != len(names):
         start = seconds_of(motion)[0]
-        at = ", ".join(f"{dwell.start - start:.0f}" for dwell in dwells)
-        where = counted(len(dwells), "place") + (f" (at {at} s)" if at else "")
+        at = ", ".join(f"{dwell.start - start:.0f} s" for dwell in dwells)
+        where = counted(len(dwells), "place") + (f" (at {at})" if at else "")
         raise CalibrationError(
             f"{recording}: the stylus pivoted on {where} where "
             f"{counted(len(names), 'landmark is', 'landmarks are')} named: touch each for two "

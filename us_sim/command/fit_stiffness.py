@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from us_sim.command.options import add_setting_options, read_settings, scene_name
 from us_sim.errors import BagError, SceneError, StiffnessError
+from us_sim.settings.spelling import unknown
 from us_sim.share import full_path
 from us_sim.tissue.identification.settings import StiffnessSettings
 
@@ -54,7 +55,7 @@ def _fit(args: argparse.Namespace) -> int:
         args.scene, args.case = None, args.scene
     name = scene_name(args)
     scene = load_scene(name, volume=args.volume)
-    if args.into_case and scene.volume.case is None:
+    if args.into_case and not scene.volume.case:
         raise StiffnessError("--into-case: this scene is of no case; name one with --case")
     landmarks = read_landmarks(settings.landmarks) if settings.landmarks else None
     show = late_progress("fit-stiffness")
@@ -68,8 +69,8 @@ def _fit(args: argparse.Namespace) -> int:
     draw_fit(settings.picture, found, f"{scene.name}: moduli from {args.session.name}")
     write_moduli(settings.out, found, _base(name, scene), scene.name)
     print(f"\n{settings.out}: a scene with these moduli; {settings.picture}: how they fit")
-    if args.into_case:
-        _write_into_case(scene, args.session, found, settings)
+    if args.into_case and scene.volume.case:
+        _write_into_case(scene.volume.case, args.session, found, settings)
     return 0
 
 
@@ -84,30 +85,21 @@ def _base(asked: str, scene: Scene) -> dict[str, str]:
 
 
 def _write_into_case(
-    scene: Scene, session: Path, found: StiffnessFit, settings: StiffnessSettings
+    case: str, session: Path, found: StiffnessFit, settings: StiffnessSettings
 ) -> None:
-    """The fitted moduli, with how they were found."""
+    """Write the fitted moduli into a case, with how they were found."""
     from us_sim.volume.cases.provenance import Source, Step
     from us_sim.volume.cases.writing import write_constants_into
 
-    assert scene.volume.case is not None
-    stiffenings = found.stiffenings
-    fitted = {
-        name: {
-            "stiffening" if name in stiffenings else "young_modulus": found.moduli[name],
-            "factor": interval.factor,
-        }
-        for name, interval in found.intervals.items()
-    }
+    fitted = {}
+    for name, interval in found.intervals.items():
+        constant = "stiffening" if name in found.stiffenings else "young_modulus"
+        fitted[name] = {constant: found.moduli[name], "factor": interval.factor}
     sources = (Source.of(session, "recorded press"),) if session.is_file() else ()
-    step = Step(
-        "fitted stiffness to a press",
-        {"confidence": settings.confidence, "kept": list(settings.keep), "moduli": fitted},
-        {"poses": len(found.depths)},
-        sources,
-    )
-    write_constants_into(scene.volume.case, found.constants, step)
-    print(f"{scene.volume.case}: has these moduli now")
+    said = {"confidence": settings.confidence, "kept": list(settings.keep), "moduli": fitted}
+    step = Step("fitted stiffness to a press", said, {"poses": len(found.depths)}, sources)
+    write_constants_into(case, found.constants, step)
+    print(f"{case}: has these moduli now")
 
 
 def _tissue(
@@ -130,25 +122,17 @@ def _tissue(
             "the fit leaves out the scene's friction and viscosity: press slowly and straight"
         )
     if section.solver != "fem_nonlinear":
-        remarks.append(
-            f"the moduli are those of fem_nonlinear; {section.solver}, the scene's method, would "
-            f"push back otherwise with them"
-        )
+        remarks.append(f"the moduli are those of fem_nonlinear, not of {section.solver}")
     materials = dict(section.materials)
     for name in stiffening:
         if name not in materials:
-            raise StiffnessError(
-                f"--stiffening {name}: there is no such structure; there are {', '.join(materials)}"
-            )
+            raise StiffnessError(f"--stiffening: {unknown(name, materials)}")
     stiffenings = {f"stiffening of {name}": name for name in stiffening}
 
     def materials_for(moduli: Mapping[str, float]) -> Any:
-        made = {
-            name: dataclasses.replace(material, young_modulus=moduli[name])
-            for name, material in materials.items()
-        }
+        made = {name: replace(one, young_modulus=moduli[name]) for name, one in materials.items()}
         for key, name in stiffenings.items():
-            made[name] = dataclasses.replace(made[name], stiffening=moduli[key])
+            made[name] = replace(made[name], stiffening=moduli[key])
         return materials_of(scene, made, model.mesh, volume)
 
     moduli = {name: material.young_modulus for name, material in materials.items()}
@@ -175,8 +159,8 @@ def _record(
     path = read_path(session, bag.topic(settings.pose).name)
     if path.frame_id != "patient":
         raise BagError(
-            f"{session}: {path.topic} is in frame '{path.frame_id}', and the tissue is in "
-            f"'patient': name the tracked probe's topic there with --pose, such as probe/pose"
+            f"{session}: {path.topic} is in frame '{path.frame_id}': name the probe's topic in "
+            f"frame 'patient' with --pose, such as probe/pose"
         )
     poses = path.stamps, path.positions, path.orientations
     remarks = [path.note] if path.note else []
@@ -189,8 +173,8 @@ def _record(
     felt = read_wrenches(session, settings.wrench)
     if felt.frame_id != "probe":
         raise StiffnessError(
-            f"{session}: {felt.topic} is in frame '{felt.frame_id}', and the force on the probe "
-            f"is wanted in frame 'probe', about its origin: turn it before it is recorded"
+            f"{session}: {felt.topic} is in frame '{felt.frame_id}': turn the force into frame "
+            f"'probe', about its origin, before it is recorded"
         )
     wrenches = felt.stamps, felt.wrenches
     late = settings.time_offset or 0.0

@@ -131,8 +131,11 @@ def _add(
 _OF_THE_VIEWER = ("host", "port", "recordings")
 
 
-def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """A case in place of a scene, another volume, and parameters of the scene's nodes."""
+def add_scene_options(parser: argparse.ArgumentParser, default: str = "") -> None:
+    """A scene, or a case in place of it, another volume, and parameters of the scene's nodes."""
+    parser.add_argument(
+        "scene", nargs="?", help=f"scene file, or name of an installed one{default}"
+    )
     parser.add_argument(
         "--case", metavar="NAME", help="case to make the scene from: its name or folder"
     )
@@ -190,14 +193,11 @@ def add_network_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_supervision_options(parser: argparse.ArgumentParser) -> None:
-    """When a node hangs, and how often one is started again."""
+def add_running_options(parser: argparse.ArgumentParser, default: str = "") -> None:
+    """Those of a scene, of the supervision of its nodes, and of the network."""
+    add_scene_options(parser, default)
     add_setting_options(parser, SupervisionSettings)
-
-
-def supervision(args: argparse.Namespace) -> SupervisionSettings:
-    """Settings of the supervision; a wrong value raises a UsSimError."""
-    return read_settings(args, SupervisionSettings)
+    add_network_option(parser)
 
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:

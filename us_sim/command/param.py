@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from us_sim.command.options import add_network_option
@@ -24,18 +23,10 @@ DISCOVERY_S = 7.0  # to discover a node: Fast DDS may miss an announcement, and 
 ALL_S = 3.5  # to discover all of them
 ANSWER_S = 5.0  # for a node to answer
 
-_TYPES = (  # by rcl_interfaces/msg/ParameterType: its name, the field of a value, and its label
-    ("not set", "", "Parameter not set."),
-    ("boolean", "bool_value", "Boolean value is:"),
-    ("integer", "integer_value", "Integer value is:"),
-    ("double", "double_value", "Double value is:"),
-    ("string", "string_value", "String value is:"),
-    ("byte array", "byte_array_value", "Byte values are:"),
-    ("boolean array", "bool_array_value", "Boolean values are:"),
-    ("integer array", "integer_array_value", "Integer values are:"),
-    ("double array", "double_array_value", "Double values are:"),
-    ("string array", "string_array_value", "String values are:"),
-)
+_TYPES = (  # by rcl_interfaces/msg/ParameterType
+    "not set", "boolean", "integer", "double", "string",
+    "byte array", "boolean array", "integer array", "double array", "string array",
+)  # fmt: skip
 
 
 def param_options(parser: argparse.ArgumentParser) -> None:
@@ -65,28 +56,32 @@ def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Na
 
 
 def _list(asker: _Asker, args: argparse.Namespace) -> int:
-    if args.node is not None:
-        for name in asker.names(asker.find(args.node)):
-            print(f"  {name}")
-        return 0
-    for node in asker.nodes():
+    for node in asker.nodes() if args.node is None else [asker.find(args.node)]:
         try:
-            names = asker.names(node)
+            names = [f"  {name}" for name in asker.names(node)]
         except UsSimError as error:
+            if args.node is not None:
+                raise
             print(error, file=sys.stderr)
             continue
-        print("\n".join([f"{node}:", *(f"  {name}" for name in names)]))
+        print("\n".join(names if args.node is not None else [f"{node}:", *names]))
     return 0
 
 
 def _get(asker: _Asker, args: argparse.Namespace) -> int:
+    from rclpy.parameter import parameter_value_to_python
+
     node = asker.find(args.node)
     values = asker.ask(node, "get_parameters", [args.name]).values
     if not values:
         asker.refuse_unknown(node, [args.name])
         raise UsSimError(f"{args.name} of {node} is not set")
-    value = _python(values[0])
-    print(_TYPES[values[0].type][2], *([] if value is None else [value]))
+    kind, _, is_array = _TYPES[values[0].type].partition(" ")
+    if not values[0].type:
+        print("Parameter not set.")
+    else:
+        said = f"{kind.capitalize()} {'values are' if is_array else 'value is'}:"
+        print(said, parameter_value_to_python(values[0]))
     return 0
 
 
@@ -118,7 +113,7 @@ def _describe(asker: _Asker, args: argparse.Namespace) -> int:
         asker.refuse_unknown(node, args.names)
     for each in descriptors:
         print("Parameter name:", each.name)
-        print("  Type:", _TYPES[each.type][0])
+        print("  Type:", _TYPES[each.type])
         if each.description:
             print("  Description:", each.description)
         print("  Constraints:")
@@ -135,6 +130,8 @@ def _describe(asker: _Asker, args: argparse.Namespace) -> int:
 
 
 def _dump(asker: _Asker, args: argparse.Namespace) -> int:
+    from rclpy.parameter import parameter_value_to_python
+
     node = asker.find(args.node)
     names = asker.names(node)
     values = asker.ask(node, "get_parameters", names).values
@@ -144,22 +141,9 @@ def _dump(asker: _Asker, args: argparse.Namespace) -> int:
         inner = nested
         for group in groups:
             inner = inner.setdefault(group, {})
-        inner[last] = _python(value)
-    print(yaml.dump({node: {"ros__parameters": nested}}, Dumper=_Dumper, default_flow_style=False))
+        inner[last] = parameter_value_to_python(value)
+    print(yaml.safe_dump({node: {"ros__parameters": nested}}, default_flow_style=False))
     return 0
-
-
-class _Dumper(yaml.SafeDumper):
-    """Writes no exponents, of which ROS's readers of YAML take some for texts."""
-
-    def represent_float(self, data: float) -> yaml.ScalarNode:
-        if not np.isfinite(data):
-            return super().represent_float(data)
-        text = np.format_float_positional(data, trim="0")
-        return self.represent_scalar("tag:yaml.org,2002:float", text)
-
-
-_Dumper.add_representer(float, _Dumper.represent_float)
 
 
 def _load(asker: _Asker, args: argparse.Namespace) -> int:
@@ -199,13 +183,6 @@ def _flat(nested: dict[Any, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
-
-
-def _python(value: Any) -> Any:
-    """The content of a rcl_interfaces/msg/ParameterValue; None where it is not set."""
-    field = _TYPES[value.type][1]
-    content: Any = getattr(value, field) if field else None
-    return list(content) if field.endswith("array_value") else content
 
 
 class _Asker:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
-from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
@@ -22,7 +19,6 @@ from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
 from us_sim.volume.reconstruction.reconstruction import (
-    APART,
     Plan,
     Prediction,
     Progress,
@@ -69,8 +65,9 @@ class SweepSettings(Settings):
 
     def check(self) -> None:
         """Refuse a place that cannot be written to, which is worth knowing before the work."""
-        if self.out.exists():
-            raise self.refused("out", f"{self.out}: exists already; choose another name")
+        for path in (self.out, self.picture):
+            if path.exists():
+                raise self.refused("out", f"{path}: exists already; choose another name")
         if not self.is_volume and 1 < len(self.out.suffix) <= 5:
             raise self.refused(
                 "out",
@@ -79,8 +76,6 @@ class SweepSettings(Settings):
             )
         if self.is_volume and not self.out.absolute().parent.is_dir():
             raise self.refused("out", f"{self.out}: there is no {self.out.absolute().parent}")
-        if self.is_volume and self.picture.exists():
-            raise self.refused("out", f"{self.picture}: exists already; choose another name")
 
     @property
     def is_volume(self) -> bool:
@@ -89,10 +84,13 @@ class SweepSettings(Settings):
 
     @property
     def picture(self) -> Path:
-        """The picture beside the file."""
-        name = self.out.name
-        ending = next((end for end in VOLUME_ENDINGS[::-1] if name.lower().endswith(end)), "")
-        return self.out.with_name(name[: len(name) - len(ending)] + ".png")
+        """The picture beside the file, or in the case."""
+        if not self.is_volume:
+            return self.out / "volume.png"
+        ending = max(
+            (end for end in VOLUME_ENDINGS if self.out.name.lower().endswith(end)), key=len
+        )
+        return self.out.with_name(f"{self.out.name[: -len(ending)]}.png")
 
 
 def reconstruct_sweep(
@@ -134,15 +132,13 @@ def reconstruct_sweep(
     prediction = None
     if settings.leave_one_out:
         prediction = leave_one_out(planned, settings.leave_one_out, progress)
-    size = (
-        f"{' × '.join(map(str, made.volume.shape))} voxels of {1e3 * planned.grid.spacing:.4g} mm"
-    )
+    shape = " × ".join(map(str, made.volume.shape))
+    size = f"{shape} voxels of {1e3 * planned.grid.spacing:.4g} mm"
+    picture = settings.picture
     if scanner is None:
-        picture = settings.picture
         write_volume(settings.out, made.volume)
         draw_slices(picture, made.volume, made.covered, size)
     else:
-        picture = settings.out / "volume.png"
         with new_case(settings.out) as folder:
             write_volume(folder / "volume.nrrd", made.volume)
             # Where the pressure is undone no pose is one that was scanned from.
@@ -167,11 +163,15 @@ def reconstruct_sweep(
     if sweep.sequence.are_colours:
         sentences.append("its colour images were made grey")
     if prediction is not None:
-        sentences.append(_prediction_said(prediction, settings.leave_one_out))
-    if scanner is not None and scanner.probe is not None:
-        sentences.append(f"its images are those of {_array_said(scanner.probe)}")
-    elif scanner is not None:
-        sentences.append("nothing shows the probe's shape, which is guessed")
+        middle, worst = _correlations(prediction)
+        sentences.append(
+            f"{counted(len(prediction.frames), 'frame')} of {settings.leave_one_out} asked for, "
+            f"predicted from the others, correlate with what was seen by {middle:.3f} in the "
+            f"median and {worst:.3f} at worst"
+        )
+    if scanner is not None:
+        probe = scanner.probe and f"those of a {scanner.probe.geometry} array"
+        sentences.append(f"its images are {probe or 'of a probe whose shape is guessed'}")
     return "; ".join([*sentences, f"slices in {picture}"])
 
 
@@ -190,8 +190,8 @@ def _step(
     }
     if prediction is not None:
         counts["frames predicted"] = len(prediction.frames)
-        counts["correlation median"] = round(float(np.nanmedian(prediction.correlations)), 4)
-        counts["correlation worst"] = round(float(np.nanmin(prediction.correlations)), 4)
+        middle, worst = _correlations(prediction)
+        counts |= {"correlation median": round(middle, 4), "correlation worst": round(worst, 4)}
     said = {
         "spacing": planned.grid.spacing,
         "method": planned.compounding.method,
@@ -204,25 +204,7 @@ def _step(
     return Step("reconstructed", said, counts, tuple(sources))
 
 
-def _prediction_said(prediction: Prediction, asked: int) -> str:
+def _correlations(prediction: Prediction) -> tuple[float, float]:
+    """The median and the worst."""
     found = prediction.correlations
-    worst = int(np.nanargmin(found))
-    between = f"{APART - 1} others or more stay between two of them"
-    why = f" (not {asked}: {between})" if len(found) < asked else ""
-    return (
-        f"{counted(len(found), 'frame')}{why} predicted from the others correlate with what was "
-        f"seen by {np.nanmedian(found):.3f} in the median and {found[worst]:.3f} at worst (frame "
-        f"{prediction.frames[worst]})"
-    )
-
-
-def _array_said(probe: ProbeSettings) -> str:
-    """The transducer in words."""
-    array: Any = probe.array.given
-    depth = f"{1e3 * array.depth:.0f} mm deep"
-    if probe.geometry == "linear":
-        return f"a linear array of {1e3 * array.aperture:.1f} mm, {depth}"
-    opening = f"{math.degrees(array.opening_angle):.1f}°, {depth}"
-    if probe.geometry == "sector":
-        return f"a phased array, {opening}"
-    return f"a curved array of radius {1e3 * array.radius:.1f} mm, {opening}"
+    return float(np.nanmedian(found)), float(np.nanmin(found))

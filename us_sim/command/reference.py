@@ -40,12 +40,9 @@ TOPICS_TEXT = """\
 Names are relative to the simulator's namespace. A message that comes from a pose carries that
 pose's stamp, so `now - stamp` is its age anywhere in the graph. Topics are published reliable, the
 last 10 kept; those marked latched are kept for subscribers that come later (transient local, the
-last 1). `probe_tracker` and `haptic_renderer` hear devices best effort, so their drivers may
-publish either way. History, depth and reliability are parameters, `qos_overrides.…`, of each.
-
-`session_recorder` subscribes to all topics that it is not told to leave out, and `session_player`
-publishes all topics of a recording. `session_monitor` is `us-sim` itself, which follows the nodes
-that it started."""
+last 1). Devices are heard best effort. History, depth and reliability are parameters,
+`qos_overrides.…`, of each. `session_recorder` subscribes to all topics that it is not told to leave
+out; `session_player` publishes all of a recording; `session_monitor` is `us-sim` itself."""
 
 PARAMETERS_TEXT = """\
 A parameter of a running node is set with `ros2 param set /tissue_deformer solver msds` where "while
@@ -58,12 +55,29 @@ SCENE_TEXT = """\
 A scene is a YAML file. Only `name`, `volume` and `probe` must be there; what it does not name costs
 nothing. Numbers are in SI units (m, s, Pa, rad) or carry a unit (`40 mm`, `12 kPa`, `30 deg`).
 Relative files are looked up beside the scene's own file. `based_on: OTHER` takes everything from
-another scene, by file or name, that this one does not say.
-
-In this page a path of keys is written with dots: `tissue.mesh.nodes` is the key `nodes` in `mesh`
-in `tissue`; `NAME` stands for a name of your choice."""
+another scene, by file or name, that this one does not say. `tissue.mesh.nodes` is the key `nodes`
+in `mesh` in `tissue`; `NAME` stands for a name of your choice."""
 
 POSE = "A pose"
+
+_OF_THE_SCENE = {
+    "slice_interpolator": {
+        "acoustics.KEY": "imaging.acoustics",
+        "acoustics.tissues.LABEL.KEY": "imaging.acoustics.tissues.NAME",
+        "strain.KEY": "strain",
+        "m_mode.KEY": "m_mode",
+        "colour.KEY": "colour",
+        "spectrum.KEY": "spectrum",
+        "flow.STRUCTURE.KEY": "structures.NAME.flow",
+    },
+    "probe_tracker": {"FILTER.KEY": "tracker.filter"},
+    "skin_deformer": {"membrane.KEY": "skin"},
+    "tissue_deformer": {
+        "SOLVER.KEY": "tissue.settings",
+        "materials.LABEL.KEY": "tissue.materials.NAME",
+    },
+}
+"""By node: parameters for the keys of a section of the scene, which can be set while running."""
 
 
 def reference_options(parser: argparse.ArgumentParser) -> None:
@@ -91,7 +105,7 @@ def reference_page() -> str:
 def reference_sections() -> Iterator[tuple[int, Section]]:
     """All sections in order, each with the level of its heading."""
     yield 2, Section("topics", "Topics", f"{TOPICS_TEXT}\n\n{_topics()}")
-    yield 2, Section("parameters", "Node parameters", f"{PARAMETERS_TEXT}\n\n{_node_list()}")
+    yield 2, Section("parameters", "Node parameters", PARAMETERS_TEXT)
     yield from ((3, section) for section in _nodes())
     yield 2, Section("scene", "Scene settings", SCENE_TEXT)
     yield from ((3, section) for section in _scene_sections())
@@ -143,17 +157,9 @@ def _names(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _node_list() -> str:
-    """A link to each node's parameters."""
-    from us_sim.nodes.settings import NODES
-
-    return "\n".join(f"- [{node}](#{anchor(node)})" for node in NODES)
-
-
 def _nodes() -> Iterator[Section]:
     """The parameters of each node."""
     from us_sim.nodes.settings import COMPRESSED, NODES, CompressedSettings, SceneNodeSettings
-    from us_sim.skin.settings import MembraneSettings
     from us_sim.slicing.settings import Imaging
 
     common = "Every node that works on a scene"
@@ -165,47 +171,18 @@ def _nodes() -> Iterator[Section]:
         for each in settings:
             if each is Imaging:
                 text.append(
-                    f"The keys of [imaging](#imaging), and of the [probe](#probe) its "
-                    f"{_of_probe()}, while running; where there is tissue `strain.KEY` for every "
-                    f"key of [strain](#strain). `acoustics.KEY` for every key of "
-                    f"[imaging.acoustics](#imagingacoustics) but the last, and "
-                    f"`acoustics.tissues.LABEL.KEY` for every key of every tissue that the scene "
-                    f"names there, such as `acoustics.tissues.muscle.attenuation`, see "
-                    f"[imaging.acoustics.tissues](#imagingacousticstissuesname). Their defaults "
-                    f"are the scene's."
+                    f"The keys of [imaging](#imaging), and {_of_probe()} of the [probe](#probe)."
                 )
             elif each is not SceneNodeSettings:
                 about = first_sentence(each.__doc__)
                 text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
+        if node in _OF_THE_SCENE:
+            keys = _OF_THE_SCENE[node].items()
+            links = ", ".join(f"`{key}` of [{title}](#{anchor(title)})" for key, title in keys)
+            text.append(f"While running, with the scene's defaults, where it names them: {links}.")
         if node == "slice_interpolator":
-            text.append(
-                "`m_mode.KEY` for every key of [m_mode](#m_mode), and where the scene names a "
-                "flow `colour.KEY` and `spectrum.KEY` for those of [colour](#colour) and "
-                "[spectrum](#spectrum), and `flow.STRUCTURE.KEY`, such as `flow.vein.heart_rate`, "
-                "for those of [structures.NAME.flow](#structuresnameflow), while running. Their "
-                "defaults are the scene's."
-            )
             companions = _names(f"{prefix}KEY" for prefix in COMPRESSED.values())
             text += [f"{companions}:", _parameters(CompressedSettings)]
-        if node == "probe_tracker":
-            text.append(
-                "`FILTER.KEY` for every key of every filter, such as `one_euro.minimum_cutoff`, "
-                "see [tracker.filter](#trackerfilter), while running. Their defaults, and that of "
-                "`filter`, are the scene's."
-            )
-        if node == "skin_deformer":
-            text.append(
-                f"`membrane.KEY` for {_names(rules_of(MembraneSettings))} of [skin](#skin), while "
-                f"running. Their defaults are the scene's."
-            )
-        if node == "tissue_deformer":
-            text.append(
-                "`SOLVER.KEY` for every key of every solver, such as `fem_cg.iterations`, see "
-                "[tissue.settings](#tissuesettings), and `materials.LABEL.KEY` for every key of "
-                "every material, such as `materials.vein.young_modulus`, see "
-                "[tissue.materials](#tissuematerialsname), while running. Their defaults, and that "
-                "of `solver`, are the scene's."
-            )
         yield Section(node, node, "\n\n".join(text))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from us_sim.errors import CaseError, VolumeError
@@ -52,10 +52,9 @@ def segment_as_asked(
         CaseError: the case cannot be read or changed.
     """
     if asked.case.is_file():
-        raise CaseError(
-            f"{asked.case}: is a file: make a case of it first, with `us-sim import {asked.case} "
-            f"--out CASE`"
-        )
+        raise CaseError(f"{asked.case}: make a case of it first: us-sim import FILE --out CASE")
+    from us_sim.command.volume_pictures import draw_segmentation
+
     case = read_case(asked.case)
     progress(0.0, "reading")
     volume = case.volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
@@ -73,7 +72,11 @@ def segment_as_asked(
                 (folder / TISSUE).unlink()
                 remarks.append(f"{TISSUE} was made of other labels and is removed")
         write_case_settings(folder, settings)
-        _write(folder, volume, labels, made)
+        shutil.rmtree(folder / SURFACES, ignore_errors=True)
+        (folder / SURFACES).mkdir()
+        for one in made:
+            write_stl(folder / SURFACES / f"{one.name}.stl", one.surface)
+        draw_segmentation(volume, labels, folder / PICTURE)
         triangles = {f"triangles of {one.name}": len(one.surface.triangles) for one in made}
         add_step(folder, step)
         add_step(folder, Step("surfaces made", document_of(surfaces), triangles))
@@ -109,8 +112,7 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> tuple[
         names = {label: name for label, name in volume.label_names.items() if label}
         if volume.labels is None or not names:
             raise VolumeError(
-                f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark to "
-                f"make some"
+                f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark"
             )
         return LabelMap(volume.labels, names), Step("labels kept")
     labels = segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
@@ -155,19 +157,6 @@ def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str
         numbers = {f"structures.{name}": label for label, name in labels.names.items()}
         hint = f"; for a file of labels that is --names {numbers.get(error.key, 'LABEL')}=NAME"
         raise CaseError(f"{error.key}: {error.problem}{hint}") from error
-
-
-def _write(
-    folder: Path, volume: Volume, labels: LabelMap, made: Sequence[StructureSurface]
-) -> None:
-    """Write the surfaces and the picture into a folder."""
-    from us_sim.command.volume_pictures import draw_segmentation
-
-    shutil.rmtree(folder / SURFACES, ignore_errors=True)
-    (folder / SURFACES).mkdir()
-    for one in made:
-        write_stl(folder / SURFACES / f"{one.name}.stl", one.surface)
-    draw_segmentation(volume, labels, folder / PICTURE)
 
 
 def _cells(one: StructureSurface) -> tuple[str, ...]:

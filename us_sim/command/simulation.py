@@ -12,33 +12,28 @@ from typing import TYPE_CHECKING
 from us_sim.command.options import (
     add_network_option,
     add_path_option,
+    add_running_options,
     add_scene_options,
     add_setting_options,
-    add_supervision_options,
     add_view_option,
     add_viewer_options,
     node_parameters,
     read_settings,
     scene_name,
-    supervision,
     viewed,
     viewer,
 )
 from us_sim.errors import BagError, UsSimError
+from us_sim.run.watch import SupervisionSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.run.plan import Parameters, Request
+    from us_sim.run.plan import Parameters
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
-    demo.add_argument(
-        "scene",
-        nargs="?",
-        help="scene file or name; default: upper_arm, or upper_arm_camera with --source camera",
-    )
     demo.add_argument(
         "--source",
         choices=("path", "camera"),
@@ -54,10 +49,9 @@ def demo_options(demo: argparse.ArgumentParser) -> None:
         default=Path("us_sim_demo"),
         help="folder to write to; default: %(default)s",
     )
-    add_scene_options(demo)
-    add_supervision_options(demo)
+    default = "; default: upper_arm, or upper_arm_camera with --source camera"
+    add_running_options(demo, default)
     add_view_option(demo)
-    add_network_option(demo)
     demo.set_defaults(command=_demo)
 
 
@@ -70,7 +64,7 @@ def _demo(args: argparse.Namespace) -> int:
         args.out,
         node_parameters(args.param),
         network=args.network,
-        supervision=supervision(args),
+        supervision=read_settings(args, SupervisionSettings),
         source=args.source,
         path=args.path,
         topic=args.topic,
@@ -98,38 +92,22 @@ class RunSettings(Settings):
 
 
 def run_options(run: argparse.ArgumentParser) -> None:
-    run.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_setting_options(run, RunSettings)
-    add_supervision_options(run)
     add_path_option(run, "play this bag's probe path")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
-    add_scene_options(run)
+    add_running_options(run)
     add_view_option(run)
-    add_network_option(run)
     run.set_defaults(command=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
     asked = read_settings(args, RunSettings)
-    if args.dry_run:
-        return _dry_run(args, asked)
     parameters = node_parameters(args.param)
-    from us_sim.run.live import run
-
-    return run(
-        _request(args, asked, parameters),
-        network=args.network,
-        supervision=supervision(args),
-    )
-
-
-def _request(
-    args: argparse.Namespace, asked: RunSettings, parameters: dict[str, dict[str, str]]
-) -> Request:
+    from us_sim.run.live import dry_run, run
     from us_sim.run.plan import Request
-    from us_sim.scene.reading import load_scene
+    from us_sim.scene.reading import check_files, load_scene
 
-    return Request(
+    request = Request(
         load_scene(scene_name(args), volume=args.volume),
         parameters,
         record=asked.record,
@@ -139,15 +117,10 @@ def _request(
         composed=asked.composed,
         view=viewed(args),
     )
-
-
-def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
-    """Print the nodes that would run, having checked the files of the scene."""
-    from us_sim.run.live import dry_run
-    from us_sim.scene.reading import check_files
-
-    request = _request(args, asked, node_parameters(args.param))
     scene = request.scene
+    if not args.dry_run:
+        supervision = read_settings(args, SupervisionSettings)
+        return run(request, network=args.network, supervision=supervision)
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
     if path is not None and not scene.volume.phantom:
@@ -162,7 +135,6 @@ def _dry_run(args: argparse.Namespace, asked: RunSettings) -> int:
 
 
 def render_options(render: argparse.ArgumentParser) -> None:
-    render.add_argument("scene", nargs="?", help="scene file, or name of an installed one")
     add_path_option(render, "bag with the probe path; default: the scene's")
     render.add_argument(
         "--session",
@@ -223,9 +195,6 @@ def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", nargs="?", help="scene file, or name of an installed one; default: upper_arm"
-    )
     add_viewer_options(parser)
     add_setting_options(parser, RunSettings, ("record", "composed"))
     add_path_option(
@@ -241,30 +210,28 @@ def view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--attach", action="store_true", help="show a simulation that runs already, anywhere"
     )
-    add_scene_options(parser)
-    add_supervision_options(parser)
-    add_network_option(parser)
+    add_running_options(parser, "; default: upper_arm")
     parser.set_defaults(command=_view)
 
 
 def _view(args: argparse.Namespace) -> int:
     parameters = node_parameters(args.param)
+    following = {
+        "network": args.network,
+        "supervision": read_settings(args, SupervisionSettings),
+    }
+    from us_sim.run.live import run, view_running
+
     if args.attach:
-        given = (args.scene, args.case, args.volume, args.path)
-        is_any = args.tracker or args.composed or any(each is not None for each in given)
-        if "record" in args or is_any:
+        given = ("scene", "case", "volume", "path", "tracker", "composed", "record")
+        if any(getattr(args, name, None) for name in given):
             raise UsSimError(
                 "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
                 "--record, --composed and --tracker, or leave out --attach"
             )
-        from us_sim.run.live import view_running
-
-        return view_running(
-            viewer(args), parameters, network=args.network, supervision=supervision(args)
-        )
+        return view_running(viewer(args), parameters, **following)
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
-    from us_sim.run.live import run
     from us_sim.run.plan import Request
     from us_sim.scene.reading import load_scene
 
@@ -280,7 +247,7 @@ def _view(args: argparse.Namespace) -> int:
         by_hand=not args.tracker,
         playing={"stay": True, "loop": args.loop} if args.path is not None else {},
     )
-    return run(request, network=args.network, supervision=supervision(args))
+    return run(request, **following)
 
 
 _OF_THE_PLAYER = ("rate", "loop", "start_offset", "playback_duration", "delay")

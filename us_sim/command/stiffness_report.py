@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import yaml
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from us_sim.errors import StiffnessError
 from us_sim.settings.spelling import aligned, counted
 from us_sim.tissue.identification.press_record import CHANNELS
 from us_sim.tissue.identification.stiffness import GROUPS, StiffnessFit
+from us_sim.volume.partial_file import partial_file
 
 
 def table(found: StiffnessFit) -> str:
@@ -23,20 +22,12 @@ def table(found: StiffnessFit) -> str:
     percent = f"{100 * found.confidence:g} %"
     rows = [("structure", "E (kPa)", f"{percent} interval (kPa)", "×/÷", "part of force")]
     for name, modulus in found.moduli.items():
-        unit = _unit(found, name)
-        interval = found.intervals.get(name)
-        if interval is None:
-            rows.append((name, f"{modulus / unit:.4g}", "kept", "", ""))
-            continue
-        rows.append(
-            (
-                name,
-                f"{modulus / unit:.4g}",
-                f"{interval.lower / unit:.4g} to {interval.upper / unit:.4g}",
-                f"{interval.factor:.3f}",
-                f"{interval.weight:.2f}",
-            )
-        )
+        unit, interval = _unit(found, name), found.intervals.get(name)
+        cells = ["kept", "", ""]
+        if interval is not None:
+            limits = f"{interval.lower / unit:.4g} to {interval.upper / unit:.4g}"
+            cells = [limits, f"{interval.factor:.3f}", f"{interval.weight:.2f}"]
+        rows.append((name, f"{modulus / unit:.4g}", *cells))
     return "\n".join([*aligned(rows), "", _left_over(found), *found.remarks])
 
 
@@ -88,13 +79,8 @@ def write_moduli(file: Path, found: StiffnessFit, base: Mapping[str, str], name:
         "# Young's moduli (Pa) fitted to a recorded press by `us-sim fit-stiffness`.\n"
         f"#\n{told}" + yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
     )
-    partial = file.with_name(f".{file.name}.partial")
-    try:
+    with partial_file(file, error_type=StiffnessError) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, file)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise StiffnessError(f"{file}: cannot be written: {error.strerror}") from error
 
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -109,55 +95,44 @@ def draw_fit(file: Path, found: StiffnessFit, title: str) -> None:
     """
     kinds = [GROUPS[k] for k in np.unique(found.observations.groups)]
     figure = Figure(figsize=(12, 2.6 + 2.4 * len(kinds)), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12, x=0.01, ha="left")
-    rows = figure.subplots(len(kinds) + 1, 2, squeeze=False)
-    for (over_time, left_over), kind in zip(rows[:-1], kinds, strict=True):
-        _draw_kind(over_time, left_over, found, kind)
-    for panel in rows[-2][:2]:
-        panel.set_xlabel("time (s)")
-    _draw_force_over_depth(rows[-1][0], found)
-    _draw_moduli(rows[-1][1], found)
-    partial = file.with_name(f".{file.name}.partial")
-    try:
+    *panels, moduli = figure.subplots(len(kinds) + 1)
+    for panel, kind in zip(panels, kinds, strict=True):
+        _draw_kind(panel, found, kind)
+    _draw_moduli(moduli, found)
+    for panel in (*panels, moduli):
+        panel.grid(True, color="0.93")
+    with partial_file(file, error_type=StiffnessError) as partial:
         figure.savefig(partial, format="png")
-        os.replace(partial, file)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise StiffnessError(f"{file}: cannot be written: {error.strerror}") from error
 
 
-def _draw_kind(over_time: Axes, left_over: Axes, found: StiffnessFit, kind: str) -> None:
+def _draw_kind(panel: Axes, found: StiffnessFit, kind: str) -> None:
     observed = found.observations
     scale, unit = _SCALES[kind]
-    its = observed.groups == GROUPS.index(kind)
-    offsets = observed.nuisance @ found.fitted.nuisance
-    for place, (label, chosen) in enumerate(_channels(found, its, kind)):
+    offsets = _offsets(found)
+    for place, (label, chosen) in enumerate(_channels(found, kind)):
         order = chosen[np.argsort(observed.times[chosen], kind="stable")]
-        times, colour = observed.times[order], _COLOURS[place % len(_COLOURS)]
+        colour = _COLOURS[place % len(_COLOURS)]
         modelled = scale * (found.modelled - offsets)[order]
         measured = scale * (observed.values - offsets)[order]
         if kind == "landmark":
-            over_time.plot(modelled, measured, ".", color=colour, markersize=4, label=label)
+            panel.plot(modelled, measured, ".", color=colour, markersize=4, label=label)
         else:
-            over_time.plot(times, measured, ".", color=colour, markersize=4, label=label)
-            over_time.plot(times, modelled, "-", color=colour, linewidth=1.0)
-        left_over.plot(times, scale * found.fitted.residual[order], ".", color=colour, markersize=4)
-    over_time.set_ylabel(f"{kind} ({unit})")
-    over_time.set_title(f"{kind}s measured (dots) and modelled (lines)", fontsize=9, loc="left")
+            times = observed.times[order]
+            panel.plot(times, measured, ".", color=colour, markersize=4, label=label)
+            panel.plot(times, modelled, "-", color=colour, linewidth=1.0)
+    left = f"left over, RMS {scale * (found.scatter(kind) or 0.0):.3g} {unit}"
     if kind == "landmark":
-        over_time.set_title("places seen over places modelled", fontsize=9, loc="left")
-    over_time.legend(fontsize=8, frameon=False)
-    left_over.axhline(0.0, color="0.6", linewidth=0.8)
-    left_over.set_ylabel(f"left over ({unit})")
-    scatter = scale * (found.scatter(kind) or 0.0)
-    left_over.set_title(f"left over, RMS {scatter:.3g} {unit}", fontsize=9, loc="left")
-    for panel in (over_time, left_over):
-        _plain(panel)
+        panel.set(xlabel="modelled (mm)", ylabel="seen (mm)", title=f"landmarks; {left}")
+    else:
+        title = f"{kind}s measured (dots) and modelled (lines); {left}"
+        panel.set(xlabel="time (s)", ylabel=f"{kind} ({unit})", title=title)
+    panel.legend(fontsize=8, frameon=False)
 
 
-def _channels(found: StiffnessFit, its: np.ndarray, kind: str) -> list[tuple[str, np.ndarray]]:
+def _channels(found: StiffnessFit, kind: str) -> list[tuple[str, np.ndarray]]:
     observed = found.observations
+    its = observed.groups == GROUPS.index(kind)
     if kind == "landmark":
         numbers = np.flatnonzero(its).reshape(-1, 3)
         return [(axis, numbers[:, k]) for k, axis in enumerate("xyz")]
@@ -168,49 +143,15 @@ def _channels(found: StiffnessFit, its: np.ndarray, kind: str) -> list[tuple[str
     ]
 
 
-def _draw_force_over_depth(panel: Axes, found: StiffnessFit) -> None:
-    observed = found.observations
-    pressed = observed.depths > 0.0
-    for place, channel in enumerate(observed.channels):
-        if channel == 2:
-            its = np.flatnonzero(pressed & (observed.nuisance[:, place] == 1.0))
-            offset = (observed.nuisance @ found.fitted.nuisance)[its]
-            depth = 1e3 * observed.depths[its]
-            panel.plot(depth, -(observed.values[its] - offset), "k.", label="measured")
-            panel.plot(
-                depth,
-                -(found.modelled[its] - offset),
-                "o",
-                color="#D55E00",
-                mfc="none",
-                markersize=6,
-                label="modelled",
-            )
-            panel.legend(fontsize=8, frameon=False)
-    panel.set_xlabel("depth in the undeformed tissue (mm)")
-    panel.set_ylabel("force against the probe (N)")
-    _plain(panel)
-
-
 def _draw_moduli(panel: Axes, found: StiffnessFit) -> None:
-    names = list(found.moduli)
-    for row, name in enumerate(names):
+    for row, (name, modulus) in enumerate(found.moduli.items()):
         unit, interval = _unit(found, name), found.intervals.get(name)
-        modulus = found.moduli[name] / unit
-        if interval is None:
-            panel.plot(modulus, row, "o", color="0.5", mfc="none")
-            continue
-        panel.plot([interval.lower / unit, interval.upper / unit], [row, row], "-", color="#0072B2")
-        panel.plot(modulus, row, "o", color="#0072B2")
+        if interval is not None:
+            ends = [interval.lower / unit, interval.upper / unit]
+            panel.plot(ends, [row, row], "-", color="#0072B2")
+        fill = "none" if interval is None else "#0072B2"
+        panel.plot(modulus / unit, row, "o", color="#0072B2", mfc=fill)
     panel.set_xscale("log")
-    panel.set_yticks(range(len(names)), names)
+    panel.set_yticks(range(len(found.moduli)), list(found.moduli))
     panel.invert_yaxis()
     panel.set_xlabel(f"Young's modulus (kPa), {100 * found.confidence:g} % intervals; hollow: kept")
-    _plain(panel)
-
-
-def _plain(panel: Axes) -> None:
-    panel.grid(True, color="0.93")
-    panel.set_axisbelow(True)
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.tick_params(labelsize=8.5)
