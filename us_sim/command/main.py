@@ -117,13 +117,7 @@ class _Lasting:
     """Standard error that may be closed, or lead to a full disk: no work ends for that."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        if stream is None:  # nothing else may get its descriptor
-            while (file := os.open(os.devnull, os.O_WRONLY)) < 2:
-                pass
-            if file > 2:
-                os.close(file)
-            stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
-        self._stream = stream
+        self._stream = stream or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError, ValueError):

@@ -7,7 +7,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,8 +51,14 @@ def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Na
     from us_sim.run.processes import prepare_ros
 
     prepare_ros(network=args.network)
-    with _asker() as asker:
-        return command(asker, args)
+    from us_sim.run.monitored import ros_context
+
+    context = ros_context()
+    try:
+        with contextlib.closing(_Asker(context)) as asker:
+            return command(asker, args)
+    finally:
+        context.try_shutdown()
 
 
 def _list(asker: _Asker, args: argparse.Namespace) -> int:
@@ -188,8 +194,23 @@ def _flat(nested: dict[Any, Any], prefix: str = "") -> dict[str, Any]:
 class _Asker:
     """A hidden node that asks others for their parameters."""
 
-    def __init__(self, node: Any, executor: Any) -> None:
-        self._node, self._executor = node, executor
+    def __init__(self, context: Any) -> None:
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+
+        self._node = Node(
+            f"_us_sim_param_{os.getpid()}",
+            context=context,
+            enable_rosout=False,
+            start_parameter_services=False,
+            use_global_arguments=False,
+        )
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self._node)
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
 
     def nodes(self) -> list[str]:
         """The full names of all nodes but hidden ones, sorted."""
@@ -239,28 +260,3 @@ class _Asker:
     def _seen(self) -> list[str]:
         nodes = self._node.get_node_names_and_namespaces()
         return sorted(f"{space.rstrip('/')}/{name}" for name, space in nodes if name[0] != "_")
-
-
-@contextlib.contextmanager
-def _asker() -> Iterator[_Asker]:
-    from us_sim.run.monitored import ros_context
-
-    context = ros_context()
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.node import Node
-
-    node = Node(
-        f"_us_sim_param_{os.getpid()}",
-        context=context,
-        enable_rosout=False,
-        start_parameter_services=False,
-        use_global_arguments=False,
-    )
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
-        yield _Asker(node, executor)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()

@@ -62,19 +62,19 @@ POSE = "A pose"
 
 _OF_THE_SCENE = {
     "slice_interpolator": {
-        "acoustics.KEY": "imaging.acoustics",
-        "acoustics.tissues.LABEL.KEY": "imaging.acoustics.tissues.NAME",
-        "strain.KEY": "strain",
-        "m_mode.KEY": "m_mode",
-        "colour.KEY": "colour",
-        "spectrum.KEY": "spectrum",
-        "flow.STRUCTURE.KEY": "structures.NAME.flow",
+        "`acoustics.KEY`, but the last,": "imaging.acoustics",
+        "`acoustics.tissues.LABEL.KEY`": "imaging.acoustics.tissues.NAME",
+        "`strain.KEY`": "strain",
+        "`m_mode.KEY`": "m_mode",
+        "`colour.KEY`": "colour",
+        "`spectrum.KEY`": "spectrum",
+        "`flow.STRUCTURE.KEY`": "structures.NAME.flow",
     },
-    "probe_tracker": {"FILTER.KEY": "tracker.filter"},
-    "skin_deformer": {"membrane.KEY": "skin"},
+    "probe_tracker": {"`FILTER.KEY`": "tracker.filter"},
+    "skin_deformer": {"`membrane.KEY`, up to `steps`,": "skin"},
     "tissue_deformer": {
-        "SOLVER.KEY": "tissue.settings",
-        "materials.LABEL.KEY": "tissue.materials.NAME",
+        "`SOLVER.KEY`": "tissue.settings",
+        "`materials.LABEL.KEY`": "tissue.materials.NAME",
     },
 }
 """By node: parameters for the keys of a section of the scene, which can be set while running."""
@@ -178,7 +178,7 @@ def _nodes() -> Iterator[Section]:
                 text += [about] * (about != f"Of `{node}`.") + [_parameters(each)]
         if node in _OF_THE_SCENE:
             keys = _OF_THE_SCENE[node].items()
-            links = ", ".join(f"`{key}` of [{title}](#{anchor(title)})" for key, title in keys)
+            links = ", ".join(f"{key} of [{title}](#{anchor(title)})" for key, title in keys)
             text.append(f"While running, with the scene's defaults, where it names them: {links}.")
         if node == "slice_interpolator":
             companions = _names(f"{prefix}KEY" for prefix in COMPRESSED.values())

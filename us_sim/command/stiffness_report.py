@@ -20,7 +20,8 @@ from us_sim.volume.partial_file import partial_file
 def table(found: StiffnessFit) -> str:
     """Structures with their moduli, intervals and part in the force, and the residuals."""
     percent = f"{100 * found.confidence:g} %"
-    rows = [("structure", "E (kPa)", f"{percent} interval (kPa)", "×/÷", "part of force")]
+    heading = ("structure", "E (kPa)", f"{percent} interval (kPa)", "×/÷", "part of force")
+    rows: list[tuple[str, ...]] = [heading]
     for name, modulus in found.moduli.items():
         unit, interval = _unit(found, name), found.intervals.get(name)
         cells = ["kept", "", ""]

@@ -52,7 +52,8 @@ def draw_segmentation(volume: Volume, found: LabelMap, file: Path) -> None:
     figure = Figure(figsize=(13, 11))
     # Its places are given: to find them out takes matplotlib as long as all the drawing.
     panels = figure.subplots(
-        *(3, _SLICES), gridspec_kw={"left": 0.05, "right": 0.8, "bottom": 0.05, "top": 0.96}
+        *(3, _SLICES),
+        gridspec_kw={"left": 0.05, "right": 0.8, "bottom": 0.05, "top": 0.96, "hspace": 0.3},
     )
     bright = np.sqrt(255.0 * np.arange(256)).astype(np.uint8)[volume.intensities]  # for vessels
     lines = {label: _LINES[k % len(_LINES)] for k, label in enumerate(found.names)}

@@ -1,4 +1,4 @@
-"""The values of a DICOM header that go on, each with its reason; all others are dropped.
+"""The values of a DICOM header that go on; all others are dropped.
 
 Where voxels lie goes on as the grid itself. Beside it only numbers go on that say how the image
 was made, within the range that such a number has, and words from the standard's own closed lists.
@@ -27,33 +27,25 @@ class KeptNumber(NamedTuple):
     keyword: str  # of the standard
     low: float
     high: float
-    why: str
     length: int | None = 1  # None: any number of them, up to 16
     within: str = ""  # the sequence whose first item has it
 
 
 _REGIONS = "SequenceOfUltrasoundRegions"
-_POWER = "power of the sound"
-_SEEN_FROM = "where the transducer was, as seen from the volume"
-NUMBERS = tuple(
-    KeptNumber(*values)
-    for values in (
-        ("frame_time_ms", "FrameTime", 1e-2, 1e5, "time between images"),
-        ("cine_rate_per_s", "CineRate", 0.1, 1e4, "time between images"),
-        ("depth_of_scan_field_mm", "DepthOfScanField", 1, 1000, "depth of the image"),
-        ("depths_of_focus_mm", "DepthsOfFocus", 0.1, 1000, "where it is sharpest", None),
-        ("mechanical_index", "MechanicalIndex", 0, 10, "pressure of the sound"),
-        ("bone_thermal_index", "BoneThermalIndex", 0, 20, _POWER),
-        ("cranial_thermal_index", "CranialThermalIndex", 0, 20, _POWER),
-        ("soft_tissue_thermal_index", "SoftTissueThermalIndex", 0, 20, _POWER),
-        ("transducer_frequency_khz", "TransducerFrequency", 100, 1e5,
-         "wavelength, and with it the grain of speckle", 1, _REGIONS),
-        ("pulse_repetition_frequency_hz", "PulseRepetitionFrequency", 1, 1e6,
-         "depth and rate of the image", 1, _REGIONS),
-        ("apex_position_mm", "ApexPosition", -1e4, 1e4, "where a fan of lines has its apex", 3),
-        ("volume_to_transducer", "VolumeToTransducerMappingMatrix", -1e4, 1e4, _SEEN_FROM, 16),
-    )
-)  # fmt: skip
+NUMBERS = (
+    KeptNumber("frame_time_ms", "FrameTime", 1e-2, 1e5),
+    KeptNumber("cine_rate_per_s", "CineRate", 0.1, 1e4),
+    KeptNumber("depth_of_scan_field_mm", "DepthOfScanField", 1, 1000),
+    KeptNumber("depths_of_focus_mm", "DepthsOfFocus", 0.1, 1000, None),
+    KeptNumber("mechanical_index", "MechanicalIndex", 0, 10),
+    KeptNumber("bone_thermal_index", "BoneThermalIndex", 0, 20),
+    KeptNumber("cranial_thermal_index", "CranialThermalIndex", 0, 20),
+    KeptNumber("soft_tissue_thermal_index", "SoftTissueThermalIndex", 0, 20),
+    KeptNumber("transducer_frequency_khz", "TransducerFrequency", 100, 1e5, 1, _REGIONS),
+    KeptNumber("pulse_repetition_frequency_hz", "PulseRepetitionFrequency", 1, 1e6, 1, _REGIONS),
+    KeptNumber("apex_position_mm", "ApexPosition", -1e4, 1e4, 3),
+    KeptNumber("volume_to_transducer", "VolumeToTransducerMappingMatrix", -1e4, 1e4, 16),
+)
 
 
 def _listed(text: str) -> frozenset[str]:

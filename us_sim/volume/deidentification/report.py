@@ -11,12 +11,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.settings.spelling import counted
 from us_sim.volume.deidentification.importing import Import
-from us_sim.volume.deidentification.kept_values import NUMBERS
 from us_sim.volume.partial_file import partial_file
 
 _REPORT, _PICTURE = "report.md", "first_image.png"
@@ -37,11 +35,9 @@ def report_text(planned: Import, picture: str = "") -> str:
             "*The first image as it was. Green: kept. It may show a name: keep it where the "
             "original is kept.*",
         ]
-    reasons = {one.name: f": {one.why}" for one in NUMBERS}
-    reasons["frame_of_reference_uid"] = ": a new one of random numbers, in place of the original's"
     said += [
         "## Kept as they are",
-        _listed({name + reasons.get(name, ""): 1 for name in source.kept}),
+        _listed(dict.fromkeys(source.kept, 1)),
         "## Dropped",
         "The grid, the times, the grey values and what is blanked come of some of these. Names "
         "only: with values this report would say whose it is.",
@@ -59,28 +55,25 @@ def summary(planned: Import) -> str:
     return "; ".join(said)
 
 
-def report_picture(planned: Import) -> NDArray[np.uint8]:
-    """Return (rows, columns, 3) the first image as it was, with boxes around its kept parts."""
+def write_report(folder: Path, planned: Import) -> list[Path]:
+    """Write the report and its picture into a new folder, or one without a report.
+
+    The picture is the first image as it was, with boxes around its kept parts.
+    """
+    refuse_report(folder)
     picture = np.asarray(cv2.cvtColor(planned.source.first, cv2.COLOR_GRAY2BGR), np.uint8)
     for box in planned.parts:
         cv2.rectangle(picture, box[:2], box[2:], (80, 220, 80), 1)
-    return picture
-
-
-def write_report(folder: Path, planned: Import) -> list[Path]:
-    """Write the report and its picture into a new folder, or one without a report."""
-    refuse_report(folder)
-    picture = cv2.imencode(".png", report_picture(planned))[1].tobytes()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise VolumeError(f"{folder}: cannot be written: {error.strerror}") from error
-    texts = {_PICTURE: picture, _REPORT: report_text(planned, _PICTURE).encode()}
-    for name, content in texts.items():
-        with partial_file(folder / name) as partial:
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {
+        folder / _REPORT: report_text(planned, _PICTURE).encode(),
+        folder / _PICTURE: cv2.imencode(".png", picture)[1].tobytes(),
+    }
+    for path, data in content.items():
+        with partial_file(path) as partial:
             partial.touch(0o600)  # the owner's alone
-            partial.write_bytes(content)
-    return [folder / _REPORT, folder / _PICTURE]
+            partial.write_bytes(data)
+    return list(content)
 
 
 def refuse_report(folder: Path) -> None:
