@@ -68,15 +68,6 @@ def test_numbers_show_where_messages_are_missing(tmp_path, slow_disk):
     assert numbers == [1, 2, 3, 4 + lost]
 
 
-def test_without_a_queue_whoever_puts_waits_and_nothing_is_lost(tmp_path, slow_disk):
-    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=0)
-    bag.add_topic("/a", STRING)
-    threading.Timer(0.2, slow_disk.set).start()
-    assert all(bag.put("/a", bytes(100_000), EPOCH + k) for k in range(30))
-    bag.close()
-    assert read_bag(tmp_path).message_count == 30
-
-
 def test_a_full_disk_is_written_to_again_when_there_is_room(tmp_path, monkeypatch):
     monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.05)
     file = tmp_path / "session.mcap"
@@ -117,23 +108,6 @@ def test_a_failure_of_any_kind_is_counted_and_ends_nothing(tmp_path):
     assert read_bag(tmp_path).lost() == {"/a": 1}
 
 
-def test_what_was_kept_in_memory_always_fits(tmp_path, slow_disk):
-    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=100)
-    bag.add_topic("/a", STRING)
-    bag.put_all([Message("/a", bytes(100), EPOCH + k, EPOCH) for k in range(5)])
-    slow_disk.set()
-    bag.close()
-    assert read_bag(tmp_path).message_count == 5
-
-
-def test_an_unknown_type_is_refused_at_once(tmp_path):
-    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), 10**6)
-    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown"):
-        bag.add_topic("/a", "my_msgs/msg/Unheard")
-    bag.close()
-    assert not [thread for thread in threading.enumerate() if thread.name == "bag writer"]
-
-
 def test_a_pre_roll_keeps_the_last_seconds_and_latched_messages_of_any_age():
     kept = PreRoll(max_bytes=1000, duration=2.0)
     kept.add(Message("/mesh", b"....", 0, 0), latched=True)
@@ -141,3 +115,24 @@ def test_a_pre_roll_keeps_the_last_seconds_and_latched_messages_of_any_age():
         kept.add(Message("/note", b"....", second * 10**9, 0))
     assert [m.topic for m in kept.take()] == ["/mesh", *["/note"] * 3]
     assert kept.take() == []
+
+
+def test_without_a_queue_whoever_puts_waits_and_nothing_is_lost(tmp_path, slow_disk):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=0)
+    bag.add_topic("/a", STRING)
+    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown"):
+        bag.add_topic("/b", "my_msgs/msg/Unheard")
+    threading.Timer(0.2, slow_disk.set).start()
+    assert all(bag.put("/a", bytes(100_000), EPOCH + k) for k in range(30))
+    bag.close()
+    assert read_bag(tmp_path).message_count == 30
+    assert not [thread for thread in threading.enumerate() if thread.name == "bag writer"]
+
+
+def test_what_was_kept_in_memory_always_fits(tmp_path, slow_disk):
+    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=100)
+    bag.add_topic("/a", STRING)
+    bag.put_all([Message("/a", bytes(100), EPOCH + k, EPOCH) for k in range(5)])
+    slow_disk.set()
+    bag.close()
+    assert read_bag(tmp_path).message_count == 5
