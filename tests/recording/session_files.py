@@ -7,6 +7,9 @@ from us_sim.recording.writer import BagWriter
 
 EPOCH = 1_700_000_000_000_000_000
 PERIOD = 16_666_667
+STRING = "std_msgs/msg/String"
+HI = bytes.fromhex("00010000 03000000 686900")
+"""The CDR of a String "hi"."""
 TYPES = {
     "/probe/pose": "geometry_msgs/msg/PoseStamped",
     "/tissue/nodes": "sensor_msgs/msg/PointCloud2",
@@ -14,6 +17,11 @@ TYPES = {
     "/ultrasound/image": "sensor_msgs/msg/Image",
 }
 T = jazzy_definitions().types
+
+
+def text(content):
+    """A std_msgs/String of ASCII text as CDR."""
+    return b"\0\1\0\0" + (len(content) + 1).to_bytes(4, "little") + content.encode() + b"\0"
 
 
 def pose(stamp, z=0.0, x=0.0, w=1.0):

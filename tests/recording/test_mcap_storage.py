@@ -3,14 +3,11 @@
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from session_files import EPOCH, HI, STRING
 
 from us_sim.recording import mcap_storage
 from us_sim.recording.reader import read_bag
 from us_sim.recording.writer import BagWriter
-
-EPOCH = 1_700_000_000_000_000_000
-HI = bytes.fromhex("00010000 03000000 686900")
-STRING = "std_msgs/msg/String"
 
 
 def session(path, compression="none", count=400):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from session_files import EPOCH, HI
 from wrench_files import write_wrenches
 
 from us_sim.errors import BagError
@@ -16,9 +17,6 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import jazzy_definitions
 from us_sim.recording.wrench import WrenchRecord, read_wrenches
 from us_sim.recording.writer import BagWriter
-
-EPOCH = 1_700_000_000_000_000_000
-HI = bytes.fromhex("00010000 03000000 686900")
 
 
 def path_of(positions, orientations=None, **fields):

@@ -16,15 +16,12 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
+from session_files import EPOCH, HI, STRING
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import describe, read_bag
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
-
-STRING = "std_msgs/msg/String"
-EPOCH = 1_700_000_000_000_000_000
-HI = bytes.fromhex("00010000 03000000 686900")
 
 
 def write_session(path, compression="none", chunk_size=2000, count=200):

@@ -5,14 +5,12 @@ import threading
 import time
 
 import pytest
+from session_files import EPOCH, STRING
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.recording.write_behind import Message, PreRoll, WriteBehind
 from us_sim.recording.writer import BagWriter
-
-STRING = "std_msgs/msg/String"
-EPOCH = 1_700_000_000_000_000_000
 
 
 def wait_until(condition, seconds=20):

@@ -13,6 +13,7 @@ from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
+from session_files import EPOCH, HI, STRING, text
 
 from us_sim.errors import BagError
 from us_sim.recording.metadata import read_metadata
@@ -20,15 +21,6 @@ from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import repair
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
-
-STRING = "std_msgs/msg/String"
-EPOCH = 1_700_000_000_000_000_000
-HI = bytes.fromhex("00010000 03000000 686900")
-
-
-def text(content):
-    """A std_msgs/String of ASCII text as CDR."""
-    return b"\0\1\0\0" + (len(content) + 1).to_bytes(4, "little") + content.encode() + b"\0"
 
 
 def write_all(bag, messages):
