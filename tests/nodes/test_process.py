@@ -11,10 +11,12 @@ import pytest
 from us_sim.nodes import process
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.process import go_first, scheduling_of
+from us_sim.share import find_bag
 
 
 def test_ctrl_c_among_imports_is_silent():
-    command = [sys.executable, "-X", "importtime", "-m", "us_sim.nodes.path_player"]
+    played = ["--ros-args", "-p", f"path:={find_bag('press_and_slide.mcap')}"]  # if it gets so far
+    command = [sys.executable, "-X", "importtime", "-m", "us_sim.nodes.path_player", *played]
     node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
     said = []
     for line in node.stderr:

@@ -177,7 +177,7 @@ class Supervisor:
             self._group.start(ready)
 
     def end(self) -> None:
-        """End all nodes; a recorder that had to be killed is lost, as is a node that is not back."""
+        """End all nodes; a recorder that had to be killed is lost, as is who is not back."""
         for loss, _ in self._away.values():
             loss.given_up = "was not back when the run ended"
         if RECORDER in self._group.stop():
