@@ -6,6 +6,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import architecture as structure
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -16,6 +17,7 @@ def test_every_room_has_its_place_in_a_layer():
     assert set(structure.places()) == set(structure.rooms())
 
 
+@pytest.mark.slow
 def test_no_arrow_leads_to_a_layer_above():
     layer = {
         room: number
@@ -65,6 +67,7 @@ def test_the_page_has_each_rooms_own_sentence():
     assert {room: told.get(room) for room in said} == said
 
 
+@pytest.mark.slow
 def test_every_class_on_the_page_is_where_it_says():
     links = re.findall(r"\[([A-Z]\w+)\]\(\.\./(us_sim/[\w/]+\.py)\)", PAGE)
     assert len(links) > 15

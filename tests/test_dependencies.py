@@ -79,6 +79,7 @@ def parameters(name):
     return None if takes_any else set(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["us_sim", "tests"])
 def test_the_installed_versions_have_all_that_is_used(folder):
     """Also the oldest versions that `setup.py` allows, with which CI runs this."""

@@ -127,6 +127,7 @@ def test_code_of_an_earlier_source_is_let_go(kept, kernel, tmp_path):
     assert the_file(kept) != earlier
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_no_change_of_a_file_goes_unnoticed(tmp_path_factory, data):

@@ -91,6 +91,7 @@ def test_every_piece_of_a_scene_can_be_read(page):
         Reader(str(page), error=SceneError).read(Scene, document)
 
 
+@pytest.mark.slow
 def test_the_readmes_script_runs_an_episode():
     (script,) = (c for c in re.findall(r"```python\n(.*?)```", README, re.S) if "rclpy" not in c)
     names: dict = {}

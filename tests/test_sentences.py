@@ -5,6 +5,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import us_sim
 
 PARSING = {
@@ -35,6 +37,7 @@ def parsed(tree: ast.AST) -> Iterator[tuple[int, str]]:
         yield from ((node.lineno, text) for each in literals for text in sentences(each))
 
 
+@pytest.mark.slow
 def test_no_code_takes_a_sentence_apart():
     root = Path(us_sim.__file__).parent
     found = {

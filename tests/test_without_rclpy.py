@@ -84,6 +84,7 @@ def last_line(ran):
     return ran.stdout.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_only_nodes_and_what_looks_at_them_import_ros(python):
     needs = set(json.loads(last_line(python("-c", IMPORTS, json.dumps(ROS)))))
     assert "us_sim.nodes.probe_tracker" in needs
@@ -92,12 +93,14 @@ def test_only_nodes_and_what_looks_at_them_import_ros(python):
     assert not needs & {"us_sim.nodes.settings", "us_sim.nodes.topics"}
 
 
+@pytest.mark.slow
 def test_an_environment_is_scanned(python, small_scene):
     grey, force = map(float, last_line(python("-c", SCAN, small_scene)).split())
     assert grey > 10
     assert force > 0.5  # N
 
 
+@pytest.mark.slow
 def test_commands_on_files_do_their_work(python, tmp_path, small_scene):
     session, folder = write(tmp_path / "s.mcap", press(30)), tmp_path / "made"
     folder.mkdir()
@@ -136,11 +139,13 @@ def test_commands_on_files_do_their_work(python, tmp_path, small_scene):
     assert (folder / "reference.md").read_text() == reference.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_time_to_publish_an_image_is_left_out(python):
     program = "from us_sim.evaluation.processes import publishing_ms; print(publishing_ms(8))"
     assert last_line(python("-c", program)) == "None"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

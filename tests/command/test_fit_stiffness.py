@@ -48,6 +48,7 @@ def felt(press: KnownPress, wrenches: np.ndarray | None = None, frame="probe") -
     return WrenchRecord("/probe/wrench", frame, press.path.stamps, made)
 
 
+@pytest.mark.slow
 def test_a_press_gives_a_scene_with_its_moduli_and_a_picture(press, small_scene, tmp_path, capsys):
     wrenches = press.noisy(0.005, np.random.default_rng(3))
     recording = session(tmp_path / "bag", press.path, felt(press, wrenches))
@@ -97,6 +98,7 @@ def test_what_is_no_press_is_one_sentence(press, small_scene, tmp_path, capsys, 
     assert not list(tmp_path.glob("*fitted*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
@@ -129,6 +131,7 @@ def test_a_scene_without_tissue_is_refused(tmp_path, capsys):
     assert "tissue: is missing" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
     grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     grid[:3, 3] = [-0.04, -0.03, 0.0]

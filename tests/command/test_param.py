@@ -138,6 +138,7 @@ def test_a_file_is_loaded_and_each_refusal_told(node, tmp_path, capsys) -> None:
     assert "has no `ros__parameters` below `/left/sample`" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -25,6 +25,7 @@ def sweep(tmp_path):
     return write_sweep(tmp_path / "doe_jane.igs.mha", block, matrices, **more), block
 
 
+@pytest.mark.slow
 def test_a_sweep_becomes_a_volume_and_a_picture(sweep, tmp_path, capsys):
     path, block = sweep
     out = tmp_path / "volume.nrrd"

@@ -23,6 +23,7 @@ def test_the_page_is_what_the_code_says():
     )
 
 
+@pytest.mark.slow
 def test_every_link_leads_to_one_heading():
     text = reference_page()
     headings = [anchor(title) for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)]

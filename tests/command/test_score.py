@@ -20,6 +20,7 @@ def table(folder):
     return {(row["MetricName"], row["MetricRoles"]): row["MetricValue"] for row in rows}
 
 
+@pytest.mark.slow
 def test_a_press_of_8_newtons_for_two_seconds(tmp_path, capsys):
     session = write(tmp_path / "s.mcap", press(120))
     assert main(["score", str(session), "--out", str(tmp_path), "--force-limit", "4 N"]) == 0
@@ -52,6 +53,7 @@ def test_without_force_it_is_said_and_not_zero(tmp_path, capsys):
     assert not [n for n, _ in table(tmp_path) if "Force" in n or "Contact" in n or " N" in n]
 
 
+@pytest.mark.slow
 def test_an_exercise_is_told_step_by_step(tmp_path, capsys):
     session = write(tmp_path / "s.mcap", press(120))
     file = tmp_path / "e.yaml"

@@ -57,6 +57,7 @@ def contents(folder):
     return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
     assert main(["segment", str(case), "--seeds", seeds]) == 0
     said = capsys.readouterr().out
@@ -80,6 +81,7 @@ def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
     assert labels.names == {1: "vein", 2: "body"}
 
 
+@pytest.mark.slow
 def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, capsys):
     file = tmp_path / "doe_jane.seg.nrrd"
     write_labels(file, block(), {6: (0.125, 0.25, 0.5)})

@@ -20,6 +20,7 @@ def test_spots_are_where_they_were_drawn_and_the_largest_comes_first():
     assert dark_spots(np.zeros((256, 256), np.uint8)) == []
 
 
+@pytest.mark.slow
 def test_the_vein_is_closed_and_let_go_by_the_image_alone():
     episode = {"steps": 150, "observe": ["image"]}
     environment = ScanEnvironment("CompressVein", settings={"episode": episode})

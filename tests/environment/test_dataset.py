@@ -56,6 +56,7 @@ def steps_of(shard):
     return list(steps.values())
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte(scene, made, tmp_path):
     assert make(scene, tmp_path / "set", "--task", "FindVein", "--workers", "2") == 0
     assert digests(tmp_path / "set") == digests(made)
@@ -185,6 +186,7 @@ def test_a_node_that_is_killed_loses_and_doubles_nothing(cluster, scene, tmp_pat
     assert digests(tmp_path / "ray") == digests(tmp_path / "one")
 
 
+@pytest.mark.slow
 def test_an_address_of_fsspec_holds_the_same_bytes(scene, made, tmp_path):
     upath = pytest.importorskip("upath", reason=WITHOUT_RAY)
     there = upath.UPath("memory://dataset/set")

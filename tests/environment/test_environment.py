@@ -36,6 +36,7 @@ def plain(scene):
     return ScanEnvironment("HoldContact", scene=scene, settings=settings)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error:.*:UserWarning")
 @pytest.mark.parametrize("task", us_sim.environment.TASK_NAMES)
 def test_gymnasium_finds_no_fault(task, scene):
@@ -71,6 +72,7 @@ print(bytes_of(ScanEnvironment("FindVein", scene={scene!r}, settings={settings!r
 """
 
 
+@pytest.mark.slow
 def test_a_seed_decides_every_byte_here_and_in_another_process(scene):
     settings = {"tissue": {"solver": "fem"}, "episode": {"observe": EVERYTHING}}
     environment = ScanEnvironment("FindVein", scene=scene, settings=settings)
@@ -81,6 +83,7 @@ def test_a_seed_decides_every_byte_here_and_in_another_process(scene):
     assert (first, other.stdout.strip()) == (again, again), other.stderr
 
 
+@pytest.mark.slow
 def test_other_processes_step_as_this_one_does_though_numba_and_threads_are_there(scene):
     def make():
         import us_sim.environment  # noqa: F401 - as in a process of its own

@@ -257,6 +257,7 @@ def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench,
         assert node.health.problems("pose age") == times
 
 
+@pytest.mark.slow
 def test_diagnostics_warn_for_as_long_as_poses_stay_away(bench, show):
     node = show(stale_after=1.0, lost_after=60.0)
     reports = bench.collect(DiagnosticArray, "diagnostics")

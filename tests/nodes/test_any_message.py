@@ -248,6 +248,7 @@ def test_no_message_of_any_source_ends_the_tracker(bench, small_scene, tmp_path,
     answers(bench, good, poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "output"), [(TissueDeformer, "tissue/nodes"), (SkinDeformer, "skin/nodes")]
 )
@@ -309,6 +310,7 @@ def test_no_message_ends_the_bridge(bench, small_scene, monkeypatch):
             assert np.isfinite(matrix).all()
 
 
+@pytest.mark.slow
 def test_no_message_ends_the_rendering_for_the_hand(bench, small_scene, tmp_path):
     scene = tmp_path / "haptic.yaml"
     section = "{source: haptic, haptic: {rate: 200, ramp: 20 ms, model_timeout: 5 s}}"

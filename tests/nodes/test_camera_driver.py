@@ -86,6 +86,7 @@ def test_a_looping_video_goes_on_and_the_latency_makes_stamps_earlier(bench, vid
         camera_from(infos[0])
 
 
+@pytest.mark.slow
 def test_a_video_that_began_earlier_goes_on_where_it_would_be(bench, video):
     now = bench.peer.get_clock().now().nanoseconds
     begun = 1e-9 * now - 30.0

@@ -49,6 +49,7 @@ def watcher():
     child.communicate()
 
 
+@pytest.mark.slow
 def test_an_image_of_512_by_512_takes_two_milliseconds_of_a_core_at_most(bench, watcher):
     pixels = np.random.default_rng(4).integers(1, 256, (512, 512), dtype=np.uint8)
     publisher = bench.peer.create_publisher(Image, "ultrasound/image", STREAM)

@@ -89,6 +89,7 @@ def attempt(node: Any, name: str, value: object) -> Any:
     return node.set_parameters([Parameter(name, value=value)])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NODES)
 def test_every_setting_is_shown_and_only_what_may_change_can_be_set(bench, scene, tmp_path, name):
     node = made(bench, name, scene, tmp_path)
@@ -248,6 +249,7 @@ def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, mo
     assert node.health.state == "fem"
 
 
+@pytest.mark.slow
 def test_a_vein_becomes_a_lumen_while_it_runs(pressed):
     node, press = pressed(solver="fem_nonlinear", lockstep=True)
     assert node.get_parameter("materials.vein.lumen_pressure").value == 0.0  # a solid

@@ -246,6 +246,7 @@ def test_of_a_damaged_recording_the_rest_is_played_and_what_is_missing_is_said(b
     assert not player.failures
 
 
+@pytest.mark.slow
 def test_a_damaged_recording_ends_the_player_with_a_status(damaged):
     command = [sys.executable, "-m", "us_sim.nodes.session_player", "--ros-args"]
     ended = subprocess.run(

@@ -117,6 +117,7 @@ UNUSED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("modules", "unused"), UNUSED)
 def test_what_a_node_does_not_use_it_does_not_import(modules, unused):
     program = f"import sys, {modules}\nprint(*({unused!r} & set(sys.modules)))"

@@ -214,6 +214,7 @@ def test_the_bag_that_was_played_is_attached_whole(bench, tmp_path, small_scene,
         path_of(again, elsewhere)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "why"),
     [
@@ -291,6 +292,7 @@ time.sleep(1.0)
 """
 
 
+@pytest.mark.slow
 def test_what_a_publisher_overwrites_before_it_was_sent_is_counted(bench, tmp_path):
     file = tmp_path / "session.mcap"
     recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
@@ -307,6 +309,7 @@ def test_what_a_publisher_overwrites_before_it_was_sent_is_counted(bench, tmp_pa
     assert read_bag(file).lost() == {"/note": 302 - len(texts(file))}
 
 
+@pytest.mark.slow
 def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_path):
     file = tmp_path / "session.mcap"
     recorder = bench.make(SessionRecorder, file=str(file), topics=["/note"])
@@ -385,6 +388,7 @@ def test_types_that_are_not_here():
         message_type("my_msgs/msg/Unheard")
 
 
+@pytest.mark.slow
 def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     file = tmp_path / "session.mcap"
     file.write_bytes(b"precious")
@@ -396,6 +400,7 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     assert not read_bag(tmp_path / "session_1.mcap").note
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_said_and_survived(bench, quiet, monkeypatch):
     full = [False]
     flush = PatientFile.flush

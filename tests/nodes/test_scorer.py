@@ -82,6 +82,7 @@ def ask(bench, name):
     return future.result().success
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("scanned")
 def test_the_picture_is_drawn_once_passed_and_when_asked_for_and_cleared(bench):
     pictures = bench.collect(CompressedImage, "score/picture", latched=True)

@@ -62,6 +62,7 @@ def test_topics_can_be_chosen_and_left_out(bench, tmp_path):
     assert [topic.name for topic in read_bag(tmp_path / "a.mcap").topics] == ["/wanted"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "topic", ["tissue/structures", "ultrasound/image_annotated", "ultrasound/displacement"]
 )
@@ -90,6 +91,7 @@ def test_what_is_made_on_demand_is_recorded_beside_all_others(bench, tmp_path):
     assert annotated.get_subscription_count() == 0
 
 
+@pytest.mark.slow
 def test_each_simulator_on_a_domain_is_recorded_alone(bench, tmp_path, small_scene):
     def start(kind, space, **parameters):
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
@@ -132,6 +134,7 @@ def test_each_simulator_on_a_domain_is_recorded_alone(bench, tmp_path, small_sce
     assert heard == {ordered} | {f"{space}/ultrasound/image" for space in ("", "/a", "/b")}
 
 
+@pytest.mark.slow
 def test_a_recording_is_not_overwritten(bench, tmp_path):
     file = tmp_path / "session.mcap"
     file.write_bytes(b"precious")
@@ -140,6 +143,7 @@ def test_a_recording_is_not_overwritten(bench, tmp_path):
     assert file.read_bytes() == b"precious"
 
 
+@pytest.mark.slow
 def test_diagnostics_say_that_a_recording_beside_another_gets_no_metadata(bench, tmp_path):
     def notes():
         said = [status for message in reports for status in message.status]
@@ -177,6 +181,7 @@ print(resident() - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
 def test_memory_of_large_messages_is_given_back():
     command = [sys.executable, "-c", GIVEN_BACK]

@@ -114,6 +114,7 @@ def test_images_follow_at_any_rate(graph, rate):
     assert 0 <= told[-1] <= 1e9 * played + 1e9  # stamped with the recording's time
 
 
+@pytest.mark.slow
 def test_nothing_ages_while_the_clock_stands(graph):
     graph.set(paused=False)
     graph.bench.spin_until(lambda: len(graph.images) > 20)
@@ -127,6 +128,7 @@ def test_nothing_ages_while_the_clock_stands(graph):
     graph.bench.spin_until(lambda: len(graph.images) > count + 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("back", [0.3, 2.0])  # s: less and more than a late pose may be late
 def test_the_graph_goes_along_when_the_clock_jumps_back(graph, back):
     graph.set(paused=False, time=3.0, rate=0.25)  # a busy machine must not miss the jump

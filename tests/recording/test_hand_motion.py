@@ -44,6 +44,7 @@ def speeds(path, rate=60):
     return rate * moved, rate * (turns[:-1].inv() * turns[1:]).magnitude()
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(motions, rooms)
 def test_the_median_speed_is_the_one_asked_for(motion, room):
@@ -59,6 +60,7 @@ def test_the_median_speed_is_the_one_asked_for(motion, room):
         assert turned.max() == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(motions, rooms)
 def test_it_stays_in_its_room(motion, room):
@@ -76,6 +78,7 @@ def test_it_stays_in_its_room(motion, room):
     np.testing.assert_allclose(np.linalg.norm(path.orientations, axis=1), 1, atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(motions)
 def test_a_seed_gives_one_motion_and_another_another(motion):
@@ -88,6 +91,7 @@ def test_a_seed_gives_one_motion_and_another_another(motion):
     assert not np.array_equal(path.orientations, other.orientations) or not KINDS[kind].turns
 
 
+@pytest.mark.slow
 def test_a_longer_motion_takes_all_of_its_room():
     path = hand_motion("free", "brisk", 3, 60.0)
     for values, low, high in zip(path.positions.T, (-18, -12, -5), (18, 12, 15), strict=True):
@@ -97,6 +101,7 @@ def test_a_longer_motion_takes_all_of_its_room():
         assert parts.max() < 0.4
 
 
+@pytest.mark.slow
 def test_it_is_smooth():
     # The curves are analytic: at twice the rate accelerations from pose to pose are the same.
     accelerations = []

@@ -56,6 +56,7 @@ poses = st.integers(1, 20).flatmap(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(poses, st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9))
 def test_round_trip_to_the_bit_with_stamps_that_go_back(tmp_path_factory, poses, frame_id):

@@ -63,6 +63,7 @@ def test_real_bags_as_rosbags_reads_them(shared_data, name):
     assert not bag.note
 
 
+@pytest.mark.slow
 def test_every_bag_of_rosbag2s_own_tests_is_read_or_refused_in_a_sentence(shared_data):
     root = shared_data / "mcap-rosbag2"
     folders = {file.parent for file in root.rglob("metadata.yaml")} - set(root.rglob("empty_bag"))

@@ -37,6 +37,7 @@ def session(tmp_path):
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["none", "zstd"])
 @pytest.mark.parametrize("after", [0.0, 0.9])
 def test_a_killed_recording_lacks_less_than_a_second_and_is_repaired(tmp_path, after, compression):
@@ -218,6 +219,7 @@ def fields(content, begin):
         begin = end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("compression", "indexed", "kinds"),
     [("none", True, len(FIELDS)), ("zstd", True, 14), ("none", False, 8), ("zstd", False, 7)],

@@ -37,6 +37,7 @@ def video(path, tmp_path_factory):
     return made
 
 
+@pytest.mark.slow
 def test_a_video_that_was_cut_off_is_made_again(tmp_path, monkeypatch):
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
     scene, short = load_scene("upper_arm_camera"), press_and_slide(rate=60.0, duration=0.1)
@@ -56,6 +57,7 @@ def test_every_second_pose_of_a_path_of_60_hz_is_in_the_video(path):
         np.testing.assert_allclose(pose.position, path.positions[2 * number], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_the_video_finds_the_probe_where_it_was(video):
     scene = load_scene("upper_arm_camera")
     registration, calibration = tracker_poses_of(scene)

@@ -54,6 +54,7 @@ def files_of(pid):
     return [Path(link) for link in links if link.startswith("/dev/shm/fastrtps_")]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere these files are not in /dev/shm")
 def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "24")
@@ -119,6 +120,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0.0, 2.0])
 def test_what_was_started_ends_with_a_killed_parent(after):
     parent = subprocess.Popen([sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True)
@@ -169,6 +171,7 @@ def test_the_second_is_refused_until_the_first_has_ended():
         pass
 
 
+@pytest.mark.slow
 def test_of_six_processes_at_once_one_goes_on_and_the_others_name_it():
     command = [sys.executable, "-c", BEGIN]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -108,6 +108,7 @@ def test_a_volume_elsewhere(tmp_path, capsys, attached):
     assert "other.nrrd is not the volume that" in told
 
 
+@pytest.mark.slow
 def test_other_versions_are_told(tmp_path, attached):
     text = versions()
     numpy = next(line for line in text.splitlines() if line.startswith("numpy "))

@@ -31,6 +31,7 @@ def test_log_times_that_go_back_are_said_with_their_place(shared_file):
     assert any("go back by 29.983 s, from 29.983 s on" in text for text in said)
 
 
+@pytest.mark.slow
 def test_a_bag_of_every_type_is_read_to_the_end(shared_file):
     checked = check(
         read_bag(shared_file("cases/bag-every-type/test_bag_mcap/metadata.yaml").parent)

@@ -127,6 +127,7 @@ def tissue_metrics(moved, matrices, surface):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "read"), [("Lumbar", lumbar), ("InPlane", in_plane)])
 def test_every_value_of_perk_tutors_tables(shared_data, name, read):
     folder = shared_data / "perktutor-truth" / name

@@ -64,6 +64,7 @@ class Node:
         return told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "probe", "steering", "flip"),
     [

@@ -5,6 +5,7 @@ How fast a page of a real browser takes what streams.
 
 from typing import Any
 
+import pytest
 from awaiting import until
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,6 +19,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(
     st.text(min_size=1),
     st.integers(0, 2**53),

@@ -260,6 +260,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has another unit elsewhere")
 def test_an_import_takes_no_more_than_three_times_its_size(tmp_path):
     voxels = np.zeros((256, 256, 256), np.uint8)

@@ -101,6 +101,7 @@ def import_whole(path, out):
         look_at([path], out, ImportSettings(keep_whole_image=True, spacing="1,1")).write()
 
 
+@pytest.mark.slow
 def test_of_every_file_that_comes_with_pydicom(tmp_path, own_words):
     imported, sentences = 0, []
     bundled = sorted(p for p in BUNDLED.rglob("*") if p.is_file() and p.suffix in (".dcm", ""))

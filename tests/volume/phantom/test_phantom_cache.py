@@ -104,6 +104,7 @@ def test_a_cache_that_cannot_be_written_costs_only_a_warning(tmp_path, monkeypat
     np.testing.assert_array_equal(volume.intensities, _small().intensities)
 
 
+@pytest.mark.slow
 def test_processes_that_ask_at_once_make_it_once(cache, tmp_path):
     marks = tmp_path / "marks"
     marks.mkdir()

@@ -68,6 +68,7 @@ def truth(made):
     return field(indices @ matrix[:3, :3].T + matrix[:3, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["nearest", "linear"])
 @pytest.mark.parametrize("compounding", COMPOUNDINGS)
 def test_a_known_field_comes_back(sweep, method, compounding):
@@ -105,6 +106,7 @@ def compounded(values, compounding):
     return grey[0, 0, 0]
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(0, 255), min_size=1, max_size=9))
 def test_what_is_compounded_is_numpys(values):
@@ -271,6 +273,7 @@ def test_volumes_of_plus_come_out_as_plus_made_them(shared_file, name):
     assert compare(made, reference)[0] >= least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("compounding", "correlation", "within"), [("mean", 0.998, 0.98), ("max", 0.986, 0.6)]
 )

@@ -51,6 +51,7 @@ def test_a_ball_keeps_its_volume_and_faces_outwards(radius, steps, mirrored, see
     np.testing.assert_allclose(vertices.mean(axis=0), centre, atol=0.3 * max(steps))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_structures_of_the_arm_keep_their_volume_within_the_triangles_allowed():
     arm = cached_phantom("upper_arm", seed=1, voxel_size=0.6e-3)

@@ -116,6 +116,7 @@ def vtk_distance(one, other):
     return max(abs(signed.EvaluateFunction(point)) for point in one.vertices[::40])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("decimation", "farthest"), [(0.5, 0.02e-3), (0.9, 0.15e-3)])
 def test_fewer_triangles_keep_shape_volume_and_handle(decimation, farthest):
     volume = labelled(ring(*GRID))
