@@ -22,7 +22,6 @@ def box_of_image(page: Any) -> Any:
     return page.evaluate("document.querySelector('.us-image').getBoundingClientRect().toJSON()")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "quantity", "sign"),
     [
@@ -58,7 +57,6 @@ def test_arrows_slide_and_go_on_while_they_are_held(page: Any, viewer: FakeHand)
     assert len(viewer.asked) == count
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pause", [0, 300])  # ms that the page takes for a picture
 def test_a_held_key_moves_the_probe_by_the_time_that_it_was_held(
     page: Any, viewer: FakeHand, pause: int
@@ -149,7 +147,6 @@ def test_a_number_beyond_its_range_is_put_to_the_nearest_end_and_that_is_said(
     assert "us-wrong" not in line.get_attribute("class")
 
 
-@pytest.mark.slow
 def test_a_press_beyond_its_range_is_said_in_millimetres(page: Any, viewer: FakeHand) -> None:
     press = page.locator(".us-quantity input[type=number]").first
     press.fill("500")
@@ -159,7 +156,6 @@ def test_a_press_beyond_its_range_is_said_in_millimetres(page: Any, viewer: Fake
     viewer.until(lambda: viewer.asked[-1:] and viewer.asked[-1]["to"] == {"press": 0.025})
 
 
-@pytest.mark.slow
 def test_a_tab_and_a_button_leave_the_page_the_keys_that_they_do_not_use(
     page: Any, viewer: FakeHand
 ) -> None:
@@ -184,7 +180,6 @@ def test_a_tab_and_a_button_leave_the_page_the_keys_that_they_do_not_use(
     assert viewer.total("slide") == pytest.approx([7.5e-4, 0])
 
 
-@pytest.mark.slow
 def test_the_space_bar_is_the_pages_after_a_click_and_a_buttons_after_tab(
     page: Any, viewer: FakeHand
 ) -> None:
@@ -243,7 +238,6 @@ def test_dragging_down_the_image_presses_as_many_millimetres(page: Any, viewer: 
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("flip", [1, -1])
 def test_dragging_sideways_slides_and_the_wheel_presses(
     page: Any, viewer: FakeHand, flip: int
@@ -264,7 +258,6 @@ def test_dragging_sideways_slides_and_the_wheel_presses(
     viewer.until(lambda: viewer.total("press") == pytest.approx(1.5e-3))
 
 
-@pytest.mark.slow
 def test_over_a_frozen_image_the_probe_stays_and_that_is_said(page: Any, viewer: FakeHand) -> None:
     box = box_of_image(page)
     x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
@@ -324,7 +317,6 @@ def test_two_fingers_press_and_rotate(page: Any, viewer: FakeHand) -> None:
     assert viewer.total("press") == pytest.approx(37.5 * metres, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_sliders_show_how_the_probe_is_held_and_move_it(page: Any, viewer: FakeHand) -> None:
     values = page.locator(".us-quantity input[type=number]").evaluate_all(
         "entries => entries.map(entry => entry.value)"
@@ -338,7 +330,6 @@ def test_sliders_show_how_the_probe_is_held_and_move_it(page: Any, viewer: FakeH
     viewer.until(lambda: viewer.asked[-1].get("go") == "home")
 
 
-@pytest.mark.slow
 def test_who_else_leads_is_said_and_what_is_refused(page: Any, viewer: FakeHand) -> None:
     said = page.locator(".us-said")
     page.keyboard.press("l")
@@ -351,7 +342,6 @@ def test_who_else_leads_is_said_and_what_is_refused(page: Any, viewer: FakeHand)
     assert "us-wrong" not in (said.get_attribute("class") or "")
 
 
-@pytest.mark.slow
 def test_the_delay_counts_from_the_key_to_the_painted_image(page: Any, viewer: FakeHand) -> None:
     assert page.evaluate("usSim.latency()") == {"count": 0}
     page.keyboard.press("s")
@@ -421,7 +411,6 @@ def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
     assert told.inner_text().startswith("Nobody holds the probe")
 
 
-@pytest.mark.slow
 def test_it_says_when_another_page_moves_the_probe_and_that_it_did_so_last(
     page: Any, viewer: FakeHand
 ) -> None:
@@ -437,7 +426,6 @@ def test_it_says_when_another_page_moves_the_probe_and_that_it_did_so_last(
         page.wait_for_function(said, arg="You hold the probe")
 
 
-@pytest.mark.slow
 def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_took_it(
     page: Any, viewer: FakeHand
 ) -> None:
@@ -461,7 +449,6 @@ def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_t
     assert set(viewer.takes) == {source}
 
 
-@pytest.mark.slow
 def test_a_viewer_that_says_nothing_any_more_does_not_answer(page: Any, viewer: FakeHand) -> None:
     said = "text => document.querySelector('.us-said').textContent.includes(text)"
     viewer.say(every=0.2)
@@ -473,7 +460,6 @@ def test_a_viewer_that_says_nothing_any_more_does_not_answer(page: Any, viewer: 
     page.wait_for_function(said, arg="Nobody holds the probe")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("width", [768, 1024, 1280])
 def test_who_holds_the_probe_can_be_read_whole_beside_how_soon_it_is_seen(
     page: Any, viewer: FakeHand, width: int

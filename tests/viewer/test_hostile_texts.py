@@ -92,7 +92,6 @@ def stranger(simulator: Simulator) -> Iterator[None]:
     bench.close()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("stranger")
 def test_no_text_of_others_becomes_part_of_the_page(page: Any, simulator: Simulator) -> None:
     hand = FakeHand(simulator)

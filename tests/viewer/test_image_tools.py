@@ -57,7 +57,6 @@ def await_grey(page: Any, grey: int) -> None:
     )
 
 
-@pytest.mark.slow
 def test_nothing_is_drawn_or_measured_before_the_first_image(
     browser: Any, served: Any, simulator: Simulator, images: Images
 ) -> None:
@@ -129,7 +128,6 @@ def test_distances_are_right_to_a_tenth_of_a_millimetre(
     assert float(value.split()[0]) == pytest.approx(math.dist(start, end), abs=0.1)
 
 
-@pytest.mark.slow
 def test_several_distances_and_their_ends_can_be_dragged(page: Any) -> None:
     for depth, length in ((8, 10), (20, 6)):
         page.get_by_role("button", name="Distance", exact=True).click()
@@ -161,7 +159,6 @@ def test_the_area_of_an_ellipse_and_its_circumference(page: Any) -> None:
     assert len(values(page)) == 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("tool", ["Distance", "Ellipse"])
 def test_measures_are_put_and_moved_by_keys_alone(page: Any, tool: str) -> None:
     page.get_by_role("button", name=tool, exact=True).focus()
@@ -211,7 +208,6 @@ def test_a_text_stays_where_it_was_written(page: Any) -> None:
     assert middle == pytest.approx(at(page, 5, 12), abs=1.0)
 
 
-@pytest.mark.slow
 def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
     page: Any, images: Images
 ) -> None:
@@ -237,7 +233,6 @@ def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
     await_grey(page, 120)
 
 
-@pytest.mark.slow
 def test_a_measure_is_seen_with_its_frame_only(page: Any, images: Images) -> None:
     other = [*MATRIX[:9], 2 * DOWN, *MATRIX[10:]]  # as deep again
     images.show(41, matrix=other)
@@ -331,7 +326,6 @@ def test_the_loop_has_no_image_that_was_taken_long_before_the_others(
     assert page.evaluate(KEPT) == [54, 55, 56]
 
 
-@pytest.mark.slow
 def test_of_another_scene_no_image_is_kept_frozen_or_on_the_plane(
     page: Any, images: Images, simulator: Simulator
 ) -> None:
@@ -436,7 +430,6 @@ def show_annotated(page: Any, simulator: Simulator, columns: int, rows: int) -> 
     )
 
 
-@pytest.mark.slow
 def test_the_annotated_picture_is_measured_as_the_image_below_it(
     page: Any, simulator: Simulator
 ) -> None:
@@ -468,7 +461,6 @@ def test_a_picture_of_another_size_is_not_measured_and_says_why(
     assert values(page) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "ending", "begins"),
     [("mp4", "mp4", b"\0\0\0\x1cftyp"), ("gif", "gif", b"GIF89a"), ("loop_dcm", "dcm", b"")],
@@ -496,7 +488,6 @@ def test_the_last_seconds_are_saved_as_they_are_seen(
         assert picture[200, 200].tolist() == pytest.approx([40] * 3, abs=4)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("images")
 def test_what_the_viewer_refuses_to_save_is_said(
     browser: Any, served: Any, monkeypatch: pytest.MonkeyPatch

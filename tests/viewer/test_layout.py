@@ -109,7 +109,6 @@ UNREACHED = """() => [...document.querySelectorAll("header button, .us-main :is(
 """Names of controls that no scrolling brings in front."""
 
 
-@pytest.mark.slow
 def test_a_remark_on_the_image_is_above_it(opened: Open) -> None:
     page = opened((1280, 720))
     remark = "No spectrum: the flow is slower than the wall filter lets through"
@@ -124,7 +123,6 @@ def test_a_remark_on_the_image_is_above_it(opened: Open) -> None:
     assert below <= page.locator(".us-image").bounding_box()["y"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "touch"),
     [(PHONE, True), (TURNED, True), (TWICE, False), (FOUR_TIMES, False), ((2560, 1440), False)],
@@ -146,7 +144,6 @@ def test_no_part_is_buried_and_every_control_can_be_reached(
     page.locator("#scene").wait_for()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [(2560, 1440), (1280, 720), PHONE])
 def test_sliders_are_as_long_as_the_window_allows(opened: Open, size: tuple[int, int]) -> None:
     widths = (
@@ -157,7 +154,6 @@ def test_sliders_are_as_long_as_the_window_allows(opened: Open, size: tuple[int,
     assert min(widths) > min(160, 0.35 * size[0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [PHONE, TURNED])
 def test_fingers_find_room_on_every_control(opened: Open, size: tuple[int, int]) -> None:
     page = opened(size, touch=True)
@@ -179,7 +175,6 @@ def test_fingers_find_room_on_every_control(opened: Open, size: tuple[int, int])
         assert page.evaluate(small) == []
 
 
-@pytest.mark.slow
 def test_a_tap_leaves_nothing_over_the_page(browser: Any, served: Any, hand: FakeHand) -> None:
     with browser.new_context(has_touch=True) as context:  # a computer with a touch screen
         page = context.new_page()
@@ -196,7 +191,6 @@ def test_a_tap_leaves_nothing_over_the_page(browser: Any, served: Any, hand: Fak
         assert page.locator("[role=tooltip], .q-tooltip").count() == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "touch"), [(PHONE, True), (TURNED, True), (TWICE, False), ((1280, 720), False)]
 )

@@ -55,7 +55,6 @@ def coloured(simulator: Simulator, kind: str, bgr: tuple[int, int, int]) -> Feed
     return feed
 
 
-@pytest.mark.slow
 def test_a_mode_is_asked_for_shown_and_left(
     page: Any, simulator: Simulator, asked: list[str]
 ) -> None:
@@ -81,7 +80,6 @@ def test_a_mode_is_asked_for_shown_and_left(
     until(lambda: not annotated.is_watched, "nobody watches what was drawn over it any more")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("asked")
 def test_a_mode_that_is_chosen_while_the_image_is_frozen_is_announced_and_comes_with_the_next(
     page: Any, simulator: Simulator
@@ -112,7 +110,6 @@ def test_a_mode_that_is_chosen_while_the_image_is_frozen_is_announced_and_comes_
     announced.wait_for(state="hidden")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("asked")
 def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simulator) -> None:
     annotated = coloured(simulator, "annotated", (0, 0, 200))
@@ -123,7 +120,6 @@ def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simul
     until(lambda: not annotated.is_watched, "what was refused is not watched")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("asked")
 def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simulator) -> None:
     page.goto(page.address)
@@ -133,7 +129,6 @@ def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simul
     page.get_by_role("button", name="Strain", exact=True, pressed=True).wait_for()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("asked")
 def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
     def see(**values: str) -> None:
@@ -171,7 +166,6 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     is_said()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), [("M-mode", "m_mode"), ("Spectrum", "spectrum")])
 def test_a_strip_is_watched_while_it_is_shown(
     page: Any, simulator: Simulator, name: str, kind: str
@@ -187,7 +181,6 @@ def test_a_strip_is_watched_while_it_is_shown(
     until(lambda: not feed.is_watched, "nobody watches the strip any more")
 
 
-@pytest.mark.slow
 def test_the_node_is_asked_for_nothing_once_the_page_has_gone(
     browser: Any, served: Any, simulator: Simulator
 ) -> None:

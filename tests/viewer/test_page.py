@@ -66,7 +66,6 @@ def test_the_stream_ends_when_the_page_closes(
     assert not image.is_watched
 
 
-@pytest.mark.slow
 def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
     image, _ = feeds_of(simulator)
     page.goto(page.address)
@@ -76,7 +75,6 @@ def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
     until(lambda: image.is_watched, "the page is back", 5.0)
 
 
-@pytest.mark.slow
 def test_the_header_says_why_few_images_come_at_rest(page: Any, simulator: Simulator) -> None:
     image, _ = feeds_of(simulator)
     hand = Feed("hand")
@@ -151,7 +149,6 @@ def test_a_taken_port_is_said(served: Any) -> None:
             listening("127.0.0.1", free.getsockname()[1])
 
 
-@pytest.mark.slow
 def test_what_the_page_says_wrongly_is_answered(page: Any, simulator: Simulator) -> None:
     feeds_of(simulator)
     page.goto(page.address)
@@ -162,7 +159,6 @@ def test_what_the_page_says_wrongly_is_answered(page: Any, simulator: Simulator)
     assert "does not know" in json.loads(answer)["problem"]
 
 
-@pytest.mark.slow
 def test_an_image_that_is_not_followed_by_another_is_marked(
     page: Any, simulator: Simulator
 ) -> None:
@@ -192,7 +188,6 @@ def test_the_header_says_what_runs_and_what_is_done_with_it(
     assert page.evaluate("usSim.scene()") == "liver"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [(768, 1024), (1024, 768), (1280, 720)])
 def test_the_panels_can_be_closed_however_the_screen_was_turned(
     page: Any, size: tuple[int, int]
@@ -219,7 +214,6 @@ def test_the_panels_can_be_closed_however_the_screen_was_turned(
     tabs.last.wait_for(state="hidden")
 
 
-@pytest.mark.slow
 def test_the_table_of_nodes_is_above_the_plots(page: Any, simulator: Simulator) -> None:
     page.goto(page.address)
     page.get_by_role("button", name="Panels").click()
@@ -234,7 +228,6 @@ def test_the_table_of_nodes_is_above_the_plots(page: Any, simulator: Simulator) 
     assert table["y"] + table["height"] <= plot["y"]
 
 
-@pytest.mark.slow
 def test_all_views_can_be_chosen_beside_the_panels_of_a_small_screen(page: Any) -> None:
     page.set_viewport_size({"width": 1024, "height": 768})
     page.goto(page.address)

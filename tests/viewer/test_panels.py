@@ -81,7 +81,6 @@ def shows(page: Any, name: str, text: str) -> None:
     until(lambda: field(page, name).input_value() == text, f"{name} shows {text}")
 
 
-@pytest.mark.slow
 def test_a_number_is_set_in_its_unit(page: Any, node: Node) -> None:
     opened(page, "Image")
     shows(page, "depth", "40")
@@ -98,7 +97,6 @@ def test_a_number_is_set_in_its_unit(page: Any, node: Node) -> None:
     assert field(page, "focus").get_attribute("placeholder") == "none"
 
 
-@pytest.mark.slow
 def test_what_cannot_be_is_said_beside_the_control(page: Any, node: Node) -> None:
     opened(page, "Image")
     shows(page, "depth", "40")
@@ -124,7 +122,6 @@ def test_what_cannot_be_is_said_beside_the_control(page: Any, node: Node) -> Non
     until(lambda: node.values("depth") == [0.06, 0.06], "it was sent twice")
 
 
-@pytest.mark.slow
 def test_a_slider_sends_ten_times_a_second_at_most_and_its_last_for_certain(
     page: Any, node: Node
 ) -> None:
@@ -171,7 +168,6 @@ def test_a_parameter_that_is_added_has_a_control(page: Any, node: Node) -> None:
     until(lambda: node.values("sparkle") == [3.0], "the new parameter is set")
 
 
-@pytest.mark.slow
 def test_every_kind_has_its_control_and_the_keyboard_will_do(page: Any, node: Node) -> None:
     opened(page, "Image")
     shows(page, "gain", "0")
@@ -207,7 +203,6 @@ def test_every_kind_has_its_control_and_the_keyboard_will_do(page: Any, node: No
     assert control(page, "scene").locator("input").count() == 0
 
 
-@pytest.mark.slow
 def test_time_gain_has_a_slider_for_each_depth(page: Any, node: Node) -> None:
     opened(page, "Image")
     gains = control(page, "time_gain")
@@ -227,7 +222,6 @@ def test_time_gain_has_a_slider_for_each_depth(page: Any, node: Node) -> None:
     until(lambda: node.values("time_gain")[-1] == (0.0,) * 8, "all are level")
 
 
-@pytest.mark.slow
 def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
     page.goto(page.address)
     page.get_by_role("button", name="Panels").wait_for()
@@ -251,7 +245,6 @@ def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
     until(lambda: node.board.watched == set(), "the page has gone")
 
 
-@pytest.mark.slow
 def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     board = simulator.status
     values = {"state": "fem", "rate_hz": "59.9", "latency_p50_ms": "7.04", "latency_p99_ms": "120"}
@@ -305,7 +298,6 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     until(lambda: not board.is_watched, "nobody looks any more")
 
 
-@pytest.mark.slow
 def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
     page: Any, simulator: Simulator, node: Node
 ) -> None:

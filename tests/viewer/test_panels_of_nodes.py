@@ -40,7 +40,6 @@ def graph(simulator: Simulator) -> Iterator[Node]:
     bench.close()
 
 
-@pytest.mark.slow
 def test_what_a_node_declares_has_a_control(page: Any, graph: Node) -> None:
     graph.declare_parameter("gain", 1.0, ParameterDescriptor(description="added to echoes (dB)"))
     page.goto(page.address)

@@ -64,7 +64,6 @@ class Node:
         return told
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "probe", "steering", "flip"),
     [

@@ -196,7 +196,6 @@ def is_dark(colour: np.ndarray) -> bool:
     return bool(colour.max() < 40)
 
 
-@pytest.mark.slow
 def test_structures_are_seen_where_they_are_in_their_colours(scene):
     scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     scene.becomes(VEIN, is_blue)
@@ -207,7 +206,6 @@ def test_structures_are_seen_where_they_are_in_their_colours(scene):
     scene.becomes(ARTERY, is_red)
 
 
-@pytest.mark.slow
 def test_skin_hides_them_unless_one_looks_under_it(scene):
     scene.ask("scene.setOpacity('skin', 1)")
     scene.becomes(VEIN, is_skin)
@@ -217,7 +215,6 @@ def test_skin_hides_them_unless_one_looks_under_it(scene):
     scene.becomes(VEIN, is_skin)
 
 
-@pytest.mark.slow
 def test_structures_go_with_the_tissue(scene):
     scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     scene.becomes(VEIN, is_blue)
@@ -227,7 +224,6 @@ def test_structures_go_with_the_tissue(scene):
     scene.becomes([0.012, 0.0, 0.015], is_dark)
 
 
-@pytest.mark.slow
 def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_it(scene):
     """The skin is at z = 0; of what is to do, the nearest to the probe at y = 40 mm is next."""
     for name in ("image", "structures", "force"):
@@ -254,7 +250,6 @@ def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_
     scene.becomes(stands(-0.04, 0.0095), lambda c: not (c[1] > c[0] + 60))
 
 
-@pytest.mark.slow
 def test_the_pointer_meets_the_skin_and_its_normal(scene):
     x, y = scene.place([-0.02, -0.03, 0.0])
     hit = scene.ask(f"return scene.pick({{ clientX: {x}, clientY: {y} }})")
@@ -264,7 +259,6 @@ def test_the_pointer_meets_the_skin_and_its_normal(scene):
     assert scene.ask("return scene.pick({ clientX: 4, clientY: 300 })") is None
 
 
-@pytest.mark.slow
 def test_a_drag_is_the_hands_if_it_takes_it_and_else_the_cameras(scene):
     scene.ask(
         """window.told = []; window.takes = true;
@@ -312,7 +306,6 @@ def test_the_gizmo_says_how_far_along_its_axis_it_was_dragged(scene):
     assert told[-1]["amount"] == pytest.approx(0.010, abs=3e-4)
 
 
-@pytest.mark.slow
 def test_colours_of_the_tissue_have_a_bar_with_a_unit_and_strain_is_asked_for_only_then(scene):
     feeds = scene.patient.feeds
     bar = scene.page.locator(".us-colour-bar")
@@ -344,7 +337,6 @@ def test_colours_of_the_tissue_have_a_bar_with_a_unit_and_strain_is_asked_for_on
     bar.wait_for(state="hidden", timeout=LIMIT_MS)
 
 
-@pytest.mark.slow
 def test_along_the_patient_it_is_the_right_way_up(scene):
     scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     scene.patient.move(np.array([0.0, 0.03, 0.0]))
@@ -352,7 +344,6 @@ def test_along_the_patient_it_is_the_right_way_up(scene):
     scene.becomes([0.0, -0.03, 0.015], is_dark)
 
 
-@pytest.mark.slow
 def test_it_keeps_to_its_place_when_the_window_becomes_another(scene):
     scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     scene.becomes(VEIN, is_blue)
@@ -369,7 +360,6 @@ def test_it_keeps_to_its_place_when_the_window_becomes_another(scene):
         scene.becomes([-0.03, 0.0, 0.015], is_dark)
 
 
-@pytest.mark.slow
 def test_where_the_processor_draws_the_page_has_the_picture_and_not_what_is_drawn_into(scene):
     scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     scene.becomes(VEIN, is_blue)
@@ -402,7 +392,6 @@ WebGL2RenderingContext.prototype.getParameter = function (name) {
 """Has the browser say that a graphics card draws (UNMASKED_RENDERER_WEBGL)."""
 
 
-@pytest.mark.slow
 def test_with_a_graphics_card_it_looks_the_same_and_is_drawn_into_the_page(page, scene_of):
     seen = scene_of()
     seen.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
@@ -424,7 +413,6 @@ def test_keys_choose_views_and_the_force_is_told(scene):
     scene.until("document.querySelector('.us-force').innerText === '2.5 N'")
 
 
-@pytest.mark.slow
 def test_nothing_is_drawn_while_nothing_changes(scene):
     scene.patient.show(90)
     scene.page.wait_for_function(f"{GREY} === 90")
@@ -441,7 +429,6 @@ def test_nothing_is_drawn_while_nothing_changes(scene):
     scene.until(f"scene.stage.pace.drawn > {drawn}")
 
 
-@pytest.mark.slow
 def test_what_is_older_than_the_image_is_marked_until_it_is_not(
     page: Any, scene: SimpleNamespace
 ) -> None:

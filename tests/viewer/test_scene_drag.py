@@ -57,7 +57,6 @@ def drag(page: Any, start: Any, end: Any) -> None:
     page.mouse.up()
 
 
-@pytest.mark.slow
 def test_over_the_skin_the_probe_is_put_under_the_pointer(page: Any, hand: FakeHand) -> None:
     first, last = [0.06, 0.05, 0.0], [0.05, -0.03, 0.0]
     drag(page, on_screen(page, first), on_screen(page, last))
@@ -66,7 +65,6 @@ def test_over_the_skin_the_probe_is_put_under_the_pointer(page: Any, hand: FakeH
     assert all(set(wish["to"]) == {"point"} and not wish["by"] for wish in hand.asked)
 
 
-@pytest.mark.slow
 def test_the_probe_dragged_along_itself_presses_as_far(page: Any, hand: FakeHand) -> None:
     grip = np.add(FACE, [0, 0.008, -0.05])
     drag(page, on_screen(page, grip), on_screen(page, np.add(grip, [0, 0, 0.012])))
@@ -76,7 +74,6 @@ def test_the_probe_dragged_along_itself_presses_as_far(page: Any, hand: FakeHand
     assert not any("slide" in wish["by"] or wish["to"] for wish in hand.asked)
 
 
-@pytest.mark.slow
 def test_the_probe_dragged_sideways_slides_with_the_pointer(page: Any, hand: FakeHand) -> None:
     grip = np.add(FACE, [0, 0.008, -0.02])
     drag(page, on_screen(page, grip), on_screen(page, np.add(grip, [0.02, 0, 0])))
@@ -87,7 +84,6 @@ def test_the_probe_dragged_sideways_slides_with_the_pointer(page: Any, hand: Fak
     assert not any("press" in wish["by"] for wish in hand.asked)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("to", "name", "sign"), [([0.02, 0, 0], "rock", -1), ([0, 0.02, 0], "fan", 1)]
 )
@@ -103,7 +99,6 @@ def test_with_shift_its_grip_follows_the_pointer(
     assert hand.total(name) == pytest.approx(sign * math.atan2(0.02, 0.09), rel=0.4)
 
 
-@pytest.mark.slow
 def test_beside_the_patient_or_with_alt_the_view_turns(page: Any, hand: FakeHand) -> None:
     before = page.evaluate(CAMERA)
     drag(page, (30, 400), (90, 430))
@@ -121,7 +116,6 @@ def test_beside_the_patient_or_with_alt_the_view_turns(page: Any, hand: FakeHand
     assert not hand.asked
 
 
-@pytest.mark.slow
 def test_the_wheel_presses_over_the_probe_and_with_shift(page: Any, hand: FakeHand) -> None:
     page.mouse.move(*on_screen(page, np.add(FACE, [0, 0.008, -0.05])))
     page.mouse.wheel(0, 200)
@@ -133,7 +127,6 @@ def test_the_wheel_presses_over_the_probe_and_with_shift(page: Any, hand: FakeHa
     hand.until(lambda: hand.total("press") == pytest.approx(0.0))
 
 
-@pytest.mark.slow
 def test_the_gizmo_moves_along_the_probes_own_axes(page: Any, hand: FakeHand) -> None:
     page.get_by_role("button", name="Gizmo", exact=True).click()
     tip = np.add(FACE, [0, 0, 0.018])
@@ -144,7 +137,6 @@ def test_the_gizmo_moves_along_the_probes_own_axes(page: Any, hand: FakeHand) ->
     hand.until(lambda: hand.total("slide") == pytest.approx([0.01, 0.0], abs=5e-4))
 
 
-@pytest.mark.slow
 def test_where_somebody_else_leads_the_view_turns_instead(page: Any, hand: FakeHand) -> None:
     hand.say(leader="path_player", obstacle="path_player moves the probe")
     page.wait_for_function("document.querySelector('.us-quantity input').disabled")

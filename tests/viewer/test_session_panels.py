@@ -38,7 +38,6 @@ def opened(page, tab):
     page.get_by_role("tab", name=tab).click()
 
 
-@pytest.mark.slow
 def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     board, asked = session
     _, picture = cv2.imencode(".jpg", np.full((180, 240), 90, np.uint8))
@@ -72,7 +71,6 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     until(lambda: len(asked) == 2, "it is asked for once more", 30.0)
 
 
-@pytest.mark.slow
 def test_a_session_is_recorded_and_replayed(page, session):
     board, asked = session
     board.bags = {"hand.mcap": "/bags/hand.mcap"}
@@ -138,7 +136,6 @@ def test_a_path_or_a_name_that_is_typed_is_replayed_and_stays(page, session, typ
     until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
 
 
-@pytest.mark.slow
 def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session):
     _, asked = session
     opened(page, "Session")
@@ -155,7 +152,6 @@ def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session
     until(lambda: asked[-1] == {"record": "mine.mcap"}, "a name of one's own stays", 30.0)
 
 
-@pytest.mark.slow
 def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recorded(page, session):
     board, asked = session
     board.bags = {"hand.mcap": "/bags/hand.mcap"}
@@ -214,7 +210,6 @@ def test_pages_of_others_name_what_is_listed_and_record_to_one_folder(asked, fil
             assert next(iter(asked.values())) in told.result() or "/etc/passwd" in told.result()
 
 
-@pytest.mark.slow
 def test_where_us_sim_does_not_run_the_simulation_that_is_said(page, session):
     board, _ = session
     board.state = SessionState()

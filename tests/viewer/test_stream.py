@@ -5,7 +5,6 @@ How fast a page of a real browser takes what streams.
 
 from typing import Any
 
-import pytest
 from awaiting import until
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +18,6 @@ JSON = st.recursive(
 )
 
 
-@pytest.mark.slow
 @given(
     st.text(min_size=1),
     st.integers(0, 2**53),

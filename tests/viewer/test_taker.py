@@ -21,7 +21,6 @@ from us_sim.viewer.stream import Feed, Packet, Simulator
 DELAY_S = 0.05
 
 
-@pytest.mark.slow
 def test_it_takes_what_streams_and_measures_how_long_a_command_takes(
     served: Any, simulator: Simulator
 ) -> None:
