@@ -178,7 +178,8 @@ class McapStorage:
         """Note damage, or raise it as a BagError."""
         text = f"{self._label} is damaged in {place}"
         if damage is None:
-            raise BagError(text) from None
+            remedy = "`us-sim bag repair` writes all that can be read as a new bag"
+            raise BagError(f"{text}; {remedy}") from None
         damage.append(Fault(text))
 
     def _content(self, place: Place) -> memoryview:
