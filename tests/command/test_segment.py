@@ -102,7 +102,10 @@ def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, 
     [
         ([], "no labels yet: give --labels, --seeds, or --vessels dark"),
         (["--seeds", "SEEDS", "--vessels", "dark"], "two sources of labels"),
-        (["--seeds", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
+        (
+            ["--seeds", "nowhere.yaml"],
+            "nowhere.yaml: there is no such file; installed are liver_sweep",
+        ),
         (["--seeds", "SEEDS", "--resample"], "--resample: is for --labels only"),
         (["--labels", "SEEDS"], "cannot be read as an image"),
         (["--labels", "SEEDS", "--names", "x"], "write LABEL=NAME"),

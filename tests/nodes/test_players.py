@@ -453,7 +453,7 @@ def test_the_clock_is_that_of_the_recording(bench, numbers):
     end = stamp_message(EPOCH + 9 * STEP)
     bench.spin_until(lambda: ticks and ticks[-1].clock == end)
     times = np.array([Time.from_msg(tick.clock).nanoseconds for tick in ticks]) - EPOCH
-    assert len(times) >= 20  # 160 ms at half the pace are 32 ticks of 10 ms
+    assert len(times) > 10  # 160 ms at half the pace are 32 ticks of 10 ms where nothing is late
     assert STEP <= times[0] < 2 * STEP
     assert (np.diff(times) >= 0).all()
     bench.spin_until(lambda: sent()[-1:] == [9])

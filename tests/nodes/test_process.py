@@ -17,6 +17,7 @@ from us_sim.share import find_bag
 def test_ctrl_c_among_imports_is_silent():
     played = ["--ros-args", "-p", f"path:={find_bag('press_and_slide.mcap')}"]  # if it gets so far
     command = [sys.executable, "-X", "importtime", "-m", "us_sim.nodes.path_player", *played]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background
     node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
     said = []
     for line in node.stderr:

@@ -123,12 +123,14 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> tuple[
 
 def _seeds_file(path: Path) -> Path:
     """The file of seeds at that path, or the installed one of that name."""
-    if not os.path.exists(path) and path.name == str(path):
-        for root in shared_roots():
-            installed = root / "config" / "seeds" / path.with_suffix(".yaml")
-            if installed.is_file():
-                return installed
-    return path
+    if os.path.exists(path):
+        return path
+    folders = [root / "config" / "seeds" for root in shared_roots()]
+    installed = {file.stem: file for folder in folders for file in folder.glob("*.yaml")}
+    if path.stem not in installed or path.name != str(path):
+        names = ", ".join(sorted(installed))
+        raise VolumeError(f"--seeds {path}: there is no such file; installed are {names}")
+    return installed[path.stem]
 
 
 def _counts(labels: LabelMap) -> dict[str, int]:
