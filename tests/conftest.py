@@ -24,6 +24,7 @@ os.environ["PYTHONSAFEPATH"] = "1"
 _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 _WORKER = "PYTEST_XDIST_WORKER"
+_MARKED = "US_SIM_TESTS_MARKED"
 
 _TISSUE = ("tissue", *(f"evaluation/{n}" for n in ("hand", "measured", "stability", "tissue")))
 """Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
@@ -44,10 +45,13 @@ _BY_GROUPS = pytest.StashKey[bool]()
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Run the quick tests where nothing else was asked for, and all of a mark in two processes."""
     option = config.option
-    if config.args_source is not pytest.Config.ArgsSource.TESTPATHS or _WORKER in os.environ:
+    if _WORKER in os.environ:  # which is given the command's words alone
+        option.markexpr = os.environ.get(_MARKED, option.markexpr)
+        return
+    if config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
         return
     if not (option.keyword or option.markexpr):
-        option.markexpr = _PLAIN
+        option.markexpr = os.environ[_MARKED] = _PLAIN
     chosen = option.keyword or option.collectonly or option.usepdb or option.capture == "no"
     if (
         not chosen
