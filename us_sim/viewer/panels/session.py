@@ -149,7 +149,7 @@ KINDS_TOLD = (
 class _Session:
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
-        self._is_dragging = False
+        self._dragged_to: float | None = None  # s, while a person holds the slider
         self._touched = 0.0  # s, monotonic: when a person last asked for something
         self._is_following = False  # while controls are set to what is so
         self._shown_record = ""  # the recording whose name the field shows
@@ -206,7 +206,7 @@ class _Session:
             self._loop.props["title"] = "Begin again at the end"
         self._time = ui.slider(min=0.0, max=1.0, step=0.01, value=0.0)
         self._time.props('aria-label="Time in the replay, s" title="Time in the replay, s"')
-        self._time.on("pan", self._drag)
+        self._time.on("update:model-value", self._drag)
         self._time.on("change", self._seek)
         self._where = ui.label().classes("us-quiet").props('role="status"')
 
@@ -250,7 +250,7 @@ class _Session:
         end = round(state.duration, 2)
         if end not in (0.0, self._time.props["max"]):
             self._time.props["max"] = end
-        if not self._is_dragging:
+        if self._dragged_to is None:
             self._time.set_value(min(state.position, state.duration) if plays else 0.0)
         told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}"
         self._where.set_text(told if plays else "nothing is replayed")
@@ -315,11 +315,12 @@ class _Session:
         await self._ask(replay_loop=bool(self._loop.value))
 
     def _drag(self, event: Any) -> None:
-        self._is_dragging = event.args == "start"
+        """Keep the time that a person points at; the replay's may come before the button is up."""
+        self._dragged_to = float(event.args)
 
     async def _seek(self, event: Any) -> None:
-        self._is_dragging = False
-        await self._ask(replay_time=float(event.args))
+        wanted, self._dragged_to = self._dragged_to, None
+        await self._ask(replay_time=float(event.args) if wanted is None else wanted)
 
     async def _ask(self, **values: object) -> bool:
         """Ask for it; whether that was taken."""
