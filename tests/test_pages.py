@@ -124,15 +124,3 @@ def test_the_readmes_node_moves_the_probe(tmp_path):
         bench.close()
     assert {pose.header.frame_id for pose in poses} == {"patient"}
     assert max(pressed(poses)) <= 0.005
-
-
-def test_modules_are_where_the_changelog_says_that_they_are_now():
-    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    table = text.partition("### Where modules are now")[2]
-    moved = re.findall(r"^\| (`[a-z_0-9.`, ]+) \| `([a-z0-9_.]+)` \|$", table, re.MULTILINE)
-    assert len(moved) > 100
-    for names, now in moved:
-        place = ROOT / "us_sim" / now.replace(".", "/")
-        assert place.with_suffix(".py").is_file() or place.is_dir(), now
-        for was in names.replace("`", "").split(", "):
-            assert not (ROOT / "us_sim" / f"{was.replace('.', '/')}.py").is_file(), was

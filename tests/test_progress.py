@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from us_sim import progress
@@ -10,7 +9,6 @@ from us_sim.command import main
 from us_sim.errors import UsSimError
 from us_sim.tissue.linear_algebra import compliance
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.msds_implicit import MsdsImplicit
 
 
 @pytest.fixture
@@ -83,9 +81,3 @@ def test_the_surface_s_compliance_tells_how_far_it_is(monkeypatch, tmp_path):
     assert fractions == sorted(fractions)
     assert 0.0 < fractions[0] < 0.6 < fractions[-1] == 1.0
     assert {text for _, text in told} == {"compliance of the surface"}
-
-
-def test_a_solver_tells_how_far_its_making_is():
-    told = []
-    MsdsImplicit(TissueModel.block(nodes=(12, 12, 3)), None, lambda done, _: told.append(done))
-    np.testing.assert_allclose(told, [64 / 144, 128 / 144, 1.0])
