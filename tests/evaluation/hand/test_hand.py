@@ -24,13 +24,11 @@ from us_sim.evaluation.hand.measure import (
     Tissue,
     converged,
     measure,
-    motions,
-    select,
 )
 from us_sim.evaluation.hand.report import JUDGED, evaluate_hand, targets
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
-from us_sim.recording.hand_motion import HASTES, KINDS, Room
+from us_sim.recording.hand_motion import HASTES, Room
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_cg import FemCg
 
@@ -163,27 +161,6 @@ def test_live_the_newest_pose_wins(monkeypatch):
     assert set(point.live.frames.error) == {0.0}
 
 
-@pytest.mark.parametrize(
-    ("errors", "poses"),
-    [
-        ([0.9, 0.9, 0.9, 0.9], 0),
-        ([9.0, 0.9, 9.0, 0.9], 1),
-        ([9.0, 9.0, 0.9, 9.0], 3),  # the second is shown for two poses, of which one was skipped
-        ([9.0, np.nan, 0.9, 9.0], 1),
-    ],
-)
-def test_tissue_is_away_until_a_frame_that_is_near(errors, poses):
-    frames = Frames(number=np.array([4, 5, 7, 8]), error=np.array(errors))
-    assert Live(5, frames).away == pytest.approx(1e3 * poses / 60)
-
-
-def test_live_nothing_is_seen_before_it_came(monkeypatch):
-    solver = Oracle(answer(), takes=0.001)
-    live_by_its_own_clock(monkeypatch, solver)
-    assert measure(solver, MOTION, answer()).live.latency == pytest.approx([1.0] * 30)
-    assert solver.seen == list(range(60))
-
-
 def test_the_probe_is_held_where_it_pressed_last():
     solver = Oracle(answer(45))
     solver.residuals = [0.5] * 47 + [0.1, 0.02, 0.005, 0.02, 1e-4, 5e-3, 1e-4]
@@ -193,25 +170,6 @@ def test_the_probe_is_held_where_it_pressed_last():
     assert len(point.held.residual) == HOLD + 1
     assert point.held.frames_to(1e-2) == 5.0  # and not 3, after which it rose again
     assert point.held.frames_to(1e-3) == 7.0
-
-
-def test_every_tissue_kind_and_haste_is_there():
-    TISSUES.pop("small")
-    quick, full = motions(quick=True, seed=1), motions(quick=False, seed=1)
-    assert {m.tissue for m in quick} == {m.tissue for m in full} == {"arm", "liver", "block"}
-    arm = {(m.kind, m.haste) for m in full if m.tissue == "arm"}
-    assert arm == {(kind, haste) for kind in KINDS for haste in HASTES}
-    assert {m.haste for m in quick} == set(HASTES)
-    assert sum(m.duration for m in quick) < 6.0
-    other = motions(quick=True, seed=2)
-    assert [str(m) for m in other] == [str(m) for m in quick]
-    assert not np.array_equal(other[0].poses[-1].position, quick[0].poses[-1].position)
-
-
-def test_the_liver_needs_no_file():
-    model = TISSUES["liver"].model
-    assert len(model.mesh.nodes) == 28 * 10 * 18
-    assert set(model.materials.young_modulus) == {6e3}
 
 
 def test_the_converged_answer_does_not_depend_on_the_way():
@@ -246,13 +204,6 @@ def done(**values):
     ]
 
 
-def test_targets_are_of_the_judged_method_only():
-    assert {target.met for target in targets([])} == {None}
-    assert {target.met for target in targets(done())} == {True}
-    others = [replace(point, method="fem") for point in done(residual=9.0, inverted=1.0)]
-    assert {target.met for target in targets([*done(), *others])} == {True}
-
-
 @pytest.mark.parametrize(
     ("wrong", "missed"),
     [
@@ -264,26 +215,6 @@ def test_targets_are_of_the_judged_method_only():
 )
 def test_a_missed_target_says_no(wrong, missed):
     assert sum(target.met is False for target in targets(done(**wrong))) == missed
-
-
-def test_errors_of_few_frames_are_not_told_of():
-    points = done()
-    for point in points:
-        point.live.frames.error[1:] = np.nan
-    (seen,) = {target.seen for target in targets(points) if "no converged answer" in target.seen}
-    assert seen == "no converged answer for 67 % of the frames"
-    assert {target.met for target in targets(points)} == {True, None}
-
-
-def test_a_residual_that_never_falls_is_named():
-    seen = {target.what: target.seen for target in targets(done(held=[1.0, 1.0]))}
-    assert "never in 3 of 3 motions" in seen.values()
-
-
-def test_a_failed_row_is_no_point_of_any_picture():
-    failed = Point(MOTION, "fem", failure="broke")
-    assert select([failed]) == []
-    assert failed.cells[-1] == "broke"
 
 
 class Raising(FemCg):
@@ -320,16 +251,3 @@ def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monk
         assert f"hand_{name}.png" in report
     assert "- fem_cg, small, pressing, brisk: LinAlgError: Singular matrix" in report
     assert "failed: fem_cg" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_without_a_converged_answer_every_row_says_so(tmp_path, monkeypatch):
-    def broken(*_):
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    monkeypatch.setattr(following, "converged", broken)
-    monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, seed=seed)])
-    assert evaluate_hand(tmp_path / "out", quick=True) == 1
-    report = (tmp_path / "out" / "hand.md").read_text(encoding="utf-8")
-    for method in TISSUE_METHODS:
-        assert f"- {method}, small, pressing, brisk: the converged answer with" in report

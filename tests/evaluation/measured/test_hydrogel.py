@@ -162,33 +162,19 @@ def _content(**changed):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        ({"other": 1.0}, "cannot be read .*parCoord_prev"),
-        (_content(before=np.zeros((1500, 2))), "do not go with"),
-        (_content(links=np.ones((7, 1))), "do not go with 7 links"),
-        (_content(after=np.zeros((3, 3))), "do not go with"),
+        ({"other": 1.0}, "parCoord_prev"),
+        (_content(links=np.ones((7, 1))), "7 links"),
         (_content(after=np.full((1500, 3), np.nan)), "not finite"),
-        (_content(links=np.zeros((1500, 1))), "0 links deep in the gel are too few"),
+        (_content(links=np.zeros((1500, 1))), "too few"),
+        (b"no such file", "cannot be read"),
+        (None, "cannot be read"),
     ],
 )
-def test_a_malformed_file_is_refused(tmp_path, content, problem):
-    savemat(tmp_path / FILE, content)
+def test_a_file_that_holds_no_beads_is_refused(tmp_path, content, problem):
+    file = tmp_path / FILE
+    if isinstance(content, dict):
+        savemat(file, content)
+    elif content is not None:
+        file.write_bytes(content)
     with pytest.raises(UsSimError, match=problem):
-        read_beads(tmp_path / FILE)
-
-
-@pytest.mark.parametrize("content", [b"no such file", b"", None])
-def test_a_broken_file_is_refused(tmp_path, content):
-    if content is not None:
-        (tmp_path / FILE).write_bytes(content)
-    with pytest.raises(UsSimError, match="cannot be read"):
-        read_beads(tmp_path / FILE)
-
-
-@pytest.mark.parametrize("damage", ["cut", "overwritten"])
-def test_a_damaged_file_is_refused(tmp_path, damage):
-    savemat(tmp_path / FILE, _content(), do_compression=True)
-    content = (tmp_path / FILE).read_bytes()
-    kept = content[: len(content) // 2]
-    (tmp_path / FILE).write_bytes(kept + (b"" if damage == "cut" else b"x" * len(kept)))
-    with pytest.raises(UsSimError, match="cannot be read"):
-        read_beads(tmp_path / FILE)
+        read_beads(file)

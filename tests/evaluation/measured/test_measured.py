@@ -48,14 +48,6 @@ def test_studies_without_data_are_left_out_and_say_from_where_to_fetch_them(tmp_
     assert "gel" not in left_out
 
 
-def test_the_environment_names_the_folder(tmp_path, found, monkeypatch, capsys):
-    (tmp_path / "steel-data").mkdir()
-    monkeypatch.setenv("US_SIM_TEST_DATA", str(tmp_path))
-    report.evaluate_measured(tmp_path / "out", False)
-    assert found == [(tmp_path / "steel-data", tmp_path / "out", False)]
-    assert str(tmp_path / "out" / "measured_steel.png") in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("named", [True, False])
 def test_no_data_at_all_is_refused_before_anything_is_written(tmp_path, found, monkeypatch, named):
     monkeypatch.chdir(tmp_path)
@@ -71,12 +63,3 @@ def test_no_data_at_all_is_refused_before_anything_is_written(tmp_path, found, m
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(UsSimError, match="measured data, is no folder"):
         report.evaluate_measured(tmp_path / "out", True, MeasuredData(data=tmp_path / "nowhere"))
-
-
-def test_a_study_that_needs_no_data_runs_without(tmp_path, found, monkeypatch):
-    calls = []
-    monkeypatch.setattr(report, "STUDIES", (*report.STUDIES, _study("vein", "", calls)))
-    monkeypatch.chdir(tmp_path)
-    assert report.evaluate_measured(tmp_path / "out", True) == 0
-    assert len(calls) == 1
-    assert not found

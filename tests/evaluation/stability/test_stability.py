@@ -5,23 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numba.core import config
 
-from us_sim.cache import cache_folder
 from us_sim.evaluation.stability import report as stability
 from us_sim.evaluation.stability.cases import (
     HOLD,
-    MESHES,
     SMALL,
-    SUPPORTS,
     StabilityCase,
-    extreme_cases,
-    fixed_nodes,
     held_cases,
-    mesh_named,
     model_of,
-    parts,
-    poses_of,
     sampled_cases,
 )
 from us_sim.evaluation.stability.measure import (
@@ -29,14 +20,12 @@ from us_sim.evaluation.stability.measure import (
     Trial,
     agrees,
     equations_of,
-    observed_step_limit,
     refusal_of,
     run_trial,
     try_case,
 )
 from us_sim.evaluation.stability.report import evaluate_stability
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.kernels import kernel_folder
 from us_sim.tissue.solvers.fem_cg import FemCg
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
@@ -207,36 +196,6 @@ def test_linear_strain_that_turns_tetrahedra_inside_out_is_caught():
     assert trial.failure.endswith("tetrahedra inside out")
 
 
-def test_who_is_not_judged_is_only_recorded():
-    trial = tried(FemCg, replace(HELD, collider="pebble", mesh="fine", depth=0.9))
-    assert trial.held_inverted > 0
-    assert trial.passed
-    assert [name for name, m in TISSUE_METHODS.items() if m.is_judged_at_rest] == ["fem_nonlinear"]
-
-
-def values_of(cases, name):
-    return np.array([getattr(case, name) for case in cases])
-
-
-def test_held_cases_are_within_anatomy():
-    cases = held_cases(400, seed=9)
-    assert cases == held_cases(400, seed=9)
-    assert not set(cases) & set(held_cases(400, seed=10))
-    for name, low, high in (
-        ("young_modulus", 1e3, 1e5),
-        ("contrast", 1.0, 1e3),
-        ("poisson_ratio", 0.3, 0.495),
-        ("depth", 0.05, 0.5),
-    ):
-        values = values_of(cases, name)
-        assert low <= values.min() < low + 0.1 * (high - low)
-        assert high - 0.1 * (high - low) < values.max() <= high
-    assert {case.support for case in cases} == {"bottom", "walls"}
-    assert {case.held for case in cases} == {HOLD}
-    for name, some in (("mesh", "delaunay"), ("collider", "plate"), ("motion", "tilt")):
-        assert some in values_of(cases, name)
-
-
 @pytest.mark.parametrize(("number", "seed"), [(135, 1), (664, 1), (988, 1), (90, 2)])
 def test_a_probe_in_tissue_of_soft_and_stiff_parts_turns_nothing_inside_out(number, seed):
     trial = try_case("fem_nonlinear", held_cases(number + 1, seed)[number])
@@ -290,80 +249,6 @@ def test_broken_input_is_refused_in_one_sentence(name):
     sentence = trial.refusal
     assert "\n" not in sentence
     assert len(sentence) > 30
-
-
-def test_input_that_is_fine_does_not_count_as_refused(monkeypatch):
-    monkeypatch.setitem(REFUSALS, "fine", lambda _: None)
-    trial = refusal_of("fem_cg", "fine")
-    assert not trial.refused
-    assert not trial.passed
-
-
-def test_the_sample_is_the_same_every_time_and_covers_the_ranges():
-    cases = sampled_cases(1024)
-    assert cases == sampled_cases(1024)
-    assert len(set(cases)) == 1024
-    for name, low, high in (
-        ("young_modulus", 1.0, 1e12),
-        ("contrast", 1.0, 1e9),
-        ("poisson_ratio", 0.0, 0.4999),
-        ("density", 1.0, 1e6),
-        ("time_step", 1e-6, 10.0),
-        ("damping", 0.0, 1e3),
-        ("depth", 0.0, 1.0),
-    ):
-        values = values_of(cases, name)
-        assert low <= values.min() <= max(2 * low, 1e-3)
-        assert high / 2 <= values.max() <= high * (1 + 1e-9)
-    stiffest = np.array([case.young_modulus * case.contrast for case in cases])
-    assert stiffest.max() <= 1e12 * (1 + 1e-9)
-
-
-def test_named_cases_have_names_of_their_own():
-    names = [case.case for case in extreme_cases(corners=True)]
-    assert len(set(names)) == len(names)
-
-
-def test_tissues_are_what_their_names_say():
-    assert len(mesh_named("tetrahedron").tetrahedra) == 1
-    assert set(parts(mesh_named("two pieces"))) == {0, 1}
-    sliver = mesh_named("sliver")
-    ends = sliver.nodes[sliver.tetrahedra]
-    longest = np.linalg.norm(ends[:, :, None] - ends[:, None], axis=3).max(axis=(1, 2))
-    assert (sliver.volumes / longest**3).min() < 2e-6
-    for name in MESHES:
-        mesh = mesh_named(name)
-        assert mesh.nodes[:, 2].min() == 0.0
-        held = {support: int(fixed_nodes(mesh, support).sum()) for support in SUPPORTS}
-        assert held["nothing"] == 0
-        assert held["everything"] == len(mesh.nodes)
-        assert 1 <= held["three"] <= 3
-
-
-def test_a_tremor_is_of_a_kilohertz():
-    heights = np.array([pose.position[2] for pose in poses_of("tremor", mesh_named("box"), 0.5)])
-    time = np.arange(len(heights)) / 2718
-    expected = 0.04 + 0.02 * 0.08 * np.sin(2 * np.pi * 1000 * time)
-    assert heights == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("springs", ["algorithm_1", "fitted with volume"])
-@pytest.mark.parametrize("damping", [0.0, 30.0])
-def test_predicted_and_observed_step_limits_agree(springs, damping):
-    case = StabilityCase("bisected", contrast=1e3, damping=damping, springs=springs)
-    predicted, observed = observed_step_limit("msds", case)
-    assert observed == pytest.approx(predicted, rel=0.02)
-
-
-def test_a_process_keeps_by_itself_all_but_the_kernels(tmp_path, monkeypatch):
-    kernels = kernel_folder()
-    monkeypatch.setenv("US_SIM_CACHE", "")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    monkeypatch.setattr(config, "CACHE_DIR", "")
-    monkeypatch.setattr(stability, "threadpool_limits", lambda _: None)
-    stability._prepare(str(tmp_path), str(kernels))
-    assert cache_folder() == tmp_path
-    assert kernel_folder() == kernels
 
 
 @pytest.mark.slow

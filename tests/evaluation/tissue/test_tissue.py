@@ -3,36 +3,25 @@
 import csv
 import re
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import us_sim
 from us_sim.command.main import main
-from us_sim.evaluation.block import LARGEST_MESH, MESHES
-from us_sim.evaluation.report import exponent
+from us_sim.evaluation.block import MESHES
 from us_sim.evaluation.tissue import reference as kept_reference
 from us_sim.evaluation.tissue import report as tissue
-from us_sim.evaluation.tissue.cases import LOCKING, SCENES
-from us_sim.evaluation.tissue.measure import Outcome, Point, Trial, compare, held_memory, plan
-from us_sim.evaluation.tissue.report import evaluate_tissue, pareto_front
-from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.settings.registry import SOLVERS
-from us_sim.settings.setting import rules_of
+from us_sim.evaluation.tissue.cases import SCENES
+from us_sim.evaluation.tissue.measure import Outcome, Trial, compare
+from us_sim.evaluation.tissue.report import evaluate_tissue
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
-from us_sim.tissue.solvers.msds import SpringSettings
-from us_sim.tissue.solvers.solver import create_solver
 
 COLUMNS = (
     "scene,method,nodes,tets,threads,setting,ms_median,ms_p99,rel_l2_error,max_error_mm,"
     "force_error,volume_error,estimated_error,reference"
 )
 PRESS = SCENES["press_12mm"]
-
-
-def point(ms, error, nodes=1000):
-    return Point("press_12mm", "fem", nodes, 1, 1, "default", ms, ms, error, 1.0, 0.0, 0.0)
 
 
 def test_errors_of_a_known_field_are_what_they_are_by_hand():
@@ -47,58 +36,6 @@ def test_errors_of_a_known_field_are_what_they_are_by_hand():
     assert errors["max_error_mm"] == pytest.approx(5.0)
     assert errors["force_error"] == pytest.approx(0.25)
     assert errors["volume_error"] == pytest.approx((0.0024 - 0.0018) / 0.002)
-
-
-def test_the_front_leaves_out_what_is_slower_and_worse():
-    points = [point(1.0, 0.2), point(2.0, 0.3), point(3.0, 0.1), point(4.0, float("nan"))]
-    assert pareto_front(points) == [points[0], points[2]]
-
-
-def test_estimated_errors_are_shown_beside_the_true_ones():
-    known = [replace(point(1.0, 0.04), default=True, estimated_error=e) for e in (0.05, 0.09)]
-    text = tissue._estimates([*known, replace(point(1.0, 0.04), default=True)])
-    assert "in 1 of 2 cases" in text
-    assert "| press_12mm | fem    | 1,000 | 4    | 9           | 2.25  |" in text
-    assert tissue._estimates([point(1.0, 0.04)]) == ""
-
-
-def test_the_exponent_of_a_power_law_is_found():
-    costs = {n: 0.001 * n**1.3 for n in (2000, 8192, 65536)}
-    assert exponent(costs | {70000: float("nan"), 80000: 0.0}) == pytest.approx(1.3)
-    assert np.isnan(exponent({2000: 1.0}))
-
-
-def test_memory_counts_every_array_once():
-    model = PRESS.model((5, 4, 4))
-    solver = create_solver("msds", model)
-    held = held_memory(solver)
-    assert held > model.mesh.nodes.nbytes + model.mesh.tetrahedra.nbytes
-    solver.again = solver.mass[::2]
-    assert held_memory(solver) == held
-    solver.more = np.zeros(1000)
-    assert held_memory(solver) == held + 8000
-
-
-def test_the_evaluated_methods_are_those_of_the_package():
-    built_in = {name for name, option in SOLVERS.options.items() if option.package is None}
-    assert set(TISSUE_METHODS) == built_in
-    for name, method in TISSUE_METHODS.items():
-        settings = rules_of(SOLVERS.settings(name))
-        for setting in (*method.tried, method.patient or {}):
-            assert set(setting) <= set(settings)
-        assert method.has_springs == issubclass(SOLVERS.settings(name), SpringSettings)
-        assert method.is_explicit == ("stabilisation" in settings)
-
-
-def test_the_full_plan_has_every_method_on_every_mesh_and_scene():
-    trials = plan(quick=False)
-    for method in TISSUE_METHODS:
-        combinations = {(t.scene.name, t.counts) for t in trials if t.method == method}
-        ordinary = set(SCENES) - set(LOCKING[1:])
-        assert combinations >= {(scene, mesh) for scene in ordinary for mesh in MESHES}
-        assert combinations >= {(scene, MESHES[-1]) for scene in LOCKING}
-        assert {scene for scene, mesh in combinations if mesh == LARGEST_MESH} == {"press_25mm"}
-    assert {t.method for t in plan(quick=True)} == set(TISSUE_METHODS)
 
 
 @pytest.fixture
@@ -145,26 +82,6 @@ def test_rows_pictures_and_report_are_there_and_a_failure_is_named(small, capsys
     # A second run takes the reference from the cache.
     monkeypatch.setattr(kept_reference, "solve_contact", None)
     assert evaluate_tissue(small.with_name("again"), quick=True) == 1
-
-
-@pytest.mark.slow
-def test_a_damaged_reference_is_made_again(small, caplog):
-    kept_reference.kept_reference(PRESS, (0.03, 0.03))
-    (file,) = (small.parent / "cache").glob("reference-*/displacement.npy")
-    file.write_bytes(file.read_bytes()[:200])
-    again = kept_reference.kept_reference(PRESS, (0.03, 0.03))
-    assert "is damaged" in caplog.text
-    assert again.difference == pytest.approx(0.0, abs=1e-6)
-    assert again.solution.force[2] < 0
-
-
-def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
-    file = tmp_path / "file"
-    file.touch()
-    assert main(["evaluate", "tissue", "--quick", "--out", str(file)]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith(f"us-sim: --out {file}: cannot be written")
-    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("subject", ["tissue", "stability", "slice", "tracking"])
