@@ -14,7 +14,6 @@ from us_sim.tissue.model import (
     TissueModel,
     face_nodes,
     facing_nodes,
-    held_remark,
     nodes_in_label,
 )
 
@@ -36,20 +35,6 @@ def test_faces_are_the_planes_they_are_named_after(face, axis, value):
     assert (mesh.nodes[nodes, axis] == value).all()
     assert len(nodes) == {0: 5 * 4, 1: 6 * 4, 2: 6 * 5}[axis]
     assert nodes.dtype == np.int32
-
-
-def test_sides_are_all_but_top_and_bottom():
-    mesh = block_mesh((6, 5, 4))
-    assert len(face_nodes(mesh, "sides")) == 4 * (6 * 5 - 4 * 3)
-
-
-def test_it_is_said_how_many_nodes_are_held_where_they_may_be_few():
-    organ, box = unstructured(), block_mesh((6, 5, 4))
-    bottom = face_nodes(organ, "bottom")
-    assert "`bottom` holds 30 of 120" in (held_remark("bottom", bottom, organ) or "")
-    assert held_remark("bottom", face_nodes(box, "bottom"), box) is None
-    assert "tissue.mesh.margin" in (held_remark("bottom", bottom[:6], organ) or "")
-    assert "`bone` holds 0 of 120" in (held_remark("bone", bottom[:0], box) or "")
 
 
 def unstructured(nodes=(6, 5, 4)):
@@ -108,19 +93,6 @@ def test_lumped_mass_is_the_tissues_mass():
     assert block().lumped_mass.sum() == pytest.approx(2.0)
 
 
-def test_contact_spacing_is_that_of_the_surface():
-    assert block((21, 11, 6)).contact_spacing == pytest.approx(0.01, rel=0.5)
-    assert block((21, 11, 6)).contact_spacing >= 0.01
-
-
-def test_no_contact_nodes_are_no_contact():
-    model = block()
-    bare = TissueModel(
-        model.mesh, model.materials, model.fixed, model.collider, np.empty(0, np.int32)
-    )
-    assert bare.contact_spacing == 0.0
-
-
 MESH = block_mesh((3, 3, 3))
 FREE = np.zeros(27, dtype=bool)
 
@@ -140,14 +112,3 @@ FREE = np.zeros(27, dtype=bool)
 def test_models_that_do_not_fit_their_mesh_are_refused(fixed, contact, words):
     with pytest.raises(MeshError, match=words):
         TissueModel(MESH, uniform_material(MESH, SOFT), fixed, Sphere(0.03), np.array(contact))
-
-
-def test_materials_of_another_mesh_are_refused():
-    with pytest.raises(MeshError, match="5 tetrahedra"):
-        TissueModel(
-            MESH,
-            uniform_material(block_mesh((2, 2, 2)), SOFT),
-            FREE,
-            Sphere(0.03),
-            np.empty(0, np.int32),
-        )

@@ -81,20 +81,6 @@ def test_the_push_is_the_slope_of_the_energy(probe, where):
 
 
 @EXAMPLES
-@given(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01), st.floats(0, 1), moduli, moduli)
-def test_the_energy_is_convex_in_the_gap(a, b, share, stiff, strong):
-    contact = contact_of(FlaredProbe(Sphere(0.03), COARSE), 1, stiff, strong)
-
-    def energy(height):
-        contact.set_pose(Pose(), np.array([[0.0, 0.0, height]]))
-        assert contact.gap[0] == pytest.approx(height, abs=1e-15)
-        return contact.energy
-
-    chord = (1 - share) * energy(a) + share * energy(b)
-    assert energy((1 - share) * a + share * b) <= chord + 1e-9 * abs(chord)
-
-
-@EXAMPLES
 @given(st.floats(-0.01, 0.01), moduli, moduli)
 def test_the_push_rises_faster_and_faster_up_to_the_greatest(gap, stiff, strong):
     contact = contact_of(FlaredProbe(Sphere(0.03), COARSE), 1, stiff, strong)
@@ -172,21 +158,6 @@ def test_springs_and_turns_together_are_the_derivative_of_the_forces(collider, s
     np.testing.assert_allclose(slope[smooth], slope[smooth].transpose(0, 2, 1), atol=1e-3 * STIFF)
 
 
-@settings(deadline=None, max_examples=40)
-@given(shapes, places, seeds)
-def test_around_a_closed_loop_the_forces_do_no_work(probe, where, seed):
-    rng = np.random.default_rng(seed)
-    centre, (u, v) = TURNED.apply(where)[0], 0.004 * np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
-    angle = np.linspace(0.0, 2 * np.pi, 4000, endpoint=False)[:, None]
-    loop = centre + np.cos(angle) * u + np.sin(angle) * v
-    along = (np.cos(angle) * v - np.sin(angle) * u) * 2 * np.pi / len(angle)
-    whole, _ = contact_at(probe, np.zeros((len(loop), 3)))
-    whole.set_pose(TURNED, loop)
-    whole.drop_planes(loop)
-    power = (whole.force * along).sum(axis=1)
-    assert abs(power.sum()) <= 2e-3 * np.abs(power).sum() + 1e-12
-
-
 @EXAMPLES
 @given(shapes, places, seeds)
 def test_energy_and_forces_know_only_the_pose_and_the_positions(probe, where, seed):
@@ -257,26 +228,6 @@ def test_a_length_along_a_change_minimises_the_energy(probe, where, seed, pull, 
     else:
         # The least lies within half of the last interval, or anywhere where it is level.
         assert slope(max(length - 1 / 64, 0.0)) <= 0.0 <= slope(min(length + 1 / 64, 1.0))
-
-
-def test_the_depth_is_that_of_the_deepest_point():
-    contact = contact_of(FlaredProbe(Sphere(0.03), COARSE), 2)
-    heights = np.array([[0.0, 0.0, -0.002], [0.0, 0.0, -0.005]])
-    assert contact.depth(Pose(), heights) == pytest.approx(0.005)
-    assert contact.depth(Pose(position=[0.0, 0.0, -0.01]), heights) == 0.0
-
-
-def test_where_no_probe_is_nothing_is_pushed():
-    contact, positions = contact_at(FlaredProbe(Sphere(0.03), COARSE), [[0.0, 0.0, -0.004]])
-    assert contact.energy > 0.0
-    contact.clear()
-    assert contact.energy == 0.0
-    contact.update_gaps(positions)
-    assert not contact.force.any()
-    assert len(contact.geometric_stiffness(positions, np.ones(1))[0]) == 0
-    assert contact.drop_planes(positions) is False
-    assert contact.set_friction_bound(np.ones(1)) is False
-    assert contact.update_friction() == 0.0
 
 
 def test_tissue_that_comes_back_to_a_probe_at_rest_is_pushed_again():
@@ -394,15 +345,6 @@ def test_the_places_where_points_hang_go_with_the_probe():
     contact.set_pose(Pose([0.0, 2e-3, 2e-3]), np.zeros((1, 3)))
     contact.set_friction_bound(contact.normal_force)
     np.testing.assert_allclose(contact.force[0, :2], 0.0)
-
-
-def test_without_a_probe_nothing_hangs():
-    contact = plate_on(np.inf)
-    contact.update_gaps(np.full((COUNT, 3), 1e-4))
-    assert contact.energy > 0.0
-    contact.clear()
-    assert contact.energy == 0.0
-    assert not contact.force.any()
 
 
 def triangle_on(probe, corners, spacing=0.01):

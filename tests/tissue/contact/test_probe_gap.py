@@ -13,7 +13,7 @@ from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.triangles import part_size
 from us_sim.tissue.contact.active_set import ActiveSet
-from us_sim.tissue.contact.probe_gap import FlaredProbe, only_forward, push_out, wrench_on_probe
+from us_sim.tissue.contact.probe_gap import FlaredProbe, push_out, wrench_on_probe
 from us_sim.tissue.contact.surface_points import SurfacePoints
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import uniform_material
@@ -35,12 +35,6 @@ depth = st.floats(-0.05, 0.02)
 def gap_at(collider, where, spacing, pose=None):
     gap, normal = push_out(collider, pose or Pose(), np.array([where], dtype=float), spacing)
     return gap[0], normal[0]
-
-
-def test_only_roundings_wider_than_two_spacings_are_resolved():
-    assert not only_forward(SPHERE, FINE)
-    assert only_forward(SPHERE, COARSE)
-    assert only_forward(BOX, FINE)
 
 
 @settings(deadline=None, max_examples=60)
@@ -110,16 +104,6 @@ def test_a_curved_face_pushes_square_to_itself(spacing):
     np.testing.assert_allclose(normal, [sine, 0, cosine], atol=1e-12)
 
 
-def test_beyond_the_ends_of_a_curved_face_an_unresolved_rounding_pushes_as_its_end_does():
-    gap, normal = gap_at(CONVEX, (0.034, 0.0, -0.03), COARSE)  # 4 mm aside of the core
-    np.testing.assert_allclose(normal, [0.6, 0, 0.8])
-    # There the rounding of 5 mm rises 3 mm above the core's end, which is 15 mm back.
-    assert gap == pytest.approx(0.8 * (-0.03 + 0.015 - 0.003))
-    assert gap_at(CONVEX, (0.0351, 0.0, -0.03), COARSE)[0] == np.inf
-    assert gap_at(CONVEX, (0.0, 0.0, -0.17), COARSE)[0] == np.inf
-    assert gap_at(CONVEX, (0.0, 0.0, -0.14), COARSE)[0] == pytest.approx(-0.14)
-
-
 def pressed_by_a_curved_face(method):
     """A solver, the pose of the face 9 mm deep in a block 50 mm high, and the deformation."""
     mesh = box_mesh(
@@ -163,17 +147,6 @@ def test_a_curved_face_sinks_into_the_points_of_a_surface_on_springs():
     assert off.max() < 0.1 * spacing + spacing**2 / (2 * CONVEX.radius)
     free = np.setdiff1d(np.arange(len(model.mesh.nodes)), deformation.contact_nodes)
     assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > 0.0
-
-
-@settings(deadline=None, max_examples=30)
-@given(lateral, lateral, depth)
-def test_pushes_move_with_the_probe(x, y, z):
-    pose = Pose(np.array([0.1, -0.2, 0.3]), np.array([0.3, -0.2, 0.5, 0.8]))
-    gap, normal = gap_at(SPHERE, (x, y, z), FINE)
-    moved, direction = gap_at(SPHERE, pose.apply(np.array([[x, y, z]]))[0], FINE, pose)
-    if gap > -0.014 and normal[2] > 1e-6:  # away from where the direction changes
-        assert moved == pytest.approx(gap, abs=1e-9)
-        np.testing.assert_allclose(direction, pose.rotation @ normal, atol=1e-6)
 
 
 def test_wrench_is_the_reaction_about_the_probes_origin():
@@ -221,12 +194,6 @@ def test_a_probe_that_is_taken_away_holds_nothing():
         assert contact.update(elsewhere, displacement)
         assert not contact.touched.any()
         assert not contact.update(elsewhere, displacement)
-
-
-def test_adopted_nodes_are_those_on_the_surface():
-    contact = ActiveSet(SPHERE, REST, FINE)
-    contact.adopt(Pose(), np.zeros((3, 3)))
-    np.testing.assert_array_equal(contact.touched, [True, False, False])
 
 
 # m, spacings that resolve the roundings below, and that do not
@@ -285,18 +252,6 @@ def test_the_normal_is_the_distances_gradient_and_its_length_is_one(collider, sp
     np.testing.assert_allclose((gap[:3] - gap[3:]) / (2 * step), normal, atol=1e-3)
 
 
-@pytest.mark.parametrize(("spacing", "least"), [(RESOLVING, 1.0), (WIDE, 0.875)])
-@pytest.mark.parametrize("collider", COLLIDERS)
-def test_only_where_two_leaning_flanks_meet_the_normal_jumps(collider, spacing, least):
-    # There from (0, s, c) to (s c, s, c^2), of 60 degrees: by 29 degrees.
-    probe, rng = FlaredProbe(collider, spacing), np.random.default_rng(0)
-    where = rng.uniform([0.0, 0.0, -0.06], [0.06, 0.06, 0.01], (50000, 3))
-    gap, normal = probe.distance(Pose(), where)
-    _, close = probe.distance(Pose(), where + 1e-6 * rng.normal(size=where.shape))
-    outside = gap > -0.99 * collider.offset_box[3]  # of its core
-    assert (normal * close)[outside].sum(axis=1).min() > least - 1e-3
-
-
 @EXAMPLES
 @given(colliders, spacings, places)
 def test_the_curvature_is_how_the_normal_turns(collider, spacing, where):
@@ -309,14 +264,6 @@ def test_the_curvature_is_how_the_normal_turns(collider, spacing, where):
     jumps = np.abs(normals[3] + normals[0] - normals[2] - normals[1]).max() / step
     assume(jumps < 1.0 and np.linalg.norm(turn, 2) < 2.0 / collider.offset_box[3])  # its bound
     np.testing.assert_allclose(probe.curvature(Pose(), where[None])[0], turn, atol=1.0)
-
-
-@pytest.mark.parametrize("spacing", [RESOLVING, WIDE])
-@pytest.mark.parametrize("height", [0.0, -0.001, 0.01])
-def test_the_curvature_of_a_sphere_is_that_of_a_sphere_about_its_middle(spacing, height):
-    # At the pole too, where its core, a point, is neither beside nor ahead.
-    turn = FlaredProbe(SMALL_SPHERE, spacing).curvature(Pose(), np.array([[0.0, 0.0, height]]))
-    np.testing.assert_allclose(turn[0], np.diag([1.0, 1.0, 0.0]) / (0.022 + height), atol=1e-9)
 
 
 @EXAMPLES
@@ -344,14 +291,6 @@ def test_a_rounding_that_the_nodes_resolve_keeps_its_own_flanks(collider, where)
     np.testing.assert_allclose(normal, direction[0], atol=1e-6)
 
 
-@EXAMPLES
-@given(colliders, spacings, places)
-def test_it_contains_the_collider(collider, spacing, where):
-    expected, _ = signed_distance(collider, Pose(), where[None])
-    gap, _ = distance_at(FlaredProbe(collider, spacing), where)
-    assert gap <= expected[0] + 1e-12
-
-
 def test_leaning_flanks_end_a_part_of_the_spacing_beside_the_collider():
     box, flare = RoundedBox(0.05, 0.03, 0.06, 0.006), 0.6 * WIDE
     probe = FlaredProbe(box, WIDE)
@@ -365,21 +304,6 @@ def test_leaning_flanks_end_a_part_of_the_spacing_beside_the_collider():
     gap, normal = distance_at(probe, where + 0.007 * lean)
     assert gap == pytest.approx(0.001)
     np.testing.assert_allclose(normal, lean)
-
-
-@pytest.mark.parametrize("collider", COLLIDERS)
-def test_behind_it_there_is_nothing(collider):
-    box = collider.offset_box
-    end = -box[3] - 2 * box[2] - 0.1  # the grip is 0.1 m long
-    probe = FlaredProbe(collider, WIDE)
-    assert distance_at(probe, (0.0, 0.0, end + 1e-6))[0] < 0.0
-    assert distance_at(probe, (0.0, 0.0, end - 1e-6))[0] == np.inf
-    assert not probe.curvature(Pose(), np.array([[0.0, 0.0, end - 1e-6]])).any()
-
-
-def test_points_that_are_not_near_are_infinitely_far():
-    gap, _ = FlaredProbe(SMALL_SPHERE, WIDE).distance(Pose(), np.zeros((3, 3)), np.array([1]))
-    np.testing.assert_array_equal(gap, [np.inf, 0.0, np.inf])
 
 
 @EXAMPLES
@@ -430,13 +354,6 @@ def test_points_enter_through_the_plane_that_touches_where_their_way_goes_in(
     along = np.linalg.svd(found[None])[2][1:]
     plane = there - gap[0] * found + 0.05 * (np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) @ along)
     assert probe.distance(Pose(), plane)[0].min() > -1e-9
-
-
-def test_without_a_last_pose_points_came_from_before_the_front():
-    probe = FlaredProbe(RoundedBox(0.05, 0.03, 0.06, 0.006), WIDE)
-    gap, normal = probe.entered(None, TURNED, TURNED.apply(np.array([[0.018, 0.0, -0.05]])))
-    assert gap[0] == pytest.approx(-0.05, abs=2e-6)
-    np.testing.assert_allclose(normal[0], TURNED.rotation[:, 2], atol=1e-9)
 
 
 def test_a_point_that_was_inside_is_pushed_out_where_it_was():

@@ -55,15 +55,6 @@ def test_points_stand_for_equal_parts_no_longer_than_the_size(size):
     np.testing.assert_array_equal(points.rest[:, 2], 0.0)
 
 
-def test_the_middles_of_a_divided_triangle_are_known():
-    # Two parts a side: three upright ones at its corners, one the other way up.
-    points = points_of(0.05)
-    assert len(points.rest) == 4 * len(top_triangles(MODEL)) + 20
-    found = np.sort(points.weights[points.weights.max(axis=1) < 1.0].round(12) * 6, axis=1)
-    first = {tuple(row) for row in found.reshape(-1, 3).round(6)}
-    assert first == {(1.0, 1.0, 4.0), (2.0, 2.0, 2.0)}
-
-
 @EXAMPLES
 @given(SIZES, seeds)
 def test_what_is_spread_has_the_same_sum(size, seed):
@@ -138,20 +129,6 @@ def test_springs_and_turns_are_dense_matrices_of_the_points(seed):
 
 @EXAMPLES
 @given(seeds)
-def test_one_spring_is_lumped_with_half_of_its_weights(seed):
-    points, rng = points_of(0.05), np.random.default_rng(seed)
-    inside = np.flatnonzero(points.weights.max(axis=1) < 1.0)
-    point, normal = rng.choice(inside, size=1), rng.normal(size=(1, 3))
-    normal /= np.linalg.norm(normal)
-    nodes, directions, firm = points.lumped(point, normal, np.array([600.0]))
-    order = np.argsort(points.nodes[point[0]])
-    np.testing.assert_array_equal(nodes, points.nodes[point[0]][order])
-    np.testing.assert_allclose(firm, 300.0 * points.weights[point[0]][order])
-    np.testing.assert_allclose(np.abs(directions @ normal[0]), 1.0)
-
-
-@EXAMPLES
-@given(seeds)
 def test_lumped_springs_are_a_little_less_than_the_tensors_of_the_nodes(seed):
     points, rng = points_of(0.05), np.random.default_rng(seed)
     active = rng.choice(len(points.rest), 20, replace=False)
@@ -215,12 +192,6 @@ def test_triangles_that_cannot_move_at_all_have_no_points():
     assert not model.fixed[some.nodes].all(axis=1).any()
     # Nor have fixed nodes by themselves.
     assert len(SurfacePoints(with_contact_nodes(np.flatnonzero(model.fixed)), 1.0).rest) == 0
-
-
-def test_where_nothing_can_be_touched_there_are_no_points():
-    points = SurfacePoints(with_contact_nodes([]), 1.0)
-    assert points.moved(np.ones((3, COUNT))).shape == (0, 3)
-    assert not points.at_nodes(np.zeros(0)).any()
 
 
 @pytest.mark.parametrize("size", [0.01, 1.0])

@@ -10,7 +10,6 @@ from us_sim.tissue.elasticity.materials import (
     TissueMaterials,
     average_over_labels,
     label_fractions,
-    uniform_material,
 )
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
@@ -88,13 +87,6 @@ def test_constants_are_averaged_by_volume():
     assert averaged.density[:5] @ fraction == pytest.approx(1005.0, rel=0.01)
 
 
-def test_the_same_input_gives_the_same_bytes():
-    mesh, labels = block_mesh((5, 4, 4)), voxels()
-    labels[40:90] = 2
-    first, second = (label_fractions(mesh, labels, INDEX)[1].tobytes() for _ in range(2))
-    assert first == second
-
-
 def test_a_label_without_material_is_named():
     labels = voxels()
     labels[:50] = 8
@@ -142,13 +134,3 @@ def test_unphysical_constants_are_refused(modulus, ratio, density, key):
         TissueMaterials(
             np.array([1e4, modulus]), np.array([0.4, ratio]), np.array([1000.0, density])
         )
-
-
-def test_constants_of_different_lengths_are_refused():
-    with pytest.raises(MaterialError, match="density"):
-        TissueMaterials(np.ones(2), np.zeros(2), np.ones(3))
-
-
-def test_uniform_material_fills_the_mesh():
-    materials = uniform_material(block_mesh((2, 2, 2)), MUSCLE)
-    np.testing.assert_array_equal(materials.density, np.full(5, 1060.0))

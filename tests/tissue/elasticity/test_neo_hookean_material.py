@@ -46,15 +46,6 @@ def test_it_is_never_below_the_tissues_own_nor_above_the_stiffest(shear):
     assert (modulus <= 5 * shear.max() * (1 + 1e-14)).all()
 
 
-@given(shears, st.floats(1e-3, 1e3), st.randoms(use_true_random=False))
-def test_it_scales_with_the_moduli_and_does_not_know_the_tetrahedras_order(shear, factor, random):
-    np.testing.assert_allclose(wall(factor * shear), factor * wall(shear), rtol=1e-12)
-    order = list(range(COUNT))
-    random.shuffle(order)
-    shuffled = barrier_modulus(MESH.tetrahedra[order], shear[order], len(MESH.nodes))
-    np.testing.assert_array_equal(shuffled, wall(shear)[order])
-
-
 def withstood(shear):
     soft = uniform_material(MESH, Material(3.0, 0.25, 1000.0))
     return barrier_strength(MESH, replace(soft, young_modulus=2.5 * shear))
@@ -88,11 +79,3 @@ def test_a_stiff_tetrahedron_beside_soft_ones_counts_no_more_than_their_walls():
             counted = shear[t] if t != 3 or alone else 1e4  # the mean of soft and stiff
             expected[node] += counted * areas[t, i]
     np.testing.assert_allclose(withstood(shear), expected, rtol=1e-12)
-
-
-@given(shears, st.floats(1e-3, 1e3))
-def test_what_is_withstood_scales_with_the_moduli_and_lies_between_uniform_ones(shear, factor):
-    found = withstood(shear)
-    np.testing.assert_allclose(withstood(factor * shear), factor * found, rtol=1e-12)
-    assert (found <= withstood(np.full(COUNT, shear.max())) * (1 + 1e-12)).all()
-    assert (found >= withstood(np.full(COUNT, shear.min())) * (1 - 1e-12)).all()

@@ -36,13 +36,6 @@ def chain(count, stiffness=100.0):
     return nodes, SpringNetwork(edges, stiffness * one, 0 * one, one)
 
 
-def test_two_masses():
-    nodes, springs = chain(2)
-    frequency = highest_frequency([springs.factor(nodes)], np.full(2, 2.0), np.zeros(2, bool))
-    assert frequency == pytest.approx(math.sqrt(2 * 100.0 / 2.0))
-    assert step_limit(frequency, 0.0) == pytest.approx(2 / frequency)
-
-
 @pytest.mark.parametrize("count", [5, 12, 200])
 def test_a_chain_between_two_walls(count):
     # w**2 = (4 k / m) sin(n pi / 2 (N + 1))**2; the highest of N masses has n = N.
@@ -100,12 +93,6 @@ def test_highest_frequency_is_the_dense_eigenvalue(held, ratio):
     assert frequency**2 < 2 * (node_stiffness(factors) / mass)[~fixed].max()
 
 
-def test_the_bound_of_springs_is_the_sum_of_their_constants():
-    total = np.zeros(len(MESH.nodes))
-    np.add.at(total, SPRINGS.edges, SPRINGS.stiffness[:, None])
-    np.testing.assert_allclose(node_stiffness([SPRINGS.factor(MESH.nodes)]), total)
-
-
 def observed_limit(model, guess, **chosen):
     """Of `Msds` at given steps, from a disturbance so small that it stays linear; by bisection."""
     disturbed = TissueState.at_rest(len(model.mesh.nodes))
@@ -155,14 +142,6 @@ def test_beyond_the_limit_the_last_good_state_is_kept_and_it_is_said():
     assert np.isfinite(deformation.nodes).all()
 
 
-def test_a_stable_step_leaves_the_masses_alone():
-    model = block((4, 3, 3))
-    factors = [SPRINGS.factor(MESH.nodes)]
-    mass, substeps, action = stabilise(model, factors, 1e-6, 0.1, "mass_scaling", 100)
-    np.testing.assert_array_equal(mass, model.lumped_mass)
-    assert (substeps, action) == (1, "")
-
-
 def test_masses_are_scaled_where_needed_and_it_is_said():
     model = block((4, 3, 3))
     factors = [SPRINGS.factor(MESH.nodes)]
@@ -186,14 +165,6 @@ def test_substeps_are_counted_or_refused():
     assert str(substeps) in action
     with pytest.raises(SolverError, match=f" {substeps} "):
         stabilise(model, factors, 0.01, 0.1, "substeps", substeps - 1)
-
-
-def test_where_nothing_is_free_any_step_is_stable():
-    model = block((3, 3, 3), held=("top", "bottom", "sides"))
-    model.fixed[:] = True
-    solver = Msds(model)
-    assert solver.step_limit == math.inf
-    np.testing.assert_array_equal(solver.deform(None).nodes, model.mesh.nodes)
 
 
 def test_the_residual_is_unbalanced_over_contact_force_or_the_largest_since_rest():

@@ -86,17 +86,6 @@ def test_any_forces_move_as_in_full(points, made, seed, count, together):
     )
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_forces_superpose(made, seed):
-    one, two = np.random.default_rng(seed).normal(size=(2, 3 * SURFACE))
-    both = moved(made, one + two)
-    np.testing.assert_allclose(
-        both, moved(made, one) + moved(made, two), atol=2e-5 * abs(both).max()
-    )
-    np.testing.assert_array_equal(moved(made, 0 * one), 0.0)
-
-
 def test_what_is_far_takes_little_place(points):
     """Forces on one side, nodes ten times as far away as both are wide: a few vectors do."""
     far = points + np.where(np.arange(len(points))[:, None] < SURFACE, 0.0, 10.0)

@@ -12,7 +12,6 @@ from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.two_level import (
     CoarseGrid,
     TwoLevel,
-    add_blocks,
     conjugate_gradients,
 )
 
@@ -109,16 +108,6 @@ def test_the_solution_is_that_of_a_dense_solve(coarse):
     np.testing.assert_allclose(solved.image, image, atol=1e-9 * abs(image).max())
 
 
-def test_a_spring_without_stiffness_changes_nothing():
-    force = np.random.default_rng(0).normal(size=(3, COUNT))
-    force[:, FIXED] = 0.0
-    with_it, without = np.empty_like(force), np.empty_like(force)
-    with np.errstate(all="raise"):
-        two_level(True, SPRINGS)[0].apply(force, with_it)
-    two_level(True, SPRINGS[:3])[0].apply(force, without)
-    np.testing.assert_array_equal(with_it, without)
-
-
 def test_the_coarse_level_saves_iterations_with_and_without_springs():
     force = np.zeros((3, COUNT))
     force[2, MODEL.movable_contact_nodes] = 1.0
@@ -134,30 +123,6 @@ def test_the_coarse_level_saves_iterations_with_and_without_springs():
             counts.append(solved.iterations)
     assert counts[2] < 0.8 * counts[0]
     assert counts[3] < 0.8 * counts[1]
-
-
-def test_springs_that_the_preconditioner_does_not_know_are_solved_for():
-    made, *_ = two_level(True, [])
-    *springs, force = *two_level(True, SPRINGS)[1:], np.zeros((3, COUNT))
-    force[:, FREE] = 1.0
-    solved = conjugate_gradients(
-        tissue().tangent_product, made, force.copy(), 500, 1e-9, add_springs(*springs)
-    )
-    image = with_springs(*springs) @ solved.solution.ravel()
-    np.testing.assert_allclose(image[MOVABLE], force.ravel()[MOVABLE], atol=1e-8)
-
-
-def test_a_node_may_have_springs_in_several_directions():
-    node = MODEL.movable_contact_nodes[3]
-    nodes, stiffness = np.array([node, node, node]), np.array([1e4, 3e3, 2e5])
-    normals = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, 0.8, 0.0]])
-    made = TwoLevel(None, FIXED, 1.0)
-    made.prepare(tissue().diagonal_blocks(), nodes, normals, stiffness)
-    residual = np.random.default_rng(5).normal(size=(3, COUNT))
-    out = np.empty_like(residual)
-    made.apply(residual, out)
-    own = with_springs(nodes, normals, stiffness).reshape(3, COUNT, 3, COUNT)[:, node, :, node]
-    np.testing.assert_allclose(out[:, node], np.linalg.solve(own, residual[:, node]), rtol=1e-8)
 
 
 def test_it_ends_at_the_tolerance_or_with_the_iterations():
@@ -229,16 +194,6 @@ def test_without_a_grid_it_is_the_inverse_of_each_nodes_block_with_its_spring():
         expected = np.linalg.solve(whole[:, node, :, node], residual[:, node])
         np.testing.assert_allclose(out[:, node], expected, rtol=1e-8)
     assert not out[:, FIXED].any()
-
-
-def test_blocks_times_a_field():
-    field = np.random.default_rng(3).normal(size=(3, COUNT))
-    own = stiffness_matrix().reshape(3, COUNT, 3, COUNT)
-    expected = np.einsum("inj,jn->in", np.einsum("injn->inj", own), field)
-    product = field.copy()
-    add_blocks(tissue().diagonal_blocks(), 0.5, field, product)
-    expected = field + 0.5 * expected
-    np.testing.assert_allclose(product, expected, atol=1e-10 * abs(expected).max())
 
 
 def test_single_precision_solves_to_single_precision():

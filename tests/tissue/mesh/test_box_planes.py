@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.errors import MeshError
 from us_sim.tissue.mesh.box_planes import (
     DesiredSpacing,
     fitted_planes,
@@ -34,15 +33,6 @@ def test_planes_ascend_from_end_to_end_and_are_no_more_than_asked(axes, nodes):
         assert (np.diff(found) > 0).all()
 
 
-def test_an_even_wish_gives_an_even_box_of_cubes():
-    axes = [wish([0.01] * 50, length) for length in (0.12, 0.06, 0.03)]
-    planes = fitted_planes(axes, 25 * 13 * 7)
-    # 24, 12 and 6 cells of 5 mm are the most that 25 × 13 × 7 nodes make.
-    assert [len(p) for p in planes] == [25, 13, 7]
-    for found in planes:
-        np.testing.assert_allclose(np.diff(found), 5e-3, rtol=1e-9)
-
-
 def test_cells_are_as_long_as_wished_where_they_are_near_to_what_is_thin():
     edges = np.linspace(0.0, 0.1, 1001)
     thin = DesiredSpacing(edges, np.where((edges[1:] > 0.05) & (edges[1:] <= 0.06), 1e-3, 1.0))
@@ -55,11 +45,6 @@ def test_cells_are_as_long_as_wished_where_they_are_near_to_what_is_thin():
     np.testing.assert_allclose(steps[inside], steps[inside][0], rtol=0.05)
     far = steps[np.abs(middles - 0.03).argmin()] / steps[inside][0]
     assert far == pytest.approx((1e-3 + 0.35 * 0.02) / 1e-3, rel=0.1)
-
-
-def test_too_few_nodes_are_refused():
-    with pytest.raises(MeshError, match="27"):
-        fitted_planes([wish([1.0], 0.1)] * 3, 26)
 
 
 @pytest.mark.parametrize("radius", [3e-3, 6e-3])
@@ -78,17 +63,6 @@ def test_a_round_vessel_asks_for_a_third_of_its_thickness_at_its_middle(radius):
         assert axis.spacing[0] == pytest.approx(0.0395 / 3)
     assert (wanted[1].spacing >= 0.0195 / 3 - 1e-9).all()  # along the vessel nothing is thin
     assert (spacing_by_labels(labels, index, box, step, counted=[])[0].spacing > 0.01).all()
-
-
-def test_a_turned_volume_asks_for_the_same():
-    labels = np.zeros((40, 30, 20), np.uint8)
-    labels[10:16, :, 5:12] = 1
-    box = np.array([[-5e-4, -5e-4, -5e-4], [0.0395, 0.0295, 0.0195]])
-    plain = spacing_by_labels(labels, np.diag([1e3, 1e3, 1e3, 1.0]), box, 1e-3)
-    turned = np.array([[0, 1e3, 0, 0], [0, 0, -1e3, 19], [1e3, 0, 0, 0], [0, 0, 0, 1]])
-    again = spacing_by_labels(labels.transpose(1, 2, 0)[:, ::-1], turned, box, 1e-3)
-    for one, other in zip(plain, again, strict=True):
-        np.testing.assert_allclose(one.spacing, other.spacing)
 
 
 def test_under_the_probe_cells_are_no_longer_than_half_its_half_width():

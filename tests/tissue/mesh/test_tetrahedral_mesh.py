@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tissue_block import block_mesh
 
 from us_sim.errors import MeshError
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, repair, uniform_planes
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, repair
 
 CORNER = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 ONE = np.array([[0, 1, 2, 3]])
@@ -37,13 +37,6 @@ def test_as_many_tetrahedra_as_in_the_paper(nodes, tetrahedra):
     assert mesh.volumes.min() > 0
 
 
-def test_planes_may_be_graded_and_cells_conform():
-    mesh = box_mesh([0.0, 0.1, 0.4], [0.0, 0.5, 0.6, 1.0], [-1.0, 0.0, 2.0])
-    assert mesh.volumes.sum() == pytest.approx(0.4 * 1.0 * 3.0)
-    # A surface without gaps: of a closed box of 2 x 3 x 2 cells, two triangles a cell face.
-    assert len(mesh.boundary) == 2 * 2 * (2 * 3 + 3 * 2 + 2 * 2)
-
-
 def test_boundary_encloses_the_volume_with_outward_triangles():
     mesh = block_mesh((4, 3, 3))
     a, b, c = np.moveaxis(mesh.nodes[mesh.boundary], 1, 0)
@@ -57,11 +50,6 @@ def test_edges_satisfy_eulers_formula():
     faces = (4 * len(mesh.tetrahedra) + len(mesh.boundary)) // 2
     assert len(mesh.nodes) - len(mesh.edges) + faces - len(mesh.tetrahedra) == 1
     assert (mesh.edges[:, 0] < mesh.edges[:, 1]).all()
-
-
-def test_node_order_is_x_then_y_then_z():
-    mesh = box_mesh([0.0, 1.0], [0.0, 2.0, 3.0], [0.0, 4.0])
-    np.testing.assert_array_equal(mesh.nodes[(1 * 3 + 2) * 2 + 1], [1.0, 3.0, 4.0])
 
 
 @pytest.mark.parametrize(
@@ -109,19 +97,6 @@ def test_parts_are_allowed_and_told_apart():
 def test_bad_planes_are_refused(planes):
     with pytest.raises(MeshError, match="planes along y"):
         box_mesh([0.0, 1.0], planes, [0.0, 1.0])
-
-
-def test_one_plane_is_not_enough():
-    with pytest.raises(MeshError, match="1 planes"):
-        uniform_planes(0.0, 1.0, 1)
-
-
-def test_a_sound_mesh_is_left_as_it_is():
-    mesh = block_mesh((4, 3, 3))
-    mended, report = repair(mesh.nodes, mesh.tetrahedra)
-    assert report == ()
-    np.testing.assert_array_equal(mended.nodes, mesh.nodes)
-    np.testing.assert_array_equal(mended.tetrahedra, mesh.tetrahedra)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

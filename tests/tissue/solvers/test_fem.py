@@ -7,7 +7,6 @@ import pytest
 from scipy.sparse.linalg import splu
 from tissue_block import block, block_mesh
 
-from us_sim.cache import cache_folder
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.compliant_contact import FrictionalContact
@@ -103,13 +102,6 @@ def test_gaps_pushes_and_residual_are_as_they_should_be(collider, ratio):
         assert max(checked, deformation.residual) < 1e-5
         reaction = Pose(np.zeros(3), pose.orientation).apply(deformation.force[None])[0]
         np.testing.assert_allclose(reaction, force[model.fixed].sum(axis=0), atol=1e-6)
-
-
-def test_a_centred_press_is_symmetric():
-    model = block((9, 5, 5))
-    deformation = Fem(model).deform(Pose(np.array([0.0, 0.0, 0.01])))
-    np.testing.assert_allclose(deformation.force[:2], 0.0, atol=1e-9)
-    np.testing.assert_allclose(deformation.torque, 0.0, atol=1e-9)
 
 
 def test_a_jump_and_a_walk_end_alike():
@@ -258,41 +250,6 @@ def test_what_takes_long_is_kept_and_mended(cache, monkeypatch, caplog):
     assert np.linalg.norm(twice.force) == pytest.approx(2 * np.linalg.norm(made.force))
 
 
-@pytest.mark.parametrize("contact", ["frictionless", "coulomb", "sticking"])
-@pytest.mark.parametrize("compressed", [False, True])
-def test_a_compliance_from_the_cache_gives_the_same_bytes(contact, compressed, monkeypatch):
-    if compressed:
-        monkeypatch.setattr(compliance_module, "_COMPRESSED", 0)
-    poses = [
-        Pose([0.002 * k - 0.01, 0.001 * k, 0.012], [0.02 * k, 0.0, 0.0, 1.0]) for k in range(6)
-    ]
-
-    def dragged():
-        solver = Fem(block((9, 5, 5)), FemSettings(contact=contact))
-        return b"".join(solver.deform(pose).nodes.tobytes() for pose in poses)
-
-    in_memory = dragged()
-    assert not cache_folder().exists()
-    monkeypatch.setattr(compliance_module, "_KEPT", 0)
-    assert dragged() == in_memory  # computed and kept
-    assert any(path.is_dir() for path in cache_folder().iterdir())
-    assert dragged() == in_memory
-
-
-def test_without_a_place_to_keep_it_there_is_a_warning(tmp_path, monkeypatch, caplog):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("US_SIM_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(compliance_module, "_KEPT", 0)
-    with caplog.at_level(logging.WARNING):
-        assert Fem(block((5, 4, 4))).deform(PRESSED).force[2] < 0
-    assert str(tmp_path / "file" / "cache") in caplog.text
-
-
-def test_small_meshes_and_warming_up_leave_the_disk_alone():
-    Fem(block((5, 4, 4))).warm_up()
-    assert not cache_folder().exists()
-
-
 def test_one_node_sticks_and_slips_as_coulomb_says():
     """On springs of 50 N/m under a flat probe: drag and push are known by hand."""
     flat = RoundedBox(0.1, 0.1, 0.03, 0.001)
@@ -326,14 +283,6 @@ def test_forces_stay_in_the_friction_cone_and_the_wrench_with_them():
         slid += (drag > 0.2999 * push).all() and i > 5
     assert slid > 0  # in the end the whole contact slides
     assert deformation.force[0] < -0.5
-
-
-def test_without_friction_and_with_hardly_any_are_the_same():
-    model = block((13, 9, 7))
-    smooth, rough = Fem(model), Fem(model, FemSettings(contact="coulomb", friction=1e-9))
-    for x in (0.0, 0.01):
-        pose = Pose(np.array([x, 0.0, 0.01]))
-        np.testing.assert_allclose(smooth.deform(pose).nodes, rough.deform(pose).nodes, atol=2e-8)
 
 
 def test_sticking_nodes_go_where_the_probe_goes():

@@ -59,29 +59,6 @@ def test_a_frame_ends_with_its_time_and_a_live_one_when_it_is_balanced(
     assert steps_until_over(balanced_after, **limits) == steps
 
 
-def test_each_step_counts_as_eight_iterations_besides_its_own():
-    budget = FrameBudget()
-    budget.begin(440, moved=True)
-    for _ in range(10):
-        budget.spend(12)
-    assert budget.iterations_left == 440 - 10 * (12 + 8)
-    budget.begin(440, moved=False)
-    assert budget.iterations_left == 2 * 440  # of a probe at rest
-    budget.begin(440, moved=False, restarted=True)
-    assert budget.iterations_left == 6 * 440
-
-
-def test_a_limit_shorter_than_a_step_is_known_where_it_was_set():
-    clock = Clock()
-    budget = FrameBudget(clock)
-    for strict, live, short in [(0.5, None, True), (1.5, None, False), (None, 0.5, False)]:
-        budget.begin(440, strict, live, moved=True)
-        budget.begin_step()
-        clock.now += 1.0
-        budget.end_step(1)
-        assert budget.is_shorter_than_a_step == short
-
-
 def test_load_steps_leave_time_and_iterations_for_the_pose_itself():
     clock = Clock()
     budget = FrameBudget(clock)
@@ -126,18 +103,6 @@ def test_tissue_inside_out_is_begun_anew_after_its_time(hurried, frames):
     recovery.judge(IDENTITY, True)
     assert not recovery.must_restart(hurried=hurried)
     np.testing.assert_array_equal(recovery.upright, IDENTITY)
-
-
-def test_a_restart_holds_for_one_frame():
-    recovery = Recovery(IDENTITY)
-    assert not recovery.take_restart()
-    recovery.restarts = True
-    assert [recovery.take_restart(), recovery.take_restart()] == [True, False]
-
-
-def test_one_core_leaves_a_frame_half_a_period_and_two_more():
-    assert Pace(0.001, cores=1).limit == pytest.approx(PERIOD / 2 - 0.001)
-    assert Pace(0.0, cores=1).limit < Pace(0.0, cores=2).limit < PERIOD
 
 
 @given(st.lists(st.floats(0.0, 0.2), max_size=50), st.floats(0.0, 0.05))

@@ -188,14 +188,6 @@ def test_forces_are_the_energys_slope_and_springs_are_theirs(seed, friction):
     assert contact.energy - energy == pytest.approx(rise, abs=1e-13)
 
 
-def test_hardly_any_friction_is_none():
-    smooth, rough = rubbing(LINEAR, contact="frictionless"), rubbing(LINEAR, friction=1e-9)
-    for x in (0.0, 0.01):
-        pose = at(x=x, z=0.015)
-        found = settle(rough, pose).nodes
-        np.testing.assert_allclose(settle(smooth, pose).nodes, found, atol=5e-6)
-
-
 def test_stiff_tissue_sticks_as_soft_one_does():
     soft = rubbing(friction=0.2)
     materials = uniform_material(block_mesh((9, 5, 5)), Material(1e6, 0.45, 1000.0))
@@ -294,25 +286,6 @@ def test_a_probe_that_is_near_does_not_end_the_creeping():
     assert dents[0] > 0.003
     assert (np.diff(dents) < 0).all()
     assert not any(len(frame.contact_nodes) for frame in away)
-
-
-def test_what_has_relaxed_is_as_without():
-    given = {"contact": "coulomb", "friction": 0.3}
-    model, pose = block((9, 5, 5), Sphere(0.04)), at(x=0.005, z=0.012)
-    plain = FemNonlinear(model, FemNonlinearSettings(**given))
-    viscous = FemNonlinear(
-        model, FemNonlinearSettings(viscosity=0.5, relaxation_time=0.02, **given)
-    )
-    ends = []
-    for solver in (plain, viscous):
-        for _ in range(60):
-            deformation = solver.deform(pose)
-        assert deformation.residual <= 1e-5
-        assert solver.deform(pose) is deformation
-        ends.append(deformation)
-    # Friction remembers how the tissue came there.
-    np.testing.assert_allclose(ends[1].force, ends[0].force, atol=0.2)
-    np.testing.assert_allclose(ends[1].nodes, ends[0].nodes, atol=3e-4)
 
 
 def test_no_step_raises_the_energy_of_viscous_tissue():

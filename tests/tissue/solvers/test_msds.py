@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from tissue_block import at, block
 
-from us_sim.errors import SolverError
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.tissue.elasticity.springs import springs_of
@@ -132,19 +131,6 @@ def test_a_probe_that_appears_inside_comes_from_above():
     deformation = solver.deform(at(z=0.012))
     assert count_inverted(deformation.nodes, solver.model.mesh.tetrahedra) == 0
     assert len(deformation.contact_nodes) > 0
-
-
-def test_a_turning_probe_is_followed():
-    solver = Msds(block((9, 5, 5), RoundedBox(0.06, 0.04, 0.1, 0.003)))
-    solver.deform(at(z=0.008))
-    deformation = solver.deform(at(z=0.008, orientation=(0.0, 0.05, 0.0, -1.0)))
-    assert np.isfinite(deformation.nodes).all()
-    assert deformation.force[2] < 0
-
-
-def test_too_many_substeps_are_refused():
-    with pytest.raises(SolverError, match="mass_scaling"):
-        Msds(block((6, 4, 4)), MsdsSettings(stabilisation="substeps", maximum_substeps=20))
 
 
 def test_a_short_frame_in_which_little_moves_is_not_taken_for_rest():

@@ -143,15 +143,6 @@ def test_the_balance_depends_on_the_pose_and_not_on_the_way_there(name):
     np.testing.assert_allclose(round_about, straight, atol=1e-6)
 
 
-def test_rest_is_at_balance_and_a_fresh_start():
-    newton = pressed("sphere", at(z=0.01))
-    first = [newton.step(20) and newton.energy for _ in range(4)]
-    newton.reset()
-    assert newton.energy == newton.residual_norm == newton.contact_norm == 0.0
-    again = pressed("sphere", at(z=0.01))
-    assert [again.step(20) and again.energy for _ in range(4)] == first
-
-
 def test_a_factor_of_the_stiffness_changes_the_way_and_not_the_end():
     ends = []
     for may_factor in (False, True):
