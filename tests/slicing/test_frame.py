@@ -7,7 +7,7 @@ from us_sim.errors import MeshError, VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.registry import SLICERS
 from us_sim.slicing.b_mode import BMode
-from us_sim.slicing.cutting.resampling import BLACK, Located, evaluate
+from us_sim.slicing.cutting.resampling import BLACK
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.probe.probe import LinearProbe, SectorProbe
 from us_sim.slicing.settings import Imaging
@@ -61,14 +61,6 @@ def test_all_of_a_frame_comes_from_one_cut_in_any_order(scanner, probe, first, m
     assert frame.pixels is frame.pixels
 
 
-def test_a_frame_is_not_confused_by_another_that_came_between(scanner):
-    scanner.use(LINEAR, Imaging())
-    one, other = scanner.frame(POSE, pressed(MESH.nodes)), scanner.frame(Pose(), MESH.nodes)
-    assert (one.pixels != other.pixels).any()
-    np.testing.assert_array_equal(one.labels, scanner.labels(POSE, one.nodes))
-    np.testing.assert_array_equal(other.labels, scanner.labels(Pose(), MESH.nodes))
-
-
 @pytest.mark.parametrize(
     "imaging", [Imaging(elevation_planes=3), Imaging(lateral_resolution=1e-3, gain=3.0)]
 )
@@ -108,19 +100,6 @@ def test_every_method_says_which_tetrahedron_a_pixel_is_in(method):
     outside = located.elements == len(located.tetrahedra)
     pixel_index = plane.pixels() @ to_index[:3, :3].T + to_index[:3, 3]
     np.testing.assert_allclose(located.rest_index()[outside], pixel_index[outside], atol=1e-9)
-
-
-def test_affine_values_are_evaluated_in_runs_and_nowhere_else():
-    rng = np.random.default_rng(3)
-    elements = np.repeat(rng.integers(-1, 6, (7, 11)), 3, axis=1).astype(np.int32)
-    maps = rng.normal(size=(5, 2, 3))
-    found = evaluate(maps, elements, threads=2)
-    column, row = np.meshgrid(np.arange(33), np.arange(7))
-    ones = np.stack([np.ones(column.shape), column, row], axis=-1)
-    expected = np.einsum("rckj,rcj->rck", maps[np.clip(elements, 0, 4)], ones)
-    expected[(elements < 0) | (elements == 5)] = np.nan
-    np.testing.assert_allclose(found, expected.astype(np.float32), rtol=1e-6)
-    assert Located(elements, maps, np.arange(5)).elements is elements
 
 
 def test_what_cannot_be_known_of_a_frame_is_said(scanner):

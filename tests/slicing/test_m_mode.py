@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from us_sim.slicing.m_mode import MMode, SweepPicture
-from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
+from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.slicing.settings import MModeSettings
 
 PROBE = LinearProbe(aperture=0.04, depth=0.03, columns=80, rows=60)
@@ -28,16 +28,6 @@ def test_a_wall_that_moves_is_where_it_was_at_each_moment():
     frame = np.ceil(times * rate - 1e-6) / rate  # what a column shows came after it
     expected = 30 + np.rint(20 * np.sin(2 * np.pi * frame))
     assert brightest[4:] == pytest.approx(expected[4:], abs=0.6)
-
-
-def test_its_line_is_a_beam_where_beams_spread():
-    probe = ConvexProbe(radius=0.04, opening_angle=1.0, depth=0.05, columns=200, rows=200)
-    line, _ = probe.pixel_beams
-    image = np.where(np.isnan(line), 0, line).astype(np.uint8)
-    for lateral in (-0.4, 0.0, 0.3):
-        shown = MMode(probe, MModeSettings(lateral=lateral)).line(image)
-        wanted = (lateral + 0.5) * probe.lines - 0.5
-        assert shown[8:-8].astype(float) == pytest.approx(wanted, abs=2.0)
 
 
 def picture(rows=32, columns=100, sweep=2.0):
@@ -63,9 +53,3 @@ def test_it_begins_anew_when_time_goes_back_or_stops_for_long():
     made.add(np.full((32, 1), 255, np.uint8))
     assert len(made.moments(60.0)) == 1
     assert not made.grey.any()
-
-
-def test_the_zero_of_its_scale_is_a_line_across():
-    drawn = picture(rows=64).drawn()
-    lit = np.flatnonzero((drawn[:64, :100] > 0).all(axis=(1, 2)))
-    assert lit.tolist() == [32]

@@ -12,7 +12,7 @@ from us_sim.errors import ProbeError
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.slicing.settings import Strain
 from us_sim.slicing.strain import compression
-from us_sim.slicing.strain_estimate import Earlier, estimate_strain, slope, track
+from us_sim.slicing.strain_estimate import Earlier, estimate_strain, track
 
 LINEAR = LinearProbe(aperture=0.03, depth=0.04, columns=150, rows=400, lines=128, samples=400)
 PROBES = (
@@ -98,32 +98,6 @@ def test_without_echoes_or_without_likeness_there_is_no_strain():
     assert np.isfinite(found.strain).mean() < 0.2
     assert found.correlation < 0.7
     assert compression(np.full((3, 3), np.nan)) == (0.0, 0.0)
-
-
-def test_motion_across_the_beams_lowers_the_correlation():
-    first, _ = pressed(LINEAR, 0.0)
-    correlations = []
-    for columns in (0, 1, 2, 3):
-        second = np.roll(first, columns, axis=1)
-        correlations.append(estimate_strain(first, second, LINEAR, SETTINGS).correlation)
-    assert correlations == sorted(correlations, reverse=True)
-    assert correlations[0] > 0.999
-    assert correlations[-1] < 0.9
-
-
-def test_a_line_is_fitted_as_numpy_fits_it():
-    rng = np.random.default_rng(5)
-    values, weight = rng.normal(size=(40, 3)), (rng.random((40, 3)) > 0.2).astype(float)
-    found = slope(values, weight, 9)
-    place = np.arange(40.0)
-    for sample, line in np.ndindex(40, 3):
-        part = slice(max(0, sample - 4), sample + 5)
-        w = weight[part, line]
-        if w.sum() < 0.5 * len(w):
-            assert np.isnan(found[sample, line])
-            continue
-        fitted = np.polyfit(place[part], values[part, line], 1, w=w)[0]
-        assert found[sample, line] == pytest.approx(fitted, abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,8 @@ import pytest
 
 from us_sim.errors import ProbeError, SceneError
 from us_sim.geometry.pose import Pose
-from us_sim.scene.building import scanner_of
 from us_sim.scene.reading import parse_scene
-from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics, table_constants
+from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import SurfaceNormals
 from us_sim.slicing.b_mode import BMode, beyond
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
@@ -63,27 +62,6 @@ def test_behind_bone_is_dark_and_behind_blood_is_bright():
     blood = BMode(ball(3), PROBE, acoustics=plain).image(Pose())
     assert blood[behind].mean() > blood[beside].mean() + 10
     assert blood[beside].mean() == pytest.approx(150, abs=1)
-
-
-def test_the_shadow_stays_with_the_ball_as_the_probe_slides():
-    scanner = BMode(ball(2), PROBE, acoustics=dataclasses.replace(LIVE, surfaces=False))
-    dark = [
-        (scanner.image(Pose(np.array([x, 0.0, 0.0])))[100] < 75).nonzero()[0].mean()
-        for x in (-5e-3, 0.0, 5e-3)
-    ]
-    np.testing.assert_allclose(np.diff(dark), -20.0, atol=1.5)  # pixels of 0.25 mm
-
-
-def test_a_mesh_at_rest_shows_what_the_volume_alone_does():
-    volume = ball(2)
-    scanner = BMode(volume, PROBE, acoustics=dataclasses.replace(LIVE, noise=-80.0))
-    pose = Pose(np.array([1.3e-4, 0.7e-4, 1.1e-4]))  # or pixels would lie on borders of voxels
-    alone = scanner.image(pose)
-    mesh = box_mesh([-0.018, 0.0, 0.018], [-0.009, 0.009], [-0.008, 0.01, 0.035])
-    scanner.carry(mesh.nodes, mesh.tetrahedra)
-    carried = scanner.image(pose, mesh.nodes)
-    off = np.abs(alone.astype(int) - carried)
-    assert np.percentile(off, 99) <= 1
 
 
 @pytest.mark.parametrize("method", ["per_pixel", "row_subdivision"])
@@ -177,14 +155,6 @@ def test_normals_of_a_ball_of_voxels_point_to_its_middle(radius):
     assert abs(np.median(distances)) < 0.5  # a curved surface seems to be a little nearer
 
 
-def test_constants_come_from_the_last_word_that_the_table_knows():
-    assert table_constants("Left_portal vein") == table_constants("blood")
-    assert table_constants("thing") is None
-    assert Acoustics().of("rib bone").impedance == 6.364e6
-    own = Acoustics(tissues={"muscle": TissueAcoustics(attenuation=1.1)}).of("muscle")
-    assert (own.attenuation, own.impedance) == (1.1, 1.645e6)
-
-
 @pytest.mark.parametrize(
     ("acoustics", "sentence"),
     [
@@ -201,14 +171,6 @@ def test_constants_come_from_the_last_word_that_the_table_knows():
 def test_what_does_not_go_with_probe_and_volume_is_said(acoustics, sentence):
     with pytest.raises(ProbeError, match=sentence):
         BMode(ball(2), PROBE, acoustics=dataclasses.replace(LIVE, **acoustics))
-
-
-def test_a_label_without_constants_is_said():
-    volume = dataclasses.replace(ball(2), label_names={1: "muscle", 2: "plastic"})
-    with pytest.raises(ProbeError, match=r"tissues.plastic.attenuation"):
-        BMode(volume, PROBE, acoustics=LIVE)
-    given = {"plastic": TissueAcoustics(attenuation=2.0, impedance=2e6)}
-    BMode(volume, PROBE, acoustics=dataclasses.replace(LIVE, tissues=given)).image(Pose())
 
 
 def test_a_volume_without_labels_is_refused_and_a_bad_change_keeps_what_was():
@@ -242,13 +204,6 @@ SCENE = {
 def test_a_scene_with_wrong_acoustics_is_refused_with_its_key(imaging, sentence):
     with pytest.raises(SceneError, match=sentence):
         parse_scene({**SCENE, "imaging": {"acoustics": {"artefacts": "live", **imaging}}})
-
-
-def test_constants_of_a_label_that_the_volume_lacks_are_refused_with_the_scene():
-    acoustics = {"artefacts": "live", "tissues": {"liver": {}}}
-    scene = parse_scene({**SCENE, "imaging": {"acoustics": acoustics}}, origin="my.yaml")
-    with pytest.raises(SceneError, match=r"^my.yaml: imaging.acoustics.tissues.liver"):
-        scanner_of(scene, ball(2))
 
 
 def test_an_image_that_is_deeper_than_a_box_says_by_how_much():

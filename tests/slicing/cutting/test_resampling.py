@@ -1,15 +1,11 @@
 """Rigid sampling against scipy.ndimage, and at the volume's edges."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from us_sim.errors import VolumeError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
-from us_sim.slicing.cutting.span_sampling import MOST_VOXELS_A_SIDE
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.volume.volume import Volume
@@ -57,41 +53,8 @@ def test_the_outer_half_voxel_keeps_the_value_and_beyond_is_zero():
     np.testing.assert_array_equal(image[0], expected)
 
 
-def test_rounding_is_half_up():
-    volume = Volume(np.array([[[0, 0], [0, 0]], [[3, 3], [3, 3]]], np.uint8), MILLIMETRES)
-    # 0.25 of the way from 0 to 3 is 0.75, half of it 1.5, and 0.125 of it 0.375.
-    np.testing.assert_array_equal(sample_plane(volume, along_x(0.0, 0.125, 5))[0], [0, 0, 1, 1, 2])
-
-
-def test_one_voxel_is_a_volume():
-    single = SimpleNamespace(
-        intensities=np.full((1, 1, 1), 9, np.uint8), labels=None, patient_to_index=np.eye(4) * 1e3
-    )
-    np.testing.assert_array_equal(sample_plane(single, along_x(-0.75, 0.5, 4))[0], [0, 9, 9, 0])
-
-
 def test_labels_are_those_of_the_nearest_voxel():
     labels = np.broadcast_to(np.array([3, 1, 200], np.uint8)[:, None, None], (3, 2, 2))
     volume = Volume(np.zeros((3, 2, 2), np.uint8), MILLIMETRES, labels)
     image = sample_labels(volume, along_x(-0.72, 0.4, 10))
     np.testing.assert_array_equal(image[0], [0, 3, 3, 3, 1, 1, 200, 200, 200, 0])
-
-
-def test_a_volume_without_labels_says_so():
-    with pytest.raises(VolumeError, match="has no labels"):
-        sample_labels(Volume(noise((3, 3, 3)), MILLIMETRES), along_x(0, 1, 3))
-
-
-def test_a_volume_beyond_the_numbers_of_the_kernel_is_refused():
-    long = np.broadcast_to(np.uint8(0), (2, 2, MOST_VOXELS_A_SIDE + 1))
-    with pytest.raises(VolumeError, match="at most 16384 a side"):
-        sample_plane(Volume(long, MILLIMETRES), along_x(0, 1, 3))
-
-
-def test_memory_mapped_voxels_are_sampled_in_place(tmp_path):
-    np.save(tmp_path / "voxels.npy", noise((5, 6, 7)))
-    mapped = Volume(np.load(tmp_path / "voxels.npy", mmap_mode="r"), MILLIMETRES)
-    plane = LinearProbe(0.006, 0.006, 6, 6).plane(Pose([3e-3, 2e-3, 0]))
-    np.testing.assert_array_equal(
-        sample_plane(mapped, plane), sample_plane(Volume(noise((5, 6, 7)), MILLIMETRES), plane)
-    )

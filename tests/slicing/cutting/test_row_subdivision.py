@@ -1,21 +1,16 @@
 """Slices of deformed meshes against a pixel-by-pixel search, analytic maps and scipy."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from slicing_cases import SIZE, around_the_box, box, plane_of_nodes
 
-from us_sim.errors import MeshError, SettingsError
+from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.cutting import resampling, row_subdivision, section, trilinear
 from us_sim.slicing.cutting.row_subdivision import RowSubdivision, RowSubdivisionSettings
-from us_sim.slicing.cutting.slicer import warm_up
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
 COUNTS = (7, 5, 6)
@@ -85,31 +80,6 @@ def test_row_subdivision_equals_a_search_of_every_pixel(seed, strength, regions,
     assert slicer.skipped == 0
 
 
-def test_two_separate_bodies_and_the_gap_between_them():
-    """Both ends of every row lie outside, and so does its middle."""
-    left = box_mesh([-0.02, -0.01], [-0.01, 0.01], [0.01, 0.02])
-    nodes = np.concatenate([left.nodes, left.nodes + np.array([0.025, 0, 0])])
-    tetrahedra = np.concatenate([left.tetrahedra, left.tetrahedra + len(left.nodes)])
-    mesh = SimpleNamespace(nodes=nodes, tetrahedra=tetrahedra)
-    plane = LinearProbe(0.06, 0.03, 301, 40).plane(Pose())
-    slicer = RowSubdivision(around_the_box(), nodes, tetrahedra)
-    moved = nodes + np.array([0, 0, 0.002])
-    np.testing.assert_allclose(
-        slicer.rest_coordinates(moved, plane), expected_rest(mesh, moved, plane), atol=1e-9
-    )
-
-
-def test_a_needle_thinner_than_the_first_splits_is_found():
-    needle = np.array([[0.0051, -0.01, 0.01], [0.0058, -0.01, 0.01], [0.0051, 0.01, 0.01],
-                       [0.0051, -0.01, 0.04]])  # fmt: skip
-    mesh = SimpleNamespace(nodes=needle, tetrahedra=np.array([[0, 1, 2, 3]]))
-    plane = LinearProbe(0.06, 0.05, 512, 64).plane(Pose([0, -0.008, 0]))
-    moved = needle + np.array([0, 0, 0.001])
-    found = RowSubdivision(around_the_box(), needle, mesh.tetrahedra).rest_coordinates(moved, plane)
-    np.testing.assert_allclose(found, expected_rest(mesh, moved, plane), atol=1e-9)
-    assert (np.abs(found - plane.pixels()).max(axis=-1) > 5e-4).sum() > 50
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("layer", [0, 1, -1])
 def test_a_plane_through_nodes_and_faces_leaves_no_hole(axis, layer):
@@ -153,33 +123,6 @@ def test_tissue_that_was_pushed_away_leaves_black_and_no_ghost():
     )
 
 
-def test_threads_and_regions_do_not_change_a_byte():
-    volume, mesh = around_the_box(), box(COUNTS)
-    plane = LinearProbe(0.07, 0.05, 200, 150).plane(Pose([0, 1e-3, -0.002], [0.1, 0, 0.2, 1]))
-    nodes = pressed(mesh)
-    images = [
-        RowSubdivision(
-            volume,
-            mesh.nodes,
-            mesh.tetrahedra,
-            threads=threads,
-            settings=RowSubdivisionSettings(regions=regions),
-        ).image(nodes, plane)
-        for regions, threads in ((32, 1), (32, 2), (32, 3), (7, 2), (1, 4))
-    ]
-    for image in images[1:]:
-        np.testing.assert_array_equal(image, images[0])
-
-
-def test_bad_regions_and_nodes_of_two_coordinates_are_refused():
-    with pytest.raises(SettingsError, match=r"slice\.regions"):
-        RowSubdivisionSettings(regions=0)
-    mesh = box((3, 3, 3))
-    slicer = RowSubdivision(around_the_box(), mesh.nodes, mesh.tetrahedra)
-    with pytest.raises(MeshError, match=r"\(27, 2\)"):
-        slicer.image(mesh.nodes[:, :2], LinearProbe(0.04, 0.04, 8, 8).plane(Pose()))
-
-
 @pytest.mark.parametrize(
     ("nodes", "tetrahedra", "words"),
     [
@@ -193,18 +136,3 @@ def test_bad_regions_and_nodes_of_two_coordinates_are_refused():
 def test_a_rest_mesh_that_cannot_be_is_refused(nodes, tetrahedra, words):
     with pytest.raises(MeshError, match=words):
         RowSubdivision(around_the_box(), nodes, np.array(tetrahedra))
-
-
-def test_nothing_is_left_to_compile_after_warming_up():
-    warm_up("row_subdivision")
-    kernels = (section._cut, row_subdivision.cells, row_subdivision.subdivide_rows,
-               row_subdivision.leave_black,
-               trilinear.sample_linear, resampling.sample_nearest)  # fmt: skip
-    before = [len(kernel.signatures) for kernel in kernels]
-    assert min(before) >= 1
-    volume, mesh = around_the_box(), box(COUNTS)
-    slicer = RowSubdivision(volume, mesh.nodes, mesh.tetrahedra)
-    plane = LinearProbe(0.04, 0.04, 30, 20).plane(Pose())
-    slicer.image(pressed(mesh), plane)
-    slicer.labels(pressed(mesh), plane)
-    assert [len(kernel.signatures) for kernel in kernels] == before

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from slicing_cases import SIZE, box, plane_of_nodes
 
-from us_sim.errors import MeshError, VolumeError
+from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting import cut_polygons, resampling, section, span_sampling
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
@@ -79,21 +79,6 @@ def test_on_nodes_edges_and_faces_nothing_is_written_twice(axis, layer, off):
     np.testing.assert_allclose(found, plane.pixels(), rtol=0, atol=1e-9)
 
 
-def test_the_closed_surface_is_covered_where_tissue_moved():
-    """With every rigid pixel black, what is seen is the mesh, its outermost pixels included."""
-    mesh = box(COUNTS)
-    plane = plane_of_nodes(mesh, axis=1, layer=2)
-    shown = SlicePlane(plane.origin - plane.column_step - plane.row_step, plane.column_step,
-                       plane.row_step, plane.columns + 2, plane.rows + 2)  # fmt: skip
-    volume = volume_around_the_box()
-    far = mesh.nodes + np.array([0.5, 0.0, 0.0])
-    slicer = ScanConversion(volume, far, mesh.tetrahedra)
-    seen = ~np.isclose(slicer.rest_coordinates(mesh.nodes, shown)[..., 0], shown.pixels()[..., 0])
-    expected = np.zeros(seen.shape, dtype=bool)
-    expected[1:-1, 1:-1] = True
-    np.testing.assert_array_equal(seen, expected)
-
-
 def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
     mesh = box(COUNTS)
     full = LinearProbe(0.05, 0.04, 64, 50).plane(Pose([0.004, 0, 0.003], [0.1, 0.05, 0, 1]))
@@ -117,34 +102,6 @@ def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
     np.testing.assert_array_equal(places[shown], slicer.rest_coordinates(nodes, full)[shown])
 
 
-def test_more_spans_than_pixels_find_room():
-    """A hundred copies of a mesh in one place: where spans overlap, each is a span of its own."""
-    mesh, copies = box((2, 2, 2)), 100
-    nodes = np.concatenate([mesh.nodes] * copies)
-    tetrahedra = np.concatenate([mesh.tetrahedra + 8 * k for k in range(copies)])
-    volume = volume_around_the_box()
-    plane = LinearProbe(0.02, 0.02, 9, 40).plane(Pose([0, 1e-3, 0.01]))
-    slicer = ScanConversion(volume, nodes, tetrahedra, threads=2)
-    single = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
-    np.testing.assert_array_equal(
-        slicer.image(nodes * 1.01, plane), single.image(mesh.nodes * 1.01, plane)
-    )
-
-
-def test_nodes_of_any_kind_are_taken_and_none_are_kept():
-    volume, mesh = volume_around_the_box(), box(COUNTS)
-    slicer = ScanConversion(volume, mesh.nodes, mesh.tetrahedra)
-    plane = LinearProbe(0.03, 0.03, 40, 40).plane(Pose([0, 1e-3, 5e-3]))
-    nodes = (mesh.nodes * 1.1).astype(np.float32)
-    expected = slicer.image(nodes.astype(np.float64), plane)
-    kernels = len(section._near.signatures)
-    wide = np.zeros((len(nodes), 6))
-    wide[:, ::2] = nodes
-    for given_nodes in (nodes, np.asfortranarray(nodes), nodes.tolist(), wide[:, ::2]):
-        np.testing.assert_array_equal(slicer.image(given_nodes, plane), expected)
-    assert len(section._near.signatures) == kernels
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_one_node_that_is_not_finite_is_found_wherever_it_is(bad):
     mesh = box(COUNTS)
@@ -157,13 +114,6 @@ def test_one_node_that_is_not_finite_is_found_wherever_it_is(bad):
             slicer.image(nodes, plane)
     with pytest.raises(MeshError, match="so far away"):
         slicer.image(mesh.nodes + np.array([0.0, 1e306, 0.0]), plane)
-
-
-def test_a_volume_beyond_the_numbers_of_the_kernel_is_refused():
-    long = np.broadcast_to(np.uint8(0), (2, 2, span_sampling.MOST_VOXELS_A_SIDE + 1))
-    mesh = box((2, 2, 2))
-    with pytest.raises(VolumeError, match="at most 16384 a side"):
-        ScanConversion(Volume(long, np.diag([1e-3] * 3 + [1.0])), mesh.nodes, mesh.tetrahedra)
 
 
 def test_grey_values_keep_within_a_level_along_the_longest_row():

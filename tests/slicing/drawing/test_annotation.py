@@ -1,7 +1,6 @@
 """Scales, outlines, colours and their bar, drawn over an image."""
 
 import math
-import time
 from functools import partial
 
 import cv2
@@ -34,13 +33,6 @@ def black(probe):
     return np.zeros((probe.rows, probe.columns), np.uint8)
 
 
-def thread_seconds(work):
-    """Processor time of this thread in ``work()``."""
-    start = time.thread_time()
-    work()
-    return time.thread_time() - start
-
-
 def runs(lit):
     """Middles of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], lit, [False]]).astype(int)))
@@ -69,18 +61,6 @@ def test_ticks_of_the_depth_scale_stand_at_whole_steps_below_the_face(probe, ins
     assert (off <= 1.01 * spacing).all()
     assert depths[0] == pytest.approx(0.0, abs=1.01 * spacing)
     assert len(rows) == 1 + math.floor(1e3 * probe.depth / apart + 1e-6)
-
-
-@PROBES
-def test_ticks_of_the_width_scale_stand_at_whole_steps_from_the_middle(probe):
-    picture = Annotation(probe, {}).draw(black(probe))
-    columns = runs(picture[-2, : probe.columns - 80].min(axis=-1) > 150)
-    x = 1e3 * (probe.image_to_probe[0, 0] * columns + probe.image_to_probe[0, 3])
-    apart = round(np.median(np.diff(x)))
-    assert apart in {1, 5, 10}
-    off = np.abs(x / apart - np.round(x / apart)) * apart
-    assert (off <= 0.51e3 * probe.pixel_spacing[0]).all()
-    assert len(columns) >= 6
 
 
 @PROBES
@@ -135,54 +115,6 @@ def test_each_structure_is_outlined_in_its_colour_and_named_once():
     np.testing.assert_array_equal(both[:300], blue_once[:300])
 
 
-def test_names_of_neighbours_do_not_cover_one_another_nor_their_outlines():
-    colours = {4: (1.0, 0.0, 0.0), 5: (0.0, 1.0, 0.0), 6: (0.0, 0.0, 1.0)}
-    structures = {number: (f"label {number}", colour) for number, colour in colours.items()}
-    places = {4: (200, 250), 5: (232, 250), 6: (216, 280)}
-    labels = black(LINEAR)
-    for number, (column, row) in places.items():
-        disk(labels, column, row, 13, number)
-    alone = {
-        number: Annotation(LINEAR, {number: structures[number]}).draw(
-            black(LINEAR), np.where(labels == number, labels, 0).astype(np.uint8)
-        )
-        for number in structures
-    }
-    together = Annotation(LINEAR, structures).draw(black(LINEAR), labels)
-    for number, colour in colours.items():
-        channel = int(np.argmax(colour))
-        own = [
-            (picture[..., channel].astype(int) - picture[..., (channel + 1) % 3] > 60)
-            & (picture[..., channel].astype(int) - picture[..., (channel + 2) % 3] > 60)
-            for picture in (alone[number], together)
-        ]
-        assert own[1].sum() == pytest.approx(own[0].sum(), rel=0.06)
-
-
-def test_the_badge_stands_in_a_frame_of_its_colour_and_the_image_stays():
-    annotation = Annotation(LINEAR, {})
-    image = np.random.default_rng(1).integers(0, 256, (512, 512), dtype=np.uint8)
-    before = image.copy()
-    live = annotation.draw(image)
-    stale = annotation.draw(image, badge=Badge("STALE 0.6 s", AMBER))
-    for edge in (stale[:3], stale[-3:], stale[:, :3], stale[:, -3:]):
-        assert (edge == AMBER).all()
-    text = stale[4:40, 100:412].astype(int)
-    assert (np.abs(text - AMBER).max(axis=-1) < 30).sum() > 300
-    np.testing.assert_array_equal(stale[50:-8, 8:-8], live[50:-8, 8:-8])
-    np.testing.assert_array_equal(image, before)
-    assert (live[100:400, 50:400] == image[100:400, 50:400, None]).all()
-
-
-@pytest.mark.parametrize(("size", "letters"), [(256, 8), (512, 13), (1024, 26)])
-def test_letters_grow_with_the_picture(size, letters):
-    probe = LinearProbe(aperture=0.05, depth=0.05, columns=size, rows=size)
-    picture = Annotation(probe, {}).draw(black(probe), badge=Badge("LOST", AMBER))
-    inner = picture[letters // 2 : 4 * letters, size // 4 : 3 * size // 4].astype(int)
-    height = np.ptp(np.nonzero((np.abs(inner - AMBER).max(axis=-1) < 60).any(axis=1))[0]) + 1
-    assert height == pytest.approx(2 * letters, abs=0.2 * letters + 2)
-
-
 @pytest.mark.parametrize("height", [8, 13, 26, 48])
 def test_letters_are_as_high_as_asked_on_a_dark_halo(height):
     label = lettering("20 mm", height, AMBER)
@@ -220,38 +152,8 @@ def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, de
     np.testing.assert_array_equal(picture, again)
 
 
-def test_a_picture_of_512_by_512_is_drawn_faster_than_thirty_thousand_numbers_are_sorted():
-    structures = {n: (f"label {n}", (0.2, 0.5, 0.8)) for n in range(1, 7)}
-    annotation = Annotation(LINEAR, structures)
-    image = np.random.default_rng(2).integers(0, 256, (512, 512), dtype=np.uint8)
-    labels = black(LINEAR)
-    for n in range(1, 7):
-        disk(labels, 70 + 130 * (n % 3), 130 + 200 * (n // 4), 15 + 8 * n, n)
-    # By Python: what NumPy takes depends on the processor by a factor of six.
-    numbers = np.random.default_rng(3).integers(0, 2**31, 30_000).tolist()
-    drawing, sorting = [], []
-    for _ in range(60):
-        drawing.append(thread_seconds(lambda: annotation.draw(image, labels)))
-        sorting.append(thread_seconds(lambda: sorted(numbers)))
-    assert min(drawing) < min(sorting)
-
-
 SCALE = ColourScale("flow", -0.2, 0.2, "cm/s", factor=100.0)
 PROBE = LinearProbe(aperture=0.04, depth=0.04, columns=300, rows=300)
-
-
-def test_the_table_goes_through_the_colours_in_even_steps():
-    table = ColourScale("all", 0.0, 1.0, "", colours=((0, 0, 0), (100, 0, 0), (100, 200, 0))).table
-    assert table.shape == (256, 3)
-    assert table[[0, 255]].tolist() == [[0, 0, 0], [100, 200, 0]]
-    np.testing.assert_allclose(table[:128, 0], np.linspace(0, 99.6, 128), atol=0.6)
-    np.testing.assert_allclose(table[128:, 1], np.linspace(0.8, 200, 128), atol=0.8)
-
-
-def test_values_beyond_the_scale_have_its_last_colours():
-    levels = SCALE.levels(np.float32([-9.0, -0.2, 0.0, 0.1, 0.2, 9.0, np.inf]))
-    assert levels.tolist() == [0, 0, 128, 191, 255, 255, 255]
-    assert [SCALE.text(value) for value in (-0.2, 0.0, 0.2)] == ["-20", "0", "20"]
 
 
 @pytest.mark.parametrize("opacity", [0.0, 0.25, 1.0])
@@ -278,12 +180,6 @@ def test_the_bar_has_the_colours_from_high_to_low_beside_their_values():
     assert len(blue)
     assert red.max() < blue.min() < bottom
     assert picture[bottom - 6 : bottom, left:right].max() > 150  # the note
-
-
-def test_a_bar_that_has_no_room_is_left_out_and_nothing_fails():
-    picture = np.zeros((20, 15, 3), np.uint8)
-    ColourBar(SCALE, 12, "a note that is too long for that").draw(picture)
-    assert picture.shape == (20, 15, 3)
 
 
 def test_an_overlay_lies_below_scales_and_names_and_its_outline_is_drawn():
@@ -371,11 +267,3 @@ def test_an_outline_has_no_steps_and_its_area_whatever_the_press(volume, flat):
     assert turned(outline) < 1.1
     area = PIXEL**2 * cv2.contourArea(outline.astype(np.float32))
     assert area == pytest.approx(np.pi * 3.1**2 * flat, rel=0.02)
-
-
-def test_what_the_image_cuts_off_ends_at_its_side(volume):
-    frame = BMode(volume, BORDER_PROBE).frame(Pose([0.0152, 0.0014, 0.0113]))
-    refine = partial(onto_border, frame)
-    (outline,) = label_outlines(frame.labels, 1, smoothing=2.0, refine=refine)
-    assert -0.6 < outline[:, 1].min() < 0.6
-    assert np.isfinite(outline).all()

@@ -90,16 +90,6 @@ def test_a_tilted_probe_is_in_air_exactly_where_it_is_off_the_skin(degrees, z, m
     assert (coupling[gap < 0.0] >= np.float32(LIGHT_CONTACT)).all()
 
 
-def test_a_convex_face_touches_in_the_middle_only():
-    probe = ConvexProbe(radius=0.05, opening_angle=1.0, depth=0.05, columns=64, rows=64, lines=101)
-    gap, _ = SURFACE.gaps(BLOCK.nodes, probe, Pose([0, 0.0011, 0.001]))
-    angle = (np.arange(101) + 0.5) / 101 - 0.5
-    # Along its radius, from the face at 50 mm to the skin 49 mm below the arc's centre.
-    np.testing.assert_allclose(gap, 0.049 / np.cos(angle) - 0.05, atol=1e-9)
-    assert gap.min() == pytest.approx(-0.001)
-    assert gap.max() > 0.004
-
-
 def test_indented_tissue_is_pressed_by_as_much_as_it_moved():
     nodes = BLOCK.nodes.copy()
     nodes[:, 2] += 0.008 * (1 - nodes[:, 2] / 0.05)
@@ -119,20 +109,6 @@ def test_beside_the_tissue_there_is_nothing_to_touch():
     assert np.isinf(SURFACE.gaps(BLOCK.nodes, PROBE, turned)[0]).all()
     far = SURFACE.contact(BLOCK.nodes, PROBE, Pose([0, 0.5, 0.002]))[0]
     assert (far == 0.0).all()
-
-
-@pytest.mark.parametrize("y", [0.0, 0.01, 0.0011])
-def test_a_plane_through_nodes_and_edges_meets_the_surface_once(y):
-    gap, _ = SURFACE.gaps(BLOCK.nodes, PROBE, Pose([0, y, -0.002]))
-    np.testing.assert_allclose(gap, 0.002, atol=1e-12)
-
-
-def test_triangles_may_face_inward():
-    inward = ContactSurface(BLOCK.nodes, BLOCK.boundary[:, ::-1])
-    pose = tilted(10.0, 0.001)
-    np.testing.assert_array_equal(
-        inward.contact(BLOCK.nodes, PROBE, pose)[0], SURFACE.contact(BLOCK.nodes, PROBE, pose)[0]
-    )
 
 
 def test_a_fold_in_the_skin_is_no_air():
@@ -159,11 +135,6 @@ def test_a_fold_in_the_skin_is_no_air():
 def test_a_surface_that_cannot_be_is_refused(nodes, triangles, words):
     with pytest.raises(MeshError, match=words):
         ContactSurface(nodes, triangles)
-
-
-def test_nodes_of_another_mesh_are_refused():
-    with pytest.raises(MeshError, match="588 nodes at rest"):
-        SURFACE.contact(BLOCK.nodes[:5], PROBE, Pose())
 
 
 PROBES = {
@@ -204,23 +175,6 @@ def test_the_layer_shows_the_tissue_beyond_it_mirrored(name, first, last):
     beyond = depth > surface + pixel
     np.testing.assert_array_equal(filled[beyond], image[beyond])
     np.testing.assert_array_equal(filled[np.isnan(depth)], image[np.isnan(depth)])
-
-
-@pytest.mark.parametrize("name", PROBES)
-def test_lines_in_air_and_a_face_in_full_contact_stay_as_they_are(name):
-    probe, layer = PROBES[name], LAYERS[name]
-    gap = np.full(probe.lines, 2e-3)
-    image, _ = graded(probe, gap)
-    assert layer.filled(image, gap, np.zeros(probe.lines)) is image
-    assert layer.filled(image, np.zeros(probe.lines), np.ones(probe.lines)) is image
-    assert layer.filled(image, np.full(probe.lines, np.inf), np.ones(probe.lines)) is image
-    assert layer.filled(image, np.full(probe.lines, 0.02), np.ones(probe.lines)) is image
-    half = np.where(np.arange(probe.lines) < probe.lines // 2, 1.0, 0.0)
-    filled = layer.filled(image, gap, half)
-    line = np.nan_to_num(probe.pixel_beams[0])
-    in_air = line > probe.lines // 2
-    np.testing.assert_array_equal(filled[in_air], image[in_air])
-    assert (filled[~in_air] != image[~in_air]).any()
 
 
 def test_no_black_wedge_where_a_coarse_mesh_stands_off_a_pressed_face():
@@ -264,10 +218,6 @@ def coupling(value):
     return np.full(100, value, dtype=np.float32)
 
 
-def test_full_contact_leaves_the_image_as_it_is():
-    assert air().shown(TISSUE, coupling(1.0)) is TISSUE
-
-
 @pytest.mark.parametrize(("share", "decibels"), [(0.5, 6.02), (0.1, 20.0)])
 def test_a_badly_coupled_line_is_dimmer_by_decibels_at_every_depth(share, decibels):
     expected = np.maximum(TISSUE.astype(int) - round(4.25 * decibels), 0)
@@ -292,14 +242,6 @@ def test_bands_are_a_lens_apart_and_each_weaker_by_as_much():
     )
     np.testing.assert_allclose(np.diff(mean[bands[:6]]), -4.25 * 5.0, atol=3.0)
     assert mean[bands[0]] == pytest.approx(255 - 4.25 * 10, abs=3.0)  # the setting's -10 dB
-
-
-def test_the_first_band_is_as_strong_as_was_set():
-    weaker = Reverberation(AIR_PROBE, Imaging(contact=True, reverberation=-30.0))
-    difference = air().shown(TISSUE, coupling(0.0)).astype(int) - weaker.shown(
-        TISSUE, coupling(0.0)
-    )
-    np.testing.assert_allclose(difference[:20], 85, atol=1)
 
 
 @pytest.mark.parametrize(("row", "aperture"), [(10, 1.5e-3), (100, 5e-3), (380, 0.04 / 3)])

@@ -1,7 +1,5 @@
 """Points as wide and long as was asked, and the thickness of the beam."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -101,27 +99,6 @@ def test_even_tissue_stays_even_to_the_edges(probe):
     assert (picture[~reached] == 0).all()
 
 
-def test_one_kind_of_loss_leaves_the_other_direction_alone():
-    rows = np.tile(np.arange(0, 240, dtype=np.uint8)[:, None].repeat(2, 0)[:480], (1, 64))
-    probe = LinearProbe(aperture=0.04, depth=0.06, columns=64, rows=480)
-    np.testing.assert_array_equal(
-        Resolution(probe, Imaging(lateral_resolution=5e-3)).spread(rows), rows
-    )
-    columns = np.tile(np.arange(1, 65, dtype=np.uint8), (480, 1))
-    np.testing.assert_array_equal(
-        Resolution(probe, Imaging(axial_resolution=5e-3)).spread(columns), columns
-    )
-
-
-def test_how_many_lines_a_fan_has_changes_neither_picture_nor_cost():
-    grain = np.random.Generator(np.random.PCG64(3)).integers(60, 200, (50, 60), dtype=np.uint8)
-    fan = dataclasses.replace(CONVEX, columns=60, rows=50)
-    imaging = Imaging(lateral_resolution=5e-3, axial_resolution=2e-3)
-    few = Resolution(fan, imaging).spread(grain).astype(int)
-    many = dataclasses.replace(fan, lines=4096, samples=16384)  # would be 67 million echoes
-    np.testing.assert_allclose(Resolution(many, imaging).spread(grain), few, atol=2)
-
-
 def probe(**settings):
     return LinearProbe(aperture=0.04, depth=0.04, columns=16, rows=64, **settings)
 
@@ -144,19 +121,6 @@ def test_weights_have_the_moments_of_the_beam(planes, width, focus):
     np.testing.assert_allclose(weights @ y**2, sigma**2, rtol=1e-6)
 
 
-def test_many_planes_weigh_as_a_gaussian():
-    elevation = Elevation(probe(focus=0.02), Imaging(elevation_planes=15, elevation_width=2e-3))
-    middle = elevation.weights[256]  # depth 20 mm
-    expected = np.exp(-4 * np.log(2) * (elevation.offsets / 2e-3) ** 2)
-    np.testing.assert_allclose(middle, expected / expected.sum(), atol=1e-3)
-
-
-def test_the_beam_is_thinnest_at_its_focus():
-    elevation = Elevation(probe(focus=0.01), Imaging(elevation_planes=7))
-    variance = elevation.weights @ elevation.offsets**2
-    assert abs(step_depths(probe())[variance.argmin()] - 0.01) < 1e-4
-
-
 def volume_of(grey):
     """81 voxels of 0.25 mm across y, from -10 mm to 10 mm."""
     y = (np.arange(81) - 40) * 0.25e-3
@@ -174,22 +138,6 @@ def averaged(volume, pose, **settings):
 def test_a_volume_linear_across_the_plane_shows_its_middle():
     picture = averaged(volume_of(lambda y: 128 + 8000 * y), Pose([0, 0.002, 0]))
     assert (abs(picture.astype(int) - 144) <= 1).all()
-
-
-def test_a_quadratic_volume_shows_the_variance():
-    picture = averaged(volume_of(lambda y: 40 + 2.1e6 * y**2), Pose(), elevation_width=6e-3)
-    depth = (np.arange(64) + 0.5) * 0.04 / 64
-    variance = (6e-3 / 2.354820045) ** 2 * (1 + ((depth - 0.02) / 0.02) ** 2)
-    # Trilinear samples of a parabola lie above it by its curvature times a quarter of d²(1-d)².
-    np.testing.assert_allclose(picture[:, 8], 40 + 2.1e6 * variance, atol=1.2)
-
-
-@pytest.mark.parametrize("planes", [2, 3, 4, 15])
-def test_even_tissue_stays_even(planes):
-    formation = ImageFormation(probe(), Imaging(elevation_planes=planes))
-    for grey in (0, 1, 77, 255):
-        images = [np.full((64, 16), grey, dtype=np.uint8)] * planes
-        assert (formation.form(images) == grey).all()
 
 
 def test_planes_are_parallel_and_lie_across_the_image():
