@@ -8,9 +8,8 @@ from scipy.spatial import cKDTree
 
 from us_sim.errors import ProbeError
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import curved_box_distance, signed_distance
+from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.probe.probe import ConvexProbe
 
 # A core of 50 mm radius, whose front reaches 30 mm to each side: its ends are 40 mm above the
 # centre of curvature, so that normals there are (0.6, 0, 0.8).
@@ -83,29 +82,6 @@ def test_analytic_points(collider, point, expected, normal):
     found, direction = distance(collider, point)
     assert found == pytest.approx(expected, abs=1e-15)
     np.testing.assert_allclose(direction, normal, atol=1e-12)
-
-
-def test_on_the_core_the_normal_points_into_the_tissue():
-    for collider, point in ((Sphere(0.03), (0, 0, -0.03)), (Capsule(0.01, 0.04), (0.01, 0, -0.01))):
-        np.testing.assert_array_equal(distance(collider, point)[1], [0.0, 0.0, 1.0])
-
-
-def test_a_hardly_curved_face_is_flat():
-    points = np.random.default_rng(2).uniform(-0.08, 0.08, (300, 3))
-    flat = RoundedBox(0.05, 0.015, 0.1, 0.003)
-    curved = np.append(flat.offset_box, 1e-5)  # 1/m, less than any that settings allow
-    found = np.array([curved_box_distance(curved, 0.0, *at) for at in points])
-    expected, direction = signed_distance(flat, Pose(), points)
-    np.testing.assert_allclose(found[:, 0], expected, atol=1e-8)
-    np.testing.assert_allclose(found[:, 1:], direction, atol=1e-5)
-
-
-def test_the_curved_face_is_where_a_convex_array_of_that_radius_has_its_beams_start():
-    probe = ConvexProbe(radius=0.055, opening_angle=2 * np.arcsin(0.5), depth=0.1, lines=64)
-    face = np.insert(probe.beam_starts, 1, 0.0, axis=1)
-    found, normal = signed_distance(BENT, Pose(), face)
-    np.testing.assert_allclose(found, 0.0, atol=1e-15)
-    np.testing.assert_allclose(normal[:, [0, 2]], probe.beam_directions, atol=1e-12)
 
 
 @settings(deadline=None, max_examples=40)

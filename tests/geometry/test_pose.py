@@ -41,12 +41,6 @@ def test_inverse_undoes(pose):
     np.testing.assert_allclose(pose.inverse().apply(pose.apply(points)), points, atol=1e-12)
 
 
-@quick
-@given(poses)
-def test_matrix_round_trip(pose):
-    np.testing.assert_allclose(Pose.from_matrix(pose.matrix).matrix, pose.matrix, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("position", "orientation", "words"),
     [
@@ -62,9 +56,3 @@ def test_matrix_round_trip(pose):
 def test_what_is_no_pose_is_refused(position, orientation, words):
     with pytest.raises(PoseError, match=words):
         Pose(position, orientation)
-
-
-def test_a_mirror_or_a_scaling_is_not_rigid():
-    for matrix in (np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1]), np.full((4, 4), np.nan)):
-        with pytest.raises(PoseError):
-            Pose.from_matrix(matrix)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.geometry.triangles import TriangleParts, part_size, vertex_normals
+from us_sim.geometry.triangles import TriangleParts, vertex_normals
 
 
 @pytest.fixture(params=[np.float32, np.float64])
@@ -33,23 +33,6 @@ def test_normals_are_weighted_by_area(dtype):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 2, 0], [0, 0, 2]], dtype=dtype)
     normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 3, 4]]))
     np.testing.assert_allclose(normals[0], np.array([4, 0, 1]) / np.sqrt(17), rtol=1e-6)
-
-
-def test_normals_that_cancel_are_zero(dtype):
-    vertices = np.eye(3, dtype=dtype)
-    np.testing.assert_array_equal(vertex_normals(vertices, [[0, 1, 2], [0, 2, 1]]), 0)
-
-
-def test_parts_are_as_large_as_the_rounding_between_the_spacing_and_a_quarter_of_it():
-    assert part_size(0.004, 0.01) == pytest.approx(0.004)
-    assert part_size(0.05, 0.01) == pytest.approx(0.01)
-    assert part_size(1e-5, 0.01) == pytest.approx(0.0025)
-
-
-def test_no_triangle_has_no_parts():
-    parts = TriangleParts(np.zeros(0), 1.0)
-    assert parts.weights.shape == (0, 3)
-    assert parts.first.tolist() == [0]
 
 
 @given(st.lists(st.floats(1e-3, 7.9), min_size=1, max_size=6))

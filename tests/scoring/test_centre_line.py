@@ -54,11 +54,3 @@ def test_a_plane_beside_the_vessel_or_above_it_cuts_nothing(tube):
     assert line.cut(Pose([0.03, 0.0, 0.0]), 0.04) is None
     assert line.cut(Pose([0.0, 0.05, 0.0]), 0.04) is None
     assert line.cut(Pose([0.0, 0.0, 0.03]), 0.04) is None
-
-
-def test_what_is_not_long_has_no_line(tube):
-    volume, labels = tube
-    assert CentreLine.of(volume, np.zeros_like(labels)) is None
-    ball = np.zeros_like(labels)
-    ball[28:34, 28:34, 28:34] = True
-    assert CentreLine.of(volume, ball) is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import ScoreError
-from us_sim.scoring.metrics import Force, Metric, Scan, Section, metrics_of
+from us_sim.scoring.metrics import Force, Scan, Section, metrics_of
 from us_sim.scoring.motion import Motion
 from us_sim.scoring.settings import ScoreSettings
 
@@ -64,24 +64,6 @@ def test_a_face_that_goes_round_scans_a_ring_where_it_touches():
     assert found["Area Scanned in Contact", "Probe"] == pytest.approx(ring / 2, rel=2e-3)
 
 
-def test_pressing_scans_nothing():
-    rest = np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
-    down = Motion(np.arange(3.0), [[0, 0, 0], [0, 0, 0.01], [0, 0.005, 0.01]], rest)
-    found = table(Scan(down, Force(np.arange(3.0), np.full(3, 5.0)), width=0.04))
-    assert found["Area Scanned in Contact", "Probe"] == pytest.approx(40 * 5)
-
-
-def test_without_force_or_vessels_nothing_is_told_of_them():
-    names = {name for name, _ in table(Scan(circle()))}
-    assert not [name for name in names if "Force" in name or "Contact" in name or "Area" in name]
-
-
-def test_a_probe_that_never_touched_has_no_mean_force_in_contact():
-    found = table(Scan(circle(), Force(np.arange(3.0), np.zeros(3))))
-    assert found["Time in Contact", "Probe"] == 0.0
-    assert ("Mean Probe Force in Contact", "Probe") not in found
-
-
 def test_the_areas_of_a_vessel():
     nan = np.nan
     section = Section(
@@ -97,11 +79,6 @@ def test_the_areas_of_a_vessel():
     assert found["Smallest Area", "vein"] == pytest.approx(4.0)  # what cannot be compared is left
     assert found["Smallest Part of the Area at Rest", "vein"] == pytest.approx(25.0)
     assert found["Mean Angle to the Vessel", "vein"] == pytest.approx(80.0)
-
-
-def test_a_value_that_is_not_known_is_a_dash():
-    assert Metric("x", "mm", np.nan).text == "-"
-    assert Metric("x", "count", 3.0).text == "3"
 
 
 def test_a_force_without_its_times_is_refused():

@@ -193,11 +193,6 @@ def test_a_line_that_moves_sideways_sweeps_a_rectangle():
     assert moved.swept_area(np.add(positions, [0.04, 0, 0]), where) == pytest.approx(0.04 * 0.01)
 
 
-def test_samples_that_do_not_come_later_are_left_out():
-    moved = Motion([0, 1, 1, 0.5, 2], np.eye(5, 3), np.tile([0, 0, 0, 2.0], (5, 1)))
-    assert moved.times.tolist() == [0, 1, 2]
-
-
 @pytest.mark.parametrize(
     ("times", "positions", "orientations"),
     [

@@ -22,11 +22,6 @@ def test_normals_of_a_sphere_point_away_from_its_centre():
     assert np.einsum("ij,ij->i", normals, round_.vertices / 0.05).min() > np.cos(np.radians(1.0))
 
 
-def test_vertex_areas_add_up_to_the_surface():
-    assert plane_surface((0.2, 0.1), 0.01).vertex_areas.sum() == pytest.approx(0.02, rel=1e-12)
-    assert ball(0.05).vertex_areas.sum() == pytest.approx(4 * np.pi * 0.05**2, rel=3e-3)
-
-
 def test_a_flat_sheet_lies_in_z_0_and_faces_out_of_the_body():
     sheet = plane_surface((0.2, 0.1), 0.01)
     assert sheet.vertices.shape == (21 * 11, 3)
@@ -60,13 +55,6 @@ def test_a_bent_sheet_is_flat_and_then_two_arcs_downwards():
     assert np.einsum("ij,ij->i", normals[side], outward).min() > np.cos(np.radians(3))
 
 
-def test_edges_are_each_there_once():
-    quad = TriangleSurface(
-        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[2, 1, 0], [3, 2, 0]])
-    )
-    np.testing.assert_array_equal(quad.edges, [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]])
-
-
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl", "vtk"])
 def test_a_sheet_comes_back_from_a_file(tmp_path, kind):
     meshio = pytest.importorskip("meshio")
@@ -85,14 +73,6 @@ def test_a_sheet_comes_back_from_a_file(tmp_path, kind):
     )
 
 
-def test_quadrilaterals_are_split(tmp_path):
-    path = tmp_path / "quad.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
-    read = read_surface(path)
-    assert len(read.triangles) == 2
-    assert read.vertex_areas.sum() == pytest.approx(1.0)
-
-
 def test_a_real_organ_is_a_closed_surface(shared_data):
     organ = read_surface(shared_data / "meshes-sofa" / "liver-smooth.obj")
     assert (len(organ.vertices), len(organ.triangles)) == (2194, 4384)
@@ -106,14 +86,6 @@ def test_a_real_head_with_texture_coordinates_is_read(shared_data):
     """It has 3969 texture coordinates for 3931 vertices, and quadrilaterals."""
     head = read_surface(shared_data / "meshes-sofa" / "head.obj")
     assert len(head.vertices) == 3931
-
-
-def test_faces_may_count_backwards(tmp_path):
-    path = tmp_path / "back.obj"
-    path.write_text("# a comment\nv 0 0 0\nv 1 0 0\nv 0 0 1\nvn 0 1 0\nf -3//1 -2//1 -1//1\n")
-    read = read_surface(path)
-    normals = vertex_normals(read.vertices, read.triangles)
-    np.testing.assert_array_equal(normals, np.tile([0, -1.0, 0], (3, 1)))
 
 
 @pytest.mark.parametrize(

@@ -65,9 +65,3 @@ def test_states_follow_the_table():
         elif event == "reset":
             clock.reset()
         assert clock.state(now) is expected, f"at {ms} ms"
-
-
-def test_without_a_time_to_coast_it_is_lost_at_once():
-    clock = TrackingClock(coast_for=0.5, lost_after=0.5)
-    clock.seen(0)
-    assert [clock.state(ms * 1_000_000) for ms in (499, 500)] == [TRACKED, LOST]

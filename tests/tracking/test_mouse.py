@@ -45,25 +45,12 @@ def test_velocity_is_integrated_over_time_at_any_rate(rate):
     assert probe.stamp == 1000 * MS
 
 
-def test_a_velocity_that_grows_evenly_is_integrated_exactly():
-    device = mouse()
-    for tick in range(101):
-        probe = device.axes(axes(x=tick / 100), (), 10 * tick * MS)
-    assert probe.pose.position[0] == pytest.approx(0.5 * 0.1 * 1.0, abs=1e-15)  # v t / 2
-
-
 def test_in_the_probes_frame_speed_and_turn_make_a_circle():
     probe = drive(mouse(), axes(x=1.0, rz=1.0), 1.0)
     radius = 0.1 / 1.0  # m/s over rad/s
     np.testing.assert_allclose(
         probe.pose.position, [radius * math.sin(1.0), radius * (1 - math.cos(1.0)), 0], atol=1e-12
     )
-    np.testing.assert_allclose(se3.rotation_log(probe.pose.orientation), [0, 0, 1], atol=1e-12)
-
-
-def test_in_the_patients_frame_a_turn_does_not_bend_the_way():
-    probe = drive(mouse(frame="patient"), axes(x=1.0, rz=1.0), 1.0)
-    np.testing.assert_allclose(probe.pose.position, [0.1, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(se3.rotation_log(probe.pose.orientation), [0, 0, 1], atol=1e-12)
 
 
@@ -94,15 +81,6 @@ def test_the_dead_band_has_no_step_at_its_edge_and_full_deflection_stays_full(de
     place = device.axes(axes(x=deflection), (), 0).pose.position[0] / 0.05
     expected = math.copysign(max(abs(deflection) - band, 0) / (1 - band), deflection)
     assert place == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_displacement_is_that_of_the_cap_and_goes_back_with_it():
-    device = mouse(mode="position")
-    probe = device.axes(axes(x=0.4, ry=-1.0), (), 0)
-    np.testing.assert_allclose(probe.pose.position, [0.02, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(se3.rotation_log(probe.pose.orientation), [0, -0.5, 0], atol=1e-12)
-    probe = device.axes(axes(), (), 10 * MS)
-    np.testing.assert_array_equal(probe.pose.position, 0.0)
 
 
 def test_with_the_clutch_a_short_reach_goes_far_without_a_jump():
@@ -151,15 +129,6 @@ def test_the_probe_stops_at_the_workspace_and_comes_back_at_once():
     device.axes(axes(x=-1.0), (), 1010 * MS)
     probe = device.axes(axes(x=-1.0), (), 1020 * MS)
     assert probe.pose.position[0] == pytest.approx(0.02 - 0.001)
-
-
-def test_axes_are_put_in_any_order():
-    device = mouse(mode="position", axes=(1, 0, 4, 3, 2, 7))
-    probe = device.axes([0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0.6], (), 0)
-    np.testing.assert_allclose(probe.pose.position / 0.05, [0.2, 0.1, 0.5], atol=1e-12)
-    np.testing.assert_allclose(
-        se3.rotation_log(probe.pose.orientation) / 0.5, [0.4, 0.3, 0.6], atol=1e-12
-    )
 
 
 @pytest.mark.parametrize(

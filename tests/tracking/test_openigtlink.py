@@ -135,12 +135,6 @@ def test_the_body_is_chosen_among_others_and_said_when_it_is_not_there(listen, p
     wait_until(lambda: heard.measurements)
 
 
-def test_without_a_name_the_only_device_is_taken(listen, plain):
-    heard = listen(plain.port, None)
-    plain.accept().sendall(message("TRANSFORM", columns(MATRIX), "Anything"))
-    wait_until(lambda: heard.measurements)
-
-
 def quaternion(x=0.0, y=0.0, z=0.5**0.5, w=0.5**0.5):
     return struct.pack(">7f", 10, 20, 30, x, y, z, w)
 
@@ -196,18 +190,6 @@ def test_what_is_no_pose_is_said_and_survived(listen, plain, sent, kind, word):
     assert said == kind
     assert word in text
     assert heard.connections == 1
-
-
-def test_a_position_without_an_orientation_is_not_turned():
-    data = message("POSITION", quaternion()[:12])
-    [(_, matrix)] = poses_in(header_of(data[: HEADER.size]), data[HEADER.size :])
-    np.testing.assert_allclose(matrix, pose_matrix(np.eye(3)), atol=1e-8)
-
-
-def pose_matrix(rotation):
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, [0.01, 0.02, 0.03]
-    return matrix
 
 
 @pytest.mark.parametrize(
@@ -306,17 +288,6 @@ def test_what_we_send_is_what_pyigtl_reads_and_its_checksum_holds():
             expected = np.diag([1e3, 1e3, 1e3, 1]) @ place
             np.testing.assert_allclose(read.ijk_to_world_matrix, expected, atol=1e-4)
             assert read.world_coordinate_system == "lps"
-
-
-def test_a_transform_is_the_same_after_the_wire():
-    matrix = np.eye(4)
-    matrix[:3, 3] = [0.1, -0.2, 0.3]
-    data = transform_message("A", STAMP, matrix)
-    header = header_of(data[: HEADER.size])
-    assert abs(header.stamp - STAMP) <= 1
-    [(name, read)] = poses_in(header, data[HEADER.size :])
-    assert name == "A"
-    np.testing.assert_allclose(read, matrix, atol=1e-8)
 
 
 def test_pyigtls_client_receives_the_newest_from_our_server():

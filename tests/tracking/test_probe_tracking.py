@@ -123,16 +123,6 @@ def test_stamps_that_jump_back_start_everything_anew(method):
     assert follow.pose.position[0] == pytest.approx(0.9, abs=1e-9)
 
 
-def test_a_looping_recording_gives_the_same_poses_each_time():
-    rng = np.random.default_rng(6)
-    recording = [at(20 * k, x) for k, x in enumerate(np.cumsum(rng.normal(0, 1e-3, 100)))]
-    tracked = tracking("one_euro", GateSettings())
-    first, second = take(tracked, *recording), take(tracked, *recording)
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a.pose.matrix, b.pose.matrix)
-    assert tracked.restarts == {"stamp": 1}
-
-
 @pytest.mark.parametrize("method", FILTERS.names)
 def test_after_it_was_lost_it_starts_where_it_is_found(method):
     tracked = tracking(method, GateSettings(), lost_after=0.5)
@@ -191,18 +181,6 @@ def test_after_nonsense_the_filter_starts_where_the_probe_is_found(method):
     found = take(tracked, at(2200, 0.02))[0]
     assert found.pose.position[0] == 0.02
     assert tracked.restarts == {"gap": 1}
-
-
-def test_zeros_for_a_covariance_mean_that_nothing_is_known():
-    assert take(tracking(), at(0, covariance=np.zeros((6, 6))))[0].covariance is None
-
-
-def test_after_a_reset_it_waits():
-    tracked = tracking("kalman", GateSettings())
-    take(tracked, at(0))
-    tracked.reset()
-    assert tracked.state(START) is TrackingState.WAITING
-    assert take(tracked, at(-500, 4.0))[0].pose.position[0] == 4.0
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from us_sim.errors import MeshError, PoseError
+from us_sim.errors import PoseError
 from us_sim.geometry.se3 import rotation_between
 from us_sim.skin.surface import bent_surface, plane_surface
 from us_sim.tracking.virtual_hand import (
@@ -116,19 +116,6 @@ def test_walking_keeps_its_length_and_bends_with_the_skin(across, along):
     assert foot.point[1] == pytest.approx(along, abs=2e-4)
 
 
-def test_at_an_edge_one_stays():
-    foot = PLANE.walk(PLANE.closest(np.zeros(3)), np.array([0.0, 5.0, 0.0]))
-    np.testing.assert_allclose(foot.point, [0.0, 0.1, 0.0], atol=1e-12)
-
-
-def test_above_is_the_side_that_faces_the_probe():
-    top = SPHERE.above(0.0, 0.02)
-    np.testing.assert_allclose(top.point[:2], [0.0, 0.02], atol=1e-12)
-    assert top.point[2] == pytest.approx(-math.sqrt(RADIUS**2 - 0.02**2), abs=2 * FACET)
-    beside = PLANE.above(3.0, 0.0)
-    np.testing.assert_allclose(beside.point, [0.1, 0.0, 0.0], atol=1e-12)
-
-
 def test_the_closest_point_is_that_of_all_triangles_tried_one_by_one():
     sheet = plane_surface((0.02, 0.02), 0.002)
     generator = np.random.default_rng(4)
@@ -170,19 +157,6 @@ def test_a_side_that_is_steeper_than_the_limit_is_not_of_the_upper_side(degrees,
     of_the_top = 0.01 * (math.sin(turn) - math.cos(turn))
     of_the_side = 0.01 * (math.cos(turn) - math.sin(turn))
     assert surface.upper[2] == pytest.approx(of_the_side if is_upper else of_the_top)
-
-
-def test_what_faces_down_only_has_no_upper_side():
-    vertices, triangles = cube()
-    down = vertices[triangles][:, :, 2].min(axis=1) > 0
-    with pytest.raises(MeshError, match="no triangle"):
-        RestSurface.upper_side(vertices, triangles[down])
-
-
-@pytest.mark.parametrize("triangles", [[[0, 1, 2]], np.empty((0, 3), dtype=int)])
-def test_what_has_no_area_is_no_surface(triangles):
-    with pytest.raises(MeshError, match="area"):
-        RestSurface(np.zeros((3, 3)), np.asarray(triangles))
 
 
 SPEED, TAU = 0.25, 0.02
@@ -249,22 +223,6 @@ def test_it_ends_at_the_goal(goal):
     assert approach.distance() < 1e-9
 
 
-def test_near_the_goal_it_is_critically_damped():
-    approach = towards(np.array([1e-3, 0.0, 0.0]))  # less than speed times time constant
-    for k in range(1, 20):
-        s = 0.25 * k
-        reached = 1e-3 * (1.0 - (1.0 + s) * math.exp(-s))  # the step response
-        assert abs(approach.advance(0.25 * TAU)[0] - reached) < 1e-15
-
-
-def test_it_moves_within_the_first_sixtieth_of_a_second():
-    approach = towards(np.array([0.02, 0.0, 0.0]))
-    t = 1 / 60
-    far = SPEED * (t - TAU * (1 - math.exp(-t / TAU)))  # a first-order lag behind a ramp
-    assert abs(approach.advance(t)[0] - far) < 1e-15
-    assert far > 1e-3
-
-
 def at(angle: float, **held: float) -> Stance:
     return Stance([RADIUS * math.sin(angle), 0.0, RADIUS * (1 - math.cos(angle))], **held)
 
@@ -290,22 +248,6 @@ def test_poses_do_not_depend_on_the_steps(press, rotation, fan, steps):
     first, second = coarse.stance.pose(CYLINDER), fine.stance.pose(CYLINDER)
     np.testing.assert_allclose(first.position, second.position, atol=1e-9)
     assert np.abs(rotation_between(first.orientation, second.orientation)).max() < 1e-6
-
-
-def test_a_press_takes_as_long_as_its_speed_says():
-    motion = Motion(Stance(press=-0.05))
-    motion.aim(Stance(press=0.02))
-    motion.advance(0.4)  # 60 mm further at 0.15 m/s, less the lag of a time constant of 20 ms
-    assert motion.stance.press == pytest.approx(-0.05 + 0.15 * (0.4 - 0.02), abs=1e-9)
-
-
-def test_rotation_takes_the_shorter_way():
-    motion = Motion(Stance(rotation=3.0))
-    motion.aim(Stance(rotation=-3.0))
-    motion.advance(0.05)
-    assert abs(motion.stance.rotation) > 3.0
-    motion.advance(1.0)
-    assert motion.stance.rotation == pytest.approx(-3.0, abs=1e-6)
 
 
 def test_who_takes_the_probe_begins_where_it_is():
@@ -359,12 +301,6 @@ def test_the_way_back_from_a_pose(polar, turn, press, rotation, fan, rock):
     assert (found.fan, found.rock) == pytest.approx((fan, rock), abs=2e-3)
 
 
-def test_a_probe_that_lies_on_its_side_has_a_stance_too():
-    pose = Stance(rotation=0.3, fan=math.pi / 2).pose(PLANE)
-    again = Stance.of(pose, PLANE).pose(PLANE)
-    assert np.abs(rotation_between(again.orientation, pose.orientation)).max() < 1e-6
-
-
 def test_sliding_is_along_the_probes_own_axes():
     turned = Stance(rotation=math.pi / 2)
     np.testing.assert_allclose(turned.slid(PLANE, 0.01, 0.0).point, [0, 0.01, 0], atol=1e-12)
@@ -373,11 +309,6 @@ def test_sliding_is_along_the_probes_own_axes():
     np.testing.assert_allclose(
         bent, [RADIUS * math.sin(0.5), 0, RADIUS * (1 - math.cos(0.5))], atol=2e-4
     )
-
-
-def test_home_is_above_the_origin_or_in_the_middle():
-    np.testing.assert_allclose(Stance.home(PLANE, 0.001).point, [0, 0, 0])
-    assert Stance.home(SPHERE, 0.0).point[2] == pytest.approx(-RADIUS, abs=1e-5)
 
 
 def test_no_hand_presses_or_turns_without_end():

@@ -150,10 +150,3 @@ def test_half_a_board_is_enough_and_a_row_or_none_of_it_is_not():
     assert scale == pytest.approx(100 / 0.03, rel=2e-3)
     assert find_board(photo[:, :200], board) is None
     assert find_board(np.zeros((100, 100), np.uint8), board) is None
-
-
-def test_old_charuco_boards_need_to_be_called_that():
-    shape = ("4X4_50", 5, 6, 0.03, 0.02)
-    photo = drawn(RigidBody.charuco(*shape, legacy=True))
-    assert find_board(photo, RigidBody.charuco(*shape)) is None
-    assert len(find_board(photo, RigidBody.charuco(*shape, legacy=True))) == 20

@@ -11,8 +11,6 @@ from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
     find_time_offset,
     line_row,
-    signal_of_images,
-    signal_of_positions,
 )
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -66,14 +64,6 @@ def test_what_lies_in_a_gap_is_not_made_up():
     assert found.correlation > 0.9999
 
 
-def test_the_direction_that_moved_most_is_the_signal():
-    times = np.linspace(0, 5, 100)
-    along = np.array([2.0, -1.0, 2.0]) / 3.0
-    path = np.outer(strokes(times), along) + np.outer(1e-4 * np.cos(9 * times), [1, 2, 0])
-    signal = signal_of_positions(times, path)
-    assert abs(np.corrcoef(signal.values, strokes(times))[0, 1]) > 0.9998
-
-
 @settings(max_examples=15, deadline=None)
 @given(height=st.floats(40.0, 160.0), slope=st.floats(-0.3, 0.3), seed=st.integers(0, 100))
 def test_a_tilted_line_is_found_to_a_part_of_a_row(height, slope, seed):
@@ -83,14 +73,6 @@ def test_a_tilted_line_is_found_to_a_part_of_a_row(height, slope, seed):
     image = 200.0 * np.exp(-0.5 * ((rows - line) / 1.5) ** 2) + rng.uniform(0, 8, (220, 301))
     image[180:, 40:90] = 230.0  # another echo, below a part of the line
     assert line_row(image.astype(np.uint8)) == pytest.approx(height, abs=0.15)
-
-
-def test_an_image_without_a_line_has_none():
-    assert np.isnan(line_row(np.zeros((50, 60), np.uint8)))
-    noise = np.random.default_rng(0).integers(0, 12, (50, 60)).astype(np.uint8)
-    assert np.isnan(line_row(noise))
-    with pytest.raises(CalibrationError, match="0 of 4 images"):
-        signal_of_images(np.arange(4.0), [noise] * 4)
 
 
 def test_the_water_tanks_lines_are_where_plus_found_them(shared_data):

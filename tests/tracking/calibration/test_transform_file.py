@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
-from us_sim.settings.text_files import load_yaml
 from us_sim.tracking.calibration.transform_file import (
     read_transform,
     write_transform,
@@ -33,38 +32,12 @@ def test_what_is_written_is_read_to_the_last_bit(tmp_path_factory, position, ori
     np.testing.assert_allclose(read.orientation, pose.orientation, rtol=0, atol=3e-16)
 
 
-def test_residuals_frames_and_method_are_kept(tmp_path):
-    file = tmp_path / "registration.yaml"
-    write_transform(
-        file,
-        Pose([0.1, 0.2, 0.3]),
-        from_frame="tracker",
-        to_frame="patient",
-        method="point registration",
-        residuals={"fre": np.float64(3e-4), "landmarks": {"#1": np.array([1e-5, 2.0, 0.0])}},
-        more={"pixel_spacing": np.array([1e-4, 2e-4])},
-    )
-    said = load_yaml(file.read_text())
-    assert (said["from"], said["to"]) == ("tracker", "patient")
-    assert said["method"] == "point registration"
-    assert said["residuals"] == {"fre": 3e-4, "landmarks": {"#1": [1e-5, 2.0, 0.0]}}
-    assert said["pixel_spacing"] == [1e-4, 2e-4]
-    assert said["date"].startswith("20")
-
-
 def test_a_file_is_never_overwritten(tmp_path):
     file = tmp_path / "t.yaml"
     file.write_text("mine")
     with pytest.raises(CalibrationError, match="exists already"):
         write_transform(file, Pose(), from_frame="a", to_frame="b", method="m")
     assert file.read_text() == "mine"
-
-
-def test_a_person_may_write_units_and_exponents(tmp_path):
-    file = tmp_path / "given.yaml"
-    file.write_text("position: [10 mm, 1e-3, 0]\n" + HALF_TURN)
-    pose = read_transform(file)
-    np.testing.assert_allclose(pose.position, [0.01, 0.001, 0.0], rtol=1e-15)
 
 
 @pytest.mark.parametrize(

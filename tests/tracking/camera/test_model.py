@@ -64,15 +64,6 @@ def test_the_ray_of_a_pixel_leads_back_to_the_point(model, x, y, depth):
     assert np.allclose(camera(model).rays(pixel), [[x, y]], atol=1e-9)
 
 
-def test_a_fisheye_sees_beyond_a_right_angles_half():
-    wide = CameraModel(
-        1000, 1000, [[300, 0, 500], [0, 300, 500], [0, 0, 1]], np.zeros(4), "equidistant"
-    )
-    # 80 degrees from the axis: 300 × 80° in radians from the middle.
-    pixel = np.array([[500 + 300 * np.radians(80), 500.0]])
-    assert np.allclose(wide.rays(pixel), [[np.tan(np.radians(80)), 0.0]], atol=1e-6)
-
-
 def test_what_is_behind_the_camera_or_beyond_its_lens_is_nowhere():
     assert np.isnan(camera("plumb_bob").project(np.array([[0.0, 0.0, -1.0]]))).all()
     # With k1 = -0.3 alone radii grow up to 1 / sqrt(0.9), where they are 0.703.

@@ -68,40 +68,6 @@ def test_the_black_of_a_marker_covers_its_projected_area():
         assert area == pytest.approx(expected, rel=0.012)
 
 
-def test_the_noise_is_as_strong_as_it_is_said_to_be(marker):
-    pose = Pose([0.0, 0.0, 0.3], FACING)
-    clean = marker.render(pose, SHARP).astype(float)
-    noisy = marker.render(pose, Conditions(defocus=0, read_noise=2.0, shot_noise=0.03), seed=3)
-    squares = (noisy - clean) ** 2
-    for low, high in ((20, 30), (60, 90), (120, 160)):
-        here = (clean >= low) & (clean < high)
-        # Rounding to grey levels adds a twelfth to each of the two.
-        expected = 4.0 + 0.03 * clean[here].mean() + 1 / 12 + 1 / 12
-        assert squares[here].mean() == pytest.approx(expected, rel=0.05)
-
-
-def test_the_same_arguments_give_the_same_bytes(camera, marker):
-    pose = Pose([0.01, 0.0, 0.3], FACING)
-    worst = Conditions(gradient=0.5, occlusion=0.3)
-    motion = np.array([0.003, 0, 0, 0, 0, 0.02])
-    first = marker.render(pose, worst, 5, motion)
-    again = RenderedView(camera, marker.body).render(pose, worst, 5, motion)
-    np.testing.assert_array_equal(first, again)
-    assert (first != marker.render(pose, worst, 6, motion)).mean() > 0.5
-
-
-def test_a_hand_covers_a_share_of_the_marker(camera, marker):
-    pose = Pose([0.0, 0.0, 0.25], FACING)
-    corners = camera.project(pose.apply(marker.body.corners[0]))
-    inside = cv2.fillConvexPoly(np.zeros((480, 640)), np.int32(corners), 1) > 0
-    free = marker.render(pose, SHARP)[inside]
-    shares = []
-    for seed in range(12):
-        covered = marker.render(pose, Conditions(0, 0, 0, occlusion=0.5), seed)[inside]
-        shares.append((covered != free).mean())
-    assert np.mean(shares) == pytest.approx(0.45, abs=0.15)
-
-
 def test_motion_smears_edges_over_the_way_that_they_go(marker):
     pose = Pose([0.0, 0.0, 0.3], FACING)
     still = marker.render(pose, SHARP)[240].astype(float)

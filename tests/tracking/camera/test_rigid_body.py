@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from us_sim.errors import TrackingError
-from us_sim.tracking.camera.markers import dictionary, family, proper_name
+from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
 CORNERS = RigidBody.single("4X4_50", 1, 0.04).corners
@@ -17,21 +17,6 @@ def test_boards_are_where_opencv_has_them():
     ours = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
     assert np.allclose(ours.corners, np.array(board.getObjPoints()), atol=1e-7)
     assert np.array_equal(ours.ids, np.ravel(board.getIds()))
-
-
-def test_a_markers_normal_points_to_who_sees_its_front():
-    # Of a single marker y is up and z out of the paper; of a board y is down and z into it.
-    assert np.allclose(RigidBody.single("4X4_50", 3, 0.04).normals, [[0, 0, 1]])
-    assert np.allclose(RigidBody.grid("4X4_50", 2, 1, 0.04, 0.01).normals, [[0, 0, -1]] * 2)
-    assert np.allclose(RigidBody.charuco("4X4_50", 3, 3, 0.04, 0.02).normals, [[0, 0, -1]] * 4)
-
-
-def test_dictionaries_are_known_by_opencvs_names():
-    assert proper_name("DICT_APRILTAG_36H11") == "APRILTAG_36h11"
-    assert family("6X6_250") == "6X6_1000"
-    assert family("APRILTAG_36h11") == "APRILTAG_36h11"
-    small, large = dictionary("5X5_50").bytesList, dictionary("5X5_1000").bytesList
-    assert np.array_equal(small, large[:50])
 
 
 def body_of(*corners, ids=(1,)):
@@ -57,11 +42,6 @@ def body_of(*corners, ids=(1,)):
 def test_an_impossible_body_is_refused(make, arguments, word):
     with pytest.raises(TrackingError, match=word):
         make(*arguments)
-
-
-def test_a_marker_is_in_a_body_once():
-    with pytest.raises(TrackingError, match="twice"):
-        body_of(CORNERS.repeat(2, 0), ids=(1, 1))
 
 
 def test_a_table_of_millimetres_is_read(tmp_path):

@@ -13,7 +13,6 @@ from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.tracking.camera.corner_refinement import refined_corners
 from us_sim.tracking.camera.encodings import decode_image
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector, detect_corners
-from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import Conditions, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
@@ -303,16 +302,6 @@ def test_webcam_videos_are_tracked_in_every_frame(video, body, least, shared_dat
             assert np.degrees(rotation_angle(seen.pose, before)) < 5.0
         before, count = seen.pose, count + 1
     assert count == 10
-
-
-def test_markers_are_of_the_family_that_is_asked_for():
-    tag = RigidBody.single("APRILTAG_36h11", 3, 0.04)
-    image = np.full((480, 640), 230, np.uint8)
-    image[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary("APRILTAG_36h11"), 3, 80)
-    assert CameraSource(WEBCAM, tag).measure(image, 0) is not None
-    refused(
-        image, "no marker", RigidBody.single("APRILTAG_25h9", 3, 0.04), view_angle_limit="60 deg"
-    )
 
 
 def tag_poses(folder):

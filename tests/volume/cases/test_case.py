@@ -11,7 +11,7 @@ from us_sim.errors import CaseError
 from us_sim.geometry.transducer import ProbeSettings
 from us_sim.settings.reading import Reader
 from us_sim.tissue.elasticity.material import Material
-from us_sim.volume.cases.case import case_roots, cases_in, find_case, read_case
+from us_sim.volume.cases.case import case_roots, find_case, read_case
 from us_sim.volume.cases.settings import CaseSettings, CaseStart, CaseStructure
 from us_sim.volume.files.writing import write_labels
 from us_sim.volume.volume import Volume
@@ -38,14 +38,6 @@ def test_a_case_is_read_as_it_was_made(make_case, block):
     np.testing.assert_array_equal(volume.labels, block.labels)
     np.testing.assert_allclose(volume.index_to_patient, block.index_to_patient, atol=1e-15)
     assert volume.label_names == {0: "tissue", 6: "vein"}
-
-
-def test_a_case_without_labels_is_a_volume_alone(make_case):
-    case = read_case(make_case(labelled=False))
-    assert not case.has_labels
-    assert case.volume().labels is None
-    assert case.surfaces == {}
-    assert case.tissue is None
 
 
 def changed(folder, text):
@@ -149,12 +141,3 @@ def test_what_is_no_case_is_said(roots, name, message):
     Path("bare/volume.nrrd").unlink()
     with pytest.raises(CaseError, match=message):
         read_case(find_case(name))
-
-
-def test_a_listing_passes_by_what_is_no_case(roots):
-    (roots[1] / "notes").mkdir()
-    (roots[1] / ".hidden").mkdir()
-    assert cases_in(roots[1]) == [roots[1] / "arm", roots[1] / "liver"]
-    assert cases_in(roots[1] / "arm") == [roots[1] / "arm"]
-    with pytest.raises(CaseError, match="nowhere"):
-        cases_in(roots[1] / "nowhere")

@@ -44,18 +44,6 @@ def test_the_probe_that_scanned_a_fan_is_found(turn):
     assert probe.array.given.depth == pytest.approx(0.12, abs=9e-3)
 
 
-def test_a_block_is_taken_for_a_linear_arrays_whose_rows_are_its_second_axis():
-    grid = np.diag([1e-3, 5e-4, 2e-3, 1.0])
-    volume = Volume(np.full((40, 60, 30), 9, np.uint8), grid)
-    region = ScannedRegion(volume)
-    pose = region.middle_pose()
-    np.testing.assert_allclose(pose.rotation[:, 2], [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(pose.position, [0.0195, 0.0, 0.029], atol=2e-3)
-    probe = region.probe_at(pose)
-    assert probe.geometry == "linear"
-    assert probe.array.given.depth == pytest.approx(0.03, abs=2e-3)
-
-
 def test_the_start_moves_to_the_structures_and_not_to_layers():
     true = Pose(np.array([0.0, 0.0, -0.06]))
 

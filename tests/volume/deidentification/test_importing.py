@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import cv2
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -66,17 +65,6 @@ def test_a_cine_becomes_images_with_their_times(cine, tmp_path):
     sweep = read_sweep(out, tracked=False)
     np.testing.assert_allclose(sweep.times, [0.0, 0.04, 0.08, 0.12])
     np.testing.assert_array_equal(np.array(list(sweep.images())), CINE[:, 5:55, 10:70])
-
-
-def test_pixels_have_the_size_that_regions_say(tmp_path):
-    made = header(CINE, US_MULTI_FRAME)
-    edges = {"MinX0": 10, "MinY0": 5, "MaxX1": 80, "MaxY1": 59}  # 80: the first column beyond
-    region = {f"RegionLocation{key}": value for key, value in edges.items()}
-    region |= {"PhysicalUnitsXDirection": 3, "PhysicalUnitsYDirection": 3}
-    region |= {"PhysicalDeltaX": 0.05, "PhysicalDeltaY": 0.025}
-    made.SequenceOfUltrasoundRegions = [item(RegionSpatialFormat=1, RegionDataType=2, **region)]
-    import_files([write(tmp_path / "a.dcm", made)], tmp_path / "a.igs.mha")
-    assert sitk.ReadImage(str(tmp_path / "a.igs.mha")).GetSpacing()[:2] == (0.5, 0.25)
 
 
 def test_without_regions_a_person_decides(cine, tmp_path, capsys):
@@ -171,17 +159,6 @@ def test_images_with_places_and_a_persons_spacing_are_a_volume(shared_file, tmp_
     np.testing.assert_allclose(steps, 0.21239e-3, rtol=1e-6)
 
 
-def test_a_volume_without_spacing_is_imported_with_that_of_a_person(tmp_path):
-    path = tmp_path / "a.mha"
-    header = "NDims = 3\nDimSize = 4 5 6\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n"
-    path.write_bytes(header.encode() + bytes(range(120)))
-    with pytest.raises(VolumeError, match="--spacing"):
-        import_files([path], tmp_path / "o.nrrd")
-    import_files([path], tmp_path / "o.nrrd", ImportSettings(spacing="0.5,0.25,2"))
-    there = read_volume(tmp_path / "o.nrrd").index_to_patient
-    np.testing.assert_allclose(np.diag(there)[:3] * 1e3, (0.5, 0.25, 2))
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -222,18 +199,6 @@ def test_files_and_outputs_that_do_not_fit_are_refused(volume, tmp_path):
     assert other.read_bytes() == before
     names = ["DOE_JANE.dcm", "a.nrrd", "cine.dcm", "empty"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
-
-
-def test_the_report_is_printed_and_written_with_its_picture(cine, tmp_path, capsys):
-    folder = tmp_path / "report"
-    assert main(["import", str(cine), "--report", str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert "- PatientName\n" in said
-    assert "Jane" not in said + (folder / "report.md").read_text()
-    assert cv2.imread(str(folder / "first_image.png")).shape == (60, 80, 3)
-    assert main(["import", str(cine), "--report", str(folder)]) == 1
-    assert main(["import", str(cine)]) == 1
-    assert capsys.readouterr().err.count("\n") == 2
 
 
 def test_only_numbers_in_their_ranges_and_words_of_closed_lists_go_on():

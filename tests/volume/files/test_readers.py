@@ -79,16 +79,6 @@ def refused(path, message):
     assert "\n" not in str(error.value)
 
 
-def test_axis_0_is_the_files_fastest_and_the_header_places_the_voxels(tmp_path):
-    # MetaImage gives one axis after another: i along y, j along z, k along x.
-    turn = {"TransformMatrix": "0 1 0 0 0 1 1 0 0", "ElementSpacing": "0.5 2 3"}
-    volume = read_volume(_metaimage(tmp_path / "a.mha", **turn, Offset="10 20 -30"))
-    np.testing.assert_array_equal(volume.intensities, GREY)
-    assert volume.intensities.flags.c_contiguous
-    expected = [0.010 + 4 * 3e-3, 0.020 + 2 * 0.5e-3, -0.030 + 3 * 2e-3, 1.0]
-    np.testing.assert_allclose(volume.index_to_patient @ [2, 3, 4, 1], expected, atol=1e-12)
-
-
 @pytest.mark.parametrize("suffix", [".mha", ".nrrd", ".nii", ".nii.gz"])
 @pytest.mark.parametrize("compressed", [False, True])
 def test_an_oblique_image_lies_where_simpleitk_says(tmp_path, suffix, compressed):
@@ -308,14 +298,6 @@ def test_units_of_nrrd_count(tmp_path, lines, scale):
     np.testing.assert_allclose(there[:3, 3], np.multiply([7, 8, 9], scale))
 
 
-def test_units_of_metaimage_and_nifti_count(tmp_path):
-    for unit, scale in (("um", 1e-3), ("cm", 10.0), ("mm", 1.0)):
-        path = _metaimage(tmp_path / "a.mha", DistanceUnits=unit, Offset="4 5 6")
-        np.testing.assert_allclose(read_placement(path)[0], [scale * 1e-3, 0, 0, scale * 4e-3])
-    microns = _nifti(tmp_path / "a.nii", GREY, np.diag([1e3, 2e3, 3e3, 1.0]), unit="micron")
-    np.testing.assert_allclose(read_placement(microns), np.diag([-1e-3, -2e-3, 3e-3, 1]))
-
-
 def test_a_spacing_that_is_not_stated_is_asked_for_and_one_that_is_stays(tmp_path):
     bare = _nrrd(tmp_path / "a.nrrd", MARKED)
     refused(bare, "--spacing X,Y,Z")
@@ -323,14 +305,6 @@ def test_a_spacing_that_is_not_stated_is_asked_for_and_one_that_is_stays(tmp_pat
     np.testing.assert_allclose(np.diag(there), [0.5e-3, 0.25e-3, 2e-3, 1])
     with pytest.raises(VolumeError, match="leave out"):
         open_image(_metaimage(tmp_path / "a.mha"), spacing=(1, 1, 1)).placement()
-
-
-def test_of_several_volumes_one_is_read_by_its_number(tmp_path):
-    path = _nifti(tmp_path / "a.nii", np.stack([RAW, RAW[::-1]], axis=-1), np.eye(4))
-    refused(path, "holds 2 volumes")
-    np.testing.assert_array_equal(grey_voxels(open_image(path), 2)[0], SPREAD[::-1])
-    with pytest.raises(VolumeError, match="number 3"):
-        grey_voxels(open_image(path), 3)
 
 
 def test_two_sizes_of_a_nifti_file_are_told_and_the_right_one_can_be_said(shared_file):
@@ -355,16 +329,6 @@ def test_axes_that_are_rounded_are_read_and_written_and_sheared_ones_refused(sha
         there = read_placement(tmp_path / f"a{suffix}")
         np.testing.assert_allclose(there, rounded.index_to_patient, atol=1e-8)
     refused(shared_file("cases/nifti-shear/shear_2e-2.nii"), r"1\.1°")
-
-
-def test_the_space_of_nrrd_is_read_and_one_of_no_body_is_refused(shared_file, tmp_path):
-    folder = shared_file("cases/nrrd-space/scanner_xyz.nhdr").parent
-    refused(folder / "scanner_xyz.nhdr", "scanner-xyz")
-    one, other = (read_volume(folder / f"{n}.nhdr") for n in ("slicer8694_las", "the_same_in_lps"))
-    np.testing.assert_allclose(one.index_to_patient, other.index_to_patient, atol=1e-12)
-    np.testing.assert_array_equal(one.intensities, other.intensities)
-    bare = _nrrd(tmp_path / "a.nrrd", MARKED, "encoding: raw", "spacings: 1 1 1")
-    assert "assumed" in grey_voxels(open_image(bare))[1][0]
 
 
 def test_radio_frequency_data_are_told_from_b_mode(shared_file):

@@ -18,7 +18,6 @@ from us_sim.volume.reconstruction.grid import (
     Grid,
     grid_around,
     image_mask,
-    proposed_spacing,
 )
 from us_sim.volume.reconstruction.insertion import Insertion, fill_holes
 from us_sim.volume.reconstruction.reconstruction import leave_one_out, plan, reconstruct
@@ -79,15 +78,6 @@ def test_a_known_field_comes_back(sweep, method, compounding):
     assert error.max() <= 9.0
     assert np.median(error) <= 1.5
     assert made.filled > 0  # frames are 0.6 mm apart
-
-
-@pytest.mark.parametrize("size", [(0.2, 0.2, 0.2), (0.31, 0.07, 0.9)])
-def test_a_proposed_spacing_is_the_pixel_or_just_keeps_below_the_most_voxels(size):
-    corners = np.array([np.zeros(3), size])
-    assert proposed_spacing(corners, 1e-2) == 1e-2
-    spacing = proposed_spacing(corners, 1e-5)
-    assert 0.9 < np.prod(np.array(size) / spacing) / 2**27 < 1.0
-    assert spacing * 1e5 == pytest.approx(round(spacing * 1e5))
 
 
 ONE_VOXEL = grid_around(np.array([[0.0, 0, 0], [1e-3, 1e-3, 1e-3]]), 1e-3)
@@ -165,13 +155,6 @@ def test_a_grid_that_is_too_large_is_refused_before_it_is_made(sweep, monkeypatc
         reconstruct(planned)
     with pytest.raises(VolumeError, match="--spacing"):
         grid_around(np.array([[0.0, 0, 0], [0.01, 0.01, 0.001]]), 0.005)
-
-
-def test_matrices_that_are_not_those_of_an_image_are_refused(tmp_path):
-    bodies = [Pose((0.0, 0.0, 1e-3 * k)).matrix for k in range(FRAMES)]
-    file = write_sweep(tmp_path / "a.igs.mha", images_at(path()), bodies, name="PToReference")
-    with pytest.raises(VolumeError, match="--calibration"):
-        plan(sweep_of(read_sequence(file), image="P"), Compounding())
 
 
 def test_frames_left_out_are_predicted(sweep):

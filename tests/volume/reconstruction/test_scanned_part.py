@@ -49,17 +49,6 @@ def test_fans_are_found_to_a_pixel(begins, half, tilt, unlike, noise):
     np.testing.assert_allclose(np.degrees(found.angles), [tilt - half, tilt + half], atol=0.8)
 
 
-def test_a_fan_may_be_cut_by_the_image_or_begin_in_a_point():
-    for mask, begins, half in (
-        (fan_mask(0.1, -0.03, 0.05, 0.2, -40, 40), 0.05, 40.0),  # cut at its sides and bottom
-        (fan_mask(0.1, 2e-3, 0.0, 0.14, -38, 38), 0.001, 38.0),  # of a phased array
-    ):
-        found = fitted_part(mask, SIDE)
-        assert isinstance(found, Fan)
-        np.testing.assert_allclose(np.degrees(found.angles), [-half, half], atol=0.8)
-        assert found.radius[0] == pytest.approx(begins, abs=1e-3)
-
-
 BOX = np.zeros((ROWS, COLUMNS), bool)
 BOX[10:250, 100:200] = True
 
@@ -71,22 +60,6 @@ def test_a_rectangle_is_a_linear_arrays_and_a_shadow_in_it_does_no_harm():
     assert isinstance(found, Rectangle)
     np.testing.assert_allclose(found.x, [0.04975, 0.09975], atol=1e-9)
     np.testing.assert_allclose(found.z, [0.00475, 0.12475], atol=1e-9)
-
-
-ROW, COLUMN = np.indices((ROWS, COLUMNS))
-SHAPES = {
-    "nothing": np.zeros((ROWS, COLUMNS), bool),
-    "a disc": np.hypot(ROW - 150, COLUMN - 200) < 120,
-    "a trapezoid": (abs(COLUMN - 200) < 50 + 0.5 * ROW) & (ROW > 20) & (ROW < 260),
-    "a parallelogram": (abs(COLUMN - 150 - 0.4 * ROW) < 60) & (ROW > 20) & (ROW < 260),
-    "a fan without its face": fan_mask(0.1, -0.06, 0.03, 0.19, -25, 25),
-    "half a fan": fan_mask(0.1, 0.0, 0.04, 0.14, -30, 30) & (ROW < 140),
-}
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_of_what_fits_badly_nothing_is_said(name):
-    assert fitted_part(SHAPES[name], SIDE) is None
 
 
 def swept(tmp_path, mask, matrices=None):

@@ -165,30 +165,6 @@ def test_a_real_flat_sequence_of_plus_has_the_images_that_itk_reads(shared_file)
     np.testing.assert_array_equal(image, stored[:, :, 50])
 
 
-def test_images_may_lie_in_a_file_beside_the_header(tmp_path):
-    (tmp_path / "a.raw").write_bytes(GREY.tobytes())
-    path = metaimage(tmp_path / "a.mhd", data=b"", data_file="a.raw", DimSize="5 2 6")
-    sweep = read_sweep(path)
-    np.testing.assert_array_equal(next(sweep.images([1])), GREY[0, 2:])
-    assert sweep.left_out == {"no field in the header": 3}
-
-
-def test_frame_numbers_may_have_ten_digits(shared_file):
-    sweep = read_sweep(shared_file("cases/ibis-sequence/ibis.igs.mha"))
-    assert (len(sweep.numbers), sweep.columns, sweep.rows, sweep.left_out) == (24, 48, 64, {})
-    corners = sweep.image_to_reference[[0, -1]] @ np.array([[0, 0, 0, 1], [47, 63, 0, 1]]).T
-    np.testing.assert_allclose(np.ptp(corners[:, :3], axis=(0, 2)) * 1e3, [9.4, 6.3, 9.2])
-
-
-@pytest.mark.parametrize("kind", ["RF_REAL", "BRIGHTNESS"])
-def test_radio_frequency_data_are_told_from_b_mode(tmp_path, kind):
-    wave = np.sin(np.arange(3 * 8 * 128) * 1.3).reshape(3, 8, 128) * 900
-    more = {"ElementType": "MET_SHORT", "UltrasoundImageType": kind}
-    path = metaimage(tmp_path / "a.mha", wave.astype("<i2"), **more)
-    with pytest.raises(VolumeError, match=r"RF_REAL|radio-frequency"):
-        list(read_sweep(path).images())
-
-
 UNUSABLE = "a transform that is singular or not finite"
 
 

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pydicom
 import pytest
-from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, enhanced, header, item, turned, write
+from made_dicom import US_IMAGE, US_MULTI_FRAME, compressed, header, item, write
 from pydicom.pixels import apply_color_lut, get_decoder, pixel_array
 from pydicom.uid import (
     ExplicitVRBigEndian,
@@ -71,17 +71,6 @@ def test_big_endian_signed_and_inverted_values(tmp_path):
     np.testing.assert_array_equal(twelve, CINE)  # four bits do not count
 
 
-def test_each_image_may_be_rescaled_on_its_own(tmp_path):
-    voxels = np.full((3, 3, 4), 10, np.uint8)
-    voxels[0] = 0
-    made = enhanced(voxels, turned())
-    for n, group in enumerate(made.PerFrameFunctionalGroupsSequence):
-        by = item(RescaleSlope=float(n + 1), RescaleIntercept=0.0, RescaleType="US")
-        group.PixelValueTransformationSequence = [by]
-    grey = images(write(tmp_path / "a.dcm", made))
-    np.testing.assert_array_equal(grey.max(axis=(1, 2)), [64, 128, 191, 255])
-
-
 def times_of(path, **values):
     return frame_times(open_dicom(write(path, header(CINE, US_MULTI_FRAME, **values))), 4)
 
@@ -109,13 +98,6 @@ def test_images_of_enhanced_objects_have_their_own_times(tmp_path, key, stamps, 
     groups = [item(FrameContentSequence=[content]) for content in contents]
     found = times_of(tmp_path / "a.dcm", PerFrameFunctionalGroupsSequence=groups)
     assert found == (None if times is None else pytest.approx(times))
-
-
-def test_times_of_images_are_those_of_a_vector_or_a_rate(tmp_path):
-    vector = times_of(tmp_path / "a.dcm", FrameTimeVector=[0.0, 10.0, 30.0, 20.0])
-    np.testing.assert_allclose(vector, [0, 0.01, 0.04, 0.06])
-    np.testing.assert_allclose(times_of(tmp_path / "a.dcm", CineRate=50), [0, 0.02, 0.04, 0.06])
-    assert times_of(tmp_path / "a.dcm") is None
 
 
 MPEG = "1.2.840.10008.1.2.4.102"

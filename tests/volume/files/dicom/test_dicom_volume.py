@@ -100,18 +100,6 @@ def test_a_real_series_with_a_gap_is_refused():
         placed_images(real_series("77654033/CT2"))
 
 
-def test_offsets_of_slices_count_along_the_normal(tmp_path):
-    made = header(VOXELS.transpose(2, 1, 0).copy(), US_MULTI_FRAME)
-    made.ImageOrientationPatient = [0, 1, 0, 0, 0, 1]  # rows along y, columns along z: normal x
-    made.ImagePositionPatient = [10, 20, 30]
-    made.PixelSpacing = [0.25, 0.5]
-    made.GridFrameOffsetVector = [0, 2, 4, 6, 8]
-    volume = read_volume(write(tmp_path / "a.dcm", made))
-    np.testing.assert_allclose(
-        volume.index_to_patient @ [1, 2, 3, 1], [0.016, 0.0205, 0.0305, 1], atol=1e-12
-    )
-
-
 def philips_cartesian():
     voxels = np.stack([VOXELS, VOXELS + np.uint8(7)])  # two volumes in time
     stack = voxels.transpose(0, 3, 2, 1).reshape(10, 6, 7).copy()
@@ -225,13 +213,3 @@ def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
     sweep = read_sweep(out, tracked=False)
     np.testing.assert_allclose(sweep.times, 0.04 * np.arange(times))
     assert sitk.ReadImage(str(out)).GetSpacing()[:2] == (0.5, 0.25)
-
-
-def test_a_folder_of_a_series_and_files_without_a_preamble_are_read(tmp_path):
-    for path in single_files(tmp_path, SpecificCharacterSet="ISO_IR 100"):
-        write(path, pydicom.dcmread(path), ImplicitVRLittleEndian)
-        content = path.read_bytes()
-        path.write_bytes(content[content.index(b"\x08\0\5\0") :])  # the first element of its data
-    (tmp_path / "note.txt").write_text("hello")
-    np.testing.assert_array_equal(read_volume(tmp_path).intensities, VOXELS)
-    np.testing.assert_allclose(read_placement(tmp_path)[:3, 3] * 1e3, PLACED[:3, 3])
