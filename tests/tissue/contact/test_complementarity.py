@@ -21,7 +21,7 @@ def enumerated(delassus, gap):
     raise AssertionError("a positive definite problem has a solution")
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_agrees_with_enumeration(seed):
     random = np.random.default_rng(seed)
     root = random.normal(size=(7, 7))

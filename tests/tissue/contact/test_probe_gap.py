@@ -213,7 +213,7 @@ STEEPEST = math.tan(math.radians(60))
 colliders = st.sampled_from(COLLIDERS)
 spacings = st.sampled_from([RESOLVING, WIDE])
 places = st.tuples(lateral, lateral, st.floats(-0.08, 0.03)).map(lambda p: np.round(p, 8))
-EXAMPLES = settings(deadline=None, max_examples=300)
+EXAMPLES = settings(deadline=None, max_examples=80)
 
 
 def distance_at(probe, where, pose=None):

@@ -192,6 +192,7 @@ def test_single_precision_keeps_the_forces_to_a_millionth(mesh, size):
     near(single.tangent_product(change), double.tangent_product(change.astype(float)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modulus", [1.0, 1e12])
 @pytest.mark.parametrize("length", [1e-3, 1.0])
 @pytest.mark.parametrize("boxed", [True, False])

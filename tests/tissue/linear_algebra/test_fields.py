@@ -9,6 +9,7 @@ from us_sim.tissue.linear_algebra.compliance import DenseFields
 from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150), st.sampled_from([np.float32, np.float64]))
 def test_a_sum_is_the_product_with_the_forces(seed, surface, precision):
@@ -64,6 +65,7 @@ def moved(made, forces):
     return displacement
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, SURFACE), st.booleans())
 def test_any_forces_move_as_in_full(points, made, seed, count, together):
@@ -86,6 +88,7 @@ def test_any_forces_move_as_in_full(points, made, seed, count, together):
     )
 
 
+@pytest.mark.slow
 def test_what_is_far_takes_little_place(points):
     """Forces on one side, nodes ten times as far away as both are wide: a few vectors do."""
     far = points + np.where(np.arange(len(points))[:, None] < SURFACE, 0.0, 10.0)

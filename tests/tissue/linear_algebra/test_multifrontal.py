@@ -50,6 +50,7 @@ def test_agrees_with_a_sparse_solver(ratio):
     np.testing.assert_allclose(found, expected, atol=1e-8 * abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", [False, True])
 def test_single_precision_and_a_file_that_may_be_full_change_little(monkeypatch, full):
     monkeypatch.setattr(multifrontal, "_LARGE", 1)
