@@ -5,10 +5,11 @@ from graphlib import TopologicalSorter
 import architecture as structure
 import pytest
 
+pytestmark = pytest.mark.slow
+
 DOMAIN_MAY_NOT = ("rclpy", "_msgs", "_interfaces")
 
 
-@pytest.mark.slow
 def test_no_arrow_leads_to_a_layer_above():
     layer = {
         room: number

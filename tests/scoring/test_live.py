@@ -81,12 +81,11 @@ def scanned(exercise, seed, seconds):
         getattr(scan, method)(*arguments)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("name", ["compression", "keep_force", "centre", "follow", "view"])
-def test_the_score_so_far_is_that_of_all_samples_so_far(name, seed):
+def test_the_score_so_far_is_that_of_all_samples_so_far(name):
     exercise = read_exercise(name)
     told = set()
-    for scan in scanned(exercise, seed, 24):
+    for scan in scanned(exercise, 1, 24):
         metrics, steps = scan.score()
         whole = scan.scan()
         expected = list(metrics_of(whole))

@@ -5,13 +5,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial import Delaunay
 
 from us_sim.geometry.pose import Pose
+from us_sim.settings.registry import SLICERS
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
+
+every_method = pytest.mark.parametrize(
+    "method",
+    [pytest.param(m, marks=[pytest.mark.slow] * (m == "row_subdivision")) for m in SLICERS],
+)
 
 KINDS = ("box", "cloud", "tangled", "squashed", "aligned", "through_nodes", "coarse", "fan")
 SIZE = np.array([0.06, 0.04, 0.05])

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from slicing_cases import every_method
 
 from us_sim.errors import MeshError, VolumeError
 from us_sim.geometry.pose import Pose
-from us_sim.settings.registry import SLICERS
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.cutting.resampling import BLACK
 from us_sim.slicing.cutting.slicer import create_slicer
@@ -78,7 +78,7 @@ def test_labels_are_of_the_middle_plane_and_of_the_beams(scanner, imaging):
     assert (was <= MESH.nodes.max(axis=0) + 1e-9).all()
 
 
-@pytest.mark.parametrize("method", [*SLICERS])
+@every_method
 def test_every_method_says_which_tetrahedron_a_pixel_is_in(method):
     nodes = pressed(MESH.nodes)
     plane = LINEAR.plane(POSE)
@@ -115,7 +115,7 @@ def test_what_cannot_be_known_of_a_frame_is_said(scanner):
             _ = bare.frame(POSE, nodes).labels
 
 
-@pytest.mark.parametrize("method", [*SLICERS])
+@every_method
 def test_labels_follow_nodes_that_were_written_to_after_an_image(method):
     plane, nodes = LINEAR.plane(POSE), MESH.nodes.copy()
     slicer = create_slicer(method, arm(), MESH.nodes, MESH.tetrahedra)

@@ -64,6 +64,7 @@ def test_behind_bone_is_dark_and_behind_blood_is_bright():
     assert blood[beside].mean() == pytest.approx(150, abs=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["per_pixel", "row_subdivision"])
 def test_every_way_of_cutting_has_the_same_acoustics(method):
     mesh = box_mesh([-0.018, 0.0, 0.018], [-0.009, 0.009], [-0.008, 0.01, 0.035])

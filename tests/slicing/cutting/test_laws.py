@@ -10,11 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.ndimage import map_coordinates
-from slicing_cases import HIGH, KINDS, LOW, SIZE, around_the_box, box, noise_volume, random_case
+from slicing_cases import (
+    HIGH,
+    KINDS,
+    LOW,
+    SIZE,
+    around_the_box,
+    box,
+    every_method,
+    noise_volume,
+    random_case,
+)
 
 from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
-from us_sim.settings.registry import SLICERS
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
 from us_sim.slicing.cutting.trilinear import SLACK
@@ -22,8 +31,6 @@ from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
-
-every_method = pytest.mark.parametrize("method", list(SLICERS))
 
 
 def random_affine(rng):

@@ -13,6 +13,8 @@ from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.volume.volume import Volume
 
+pytestmark = pytest.mark.slow
+
 COUNTS = (7, 5, 6)
 
 
@@ -50,7 +52,6 @@ def pressed(mesh, depth=0.008, width=0.012):
     return mesh.nodes + np.column_stack([0 * dent, 0 * dent, dent])
 
 
-@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
