@@ -54,11 +54,13 @@ def test_a_round_vein_closes_a_little_as_lames_solution_says():
     assert round_vein_pressure(10e3, (1 - 1e-4) ** 2) == pytest.approx(2e-4 * shear, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_softer_tissue_lets_the_vein_close_at_less(lying):
     soft = press(VENOUS["lying"], 10, MODULI["of volunteers"])
     assert soft.at(0.5, soft.interface) < lying.at(0.5, lying.interface) - 3.0
 
 
+@pytest.mark.slow
 def test_the_study_needs_no_data_and_reports_each_posture(lying, tmp_path, monkeypatch):
     monkeypatch.setattr(vein, "press", lambda *_, **__: lying)
     section = measure_vein(tmp_path / "none", ReportFolder("measured", tmp_path, True))
