@@ -5,7 +5,6 @@ import io
 import json
 import resource
 import socket
-import sys
 import tarfile
 
 import cv2
@@ -220,13 +219,3 @@ def test_addresses_that_lead_nowhere_are_one_sentence(
     monkeypatch.chdir(tmp_path)
     assert make(scene, out, *options) == 1
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("package", "out", "options"), [("ray", "set", ["--ray", "auto"]), ("upath", "s3://set", [])]
-)
-def test_what_the_extra_brings_is_said(package, out, options, scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, package, None)
-    assert make(scene, out, *options) == 1
-    assert "pip install 'us_sim[ray]'" in capsys.readouterr().err

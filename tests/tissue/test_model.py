@@ -8,7 +8,6 @@ from us_sim.errors import MeshError
 from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.materials import label_fractions, uniform_material
 from us_sim.tissue.mesh.file import read_mesh
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import (
     FACES,
     TissueModel,
@@ -35,20 +34,6 @@ def test_faces_are_the_planes_they_are_named_after(face, axis, value):
     assert (mesh.nodes[nodes, axis] == value).all()
     assert len(nodes) == {0: 5 * 4, 1: 6 * 4, 2: 6 * 5}[axis]
     assert nodes.dtype == np.int32
-
-
-def unstructured(nodes=(6, 5, 4)):
-    """The block's mesh as if a file had brought it."""
-    block = block_mesh(nodes)
-    return TetrahedralMesh(block.nodes, block.tetrahedra)
-
-
-def test_faces_of_a_box_from_a_file_are_the_same():
-    for face in FACES:
-        expected = face_nodes(block_mesh((6, 5, 4)), face)
-        np.testing.assert_array_equal(face_nodes(unstructured(), face), expected)
-    top = face_nodes(block_mesh((6, 5, 4)), "top")
-    np.testing.assert_array_equal(facing_nodes(unstructured()), top)
 
 
 def test_faces_of_an_organ_are_its_boundary_near_its_bounding_box(shared_data):

@@ -12,20 +12,11 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
-from us_sim.errors import TrackingError
 from us_sim.geometry import se3
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.filters import ConstantVelocityKalman, OneEuro, Unfiltered, create_filter
+from us_sim.tracking.filters import ConstantVelocityKalman, OneEuro
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import KalmanSettings, OneEuroSettings
-
-
-def test_each_method_is_its_filter():
-    kinds = {"none": Unfiltered, "one_euro": OneEuro, "kalman": ConstantVelocityKalman}
-    for method, kind in kinds.items():
-        assert type(create_filter(method)) is kind
-    with pytest.raises(TrackingError, match="median"):
-        create_filter("median")
 
 
 def scalar_one_euro(times, values, minimum, beta, derivative_cutoff):
@@ -120,16 +111,6 @@ def test_behind_a_sway_as_exponential_smoothing_is(rate, frequency):
     assert measured == pytest.approx(phase / (2 * np.pi * frequency), rel=0.01, abs=2e-5)
     if frequency == 0.25:
         assert measured == pytest.approx(one_euro.lag, rel=0.02)
-
-
-def test_after_a_reset_the_next_pose_is_the_first():
-    one_euro = OneEuro(SETTINGS)
-    for k in range(10):
-        one_euro.update(Measurement(k * 10_000_000, Pose([0.1 * k, 0, 0])))
-    one_euro.reset()
-    seen = Measurement(5, Pose([-1.0, 2.0, 3.0], [1.0, 0, 0, 0]))
-    assert one_euro.update(seen).pose is seen.pose
-    assert one_euro.lag == pytest.approx(1 / (2 * np.pi * 1.2))
 
 
 ACCELERATION, ANGULAR_ACCELERATION = 0.7, 6.0

@@ -1,8 +1,5 @@
 """Latency and usage of arrivals and processes that are known beforehand, and of a real graph."""
 
-import subprocess
-import sys
-
 import pytest
 
 from us_sim.evaluation.latency.measure import (
@@ -11,7 +8,6 @@ from us_sim.evaluation.latency.measure import (
     Point,
     run_case,
 )
-from us_sim.evaluation.processes import usage_of
 
 PERIOD = 16_000_000  # ns
 
@@ -40,34 +36,6 @@ def test_ages_counts_and_ways_are_those_of_what_was_heard():
     assert values["ultrasound_image_ms_p50"] == pytest.approx(9.0)
     assert values["image_mm_p99"] == pytest.approx(0.9)  # 9 ms at 100 mm/s
     assert point.rate == pytest.approx(1e9 / PERIOD, rel=0.03)
-
-
-FAMILY = """
-import os, sys
-kept = bytearray(os.urandom(1)) * 80_000_000
-family = [os.getpid()]
-for _ in range(3):
-    child = os.fork()
-    if not child:
-        break
-    family.append(child)
-else:
-    print(*family, flush=True)
-sys.stdin.read()
-os._exit(0)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
-def test_memory_that_a_family_of_processes_shares_is_counted_once():
-    process = subprocess.Popen(
-        [sys.executable, "-c", FAMILY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    pids = [int(word) for word in process.stdout.readline().split()]
-    uses = [usage_of(pid) for pid in pids]
-    process.communicate("")
-    assert len(uses) == 4
-    assert 80e6 < sum(use.memory for use in uses) < 160e6
 
 
 def test_a_running_graph_is_heard_and_recorded():

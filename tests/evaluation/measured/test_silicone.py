@@ -141,22 +141,22 @@ def test_constants_of_a_made_up_silicone_are_found_and_its_forces_predicted(tmp_
     assert all(row.ms > 0 for row in section.findings)
 
 
-def test_bad_files_are_told_by_name_and_line(tmp_path):
+HEAD = "Time (s),Compression (mm),Load (N)\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("Compression test;\n", "no line"),
+        (f"{HEAD}0,0,0\n1,heavy,2\n", ":3:"),
+        (f"{HEAD}0,0,0\n1,3,2\n", "66 %"),
+    ],
+)
+def test_a_file_that_is_no_test_is_refused(tmp_path, text, word):
     file = tmp_path / "EF" / "EF_A1.csv"
     file.parent.mkdir()
-    with pytest.raises(UsSimError, match="EF: needs tests of specimens A and B"):
+    with pytest.raises(UsSimError, match="specimens A and B"):
         read_silicones(tmp_path)
-    with pytest.raises(UsSimError, match="no folder of a silicone"):
-        read_silicones(file.parent)
-    file.write_text("Compression test;\n")
-    with pytest.raises(UsSimError, match=r"EF_A1.csv: has no line that begins"):
-        read_test(file)
-    file.write_text("Time (s),Compression (mm),Load (N)\n0,0,0\n1,heavy,2\n")
-    with pytest.raises(UsSimError, match=r"EF_A1.csv:3: is no row"):
-        read_test(file)
-    write_test(file, np.full(len(COMPRESSIONS), np.nan))
-    with pytest.raises(UsSimError, match=r"EF_A1.csv: ends before"):
-        read_test(file)
-    file.write_text("Time (s),Compression (mm),Load (N)\n0,0,0\n1,3,2\n")
-    with pytest.raises(UsSimError, match=r"EF_A1.csv: ends before 66 % of compression"):
+    file.write_text(text)
+    with pytest.raises(UsSimError, match=f"EF_A1.csv.*{word}"):
         read_test(file)

@@ -71,29 +71,6 @@ def test_the_fan_is_where_the_real_frames_are_lit(liver):
     assert probe.depth == pytest.approx(563.01 * SPACING)
 
 
-def test_a_frame_on_the_probes_pixels_keeps_places():
-    probe = LIVER_SWEEP.probe(SPACING)
-    row, column = np.mgrid[:593, :739]
-    ramp = (column // 4 + row // 8).astype(np.uint8)
-    moved = LIVER_SWEEP.on_probe_pixels(ramp, probe, SPACING)
-    pixel = np.array([400, 200, 0, 1])
-    x, _, z, _ = probe.image_to_probe @ pixel / SPACING
-    expected = (x + LIVER_SWEEP.column) / 4 + (z + LIVER_SWEEP.row) / 8
-    assert moved[200, 400] == pytest.approx(expected, abs=1.0)
-
-
-def test_the_pose_of_a_frame_puts_its_pixels_where_its_matrix_does():
-    turn = np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])
-    matrix = np.eye(4)
-    matrix[:3, :3] = SPACING * turn
-    matrix[:3, 3] = (0.1, -0.2, 0.3)
-    pose = LIVER_SWEEP.pose(matrix)
-    column, row = 100.0, 500.0
-    in_probe = SPACING * np.array([column - LIVER_SWEEP.column, 0.0, row - LIVER_SWEEP.row])
-    expected = (matrix @ [column, row, 0, 1])[:3]
-    np.testing.assert_allclose(pose.apply(in_probe[None])[0], expected, atol=1e-12)
-
-
 def test_normalised_cross_correlation_is_pearsons():
     random = np.random.Generator(np.random.PCG64(3))
     a, b = random.normal(size=(2, 30, 20))

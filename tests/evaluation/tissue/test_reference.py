@@ -109,16 +109,6 @@ def test_nearly_incompressible_tissue_is_found_at_once_where_it_is_found_in_step
     assert at_once.force[2] == pytest.approx(in_steps.force[2], rel=1e-4)
 
 
-def test_graded_planes_are_fine_where_asked_and_reach_the_ends():
-    planes = graded_planes(-0.1, 0.1, -0.01, 0.05, 0.005, 1.2)
-    assert planes[0] == -0.1
-    assert planes[-1] == 0.1
-    steps = np.diff(planes)
-    inside = (planes[:-1] >= -0.0101) & (planes[1:] <= 0.0501)
-    np.testing.assert_allclose(steps[inside], 0.005)
-    assert (steps[1:] / steps[:-1]).max() < 1.5
-
-
 def test_linear_equations_are_hookes_where_nothing_is_averaged():
     scene = SCENES["press_12mm"]
     model = scene.model((5, 4, 4))

@@ -13,7 +13,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.drawing.annotation import Annotation, Badge
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
-from us_sim.slicing.drawing.overlay import ColourBar, ColourScale, Overlay, lettering
+from us_sim.slicing.drawing.overlay import ColourBar, ColourScale, Overlay
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
@@ -115,17 +115,6 @@ def test_each_structure_is_outlined_in_its_colour_and_named_once():
     np.testing.assert_array_equal(both[:300], blue_once[:300])
 
 
-@pytest.mark.parametrize("height", [8, 13, 26, 48])
-def test_letters_are_as_high_as_asked_on_a_dark_halo(height):
-    label = lettering("20 mm", height, AMBER)
-    assert label.height == pytest.approx(height + 4, abs=0.1 * height + 1)
-    assert label.width < 6 * height + 4
-    picture = np.full((100, 300, 3), 255, np.uint8)
-    assert label.draw(picture, 10, 10)
-    assert picture[:10].min() == picture[:, :10].min() == 255
-    assert picture.min() < 80  # letters on white stand out
-
-
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
@@ -154,16 +143,6 @@ def test_a_picture_of_any_size_has_everything_inside(columns, rows, aperture, de
 
 SCALE = ColourScale("flow", -0.2, 0.2, "cm/s", factor=100.0)
 PROBE = LinearProbe(aperture=0.04, depth=0.04, columns=300, rows=300)
-
-
-@pytest.mark.parametrize("opacity", [0.0, 0.25, 1.0])
-def test_colours_are_blended_where_there_are_values(opacity):
-    values = np.array([[-0.2, np.nan], [0.2, 0.0]], np.float32)
-    picture = np.full((2, 2, 3), 80, np.uint8)
-    Overlay(values, SCALE, opacity).lay_over(picture)
-    expected = opacity * SCALE.table[[0, 128, 255, 128]] + (1 - opacity) * 80
-    expected[1] = 80
-    np.testing.assert_allclose(picture.reshape(-1, 3), expected, atol=1)
 
 
 def test_the_bar_has_the_colours_from_high_to_low_beside_their_values():

@@ -49,14 +49,6 @@ def test_what_is_off_is_not_imported():
     assert done.stdout.strip() == "[] False"
 
 
-def test_a_fan_is_cut_whole_where_beams_are_resampled():
-    assert ImageFormation(FAN, Imaging()).planes(Pose())[0].spans is not None
-    blurred = ImageFormation(FAN, Imaging(lateral_resolution=1e-3, elevation_planes=3))
-    planes = blurred.planes(Pose())
-    assert len(planes) == 3
-    assert all(plane.spans is None for plane in planes)
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     imaging=st.builds(

@@ -110,29 +110,6 @@ def test_the_energy_goes_on_at_the_greatest_push(stiff, strong):
 
 
 @EXAMPLES
-@given(shapes, places, seeds)
-def test_springs_are_how_the_force_falls_with_a_change(probe, where, seed):
-    contact, _ = contact_at(probe, where)
-    rng, step = np.random.default_rng(seed), 1e-8
-    change = 1e-3 * rng.normal(size=contact.normal.shape)
-    along = rng.normal(size=change.shape)
-    ends = [contact.force_after(change + sign * step * along) for sign in (1, 0, -1)]
-    fall = (ends[2] - ends[0]) / (2 * step)
-    kinked = np.abs(ends[0] + ends[2] - 2 * ends[1]).max(axis=1) > 1e-2 * STIFF * step
-    active, directions, stiffness = contact.springs_after(change)
-    expected = np.zeros_like(fall)
-    np.add.at(
-        expected,
-        active,
-        (stiffness * np.einsum("ki,ki->k", directions, along[active]))[:, None] * directions,
-    )
-    np.testing.assert_allclose(expected[~kinked], fall[~kinked], atol=1e-3 * STIFF)
-    work = (ends[1] * along).sum()
-    assert contact.work_along(change, along, 0.0) == pytest.approx(work)
-    assert contact.work_along(change - 2.0 * along, along, 2.0) == pytest.approx(work)
-
-
-@EXAMPLES
 @given(colliders, spacings, places)
 def test_springs_and_turns_together_are_the_derivative_of_the_forces(collider, spacing, where):
     contact, positions = contact_at(FlaredProbe(collider, spacing), where)

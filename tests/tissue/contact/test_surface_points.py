@@ -16,7 +16,6 @@ from us_sim.tissue.contact.surface_points import (
     surface_contact,
 )
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
 
 MODEL = block((5, 4, 3))
@@ -166,21 +165,6 @@ def test_a_node_that_is_no_triangles_is_a_point_by_itself():
     assert np.isinf(np.delete(gap, lone)).all()
 
 
-def test_the_springs_of_nodes_are_the_weighted_means_of_their_points():
-    points = points_of(1.0)
-    rng = np.random.default_rng(0)
-    stiffness, gap = rng.uniform(1.0, 9.0, (2, len(points.rest)))
-    stiffness[::3] = 0.0
-    normal = np.broadcast_to([0.0, 0.6, 0.8], points.rest.shape)
-    gaps, normals, softness = points.nodal_springs(stiffness, gap, normal)
-    firm = points.at_nodes(stiffness)
-    some = firm > 0.0
-    np.testing.assert_allclose(1 / softness[some], firm[some])
-    np.testing.assert_allclose(gaps[some], points.at_nodes(stiffness * gap)[some] / firm[some])
-    np.testing.assert_allclose(normals[some], np.broadcast_to([0, 0.6, 0.8], (some.sum(), 3)))
-    assert np.isinf(gaps[~some]).all()
-
-
 def test_triangles_that_cannot_move_at_all_have_no_points():
     everything = np.unique(MODEL.mesh.boundary)
     some = SurfacePoints(with_contact_nodes(everything), 1.0)
@@ -192,24 +176,6 @@ def test_triangles_that_cannot_move_at_all_have_no_points():
     assert not model.fixed[some.nodes].all(axis=1).any()
     # Nor have fixed nodes by themselves.
     assert len(SurfacePoints(with_contact_nodes(np.flatnonzero(model.fixed)), 1.0).rest) == 0
-
-
-@pytest.mark.parametrize("size", [0.01, 1.0])
-def test_a_triangle_of_any_shape_keeps_its_area_and_its_middle(size):
-    nodes = np.array([[0.0, 0, 0], [0.07, 0.01, 0.0], [0.02, 0.05, -0.01], [0.02, 0.02, 0.06]])
-    mesh = TetrahedralMesh(nodes, np.array([[0, 1, 2, 3]]))
-    model = block((2, 2, 2))
-    materials = type(model.materials)(*(value[:1] for value in vars(model.materials).values()))
-    fixed = np.array([False, False, False, True])
-    touched = TissueModel(mesh, materials, fixed, model.collider, np.arange(3))
-    points = SurfacePoints(touched, size)
-    share = points.spread(np.ones(4))
-    assert share.sum() == pytest.approx(3.0)
-    at_nodes = points.weights.max(axis=1) == 1.0
-    assert share[at_nodes].sum() == pytest.approx(0.1 * 3.0)
-    for those in (at_nodes, ~at_nodes):
-        np.testing.assert_allclose(share[those], share[those][0])
-    np.testing.assert_allclose(points.rest.mean(axis=0), nodes[:3].mean(axis=0), atol=1e-15)
 
 
 def test_the_springs_of_a_contact_are_as_firm_as_the_tissues_shear():

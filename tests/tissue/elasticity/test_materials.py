@@ -38,14 +38,6 @@ def test_plane_through_a_tetrahedron_cuts_off_the_analytic_fraction():
         assert fractions.sum() == pytest.approx(1.0)
 
 
-def test_layers_of_a_block_keep_their_fraction_of_the_volume():
-    labels = voxels()
-    labels[:, :, 37:] = 2
-    mesh = block_mesh((20, 10, 10))
-    _, fractions = label_fractions(mesh, labels, INDEX)
-    assert fractions[:, 0] @ mesh.volumes / 0.002 == pytest.approx(0.37, abs=0.002)
-
-
 def test_a_cylinder_keeps_its_volume():
     x, _, z = np.indices((200, 100, 100))
     labels = voxels()

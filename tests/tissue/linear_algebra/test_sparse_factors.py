@@ -10,7 +10,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
-from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness, ScalarPreconditioner
+from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import CoarseGrid, TwoLevel, conjugate_gradients
 
 NODES = (5, 4, 4)
@@ -122,13 +122,3 @@ def test_it_stiffens_as_the_tissue_does():
         solution = conjugate_gradients(tissue.tangent_product, factored, force.copy(), 400, 1e-4)
         counts.append(solution.iterations)
     assert 2 * counts[0] < counts[1], counts
-
-
-def test_a_chain_of_springs_confined_to_a_plane():
-    """Node 0 is held, springs of 1 N/m join 0, 1 and 2; node 2 may later move only across x."""
-    free, ends = np.array([False, True, True]), np.array([[0, 1], [1, 2]])
-    chain = ScalarPreconditioner(ends, np.ones(2), np.zeros(3), free, np.array([2]))
-    pull = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0]])
-    np.testing.assert_allclose(chain.solve(pull)[1:], [[2.0, 0.0, 1.0], [3.0, 0.0, 2.0]])
-    chain.confine(np.array([0]), np.array([[1.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(chain.solve(pull)[2], [0.0, 0.0, 2.0])

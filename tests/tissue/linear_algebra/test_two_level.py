@@ -184,18 +184,6 @@ def kept(coarse):
     return TwoLevel(grid() if coarse else None, FIXED, 1.0)
 
 
-def test_without_a_grid_it_is_the_inverse_of_each_nodes_block_with_its_spring():
-    made, nodes, normals, stiffness = two_level(False, SPRINGS)
-    residual = np.random.default_rng(2).normal(size=(3, COUNT))
-    out = np.empty_like(residual)
-    made.apply(residual, out)
-    whole = with_springs(nodes, normals, stiffness).reshape(3, COUNT, 3, COUNT)
-    for node in (*nodes, FREE[0], FREE[-1]):
-        expected = np.linalg.solve(whole[:, node, :, node], residual[:, node])
-        np.testing.assert_allclose(out[:, node], expected, rtol=1e-8)
-    assert not out[:, FIXED].any()
-
-
 def test_single_precision_solves_to_single_precision():
     made, *springs = two_level(True, SPRINGS, np.float32)
     single = NeoHookean(MODEL.mesh, MODEL.materials, np.float32)

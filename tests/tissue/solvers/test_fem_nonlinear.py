@@ -352,15 +352,6 @@ def test_a_state_inside_out_that_is_taken_over_is_never_shown():
         assert deformation.residual < 0.01
 
 
-def test_an_upright_state_that_is_taken_over_is_the_solvers_own():
-    model = block(FINE, Sphere(0.05))
-    linear = Fem(model)
-    linear.deform(at(z=0.02))
-    solver = FemNonlinear(model)
-    solver.take_over(linear.state)
-    np.testing.assert_array_equal(solver.state.displacement, linear.state.displacement)
-
-
 def hand_motion(seed, seconds, speed=0.05, depth=0.02):
     """Poses at 60 Hz: a press, and then a smooth random walk of a hand with tilts and lifts."""
     rng = np.random.default_rng(seed)

@@ -5,8 +5,6 @@ import pytest
 from tissue_block import at, block
 
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
-from us_sim.geometry.collider_distance import signed_distance
-from us_sim.tissue.elasticity.springs import springs_of
 from us_sim.tissue.elasticity.stability import count_inverted
 from us_sim.tissue.model import Intervention, TissueState
 from us_sim.tissue.solvers.msds import Msds, MsdsSettings
@@ -55,30 +53,6 @@ def test_what_a_free_body_gains_the_probe_has_lost():
         slack = 0.05 * abs(torque).max() * FRAME
         np.testing.assert_allclose(spun - spin, -torque * FRAME, atol=slack)
     assert momentum(solver)[0][2] > 0
-
-
-def test_held_by_its_bottom_the_block_passes_the_push_on():
-    solver = Msds(block((9, 5, 5)))
-    for _ in range(400):
-        deformation = solver.deform(at(z=0.008))
-    model = solver.model
-    springs = springs_of(model.mesh, model.materials)
-    force = springs.forces(deformation.nodes, np.zeros_like(deformation.nodes))
-    on_the_ground = force[model.fixed].sum(axis=0)
-    assert deformation.residual < 1e-3
-    assert on_the_ground[2] > 0.5
-    np.testing.assert_allclose(on_the_ground, -deformation.force, atol=0.01)
-
-
-def test_touched_nodes_lie_on_the_probe():
-    model = block((13, 7, 6))
-    solver = Msds(model)
-    for frame in range(60):
-        deformation = solver.deform(at(z=min(0.0005 * frame, 0.012)))
-    distance, _ = signed_distance(model.collider, at(z=0.012), deformation.nodes)
-    assert distance[model.contact_nodes].min() > -1e-9
-    assert len(deformation.contact_nodes) > 3
-    assert abs(distance[deformation.contact_nodes]).max() < 1e-9
 
 
 def test_a_violent_start_calms_down_at_the_scaled_masses():

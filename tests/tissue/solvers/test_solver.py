@@ -195,15 +195,6 @@ def test_tissue_that_is_not_held_is_refused(name):
         create_solver(name, block((3, 3, 3), held=()))
 
 
-@pytest.mark.parametrize("held", [("top",), ("bottom", "top")])
-@pytest.mark.parametrize("name", list(SOLVERS))
-def test_held_nodes_are_passed_by(name, held):
-    model = block(held=held)
-    deformation = create_solver(name, model).deform(Pose(np.array([0.0, 0.0, 0.02])))
-    np.testing.assert_array_equal(deformation.nodes, model.mesh.nodes)
-    assert len(deformation.contact_nodes) == 0
-
-
 @pytest.mark.parametrize("ratio", [0.2, 0.45])  # without and with averaged pressures
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_tissue_that_is_all_held_does_not_move(name, ratio):

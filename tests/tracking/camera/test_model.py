@@ -138,11 +138,6 @@ def test_what_is_no_camera_is_refused(arguments, word):
         CameraModel(*arguments)
 
 
-def test_drivers_have_other_names_for_lenses():
-    assert CameraModel(640, 480, MATRIX, [], "").distortion.tolist() == [0.0] * 5
-    assert CameraModel(640, 480, MATRIX, [0.1] * 4, "fisheye").distortion_model == "equidistant"
-
-
 REST = "image_width: 640\ncamera_matrix: 0\ndistortion_coefficients: 0\n"
 
 
