@@ -142,6 +142,7 @@ def test_the_walls_of_a_crushed_vein_are_drawn_without_steps(flat):
 @pytest.mark.parametrize("radius", [5.0, 8.0])
 def test_normals_of_a_ball_of_voxels_point_to_its_middle(radius):
     labels = (np.linalg.norm(np.indices((32, 32, 32)) - 15.3, axis=0) < radius).astype(np.uint8)
+    labels.flags.writeable = False  # as those of a volume
     found = SurfaceNormals(labels)
     angles, distances = [], []
     for voxel in np.argwhere(labels):
