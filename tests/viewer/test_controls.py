@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from us_sim.viewer.panels.controls import on_sliders, slider_count, slider_span
 from us_sim.viewer.panels.nodes import arrange_tissue
-from us_sim.viewer.panels.sections import common_first
+from us_sim.viewer.panels.sections import arrange
 from us_sim.viewer.parameters import Kind, Parameter
 
 
@@ -20,7 +20,7 @@ def known(*names: str, **fields: object) -> dict[str, Parameter]:
 def test_the_common_come_first_and_the_rest_by_groups():
     parameters = known("noise", "gain", "colour.gain", "depth", "colour.steering", "a.b.c")
     parameters |= known("scene", "qos.x", is_live=False)
-    sections = common_first(("depth", "gain", "time_gain"))(parameters)
+    sections = arrange(parameters, ("depth", "gain", "time_gain"))
     assert [(s.title, s.names) for s in sections] == [
         ("", ("depth", "gain")),
         ("More", ("noise",)),
@@ -32,7 +32,7 @@ def test_the_common_come_first_and_the_rest_by_groups():
 
 
 def test_a_node_without_common_ones_begins_with_those_of_no_group():
-    sections = common_first(())(known("marker_rate", "skin.damping"))
+    sections = arrange(known("marker_rate", "skin.damping"))
     assert [(s.title, s.names) for s in sections] == [
         ("", ("marker_rate",)),
         ("Skin", ("skin.damping",)),
@@ -59,9 +59,9 @@ def test_only_the_settings_of_the_methods_in_use_are_shown():
         ("", ("solver", "compare_with")),
         ("Settings of fem_cg", ("fem_cg.iterations",)),
         ("Young's modulus", ("materials.fat.young_modulus", "materials.bone.young_modulus")),
+        ("More", ("marker_rate",)),
         ("Materials · fat", ("materials.fat.density",)),
         ("Materials · bone", ("materials.bone.density",)),
-        ("More", ("marker_rate",)),
     ]
     parameters["compare_with"] = parameters["compare_with"].with_raw("msds")
     assert ("Settings of msds", ("msds.steps",)) in shown()

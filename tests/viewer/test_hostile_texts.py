@@ -52,7 +52,7 @@ def stranger(simulator: Simulator) -> Iterator[None]:
     viewer = bench.add(GuardedNode("viewer", context=bench.context))
     post = Posted(viewer)
     simulator.session = ViewerSession(viewer, post)
-    simulator.nodes = RemoteParameters(viewer, post)
+    simulator.nodes = RemoteParameters(viewer)
     simulator.status = StatusListener(viewer, post)
     for name in NODES:
         node = bench.add(Node(name, context=bench.context))

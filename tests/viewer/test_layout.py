@@ -8,9 +8,10 @@ import pytest
 from awaiting import until
 from chromium import watched
 from fake_hand import FACE, FakeHand, show_patient
+from fake_nodes import FakeNodes
 
 from us_sim.scene.listing import ListedScene
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Simulator
@@ -35,9 +36,8 @@ def hand(simulator: Simulator) -> FakeHand:
     """A simulator that has something to show in every part of the page."""
     hand = FakeHand(simulator)
     show_patient(simulator)
-    simulator.nodes = ParameterBoard()
-    known = {parameter.name: parameter for parameter in PARAMETERS}
-    simulator.nodes.tell(NodeParameters(NODE, State.THERE, known))
+    simulator.nodes = FakeNodes()
+    simulator.nodes.tell(*PARAMETERS)
     simulator.session.state = SessionState(True, "running", "upper_arm", "/arm.yaml")
     simulator.session.scenes = (
         ListedScene("upper_arm", "/arm.yaml", description="An arm.", tracker="pose"),

@@ -1,15 +1,15 @@
 """The bar above the image: what it sets, what it watches, and what it does when it is refused."""
 
 import time
-from concurrent.futures import Future
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from awaiting import until
+from fake_nodes import FakeNodes
 
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Feed, Packet, Simulator
 
@@ -18,11 +18,10 @@ PIXEL = "() => {{ const c = document.querySelector('{}'); return c ? Array.from(
 PIXEL += "c.getContext('2d').getImageData(5, 5, 1, 1).data).slice(0, 3) : null; }}"
 
 
-def known(value: str, is_flipped: bool = False) -> NodeParameters:
+def known(value: str, is_flipped: bool = False) -> list[Parameter]:
     overlay = Parameter(NODE, "overlay", Kind.TEXT, value, choices=("none", "strain", "velocity"))
     switches = {"flip": is_flipped, "beside": False}
-    made = {name: Parameter(NODE, name, Kind.TRUTH, value) for name, value in switches.items()}
-    return NodeParameters(NODE, State.THERE, {"overlay": overlay, **made})
+    return [overlay, *(Parameter(NODE, name, Kind.TRUTH, on) for name, on in switches.items())]
 
 
 @pytest.fixture
@@ -30,17 +29,15 @@ def asked(simulator: Simulator) -> list[str]:
     """The modes that the node was asked to show; it refuses velocity."""
     values: list[str] = []
 
-    def send(_: Parameter, raw: Any) -> "Future[str]":
+    def take(_: Parameter, raw: Any) -> str:
         values.append(raw)
-        told: Future[str] = Future()
-        refused = raw == "velocity"
-        told.set_result("overlay: this scene has nothing for 'velocity'" if refused else "")
-        if not refused:
-            simulator.nodes.tell(known(raw))
-        return told
+        if raw == "velocity":
+            return "overlay: this scene has nothing for 'velocity'"
+        simulator.nodes.tell(*known(raw))
+        return ""
 
-    simulator.nodes = ParameterBoard(send=send)
-    simulator.nodes.tell(known("none"))
+    simulator.nodes = FakeNodes(take)
+    simulator.nodes.tell(*known("none"))
     return values
 
 
@@ -125,7 +122,7 @@ def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simul
     page.goto(page.address)
     page.get_by_role("button", name="Outlines").click()
     page.get_by_role("button", name="Outlines", pressed=True).wait_for()
-    simulator.nodes.tell(known("strain"))
+    simulator.nodes.tell(*known("strain"))
     page.get_by_role("button", name="Strain", exact=True, pressed=True).wait_for()
 
 
@@ -150,7 +147,7 @@ def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator
     is_said()
     page.get_by_role("button", name="Outlines").click()
     page.get_by_role("button", name="Outlines", pressed=True).wait_for()
-    simulator.nodes.tell(known("velocity"))
+    simulator.nodes.tell(*known("velocity"))
     is_said("No colour: the beams cross")
     see(contact="poor", no_colour="no_contact", no_spectrum="no_vessel")
     is_said("Poor contact")
@@ -187,9 +184,9 @@ def test_the_node_is_asked_for_nothing_once_the_page_has_gone(
     page = browser.new_page()
     page.goto(served[0].address)
     page.wait_for_function("document.querySelector('.us-modes')")
-    until(lambda: NODE in simulator.nodes.watched, "the page looks at the node")
+    until(lambda: simulator.nodes.of(NODE).pages, "the page looks at the node")
     page.close()
-    until(lambda: not simulator.nodes.watched, "nobody looks at any node any more")
+    until(lambda: not simulator.nodes.of(NODE).pages, "nobody looks at any node any more")
 
 
 def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(
@@ -199,7 +196,7 @@ def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(
     flip = page.get_by_role("button", name="Flip")
     flip.click()
     until(lambda: asked == [True], "the node is asked")
-    simulator.nodes.tell(known("none", is_flipped=True))
+    simulator.nodes.tell(*known("none", is_flipped=True))
     until(lambda: flip.get_attribute("aria-pressed") == "true", "it is flipped")
     flip.click()
     until(lambda: asked == [True, False], "the node is asked for the other")

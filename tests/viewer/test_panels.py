@@ -2,13 +2,13 @@
 
 import re
 import time
-from concurrent.futures import Future
 from typing import Any
 
 import pytest
 from awaiting import until
+from fake_nodes import FakeNodes
 
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Simulator
 
@@ -39,23 +39,21 @@ class Node:
         self.sent: list[tuple[float, str, Any]] = []
         self.refusal = ""
         self.parameters = {parameter.name: parameter for parameter in PARAMETERS}
-        self.board = simulator.nodes = ParameterBoard(send=self._take)
+        self.nodes = simulator.nodes = FakeNodes(self._take)
         self.tell()
 
     def tell(self, *parameters: Parameter) -> None:
         self.parameters |= {parameter.name: parameter for parameter in parameters}
-        self.board.tell(NodeParameters(NODE, State.THERE, dict(self.parameters)))
+        self.nodes.tell(*self.parameters.values())
 
     def values(self, name: str) -> list[Any]:
         return [raw for _, which, raw in self.sent if which == name]
 
-    def _take(self, parameter: Parameter, raw: Any) -> "Future[str]":
+    def _take(self, parameter: Parameter, raw: Any) -> str:
         self.sent.append((time.monotonic(), parameter.name, raw))
         if not self.refusal:
             self.tell(self.parameters[parameter.name].with_raw(raw))
-        future: Future[str] = Future()
-        future.set_result(self.refusal)
-        return future
+        return self.refusal
 
 
 @pytest.fixture
@@ -228,21 +226,21 @@ def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
     page.get_by_role("button", name="Panels").click()
     tissue = {"tissue_deformer", "skin_deformer", "probe_tracker"}
     page.get_by_role("tab", name="Tissue").click()
-    until(lambda: node.board.watched >= tissue, "the tissue panel is seen")
+    until(lambda: node.nodes.watched >= tissue, "the tissue panel is seen")
     until(
         lambda: "tissue_deformer is not running" in page.locator(".us-panels").inner_text(),
         "absent nodes are said",
     )
     page.get_by_role("button", name="Panels").click()
-    until(lambda: not node.board.watched & tissue, "the drawer is closed")
+    until(lambda: not node.nodes.watched & tissue, "the drawer is closed")
     page.get_by_role("button", name="Panels").click()
-    until(lambda: node.board.watched >= tissue, "and open again")
+    until(lambda: node.nodes.watched >= tissue, "and open again")
     page.get_by_role("tab", name="Image").click()
-    until(lambda: not node.board.watched & tissue, "another tab is chosen")
+    until(lambda: not node.nodes.watched & tissue, "another tab is chosen")
     page.get_by_role("tab", name="Tissue").click()
-    until(lambda: node.board.watched >= tissue, "and this one again")
+    until(lambda: node.nodes.watched >= tissue, "and this one again")
     page.goto("about:blank")
-    until(lambda: node.board.watched == set(), "the page has gone")
+    until(lambda: node.nodes.watched == set(), "the page has gone")
 
 
 def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
@@ -288,9 +286,9 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     ]
     page.get_by_role("button", name="tissue_deformer").click()
     page.get_by_role("dialog").wait_for()
-    until(lambda: "tissue_deformer" in node.board.watched, "the dialog shows its parameters")
+    until(lambda: "tissue_deformer" in node.nodes.watched, "the dialog shows its parameters")
     page.keyboard.press("Escape")
-    until(lambda: "tissue_deformer" not in node.board.watched, "the dialog is closed")
+    until(lambda: "tissue_deformer" not in node.nodes.watched, "the dialog is closed")
     page.get_by_role("tab", name="Image").click()
     until(lambda: not board.force.is_watched, "nobody looks at the plots any more")
     assert board.is_watched  # the image says what its node says of it
@@ -310,8 +308,7 @@ def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
         Parameter(tissue, "fem.friction", Kind.NUMBER, 0.3, limits=(0.1, 1.0)),
         Parameter(tissue, "msds.steps", Kind.WHOLE, 20, limits=(1, 100)),
     ]
-    known = {parameter.name: parameter for parameter in parameters}
-    node.board.tell(NodeParameters(tissue, State.THERE, known))
+    node.nodes.tell(*parameters)
     opened(page, "Tissue")
     panel = page.locator(".us-panels")
 
@@ -337,8 +334,7 @@ def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
     says("msds is 0.412 mm away at most, 0.05 mm root mean square", **apart)
     assert panel.get_by_text("Settings of fem").is_visible()
     assert not panel.get_by_text("Settings of msds").is_visible()
-    known = known | {"solver": known["solver"].with_raw("msds")}
-    node.board.tell(NodeParameters(tissue, State.THERE, known))
+    node.nodes.tell(parameters[0].with_raw("msds"), *parameters[1:])
     panel.get_by_text("Settings of msds").wait_for()
     panel.get_by_text("Settings of fem").wait_for(state="hidden")
     sentence = "msds: its step is too long; it is set back"

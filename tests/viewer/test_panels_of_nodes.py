@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.viewer.remote_parameters import RemoteParameters
-from us_sim.viewer.stream import Posted, Simulator
+from us_sim.viewer.stream import Simulator
 
 NODE = "slice_interpolator"
 
@@ -25,7 +25,7 @@ def graph(simulator: Simulator) -> Iterator[Node]:
     bench = Bench()
     node = bench.add(Node(NODE, context=bench.context))
     asking = bench.add(GuardedNode("viewer", context=bench.context))
-    simulator.nodes = RemoteParameters(asking, Posted(asking))
+    simulator.nodes = RemoteParameters(asking)
     ended = threading.Event()
 
     def spin() -> None:

@@ -1,15 +1,15 @@
 """The colour box, the gate and the line of M-mode are dragged over the image to where they look."""
 
-from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
 import pytest
 from awaiting import until
+from fake_nodes import FakeNodes
 
 from us_sim.slicing.probe.beams import pixels_of
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, image_outline
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.stream import Feed, Packet, Simulator
 from us_sim.viewer.surfaces import transducer_packet
 
@@ -29,7 +29,7 @@ class Node:
             self.values[f"{kind}.steering"] = steering
         self.values |= {"colour.width": 0.4, "colour.height": 0.01, "spectrum.size": 0.002}
         self.values["m_mode.lateral"] = 0.1
-        simulator.nodes = self._board = ParameterBoard(send=self._send)
+        simulator.nodes = self._nodes = FakeNodes(self._take)
         self._tell()
         matrix = probe.image_to_probe.copy()
         if flip:
@@ -49,19 +49,17 @@ class Node:
             simulator.feeds[kind].offer(pack)
 
     def _tell(self) -> None:
-        made = {}
+        made = []
         for name, value in self.values.items():
             kind = Kind.TEXT if isinstance(value, str) else Kind.NUMBER
             size = 1e-3 if name.endswith(("depth", "height", "size")) else 1.0
-            made[name] = Parameter(NODE, name, kind, value, size=size)
-        self._board.tell(NodeParameters(NODE, State.THERE, made))
+            made.append(Parameter(NODE, name, kind, value, size=size))
+        self._nodes.tell(*made)
 
-    def _send(self, parameter: Parameter, raw: Any) -> "Future[str]":
+    def _take(self, parameter: Parameter, raw: Any) -> str:
         self.values[parameter.name] = raw
         self._tell()
-        told: Future[str] = Future()
-        told.set_result("")
-        return told
+        return ""
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from us_sim.skin.surface import bent_surface, plane_surface
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.viewer.feeds import RestMesh
 from us_sim.viewer.hand import ViewerHand, ViewerSurface
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, State
+from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.session import SessionBoard, SessionState
 from us_sim.viewer.stream import Feed, Posted, Simulator
 
@@ -194,7 +194,7 @@ def test_while_blood_or_time_is_watched_the_resting_probe_is_imaged_as_if_it_mov
     bench.spin_until(lambda: len(tracked) >= 2 and page.state.get("is_resting"))
     simulator = page._holder.simulator
     overlay = Parameter("slice_interpolator", "overlay", Kind.TEXT, "velocity")
-    simulator.nodes.tell(NodeParameters("slice_interpolator", State.THERE, {"overlay": overlay}))
+    simulator.nodes.of("slice_interpolator").parameters = {"overlay": overlay}
     for kind in ("m_mode", "spectrum", "annotated"):
         simulator.add(Feed(kind))
         simulator.feeds[kind].watch(page.nothing)

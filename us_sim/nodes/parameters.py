@@ -25,7 +25,7 @@ from rclpy.parameter import Parameter
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import is_live
 from us_sim.settings.quantity import dial_unit
-from us_sim.settings.setting import Rule, Settings, kinds_of, rules_of
+from us_sim.settings.setting import Settings, kinds_of, rules_of
 
 S = TypeVar("S", bound=Settings)
 
@@ -45,11 +45,11 @@ def declared(node: Node, settings: S, names: Collection[str] | None = None, pref
     """
     cls = type(settings)
     chosen = [name for name in rules_of(cls) if names is None or name in names]
-    for name in chosen:
-        descriptor = _descriptor(cls, name)
-        node.declare_parameter(prefix + name, _default(settings, name), descriptor)
-    values = {prefix + name: node.get_parameter(prefix + name).value for name in chosen}
-    return _changed(settings, values, prefix, f"{node.get_name()}.")
+    given = [
+        node.declare_parameter(prefix + name, _raw(settings, name), _descriptor(cls, name))
+        for name in chosen
+    ]
+    return changed(settings, given, prefix, f"{node.get_name()}.")
 
 
 @dataclass(frozen=True)
@@ -88,91 +88,89 @@ class LiveSettings:
             key: declared(node, group.settings, group.names, group.prefix)
             for key, group in groups.items()
         }
+        self._checked = self.values  # of the change that is about to be made
         node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._change)
+        node.add_post_set_parameters_callback(self._take_over)
 
     def restore(self, values: Mapping[str, Any]) -> None:
         """Set parameters back to former settings, by the groups' names."""
-        back = []
-        for key, settings in values.items():
-            group = self._groups[key]
-            for name in rules_of(type(settings)):
-                is_parameter = group.names is None or name in group.names
-                if is_parameter and getattr(settings, name) != getattr(self.values[key], name):
-                    back.append(Parameter(group.prefix + name, value=_default(settings, name)))
+        back = [
+            Parameter(self._groups[key].prefix + name, value=_raw(settings, name))
+            for key, settings in values.items()
+            for name in rules_of(type(settings))
+            if getattr(settings, name) != getattr(self.values[key], name)
+        ]
         if back:
             self._node.set_parameters_atomically(back)  # one alone may not go with another
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Make the settings as they would be; what refuses that refuses the parameters."""
         try:
-            wanted = self._with(parameters)
-            if wanted != self.values and self._prepare is not None:
-                self._prepare(wanted)
+            checked = {
+                key: changed(settings, parameters, self._groups[key].prefix)
+                for key, settings in self.values.items()
+            }
+            if checked != self.values and self._prepare is not None:
+                self._prepare(checked)
         except UsSimError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        self._checked = checked
         return SetParametersResult(successful=True)
 
-    def _change(self, parameters: list[Parameter]) -> None:
-        wanted = self._with(parameters)
-        if wanted != self.values:
-            self.values = wanted
+    def _take_over(self, _: list[Parameter]) -> None:
+        """Use the settings that were checked, now that the parameters have been set."""
+        if self._checked != self.values:
+            self.values = self._checked
             if self._use is not None:
-                self._use(wanted)
-
-    def _with(self, parameters: list[Parameter]) -> dict[str, Any]:
-        return {
-            key: changed(settings, parameters, self._groups[key].prefix)
-            for key, settings in self.values.items()
-        }
+                self._use(self.values)
 
 
-def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "") -> S:
-    """The settings with the values of parameters that are theirs.
+def changed(settings: S, parameters: Sequence[Parameter], prefix: str = "", before: str = "") -> S:
+    """Make the settings with the values of parameters that are theirs.
+
+    Args:
+        settings: as they are.
+        parameters: of which some may be others'.
+        prefix: before the names of theirs.
+        before: likewise, in the sentence of an error.
 
     Raises:
         SettingsError: or the settings' own error: a value will not do.
     """
-    return _changed(settings, {each.name: each.value for each in parameters}, prefix)
-
-
-def parameters_with(settings: Settings) -> list[Parameter]:
-    """The parameters that settings are."""
-    return [Parameter(name, value=_default(settings, name)) for name in rules_of(type(settings))]
-
-
-def _changed(settings: S, values: Mapping[str, Any], prefix: str, before: str = "") -> S:
-    """The settings with the values of parameters that are theirs."""
-    changes = {}
-    for name, kind in kinds_of(type(settings)).items():
-        if prefix + name not in values:
-            continue
-        value = values[prefix + name]
-        if kind is str and isinstance(value, int | float):
-            value = str(value)  # a camera's number, say
-        if _may_be_none(kind) and _is_nothing(value):
-            value = None
-        elif get_origin(kind) is tuple and get_args(kind)[0] is str:
-            value = tuple(text for text in value or () if text)
-        changes[name] = value
+    values = {each.name: each.value for each in parameters}
+    changes = {
+        name: _value(kind, values[prefix + name])
+        for name, kind in kinds_of(type(settings)).items()
+        if prefix + name in values
+    }
     if not changes:
         return settings
     try:
-        changed: S = dataclasses.replace(settings, **changes)
+        return dataclasses.replace(settings, **changes)
     except UsSimError as error:
         at = f"{before}{prefix}{error.key}: {error.problem}" if error.key else str(error)
         raise type(error)(at) from error
-    return changed
 
 
-def _is_nothing(value: Any) -> bool:
-    """Whether a parameter's value stands for none: 0, a list of zeros, or an empty text."""
-    if isinstance(value, str) or not hasattr(value, "__iter__"):
-        return bool(value == 0 or value == "")
-    return not any(value)
+def parameters_with(settings: Settings) -> list[Parameter]:
+    """List the parameters that settings are."""
+    return [Parameter(name, value=_raw(settings, name)) for name in rules_of(type(settings))]
 
 
-def _default(settings: Settings, name: str) -> Any:
-    """A setting's value as a parameter's."""
+def _value(kind: Any, raw: Any) -> Any:
+    """Convert a parameter's value to that of a setting of this type."""
+    if kind is str and isinstance(raw, int | float):
+        return str(raw)  # a camera's number, say
+    is_list = not isinstance(raw, str) and hasattr(raw, "__iter__")
+    if _may_be_none(kind) and not (any(raw) if is_list else raw):
+        return None
+    if get_origin(kind) is tuple and get_args(kind)[0] is str:
+        return tuple(text for text in raw or () if text)
+    return raw
+
+
+def _raw(settings: Settings, name: str) -> Any:
+    """Convert a setting's value to that of a parameter."""
     value, kind = getattr(settings, name), kinds_of(type(settings))[name]
     lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
     if lists:
@@ -207,23 +205,16 @@ def _descriptor(settings: type[Settings], name: str) -> ParameterDescriptor:
         read_only=not live,
         dynamic_typing=kind is str and not live,
     )
-    _set_range(descriptor, rule, kind)
+    if rule.quantity is not None:  # ROS has no range for lists
+        low, high = rule.quantity.minimum, rule.quantity.maximum
+        kinds = get_args(kind) if _may_be_none(kind) else (kind,)
+        low = min(low, 0.0) if _may_be_none(kind) else low
+        if float in kinds:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        elif int in kinds:
+            whole = IntegerRange(from_value=int(low), to_value=int(high), step=1)
+            descriptor.integer_range = [whole]
     return descriptor
-
-
-def _set_range(descriptor: ParameterDescriptor, rule: Rule, kind: Any) -> None:
-    """Tell ROS the range of a number; it has none for lists."""
-    if rule.quantity is None:
-        return
-    low, high = rule.quantity.minimum, rule.quantity.maximum
-    if _may_be_none(kind):
-        low = min(low, 0.0)
-        kind = next(each for each in get_args(kind) if each is not type(None))
-    if kind is float:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    elif kind is int:
-        whole = IntegerRange(from_value=int(low), to_value=int(high), step=1)
-        descriptor.integer_range = [whole]
 
 
 def _may_be_none(kind: Any) -> bool:

@@ -75,9 +75,9 @@ class _Modes:
         bar.on("us-place", lambda event: self._move(event.args.get("detail")), ["detail"])
         self._mark()
         self._remarks: list[str] = []
-        board, status = simulator.nodes, simulator.status
-        board.watch(NODE)
-        ui.context.client.on_delete(lambda: board.unwatch(NODE))
+        node, status = simulator.nodes.of(NODE), simulator.status
+        node.watch()
+        ui.context.client.on_delete(node.unwatch)
         status.watch()
         ui.context.client.on_delete(status.unwatch)
         ui.timer(0.3, self._refresh)
@@ -94,7 +94,7 @@ class _Modes:
 
     async def _set(self, name: str, value: object) -> bool:
         """Set a parameter; whether that was not refused."""
-        refused = await asyncio.wrap_future(self._simulator.nodes.set(NODE, name, value))
+        refused = await self._simulator.nodes.of(NODE).set(name, value)
         if refused:
             ui.notify(refused, type="warning", multi_line=True)
         return not refused

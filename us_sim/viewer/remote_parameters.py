@@ -1,4 +1,4 @@
-"""Parameters of other nodes: found, read, followed and set while pages show them.
+"""Parameters of other nodes: read, followed and set while pages show them.
 
 The nodes of this package say more in a descriptor than ROS has fields for, as a JSON object in
 ``additional_constraints``, see `us_sim.nodes.parameters`. Others may write there what they like.
@@ -6,346 +6,258 @@ The nodes of this package say more in a descriptor than ROS has fields for, as a
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
-import time
-from array import array
-from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent, ParameterValue
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.errors import SettingsError
 from us_sim.settings.quantity import units_of
-from us_sim.viewer.parameters import Kind, NodeParameters, Parameter, ParameterBoard, State
+from us_sim.viewer.parameters import Kind, Parameter
 
 ANSWER_S = 10.0  # how long an answer is waited for: a node that makes images anew may need seconds
-_SERVICES_S = 5.0  # how long a node may take to offer its services
-_EVERY_S = 0.5  # how often the graph is searched for nodes that come, go, or are started again
-_EVENTS = "/parameter_events"
+LOOK_S = 0.5  # how often it is looked whether a node has come, gone, or been started again
 _OF_ROS = ("use_sim_time", "qos_overrides.", "start_type_description_service")
 """Parameters that rclpy itself declares, or prefixes of them: not what a page is for."""
-_TYPES = {
-    Kind.TRUTH: (ParameterType.PARAMETER_BOOL, "bool_value"),
-    Kind.WHOLE: (ParameterType.PARAMETER_INTEGER, "integer_value"),
-    Kind.NUMBER: (ParameterType.PARAMETER_DOUBLE, "double_value"),
-    Kind.TEXT: (ParameterType.PARAMETER_STRING, "string_value"),
-    Kind.WHOLES: (ParameterType.PARAMETER_INTEGER_ARRAY, "integer_array_value"),
-    Kind.NUMBERS: (ParameterType.PARAMETER_DOUBLE_ARRAY, "double_array_value"),
-    Kind.TEXTS: (ParameterType.PARAMETER_STRING_ARRAY, "string_array_value"),
-}
-_KINDS = {number: (kind, field) for kind, (number, field) in _TYPES.items()}
+
+ABSENT = "is not running"
+ASKED = "is being asked for its parameters"
+SILENT = "does not answer what its parameters are"
+THERE = ""
+
+Door = Callable[..., "Future[str]"]
+"""Sets parameters, given by name; the future holds why not, or nothing."""
+
+
+class NodeParameters:
+    """The parameters of another node, up to date while pages show them.
+
+    A node is told from one of the same name that was started later by who publishes its parameter
+    events, as the middleware numbers publishers. Any thread may read `state` and `parameters`; the
+    rest is for the event loop that serves the pages, while another thread spins the client's node.
+
+    Args:
+        name: of the node, within the namespace.
+        client: asks the node; without one nothing is asked.
+        door: sets parameters in place of the client.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        client: AsyncParameterClient | None = None,
+        door: Door | None = None,
+    ) -> None:
+        self.name = name
+        self.state = ABSENT
+        self.parameters: Mapping[str, Parameter] = {}  # by name; another object after each change
+        self.pages = 0  # that show them
+        self._client, self._door = client, door
+        self._following: asyncio.Task[None] | None = None
+        self._is_old = asyncio.Event()  # what is known
+
+    def watch(self) -> None:
+        """Follow the parameters, until `unwatch`."""
+        self.pages += 1
+        if self.pages == 1 and self._client is not None:
+            self._following = asyncio.ensure_future(self._follow(self._client))
+
+    def unwatch(self) -> None:
+        """Follow them no longer."""
+        self.pages -= 1
+        if not self.pages and self._following is not None:
+            self._following.cancel()
+
+    async def set(self, name: str, value: Any) -> str:
+        """Set a parameter to a value in the unit that is shown; None is nothing.
+
+        Returns:
+            the reason if it is refused, an empty text if not.
+        """
+        parameter = self.parameters.get(name)
+        if parameter is None:
+            return f"{self.name} has no parameter {name} at present"
+        try:
+            return await self._send(parameter, parameter.raw_of(value))
+        except SettingsError as error:
+            return str(error)
+        except TimeoutError:
+            return f"{self.name} did not answer within {ANSWER_S:g} s"
+
+    async def _send(self, parameter: Parameter, raw: Any) -> str:
+        name = parameter.name
+        if self._door is not None:
+            return await asyncio.wrap_future(self._door(**{name: raw}))
+        if self._client is None or not self._client.services_are_ready():
+            return f"{self.name} offers no parameters at present"
+        wanted = RosParameter(name, parameter.kind.value, raw)
+        async with asyncio.timeout(ANSWER_S):
+            (result,) = (await _answer(self._client.set_parameters([wanted]))).results
+        if not result.successful:
+            return result.reason or f"{self.name} refuses it"
+        if self.parameters.get(name) is parameter:  # nothing newer has come meanwhile
+            self.parameters = {**self.parameters, name: parameter.with_raw(raw)}
+        return ""
+
+    async def _follow(self, client: AsyncParameterClient) -> None:
+        """Read the parameters, again whenever they are another process's, and follow changes."""
+        loop, is_old, name = asyncio.get_running_loop(), self._is_old, client.remote_node_name
+
+        def on_event(event: ParameterEvent) -> None:
+            if event.node == name:
+                with contextlib.suppress(RuntimeError):  # the loop has ended
+                    loop.call_soon_threadsafe(self._update, event)
+
+        events = client.on_parameter_event(on_event)
+        known: set[Any] = set()
+        try:
+            while True:
+                there = {
+                    tuple(each.endpoint_gid)
+                    for each in client.node.get_publishers_info_by_topic("/parameter_events")
+                    if f"{each.node_namespace.rstrip('/')}/{each.node_name}"
+                    == client.remote_node_name
+                }
+                if there != known:
+                    known, self.parameters, self.state = there, {}, ASKED if there else ABSENT
+                    (is_old.set if there else is_old.clear)()
+                if is_old.is_set():
+                    is_old.clear()
+                    await self._read(client)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(is_old.wait(), LOOK_S)
+        finally:
+            self.parameters, self.state = {}, ABSENT  # they may change unseen
+            client.node.destroy_subscription(events)
+
+    async def _read(self, client: AsyncParameterClient) -> None:
+        """Ask for all parameters; what is known of them stays until the answers are there."""
+        before = self.parameters
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                while not client.services_are_ready():
+                    await asyncio.sleep(0.1 * LOOK_S)
+                listed = (await _answer(client.list_parameters())).result.names
+                names = [name for name in listed if not name.startswith(_OF_ROS)]
+                types = (await _answer(client.get_parameter_types(names))).types
+                # Of one without a value rclpy tells none, and with it of no other one.
+                names = [name for name, type_ in zip(names, types, strict=False) if type_]
+                told = (await _answer(client.describe_parameters(names))).descriptors
+                values = (await _answer(client.get_parameters(names))).values
+        except TimeoutError:
+            self.state = SILENT
+            self._is_old.set()
+            return
+        if self.parameters is not before:
+            self._is_old.set()  # what was answered may be older than an event
+        self.state = THERE
+        self.parameters = {  # none where one was undeclared meanwhile
+            name: _parameter(self.name, name, descriptor, value)
+            for name, descriptor, value in zip(names, told, values, strict=False)
+        }
+
+    def _update(self, event: ParameterEvent) -> None:
+        """Take over parameters that were declared, set or undeclared."""
+        if event.deleted_parameters:
+            self._is_old.set()
+        for message in (*event.new_parameters, *event.changed_parameters):
+            known = self.parameters.get(message.name)
+            kind, raw = _value(message.value)
+            if known is not None and known.kind is kind:
+                self.parameters = {**self.parameters, message.name: known.with_raw(raw)}
+            elif not message.name.startswith(_OF_ROS):
+                self._is_old.set()
+
+
+class RemoteParameters:
+    """The parameters of all nodes; without ``node``, of none.
+
+    Args:
+        node: that asks.
+        doors: by the names of nodes, functions that set their parameters in place of them.
+    """
+
+    def __init__(
+        self,
+        node: Node | None = None,
+        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
+    ) -> None:
+        self._node, self._doors = node, doors or {}
+        self._nodes: dict[str, NodeParameters] = {}
+
+    def of(self, name: str) -> NodeParameters:
+        """Return those of a node, always the same object; any thread may ask."""
+        made = self._nodes.get(name)
+        return made or self._nodes.setdefault(name, self._make(name))
+
+    def _make(self, name: str) -> NodeParameters:
+        if self._node is None:
+            return NodeParameters(name)
+        space = self._node.get_namespace().rstrip("/")
+        client = AsyncParameterClient(self._node, f"{space}/{name}")
+        return NodeParameters(name, client, self._doors.get(name))
+
+
+async def _answer(asked: Any) -> Any:
+    """Await an answer in the running event loop that comes in the thread that spins the node."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[Any] = loop.create_future()
+
+    def deliver() -> None:
+        if not answer.done():  # nobody has given it up
+            answer.set_result(asked.result())
+
+    def on_answer(_: Any) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(deliver)
+
+    asked.add_done_callback(on_answer)
+    return await answer
 
 
 def _parameter(
     node: str, name: str, descriptor: ParameterDescriptor, value: ParameterValue
 ) -> Parameter:
-    kind, raw = _raw(value)
-    told = _extras(descriptor)
+    """Make the parameter of what its node says of it."""
+    kind, raw = _value(value)
+    try:
+        told = json.loads(descriptor.additional_constraints)
+    except (ValueError, RecursionError):
+        told = None
+    told = told if isinstance(told, dict) else {}  # another's node has something else there
     unit, reads = str(told.get("unit", "")), str(told.get("shown_in", ""))
+    sizes = units_of(unit)
+    reads = reads if reads in sizes else unit
     choices = told.get("choices")
     meanings = {str(k): str(v) for k, v in choices.items()} if isinstance(choices, dict) else {}
     ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
-    if reads not in units_of(unit):
-        reads = unit
     return Parameter(
         node,
         name,
         kind,
         raw,
         unit=reads,
-        size=units_of(unit).get(reads, 1.0),
+        size=sizes.get(reads, 1.0),
         limits=(float(ranges[0].from_value), float(ranges[0].to_value)) if ranges else None,
         choices=tuple(meanings),
-        meanings={name: text for name, text in meanings.items() if text},
+        meanings={choice: text for choice, text in meanings.items() if text},
         may_be_nothing="none" in told,
-        description=str(descriptor.description),
+        description=descriptor.description,
         is_live=not descriptor.read_only and kind is not Kind.OTHER,
     )
 
 
-def _extras(descriptor: ParameterDescriptor) -> dict[str, Any]:
-    """The JSON object in the constraints; empty where another's node has something else there."""
-    try:
-        told = json.loads(str(descriptor.additional_constraints))
-    except (ValueError, RecursionError):
-        return {}
-    return told if isinstance(told, dict) else {}
-
-
-def _raw(value: ParameterValue) -> tuple[Kind, Any]:
-    if value.type not in _KINDS:
-        return Kind.OTHER, None
-    kind, field = _KINDS[value.type]
-    raw = getattr(value, field)
+def _value(value: ParameterValue) -> tuple[Kind, Any]:
+    """Return a value's kind and its value; lists are tuples."""
+    kind, raw = Kind(RosParameter.Type(value.type)), parameter_value_to_python(value)
+    if kind is Kind.OTHER:
+        return kind, None
     return kind, tuple(raw) if kind.is_list else raw
-
-
-def _message(parameter: Parameter, raw: Any) -> ParameterMessage:
-    number, field = _TYPES[parameter.kind]
-    if parameter.kind.is_list:
-        raw = array("d", raw) if parameter.kind is Kind.NUMBERS else list(raw)
-    value = ParameterValue(type=number, **{field: raw})
-    return ParameterMessage(name=parameter.name, value=value)
-
-
-class RemoteParameters(ParameterBoard):
-    """A board that is up to date while pages show it, and asks nothing while none does.
-
-    A node is told from one of the same name that was started later by who publishes its
-    parameter events, as the middleware numbers publishers.
-
-    Args:
-        node: that asks.
-        post: has work done in the thread that spins ``node``; returns a future.
-        doors: by the names of nodes, functions that set their parameters in place of them.
-    """
-
-    def __init__(
-        self,
-        node: GuardedNode,
-        post: Callable[[Callable[[], Any]], Any],
-        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
-    ) -> None:
-        super().__init__(lambda: post(self._follow_graph), self._send)
-        self._doors = doors or {}
-        self._node, self._post = node, post
-        self._space = node.get_namespace().rstrip("/")
-        self._nodes: dict[str, _RemoteNode] = {}
-        self._timer: Any = None
-        self._events: Any = None
-
-    def close(self) -> None:
-        """Answer whoever waits."""
-        for remote in self._nodes.values():
-            remote.close()
-
-    def _follow_graph(self) -> None:
-        watched = self.watched
-        if not watched:
-            if self._timer is not None:
-                self._node.destroy_timer(self._timer)
-                self._node.destroy_subscription(self._events)
-                self._timer = None
-            for remote in self._nodes.values():
-                remote.forget()  # it may change unseen
-            return
-        if self._timer is None:
-            every_event = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-            self._events = self._node.create_subscription(
-                ParameterEvent, _EVENTS, self._follow, every_event
-            )
-            self._timer = self._node.create_timer(_EVERY_S, self._follow_graph)
-        there = self._identities()
-        for name in watched:
-            if name not in self._nodes:
-                self._nodes[name] = _RemoteNode(self._node, name, self.tell)
-            self._nodes[name].follow_graph(there.get(f"{self._space}/{name}", frozenset()))
-
-    def _identities(self) -> dict[str, frozenset[Any]]:
-        """The publishers of parameter events of each node of the graph, by its full name."""
-        found: dict[str, set[Any]] = defaultdict(set)
-        for name, space in self._node.get_node_names_and_namespaces():
-            found[f"{space.rstrip('/')}/{name}"].add(name)
-        for each in self._node.get_publishers_info_by_topic(_EVENTS):
-            name = f"{each.node_namespace.rstrip('/')}/{each.node_name}"
-            if name in found:
-                found[name].add(tuple(each.endpoint_gid))
-        return {name: frozenset(identity) for name, identity in found.items()}
-
-    def _follow(self, event: ParameterEvent) -> None:
-        space, _, name = event.node.rpartition("/")
-        if space == self._space and name in self._nodes and name in self.watched:
-            self._nodes[name].follow(event)
-
-    def _send(self, parameter: Parameter, raw: Any) -> Future[str]:
-        if parameter.node in self._doors:
-            return self._doors[parameter.node](**{parameter.name: raw})
-        told: Future[str] = Future()
-
-        def ask() -> None:
-            remote = self._nodes.get(parameter.node)
-            if remote is None:
-                told.set_result(f"{parameter.node} is not shown any more")
-            else:
-                remote.set(parameter, raw, told)
-
-        if self._post(ask).cancelled():
-            told.set_result("the viewer ends")
-        return told
-
-
-class _RemoteNode:
-    """Another node's parameters. All of it happens in the thread that spins ``node``.
-
-    Args:
-        node: that asks.
-        name: of the other, in the namespace of ``node``.
-        tell: called whenever there is something newer.
-    """
-
-    def __init__(self, node: GuardedNode, name: str, tell: Callable[[NodeParameters], None]):
-        self._name, self._tell = name, tell
-        self._guarded = lambda callback: node.guarded(f"parameters of {name}", callback)
-        self._client = AsyncParameterClient(node, f"{node.get_namespace().rstrip('/')}/{name}")
-        self._parameters: dict[str, Parameter] = {}
-        self._identity: frozenset[Any] = frozenset()
-        self._since = 0.0  # s, monotonic: when it was asked, or when it came
-        self._reading = 0  # counts; answers to earlier readings are ignored
-        self._is_read = self._is_asked = False
-        self._heard: Counter[str] = Counter()  # events, by parameters' names
-        self._setting: dict[Future[str], float] = {}  # until when its answer is waited for
-
-    def follow_graph(self, identity: frozenset[Any]) -> None:
-        """Read the parameters if they are not, or are another process's.
-
-        Args:
-            identity: the same as long as the node is; empty where there is no such node.
-        """
-        now = time.monotonic()
-        for told in [told for told, until in self._setting.items() if now > until]:
-            del self._setting[told]
-            told.set_result(f"{self._name} did not answer within {ANSWER_S:g} s")
-        if not identity:
-            if self._identity or self._is_asked:
-                self.forget()
-            self._say(State.ABSENT)
-            return
-        if identity != self._identity:
-            self.forget()
-            self._identity, self._since = identity, now
-            self._say(State.ASKED)
-        if self._is_read or (self._is_asked and now - self._since < ANSWER_S):
-            return
-        if self._client.services_are_ready():
-            self._read()
-        elif now - self._since > _SERVICES_S:
-            self._say(State.SILENT)
-
-    def forget(self) -> None:
-        """Drop what was read."""
-        self._identity = frozenset()
-        self._parameters = {}
-        self._is_read = self._is_asked = False
-        self._reading += 1
-
-    def follow(self, event: ParameterEvent) -> None:
-        """Take over parameters that were declared, set or undeclared."""
-        if not self._is_read:
-            if self._is_asked:
-                self._read()  # what is being answered may be older
-            return
-        changed = [*event.new_parameters, *event.changed_parameters]
-        if event.deleted_parameters or any(
-            each.name not in self._parameters and not each.name.startswith(_OF_ROS)
-            for each in changed
-        ):
-            self._read()
-            return
-        for each in changed:
-            self._heard[each.name] += 1
-            if each.name in self._parameters:
-                kind, raw = _raw(each.value)
-                if kind is not self._parameters[each.name].kind:
-                    self._read()  # it is typed dynamically, and has another type now
-                    return
-                self._parameters[each.name] = self._parameters[each.name].with_raw(raw)
-        self._say(State.THERE)
-
-    def set(self, parameter: Parameter, raw: Any, told: Future[str]) -> None:
-        """Ask the node to set a parameter; ``told`` gets the reason why not, or an empty text."""
-        if not self._client.services_are_ready():
-            told.set_result(f"{self._name} offers no parameters at present")
-            return
-        self._setting[told] = time.monotonic() + ANSWER_S
-        heard = self._heard[parameter.name]
-
-        def answered(future: Any) -> None:
-            answer = _answer(future)
-            if self._setting.pop(told, None) is None:
-                return  # it was given up
-            if answer is None or not answer.results:
-                told.set_result(f"{self._name} did not say whether it took {parameter.name}")
-                return
-            result = answer.results[0]
-            # An event that came before the answer is of this change, or of a later one.
-            is_newest = self._heard[parameter.name] == heard
-            if result.successful and is_newest and parameter.name in self._parameters:
-                known = self._parameters[parameter.name]
-                self._parameters[parameter.name] = known.with_raw(raw)
-                self._say(State.THERE)
-            refused = result.reason or f"{self._name} refuses it"
-            told.set_result("" if result.successful else refused)
-
-        self._client.set_parameters([_message(parameter, raw)], callback=self._guarded(answered))
-
-    def close(self) -> None:
-        """Answer whoever waits."""
-        for told in self._setting:
-            told.set_result("the viewer ends")
-        self._setting.clear()
-
-    def _read(self) -> None:
-        """Ask for all parameters; what is known of them stays until the answers are there."""
-        if self._is_asked and time.monotonic() - self._since >= ANSWER_S:
-            self._say(State.SILENT)
-        self._reading += 1
-        self._is_asked, self._since = True, time.monotonic()
-        turn = self._reading
-
-        def listed(future: Any) -> None:
-            answer = _answer(future)
-            if turn == self._reading and answer is not None:
-                self._describe(turn, [n for n in answer.result.names if not n.startswith(_OF_ROS)])
-
-        self._client.list_parameters(callback=self._guarded(listed))
-
-    def _describe(self, turn: int, names: list[str]) -> None:
-        """Ask for descriptors and values, and tell them once both are there."""
-        answers: dict[str, Any] = {}
-
-        def take(what: str, future: Any) -> None:
-            answers[what] = _answer(future)
-            if turn != self._reading or len(answers) < 2 or None in answers.values():
-                return
-            descriptors, values = answers["describe"].descriptors, answers["get"].values
-            if not len(descriptors) == len(values) == len(names):
-                self._leave_out_unset(turn, names)
-                return
-            self._parameters = {
-                name: _parameter(self._name, name, descriptor, value)
-                for name, descriptor, value in zip(names, descriptors, values, strict=True)
-            }
-            self._is_read, self._is_asked = True, False
-            self._say(State.THERE)
-
-        guarded = self._guarded
-        self._client.describe_parameters(names, callback=guarded(lambda f: take("describe", f)))
-        self._client.get_parameters(names, callback=guarded(lambda f: take("get", f)))
-
-    def _leave_out_unset(self, turn: int, names: list[str]) -> None:
-        """Ask again without parameters that have a type and no value: with one, none is told."""
-
-        def typed(future: Any) -> None:
-            answer = _answer(future)
-            if turn != self._reading:
-                return
-            types = [] if answer is None else list(answer.types)
-            told = [name for name, number in zip(names, types, strict=False) if number]
-            if 0 < len(told) < len(names):
-                self._describe(turn, told)
-            else:
-                self._is_asked = False  # one was undeclared meanwhile: all is asked anew
-
-        self._client.get_parameter_types(names, callback=self._guarded(typed))
-
-    def _say(self, state: State) -> None:
-        self._tell(NodeParameters(self._name, state, dict(self._parameters)))
-
-
-def _answer(future: Any) -> Any:
-    return None if future.cancelled() or future.exception() is not None else future.result()

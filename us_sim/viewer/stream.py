@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.slicing.settings import STRIPS
-from us_sim.viewer.parameters import ParameterBoard
+from us_sim.viewer.remote_parameters import RemoteParameters
 from us_sim.viewer.session import SessionBoard
 from us_sim.viewer.status import StatusBoard
 
@@ -148,7 +148,7 @@ class Simulator:
     feeds: dict[str, Feed] = field(default_factory=dict)  # by kind
     commands: dict[str, Callable[[Any, int], str | None]] = field(default_factory=dict)
     """By the key of a page's message: takes the value and the page's number, returns an error."""
-    nodes: ParameterBoard = field(default_factory=ParameterBoard)
+    nodes: RemoteParameters = field(default_factory=RemoteParameters)
     status: StatusBoard = field(default_factory=StatusBoard)
     session: SessionBoard = field(default_factory=SessionBoard)
     ask_scorer: Callable[[str], object] = lambda _: None  # to "clear" or to "draw"

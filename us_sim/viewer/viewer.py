@@ -53,7 +53,7 @@ class Viewer(GuardedNode):
             folder if settings.recordings else "",
             is_own=is_loopback(settings.host),
         )
-        self._remote = RemoteParameters(self, post, {CONTROL: self._session.ask})
+        self._remote = RemoteParameters(self, {CONTROL: self._session.ask})
         self.simulator = Simulator(
             nodes=self._remote,
             status=StatusListener(self, post),
@@ -115,7 +115,6 @@ class Viewer(GuardedNode):
     def destroy_node(self) -> None:
         """End the web server first."""
         self.post.close()
-        self._remote.close()
         self._session.close()
         self._server.close()
         super().destroy_node()

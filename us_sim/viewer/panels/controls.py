@@ -11,7 +11,6 @@ SliderSpan(low=0.12, high=1200.0, step=0.0, is_logarithmic=True)
 
 from __future__ import annotations
 
-import asyncio
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -23,7 +22,8 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from us_sim.viewer.parameters import Kind, Parameter, ParameterBoard
+from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.remote_parameters import NodeParameters
 
 
 class WhileShown(Element, component="while_shown.js"):
@@ -132,15 +132,15 @@ class Control(Element):
     """A control of one parameter, which sets one value at a time, and of several the last.
 
     Args:
-        board: where the parameter is set.
+        node: whose parameter it is.
         parameter: as it is now.
         label: in place of the parameter's own.
     """
 
-    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
+    def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
         super().__init__()
         self.parameter = parameter
-        self._board = board
+        self._node = node
         self._wanted: tuple[Any, int] | None = None  # a value, and the number of the change
         self._is_asking = False
         self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
@@ -168,14 +168,12 @@ class Control(Element):
         try:
             while self._wanted is not None:
                 (value, turn), self._wanted = self._wanted, None
-                future = self._board.set(self.parameter.node, self.parameter.name, value)
-                reason = await asyncio.wrap_future(future)
+                reason = await self._node.set(self.parameter.name, value)
         finally:
             self._is_asking = False
         if self.is_deleted:
             return
-        known = self._board.of(self.parameter.node).parameters.get(self.parameter.name)
-        self.parameter = known or self.parameter
+        self.parameter = self._node.parameters.get(self.parameter.name, self.parameter)
         self.props["seen"], self.props["reason"] = turn, reason
         self._show()
 
@@ -183,8 +181,8 @@ class Control(Element):
 class ParameterControl(Control, component="parameter_control.js"):
     """A slider with a number field, a choice, a switch, or a text; read-only ones are shown."""
 
-    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
-        super().__init__(board, parameter, label)
+    def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
+        super().__init__(node, parameter, label)
         self._span: SliderSpan | None = None
         self._show()
 
@@ -195,7 +193,7 @@ class ParameterControl(Control, component="parameter_control.js"):
         span = asdict(self._span) if self._span else None
         self.props.update(
             {
-                "kind": parameter.kind.value,
+                "kind": parameter.kind.name.lower(),
                 "value": list(value) if isinstance(value, tuple) else value,
                 "unit": parameter.unit,
                 "choices": list(parameter.choices),
@@ -257,8 +255,8 @@ class TimeGain(Control, component="time_gain.js"):
 
     REACH = 20.0  # dB up and down that the sliders cover, as consoles have it
 
-    def __init__(self, board: ParameterBoard, parameter: Parameter, label: str = "") -> None:
-        super().__init__(board, parameter, label)
+    def __init__(self, node: NodeParameters, parameter: Parameter, label: str = "") -> None:
+        super().__init__(node, parameter, label)
         self._count = slider_count(parameter.value)
         self._name_depths(100.0, "%")
         self._show()

@@ -12,12 +12,10 @@ from nicegui.element import Element
 
 from us_sim.viewer.panels.controls import TimeGain, WhileShown
 from us_sim.viewer.panels.sections import (
-    ParameterSections,
+    REFRESH_S,
     Section,
-    chosen_first,
-    common_first,
-    given_at_the_start,
-    groups_in_use,
+    arrange,
+    build_parameters,
     title_of,
 )
 from us_sim.viewer.parameters import Parameter
@@ -35,7 +33,7 @@ COMMON = (
     "contact",
 )
 """Parameters of ``slice_interpolator`` that stand first."""
-PARAMETERS_S, STATUS_S = 0.2, 0.5  # how often parameters and states are brought up to date
+STATUS_S = 0.5  # how often states are brought up to date
 TISSUE = "tissue_deformer"
 METHOD = ("solver", "compare_with")
 MATERIALS, STIFFNESS = "materials.", ".young_modulus"
@@ -49,83 +47,43 @@ Series = dict[str, list[Point]]
 
 def build_image(simulator: Simulator) -> None:
     """Make the panel of the scanner's console."""
-    shown_while_visible(
-        lambda: ParameterSections(
-            simulator.nodes, "slice_interpolator", common_first(COMMON), {"time_gain": TimeGain}
-        )
-    )
-
-
-def shown_while_visible(make: Callable[[], ParameterSections]) -> WhileShown:
-    """Parameters that are followed while a person can see them."""
-    with WhileShown(
-        lambda: sections.watch(),
-        lambda: sections.unwatch(),
-        PARAMETERS_S,
-        lambda: sections.refresh(),
-    ) as shown:
-        sections = make()
-    return shown
+    console = "", "slice_interpolator", partial(arrange, first=COMMON)
+    build_parameters(simulator.nodes, console, special={"time_gain": TimeGain})
 
 
 def arrange_tissue(parameters: Mapping[str, Parameter]) -> list[Section]:
-    """The method, the settings of those in use, the structures' stiffness, and their materials."""
-    methods = tuple(name for name in METHOD if name in parameters)
-    stiffness = tuple(
-        name for name in parameters if name.startswith(MATERIALS) and name.endswith(STIFFNESS)
-    )
-    rest = [name for name in parameters if name not in methods + stiffness]
-    of_methods, others = groups_in_use(parameters, rest, methods)
-    labels = {name: title_of(name[len(MATERIALS) : -len(STIFFNESS)]) for name in stiffness}
-    materials = [group for group in others if group.names[0].startswith(MATERIALS)]
-    return [
-        Section("method", "", methods),
-        *of_methods,
-        Section("stiffness", "Young's modulus", stiffness, labels, is_open=True),
-        *materials,
-        *(group for group in others if group not in materials),
-        *given_at_the_start(parameters, rest),
-    ]
+    """Put the method first, the settings of those in use, and the structures' stiffness."""
+    labels = {
+        name: title_of(name[len(MATERIALS) : -len(STIFFNESS)])
+        for name in parameters
+        if name.startswith(MATERIALS) and name.endswith(STIFFNESS)
+    }
+    stiffness = Section("Young's modulus", tuple(labels), labels, is_open=True)
+    return arrange(parameters, choosing=METHOD, ahead=[stiffness])
 
 
 def build_tissue(simulator: Simulator) -> None:
     """Make the panel of the tissue, with the skin and the tracker."""
-    parts: list[ParameterSections] = []
-
-    def begin() -> None:
-        simulator.status.watch()
-        for part in parts:
-            part.watch()
-
-    def end() -> None:
-        simulator.status.unwatch()
-        for part in parts:
-            part.unwatch()
+    board = simulator.status
 
     def refresh() -> None:
-        for part in parts:
-            part.refresh()
-        status = simulator.status.node(TISSUE, time.monotonic())
-        for label, text in zip(labels, _tissue_notes(status), strict=True):
-            if label.text != text:
-                label.set_text(text)
-            if label.visible != bool(text):
-                label.set_visibility(bool(text))
+        notes = _tissue_notes(board.node(TISSUE, time.monotonic()))
+        for label, text in zip(labels, notes, strict=True):
+            label.set_text(text)
+            label.set_visibility(bool(text))
 
-    with WhileShown(begin, end, PARAMETERS_S, refresh):
+    with WhileShown(board.watch, board.unwatch, REFRESH_S, refresh):
         labels = (
             ui.label().classes("us-note us-accent").props('role="status"'),
             ui.label().classes("us-note"),
             ui.label().classes("us-reason").props('role="alert"'),
         )
-        for title, node, arrange in (
-            ("", TISSUE, arrange_tissue),
-            ("Skin", "skin_deformer", common_first(())),
-            ("Tracker", "probe_tracker", chosen_first("filter")),
-        ):
-            if title:
-                ui.label(title).classes("us-heading").props('role="heading" aria-level="2"')
-            parts.append(ParameterSections(simulator.nodes, node, arrange))
+    build_parameters(
+        simulator.nodes,
+        ("", TISSUE, arrange_tissue),
+        ("Skin", "skin_deformer", arrange),
+        ("Tracker", "probe_tracker", partial(arrange, choosing=("filter",))),
+    )
 
 
 def _tissue_notes(status: NodeStatus | None) -> tuple[str, str, str]:
@@ -167,9 +125,7 @@ def _show_parameters(simulator: Simulator, node: str) -> None:
             ui.space()
             button = ui.button(icon="close", on_click=dialog.close)
             button.props("flat round dense title=Close aria-label=Close")
-        shown = shown_while_visible(
-            lambda: ParameterSections(simulator.nodes, node, common_first(()))
-        )
+        shown = build_parameters(simulator.nodes, ("", node, arrange))
 
     def close() -> None:
         shown.close()
