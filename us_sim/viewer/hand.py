@@ -1,22 +1,13 @@
-"""The hand of the pages: moves the probe as they ask, unless somebody else moves it.
-
->>> from us_sim.tracking.virtual_hand import RestSurface, Stance
->>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
->>> asked = asked.stance(Stance(rotation=0.1), RestSurface.plane(0.1))
->>> asked.press, asked.rotation
-(0.004, 0.1)
-"""
+"""The hand of the pages: moves the probe as they ask, unless somebody else moves it."""
 
 from __future__ import annotations
 
-import math
 import os
-import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import PurePath
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -24,7 +15,7 @@ from geometry_msgs.msg import PoseStamped
 from numpy.typing import ArrayLike
 from shape_msgs.msg import Mesh
 
-from us_sim.errors import MessageError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.messages import pose_message
@@ -32,206 +23,29 @@ from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.nodes.settings import PLAYERS
 from us_sim.recording.decoding import mesh_from, pose_from, pose_from_text
-from us_sim.settings.spelling import shown
 from us_sim.tracking.measurement import PATIENT, TrackingState
 from us_sim.tracking.virtual_hand import DEEPEST, HIGHEST, STEEPEST, Motion, RestSurface, Stance
 from us_sim.viewer.feeds import RestMesh
+from us_sim.viewer.hand_command import HOME_PRESS, SINGLE, HandCommand, is_source
 from us_sim.viewer.session import SessionState
 from us_sim.viewer.stream import Feed, Packet, Posted, Simulator
 
-HOME_PRESS = 1e-3  # m: where the probe begins it touches, so that there is an image
-LIFTED = -0.01  # m
-
-_FARTHEST, _FULL = 10.0, 2.0 * math.pi
-_TO = {"point": 3, "x": 1, "y": 1, "press": 1, "rotation": 1, "fan": 1, "rock": 1}
-_BY = {"slide": 2, "press": 1, "rotation": 1, "fan": 1, "rock": 1}
-_ANGLES = ("rotation", "fan", "rock")
-_SINGLE = ("press", *_ANGLES)
-_PLACES = ("home", "lift", "upright")
-_LONGEST_SOURCE, _LAST = 40, 2**53
-
-
-@dataclass(frozen=True)
-class HandCommand:
-    """One wish, as absolute values, changes, or a place that has a name."""
-
-    source: str  # of which page
-    sequence: int  # the page's number of the wish
-    to: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # m and rad, by _TO
-    by: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # m and rad, by _BY
-    go: str | None = None  # home: begin anew; lift: off the skin; upright: no angles
-
-    @classmethod
-    def read(cls, value: Any) -> HandCommand:
-        """The wish that a page sent, decoded from JSON.
-
-        Raises:
-            MessageError: it is none, with what is wrong.
-        """
-        if not isinstance(value, dict):
-            raise MessageError(f"a command to the hand is an object, not {shown(value)}")
-        unknown = value.keys() - {"source", "sequence", "to", "by", "go"}
-        if unknown:
-            raise MessageError(f"a command to the hand has no {shown(min(unknown))}")
-        source, sequence, go = value.get("source"), value.get("sequence"), value.get("go")
-        if not is_source(source):
-            raise MessageError(
-                f"the hand's source is a text of 1 to {_LONGEST_SOURCE} characters, not "
-                f"{shown(source)}"
-            )
-        if type(sequence) is not int or not 0 <= sequence <= _LAST:
-            raise MessageError(f"the hand's sequence is a count, not {shown(sequence)}")
-        if go is not None and go not in _PLACES:
-            raise MessageError(f"the hand goes to {', '.join(_PLACES)}, not to {shown(go)}")
-        to, by = _numbers(value, "to", _TO), _numbers(value, "by", _BY)
-        return cls(source, sequence, to, by, go)
-
-    def stance(self, goal: Stance, surface: RestSurface) -> Stance:
-        """The stance that is wanted now, within a hand's limits.
-
-        Args:
-            goal: what was wanted before.
-            surface: that the probe stands on.
-        """
-        if self.go == "home":
-            goal = Stance.home(surface, HOME_PRESS)
-        elif self.go == "lift":
-            goal = replace(goal, press=LIFTED)
-        elif self.go == "upright":
-            goal = replace(goal, rotation=0.0, fan=0.0, rock=0.0)
-        wanted: dict[str, Any] = {name: n[0] for name, n in self.to.items() if name in _SINGLE}
-        goal = replace(goal, **wanted)
-        if "point" in self.to:
-            goal = replace(goal, point=surface.closest(np.array(self.to["point"])).point)
-        if "x" in self.to or "y" in self.to:
-            x, y = (self.to.get(name, (goal.point[axis],))[0] for axis, name in enumerate("xy"))
-            goal = replace(goal, point=surface.above(x, y).point)
-        if "slide" in self.by:
-            goal = goal.slid(surface, *self.by["slide"])
-        changed = {n: getattr(goal, n) + self.by[n][0] for n in _SINGLE if n in self.by}
-        return replace(goal, **changed).within_reach()
-
-
-def is_source(value: Any) -> TypeGuard[str]:
-    """Whether it can be the name that a page has given itself."""
-    return isinstance(value, str) and 0 < len(value) <= _LONGEST_SOURCE
-
-
-def _numbers(
-    value: dict[str, Any], key: str, sizes: dict[str, int]
-) -> dict[str, tuple[float, ...]]:
-    """The numbers of one part of a command, each as many as there must be."""
-    given = value.get(key, {})
-    if not isinstance(given, dict):
-        raise MessageError(f"the hand's {key} is an object, not {shown(given)}")
-    numbers = {}
-    for name, listed in given.items():
-        if name not in sizes:
-            raise MessageError(f"the hand cannot move {shown(name)}: {', '.join(sizes)}")
-        values = listed if isinstance(listed, list) else [listed]
-        proper = all(type(n) in (int, float) and abs(n) <= sys.float_info.max for n in values)
-        if not proper or len(values) != sizes[name]:
-            raise MessageError(
-                f"the hand's {name} is {sizes[name]} finite number{'s' * (sizes[name] > 1)}, not "
-                f"{shown(listed)}"
-            )
-        limit = _FULL if name in _ANGLES else _FARTHEST
-        if max(map(abs, values)) > limit:
-            far, end = max(values, key=abs), limit
-            if name in _ANGLES:
-                far, end = math.degrees(far), math.degrees(end)
-            unit = "°" if name in _ANGLES else " m"
-            raise MessageError(
-                f"the hand's {name} is -{end:.4g} to {end:.4g}{unit}, not {far:.4g}{unit}"
-            )
-        numbers[name] = tuple(map(float, values))
-    return numbers
-
-
-def hand_state(
-    surface: RestSurface | None, stance: Stance | None, goal: Stance | None
-) -> dict[str, Any]:
-    """Where the probe is and goes, and where it may be, as far as that is known.
-
-    Args:
-        surface: on which it stands.
-        stance: how it is held.
-        goal: how it will be.
-
-    Returns:
-        m and rad, frame ``patient``.
-    """
-    state: dict[str, Any] = {}
-    if stance is not None and goal is not None:
-        state |= {"stance": _stance_numbers(stance), "goal": _stance_numbers(goal)}
-    if surface is not None:
-        lower, upper = surface.lower.tolist(), surface.upper.tolist()
-        state["range"] = {
-            "x": [lower[0], upper[0]],
-            "y": [lower[1], upper[1]],
-            "press": [-HIGHEST, DEEPEST],
-            "tilt": [-STEEPEST, STEEPEST],
-        }
-    return state
-
-
-def _stance_numbers(stance: Stance) -> dict[str, float]:
-    place = dict(zip("xyz", stance.point.tolist(), strict=True))
-    return place | {name: getattr(stance, name) for name in _SINGLE}
-
-
+MOVING_HZ = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
+"""Poses a second: on two cores the simulator and the browser share them, and a page shows no more
+images than that."""
+RESTING_HZ = 5.0  # poses a second; images are called stale after half a second
+STREAMING, LATEST = 3.0, 1.45
+"""From pose to pose: how long after a command the next is expected, and then waited for. A timer's
+pose just before it would hold up the command's own."""
+LONGEST_STEP = 0.05
+"""s of movement at most between two poses: were the node held up, the probe would leap."""
+UNANSWERED = 3.0
+"""s without a pose of the tracked probe, after which it is said that nobody answers."""
+ASTRAY, SETTLED = 3e-3, 1.0
+"""m, and s of rest, from which on the tracked probe is not where it was put."""
+SAME_PATIENT = 0.02  # m, from one surface to the next: the probe stays where it is
 _KEPT = 512  # poses, until their images are made
 _MOVES_S = 2.0  # after its last wish a page holds the probe, and moves it no more
-
-
-class AskedPoses:
-    """The commands of pages, and the poses that obey them.
-
-    It is written in one thread, and may be read in others.
-    """
-
-    def __init__(self) -> None:
-        self.at = 0.0
-        """When the last wish came, s of the monotonic clock."""
-        self.holder = ""
-        """The page that acted last; nothing if none has, or once it has gone."""
-        self._connection = 0
-        self._last: tuple[str, int] | None = None
-        self._by_stamp: dict[int, tuple[float, tuple[str, int] | None]] = {}
-
-    @property
-    def is_moving(self) -> bool:
-        """Whether the page that holds the probe has moved it a moment ago."""
-        return bool(self.holder) and time.monotonic() - self.at < _MOVES_S
-
-    def ask(self, source: str, sequence: int, connection: int = 0) -> None:
-        """A page (``source``), on a connection, has a wish, by the page's own number."""
-        self._last = (source, sequence)
-        self.at = time.monotonic()
-        self.hold(source, connection)
-
-    def hold(self, source: str, connection: int = 0) -> None:
-        """A page holds the probe from here on, until another acts or its connection ends."""
-        self.holder, self._connection = source, connection
-
-    def left(self, connection: int) -> None:
-        """A connection has ended."""
-        if connection == self._connection:
-            self.holder = ""
-
-    def published(self, stamp: int, press: float) -> None:
-        """The pose of a stamp (ns), pressed so deep (m), contains all wishes until now."""
-        self._by_stamp[stamp] = press, self._last
-        if len(self._by_stamp) > _KEPT:
-            del self._by_stamp[next(iter(self._by_stamp))]
-
-    def by(self, stamp: int) -> tuple[str, int] | None:
-        """The page, and the number of its last wish, that the pose of a stamp (ns) contains."""
-        return self._by_stamp.get(stamp, (0.0, None))[1]
-
-    def press(self, stamp: int) -> float | None:
-        """How deep (m) the pose of a stamp (ns) is pressed; None for poses of others."""
-        return self._by_stamp.get(stamp, (None, None))[0]
 
 
 @dataclass(frozen=True)
@@ -243,8 +57,8 @@ class Lead:
     can_take: bool = False  # whether a page can end what moves it
 
 
-def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> Lead:
-    """Who moves the probe, by who publishes and hears ``tracker/pose``.
+def find_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool) -> Lead:
+    """Find out who moves the probe, by who publishes and hears ``tracker/pose``.
 
     Args:
         node: whose hand would move it.
@@ -277,31 +91,34 @@ def probe_lead(node: GuardedNode, session: SessionState, *, is_publishing: bool)
 
 
 def _is_offered(node: GuardedNode, topic: str) -> bool:
-    """Whether anybody publishes a topic."""
     return node.count_publishers(node.resolve_topic_name(topic)) > 0
 
 
-class ViewerSurface:
+class PatientSurface:
     """The skin at rest; where the scene has none the tissue's upper side, else the plane z = 0.
 
     Args:
         node: that hears ``skin/mesh``.
         rest: the tissue's mesh.
-        changed: called when there is another surface.
     """
 
-    def __init__(self, node: GuardedNode, rest: RestMesh, changed: Callable[[], None]) -> None:
-        self._node, self._rest, self._changed = node, rest, changed
+    def __init__(self, node: GuardedNode, rest: RestMesh) -> None:
+        self._node, self._rest = node, rest
         self._skin: RestSurface | None = None
         self._tissue: RestSurface | None = None
         self._plane = RestSurface.plane(0.1)  # m around the origin
-        self._heard = node.create_subscription(Mesh, "skin/mesh", self._take_skin, LATCHED)
-        rest.watch(self._make_tissue)
-        node.guarded(node.resolve_topic_name("tissue/rest"), self._make_tissue)()
+        self._meshes = Subscriptions(node, (Mesh, "skin/mesh", self._on_skin, LATCHED, False))
 
-    @property
-    def best(self) -> RestSurface | None:
-        """The surface; None while one is still awaited."""
+    def listen(self, is_wanted: bool) -> None:
+        """Follow the meshes, or no longer."""
+        self._skin = self._tissue = None
+        self._meshes.keep(is_wanted)
+        self._rest.watch(self._on_tissue, is_wanted)
+        if is_wanted:
+            self._node.guarded(self._node.resolve_topic_name("tissue/rest"), self._on_tissue)()
+
+    def find(self) -> RestSurface | None:
+        """Return the surface to stand on; None while one is still awaited."""
         is_skin_offered = _is_offered(self._node, "skin/mesh")
         if self._skin is not None and (self._tissue is None or is_skin_offered):
             return self._skin
@@ -310,160 +127,164 @@ class ViewerSurface:
         is_awaited = is_skin_offered or _is_offered(self._node, "tissue/rest")
         return None if is_awaited else self._plane
 
-    def close(self) -> None:
-        """Hear no more."""
-        self._node.destroy_subscription(self._heard)
-        self._rest.watch(self._make_tissue, is_wanted=False)
-
-    def _take_skin(self, message: Mesh) -> None:
+    def _on_skin(self, message: Mesh) -> None:
         self._skin = RestSurface(*mesh_from(message))
-        self._changed()
 
-    def _make_tissue(self) -> None:
+    def _on_tissue(self) -> None:
         if self._rest.mesh is not None:
             self._tissue = RestSurface.upper_side(self._rest.mesh.nodes, self._rest.mesh.boundary)
-            self._changed()
 
 
-MOVING = 60.0 if (os.cpu_count() or 1) > 2 else 30.0
-"""Poses a second: on two cores the simulator and the browser share them, and a page shows no more
-images than that."""
-RESTING = 5.0  # poses a second; images are called stale after half a second
-STREAMING, LATEST = 3.0, 1.45
-"""From pose to pose: how long after a command the next is expected, and then waited for. A timer's
-pose just before it would hold up the command's own."""
-LONGEST_STEP = 0.05
-"""s of movement at most between two poses: were the node held up, the probe would leap."""
-UNANSWERED = 3.0
-"""s without a pose of the tracked probe, after which it is said that nobody answers."""
-ASTRAY, SETTLED = 3e-3, 1.0
-"""m, and s of rest, from which on the tracked probe is not where it was put."""
+class HandState(Enum):
+    """What the hand does; ``docs/architecture.md`` draws what leads from one to the next."""
+
+    IDLE = "no page watches"
+    WAITING = "somebody else leads, or it is not known where the probe is and stands"
+    RESTING = "it holds the probe, which stays"
+    MOVING = "it holds the probe, which moves, or is imaged as if it did"
+
+    @property
+    def holds(self) -> bool:
+        """Whether the hand publishes the probe's poses."""
+        return self in (HandState.RESTING, HandState.MOVING)
 
 
 class ViewerHand:
     """A tracker source that pages move: ``tracker/pose`` in frame ``patient``.
 
-    It publishes only while a page watches and nobody else does: a driver or a player leads as long
-    as it has a publisher, and the hand goes on from where that has left the probe. Poses come as
-    soon as a page asks, `MOVING` times a second while the probe moves or a page watches what goes
-    on by itself, such as blood, and `RESTING` else.
+    It holds the probe only while a page watches and nobody else does: a driver or a player leads as
+    long as it has a publisher, and the hand goes on from where that has left the probe. Poses come
+    as soon as a page asks, `MOVING_HZ` while the probe moves or a page watches what goes on by
+    itself, such as blood, and `RESTING_HZ` else.
 
     Args:
         node: that publishes.
         post: has work done in the node's thread.
-        simulator: given the stream ``hand`` and the command of the same name.
+        simulator: given the stream ``hand`` and the commands ``hand`` and ``take``.
         rest: the tissue's mesh, on which the probe stands where there is no skin.
     """
 
     def __init__(
         self, node: GuardedNode, post: Posted, simulator: Simulator, rest: RestMesh
     ) -> None:
-        self._node, self._post, self._rest = node, post, rest
+        self._node, self._post, self._simulator = node, post, simulator
         # To a person's eye sliders follow at 10 Hz, and more would take time from the image.
-        self.feed = Feed("hand", lambda _: post(self._watch), 10.0)
-        self._simulator = simulator
+        self.feed = Feed("hand", lambda _: post(self._on_watch), 10.0)
         simulator.add(self.feed)
-        simulator.commands["hand"] = self._command
-        simulator.commands["take"] = self._ask_for_probe
-        simulator.leaving.append(lambda page: post(lambda: self.asked.left(page)))
-        self._session = simulator.session
+        simulator.commands |= {"hand": self._on_command, "take": self._on_take}
+        simulator.leaving.append(lambda page: post(lambda: self._on_leave(page)))
+        self._state = HandState.IDLE
         self._lead = Lead("nobody", "the viewer finds out who moves the probe")
-        self._surface: ViewerSurface | None = None
+        self._surface = PatientSurface(node, rest)
         self._standing: RestSurface | None = None  # the surface that the motion is on
         self._motion: Motion | None = None
         self._publisher: Any = None
         self._subscriptions = Subscriptions(
             node,
-            (PoseStamped, "probe/pose", self._follow, STREAM, False),
-            (DiagnosticStatus, "probe/status", self._find, LATCHED, False),
+            (PoseStamped, "probe/pose", self._on_pose, STREAM, False),
+            (DiagnosticStatus, "probe/status", self._on_status, LATCHED, False),
         )
         self._is_found = False  # whether it is known where the probe is, or that it is nowhere yet
         self._elsewhere: Pose | None = None  # where somebody else has the probe
-        self._last_stamp = 0  # ns, of the last pose
-        self.asked = AskedPoses()
-        self._sent_at = self._rests_since = self._taken_at = 0.0  # s, of the monotonic clock
+        self._page = ""  # that acted last; nothing if none has, or once it has gone
+        self._connection = 0  # of that page
+        self._wish: tuple[str, int] | None = None  # the last: its page, and that page's number
+        self._published: dict[int, tuple[float, tuple[str, int] | None]] = {}
+        """By stamp (ns): how deep (m) the pose is pressed, and the last wish that it contains."""
         self._warning = ""
-        self._followed_at = 0.0  # s, monotonic: when it was last said where the probe is
-        self._moving_timer = node.create_timer(0.5 / MOVING, self._tick)
-        self._resting_timer = node.create_timer(1.0 / RESTING, self._update)
-        self._moving_timer.cancel()
-        self._resting_timer.cancel()
+        # s, monotonic: when a page asked last, when the probe moved, was taken, and was said to be
+        # somewhere last, when a pose went out, and when it was looked who leads
+        self._asked_at = self._moved_at = self._held_at = self._followed_at = 0.0
+        self._sent_at = self._looked_at = 0.0
+        self._timer = node.create_timer(1.0 / RESTING_HZ, self._on_timer)
+        self._timer.cancel()
 
-    def press(self, stamp: int, position: ArrayLike | None) -> float | None:
-        """How deep (m) the probe is pressed, see `Stance`; None while that is not known.
+    def pose_facts(self, stamp: int, position: ArrayLike | None) -> dict[str, Any]:
+        """Describe the pose of an image; any thread may ask.
 
         Args:
-            stamp: ns, of its pose.
-            position: (3,) m, where it is, for poses of others.
+            stamp: ns, of the pose.
+            position: (3,) m, where the probe is, for poses of others.
+
+        Returns:
+            ``press`` (m), see `Stance`, and ``command``, the last wish in it: the page, and its
+            number for it; None for what is not known.
         """
-        known, surface = self.asked.press(stamp), self._standing
-        if known is not None or surface is None or position is None:
-            return known
-        return surface.under(np.asarray(position, dtype=np.float64))[1]
+        press, wish = self._published.get(stamp, (None, None))
+        if press is None and self._standing is not None and position is not None:
+            press = self._standing.under(np.asarray(position, dtype=np.float64))[1]
+        return {"press": press, "command": wish}
 
-    def _command(self, value: Any, page: int) -> str | None:
-        """Take a page's command, in its thread; why it is not done, or None."""
-        try:
-            asked = HandCommand.read(value)
-        except UsSimError as error:
-            return str(error)
-        if self._lead.obstacle:
-            return self._lead.obstacle
-        self._post(lambda: self._obey(asked, page))
-        return None
-
-    def _watch(self) -> None:
-        """Begin with the first page, and leave everything when the last has gone."""
-        if self.feed.is_watched and self._surface is None:
-            self._surface = ViewerSurface(self._node, self._rest, self._stand)
-            self._session.watch()
+    def _enter(self, state: HandState) -> None:
+        """Go to another state, and begin and end all that depends on it."""
+        before, self._state = self._state, state
+        is_watched = state is not HandState.IDLE
+        if is_watched != (before is not HandState.IDLE):
+            session = self._simulator.session
+            (session.watch if is_watched else session.unwatch)()
+            self._surface.listen(is_watched)
+            self._subscriptions.keep(is_watched)
             self._is_found = False
-            self._subscriptions.keep(True)
-            self._resting_timer.reset()
-            self._update()
-        elif not self.feed.is_watched and self._surface is not None:
-            self._let_go()
-            self._surface.close()
-            self._surface = None
-            self._subscriptions.keep(False)
-            self._session.unwatch()
-            self._resting_timer.cancel()
+        if state.holds and not before.holds:
+            self._take_probe()
+        elif before.holds and not state.holds:
+            assert self._motion is not None
+            self._motion.rest_at(self._motion.stance)
+            self._node.destroy_publisher(self._publisher)
+            self._warning = ""
+        rate = 2.0 * MOVING_HZ if state is HandState.MOVING else RESTING_HZ
+        self._timer.timer_period_ns = round(1e9 / rate)
+        (self._timer.reset if is_watched else self._timer.cancel)()
 
-    def _stand(self) -> None:
-        """On another surface: where the probe is, if that is near, else at home."""
-        surface = self._surface.best if self._surface is not None else None
-        if surface is None or surface is self._standing:
-            return
-        self._standing = surface
-        if self._motion is None:
-            return
-        stance = self._motion.stance
-        foot = surface.closest(stance.point)
-        if float(np.linalg.norm(foot.point - stance.point)) < 0.02:  # of the same patient
-            self._motion.rest_at(replace(stance, point=foot.point))
-        else:
-            self._motion.rest_at(Stance.home(surface, HOME_PRESS))
+    def _take_probe(self) -> None:
+        """Hold it from where it is, or else where it was held, or at home."""
+        assert self._standing is not None
+        if self._elsewhere is not None:
+            self._motion = Motion(Stance.of(self._elsewhere, self._standing))
+            self._elsewhere = None
+        elif self._motion is None:
+            self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
+        self._publisher = self._node.stream(PoseStamped, LEAD_TOPIC)
+        self._moved_at = self._held_at = time.monotonic()
 
-    def _update(self) -> None:
-        """Find out who leads and where to stand, and publish the pose at rest."""
+    def _on_watch(self) -> None:
+        """Begin with the first page, and leave everything when the last has gone."""
+        if self.feed.is_watched and self._state is HandState.IDLE:
+            self._enter(HandState.WAITING)
+            self._look()
+        elif not self.feed.is_watched and self._state is not HandState.IDLE:
+            self._enter(HandState.IDLE)
+
+    def _on_timer(self) -> None:
+        now = time.monotonic()
+        if self._state is HandState.MOVING:
+            is_streaming = now - self._asked_at < STREAMING / MOVING_HZ
+            if now - self._sent_at > (LATEST if is_streaming else 0.9) / MOVING_HZ:
+                self._advance(LONGEST_STEP)
+        if self._state is not HandState.MOVING or now - self._looked_at > 1.0 / RESTING_HZ:
+            self._look()
+
+    def _look(self) -> None:
+        """Find out who leads and where to stand, and repeat the pose at rest."""
+        self._looked_at = time.monotonic()
         self._stand()
-        self._lead = self._lead_now()
+        self._lead = self._find_lead()
         if self._lead.obstacle:
-            self._let_go()
+            if self._state.holds:
+                self._enter(HandState.WAITING)
             self._tell()
             return
-        if self._publisher is None:
-            self._take()
-        if self._moving_timer.is_canceled():
+        if self._state is HandState.WAITING:
+            self._enter(HandState.RESTING)
+        if self._state is HandState.RESTING:
             self._publish()
             if self._simulator.is_changing_by_itself:
-                self._moving_timer.reset()
+                self._enter(HandState.MOVING)
 
-    def _lead_now(self) -> Lead:
-        """Who moves the probe; the hand, if there is also somewhere to begin."""
-        lead = probe_lead(
-            self._node, self._session.state, is_publishing=self._publisher is not None
-        )
+    def _find_lead(self) -> Lead:
+        """Find out who moves the probe; the hand, if there is also somewhere to begin."""
+        session = self._simulator.session.state
+        lead = find_lead(self._node, session, is_publishing=self._state.holds)
         if lead.obstacle:
             return lead
         if self._standing is None:
@@ -472,60 +293,45 @@ class ViewerHand:
             return Lead("nobody", "the viewer finds out where the probe is")
         return lead
 
-    def _take(self) -> None:
-        """Lead from here on: from where the probe is, or else where it was held, or at home."""
-        assert self._standing is not None
-        if self._elsewhere is not None:
-            self._motion = Motion(Stance.of(self._elsewhere, self._standing))
-            self._elsewhere = None
-        elif self._motion is None:
-            self._motion = Motion(Stance.home(self._standing, HOME_PRESS))
-        self._publisher = self._node.stream(PoseStamped, LEAD_TOPIC)
-        self._rests_since = self._taken_at = time.monotonic()
+    def _stand(self) -> None:
+        """Stand on another surface: where the probe is, if that is near, else at home."""
+        surface = self._surface.find()
+        if surface is None or surface is self._standing:
+            return
+        self._standing = surface
+        if self._motion is None:
+            return
+        stance = self._motion.stance
+        foot = surface.closest(stance.point)
+        if float(np.linalg.norm(foot.point - stance.point)) < SAME_PATIENT:
+            self._motion.rest_at(replace(stance, point=foot.point))
+        else:
+            self._motion.rest_at(Stance.home(surface, HOME_PRESS))
 
-    def _let_go(self) -> None:
-        self._moving_timer.cancel()
-        self._warning = ""
-        if self._publisher is not None:
-            self._node.destroy_publisher(self._publisher)
-            self._publisher = None
-        if self._motion is not None:
-            self._motion.rest_at(self._motion.stance)
-
-    def _ask_for_probe(self, value: Any, page: int) -> str | None:
-        """Hold the probe that nobody holds, or that a replay moves, which ends; in its thread."""
-        if self._lead.can_take:
-            self._session.ask(replay="")
-        elif self._lead.obstacle or self.asked.holder not in ("", value):
-            return self._lead.obstacle or None
-        if is_source(value):
-            self._post(lambda: self.asked.hold(value, page))
-        return None
-
-    def _find(self, status: DiagnosticStatus) -> None:
-        """Where the probe was when poses ended; there it is unless this hand has had it."""
+    def _on_status(self, status: DiagnosticStatus) -> None:
+        """Learn where the probe was when poses ended; there it is unless this hand has had it."""
         said = {each.key: each.value for each in status.values}
         if "pose" in said:
-            pose, stamp = pose_from_text(said["pose"]), said.get("stamp", "")
-            if self._publisher is None and stamp != str(self._last_stamp):
+            pose = pose_from_text(said["pose"])
+            own = str(next(reversed(self._published), None))
+            if not self._state.holds and said.get("stamp") != own:
                 self._elsewhere = pose
         elif status.message != TrackingState.WAITING.value:  # poses come
             self._is_found |= self._motion is not None
             return
         self._is_found = True
-        self._update()
+        if self._state is HandState.WAITING:
+            self._look()
 
-    def _follow(self, message: PoseStamped) -> None:
-        """Where the probe is: there somebody else has it, or there it should not be."""
+    def _on_pose(self, message: PoseStamped) -> None:
+        """Follow the probe while others have it; warn where it is not where the hand has put it."""
         pose = pose_from(message, PATIENT)
-        self._followed_at = time.monotonic()
-        if self._publisher is None or self._motion is None or self._standing is None:
+        now = self._followed_at = time.monotonic()
+        if not self._state.holds:
             self._elsewhere, self._is_found = pose, True
-        elif (
-            self._motion.is_at_rest
-            and time.monotonic() - self._rests_since > SETTLED
-            and not self._warning
-        ):
+        elif not self._warning and now - self._moved_at > SETTLED:
+            assert self._motion is not None
+            assert self._standing is not None
             wanted = self._motion.stance.pose(self._standing).position
             distance = float(np.linalg.norm(pose.position - wanted))
             if distance > ASTRAY:
@@ -535,75 +341,111 @@ class ViewerHand:
                     f"frame"
                 )
 
-    def _obey(self, asked: HandCommand, page: int) -> None:
-        """Move to where a page wants the probe, from now on."""
-        if self._publisher is None or self._motion is None or self._standing is None:
-            return  # somebody else has taken it meanwhile
-        self._motion.aim(asked.stance(self._motion.goal, self._standing))
-        self.asked.ask(asked.source, asked.sequence, page)
-        rested = self._moving_timer.is_canceled()
-        if rested:
-            self._moving_timer.reset()
-        if rested or self.asked.at - self._sent_at > 0.5 / MOVING:
-            self._advance(1.0 / MOVING if rested else LONGEST_STEP)
+    def _on_command(self, value: Any, connection: int) -> str | None:
+        """Take a page's command, in its thread; return why it is not obeyed, or None."""
+        try:
+            asked = HandCommand.read(value)
+        except UsSimError as error:
+            return str(error)
+        if not self._lead.obstacle:
+            self._post(lambda: self._obey(asked, connection))
+        return self._lead.obstacle or None
 
-    def _tick(self) -> None:
-        now = time.monotonic()
-        is_streaming = now - self.asked.at < STREAMING / MOVING
-        if now - self._sent_at > (LATEST if is_streaming else 0.9) / MOVING:
+    def _on_take(self, page: Any, connection: int) -> str | None:
+        """Hold the probe that nobody holds, or that a replay moves, which ends; in its thread."""
+        if self._lead.can_take:
+            self._simulator.session.ask(replay="")
+        elif self._lead.obstacle or self._page not in ("", page):
+            return self._lead.obstacle or None
+        if is_source(page):
+            self._post(lambda: self._hold(page, connection))
+        return None
+
+    def _hold(self, page: str, connection: int) -> None:
+        """Let a page hold the probe, until another acts or its connection ends."""
+        self._page, self._connection = page, connection
+
+    def _on_leave(self, connection: int) -> None:
+        if connection == self._connection:
+            self._page = ""
+
+    def _obey(self, asked: HandCommand, connection: int) -> None:
+        """Move to where a page wants the probe, from now on."""
+        if not self._state.holds:
+            return  # somebody else has taken it meanwhile
+        assert self._motion is not None
+        assert self._standing is not None
+        self._motion.aim(asked.stance(self._motion.goal, self._standing))
+        self._hold(asked.source, connection)
+        self._wish, self._asked_at = (asked.source, asked.sequence), time.monotonic()
+        if self._state is HandState.RESTING:
+            self._enter(HandState.MOVING)
+            self._advance(1.0 / MOVING_HZ)
+        elif self._asked_at - self._sent_at > 0.5 / MOVING_HZ:
             self._advance(LONGEST_STEP)
 
     def _advance(self, longest: float) -> None:
         """Publish where the movement is by now; at most so many s after the last pose."""
-        if self._publisher is None or self._motion is None:
-            self._moving_timer.cancel()
-            return
+        assert self._motion is not None
         if not self._motion.is_at_rest:
-            self._motion.advance(min(time.monotonic() - self._sent_at, longest))
-            self._rests_since = time.monotonic()
+            self._moved_at = time.monotonic()
+            self._motion.advance(min(self._moved_at - self._sent_at, longest))
         self._publish()
         if self._motion.is_at_rest and not self._simulator.is_changing_by_itself:
-            self._moving_timer.cancel()
-            self._resting_timer.reset()
+            self._enter(HandState.RESTING)
             self._tell()
 
     def _publish(self) -> None:
         assert self._motion is not None
         assert self._standing is not None
         stamp = self._node.get_clock().now()
-        self._last_stamp = stamp.nanoseconds
         stance = self._motion.stance
         pose = stance.pose(self._standing)
-        # Said first: its image may be there at once.
-        self.asked.published(stamp.nanoseconds, stance.press)
+        # Kept first: its image may be there at once.
+        self._published[stamp.nanoseconds] = stance.press, self._wish
+        if len(self._published) > _KEPT:
+            del self._published[next(iter(self._published))]
         self._publisher.publish(pose_message(pose, stamp.to_msg(), PATIENT))
         self._sent_at = time.monotonic()
         self._node.health.published(LEAD_TOPIC)
         self._tell()
 
-    def _unanswered(self) -> str:
-        """Whether nobody follows the poses any more that are published; "" if somebody does."""
-        silent = time.monotonic() - max(self._followed_at, self._taken_at)
-        if self._publisher is None or silent < UNANSWERED:
-            return ""
-        return f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
-
     def _tell(self) -> None:
         """Tell the pages how the probe is held, and by whom."""
-        motion, surface = self._motion, self._standing
-        stance = motion.stance if motion is not None else None
-        goal = motion.goal if motion is not None else None
-        if self._publisher is None and self._elsewhere is not None and surface is not None:
+        now, motion, surface = time.monotonic(), self._motion, self._standing
+        stance, goal = (motion.stance, motion.goal) if motion is not None else (None, None)
+        if not self._state.holds and self._elsewhere is not None and surface is not None:
             stance = goal = Stance.of(self._elsewhere, surface)
-        header = {
+        silent = now - max(self._followed_at, self._held_at)
+        warning = self._warning
+        if self._state.holds and silent > UNANSWERED:
+            warning = (
+                f"The simulator does not answer: the probe has not followed for {silent:.0f} s"
+            )
+        header: dict[str, Any] = {
             "leader": self._lead.who,
-            "holder": self.asked.holder,
-            "is_moving": self.asked.is_moving,
-            "every": 1.0 / RESTING,  # s, at the latest
-            "is_resting": self._publisher is not None and self._moving_timer.is_canceled(),
+            "holder": self._page,
+            "is_moving": bool(self._page) and now - self._asked_at < _MOVES_S,
+            "every": 1.0 / RESTING_HZ,  # s, at the latest
+            "is_resting": self._state is HandState.RESTING,
             "obstacle": self._lead.obstacle,
             "can_take": self._lead.can_take,
-            "warning": self._unanswered() or self._warning,
-            **hand_state(surface, stance, goal),
+            "warning": warning,
         }
+        if surface is not None:
+            header["range"] = _range(surface)
+        if stance is not None and goal is not None:
+            header |= {"stance": _numbers(stance), "goal": _numbers(goal)}
         self.feed.offer(lambda sequence: Packet("hand", sequence, header, b""))
+
+
+def _range(surface: RestSurface) -> dict[str, list[float]]:
+    """Return where the probe may be, m and rad, frame ``patient``."""
+    lower, upper = surface.lower.tolist(), surface.upper.tolist()
+    place = {"x": [lower[0], upper[0]], "y": [lower[1], upper[1]]}
+    return place | {"press": [-HIGHEST, DEEPEST], "tilt": [-STEEPEST, STEEPEST]}
+
+
+def _numbers(stance: Stance) -> dict[str, float]:
+    place = dict(zip("xyz", stance.point.tolist(), strict=True))
+    return place | {name: getattr(stance, name) for name in SINGLE}

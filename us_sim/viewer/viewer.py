@@ -100,8 +100,7 @@ class Viewer(GuardedNode):
         probe = self._probe.at(str(stamp))
         parameters = self._imaging
         told = {
-            "command": self._hand.asked.by(stamp),
-            "press": self._hand.press(stamp, probe.get("position")),
+            **self._hand.pose_facts(stamp, probe.get("position")),
             "force": float(np.linalg.norm(probe["force"])) if "force" in probe else None,
             "scene": self._session.state.scene or None,
             "settings": {

@@ -1,0 +1,111 @@
+"""What a page asks of the hand that holds the probe.
+
+>>> from us_sim.tracking.virtual_hand import RestSurface, Stance
+>>> asked = HandCommand.read({"source": "a", "sequence": 7, "to": {"press": 0.004}})
+>>> asked = asked.stance(Stance(rotation=0.1), RestSurface.plane(0.1))
+>>> asked.press, asked.rotation
+(0.004, 0.1)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from us_sim.errors import MessageError
+from us_sim.settings.spelling import shown
+from us_sim.tracking.virtual_hand import RestSurface, Stance
+
+HOME_PRESS = 1e-3  # m: where the probe begins it touches, so that there is an image
+LIFTED = -0.01  # m
+ANGLES = ("rotation", "fan", "rock")
+SINGLE = ("press", *ANGLES)
+_PLACES = ("home", "lift", "upright")
+_SIZES = {"to": {"point": 3, "x": 1, "y": 1}, "by": {"slide": 2}}
+_SIZES = {key: sizes | dict.fromkeys(SINGLE, 1) for key, sizes in _SIZES.items()}
+"""How many numbers each value (``to``) and each change (``by``) has."""
+_FARTHEST, _FULL = 10.0, 2.0 * math.pi  # m and rad
+_LONGEST_SOURCE, _LAST = 40, 2**53
+
+
+@dataclass(frozen=True)
+class HandCommand:
+    """One wish, as absolute values, changes, or a place that has a name."""
+
+    source: str  # of which page
+    sequence: int  # the page's number of the wish
+    to: Mapping[str, tuple[float, ...]]  # m and rad, by name
+    by: Mapping[str, tuple[float, ...]]  # m and rad, by name
+    go: str | None = None  # home: begin anew; lift: off the skin; upright: no angles
+
+    @classmethod
+    def read(cls, value: Any) -> HandCommand:
+        """Read what a page sent, decoded from JSON.
+
+        Raises:
+            MessageError: it is no command.
+        """
+        known = {"source", "sequence", "to", "by", "go"}
+        if not isinstance(value, dict) or not value.keys() <= known:
+            raise MessageError(f"{shown(value)} is no command to the hand: load the page again")
+        source, sequence, go = value.get("source"), value.get("sequence"), value.get("go")
+        if not is_source(source):
+            raise MessageError(f"source: {shown(source)} names no page: load it again")
+        if type(sequence) is not int or not 0 <= sequence <= _LAST:
+            raise MessageError(f"sequence: {shown(sequence)} is no count: load the page again")
+        if go not in (None, *_PLACES):
+            raise MessageError(f"go: {shown(go)} is none of {', '.join(_PLACES)}")
+        return cls(source, sequence, _numbers(value, "to"), _numbers(value, "by"), go)
+
+    def stance(self, goal: Stance, surface: RestSurface) -> Stance:
+        """Return the stance that is wanted now, within a hand's limits.
+
+        Args:
+            goal: what was wanted before.
+            surface: that the probe stands on.
+        """
+        if self.go == "home":
+            goal = Stance.home(surface, HOME_PRESS)
+        elif self.go == "lift":
+            goal = replace(goal, press=LIFTED)
+        elif self.go == "upright":
+            goal = replace(goal, rotation=0.0, fan=0.0, rock=0.0)
+        wanted: dict[str, Any] = {name: n[0] for name, n in self.to.items() if name in SINGLE}
+        goal = replace(goal, **wanted)
+        if "point" in self.to:
+            goal = replace(goal, point=surface.closest(np.array(self.to["point"])).point)
+        if "x" in self.to or "y" in self.to:
+            x, y = (self.to.get(name, (goal.point[axis],))[0] for axis, name in enumerate("xy"))
+            goal = replace(goal, point=surface.above(x, y).point)
+        if "slide" in self.by:
+            goal = goal.slid(surface, *self.by["slide"])
+        changed = {n: getattr(goal, n) + self.by[n][0] for n in SINGLE if n in self.by}
+        return replace(goal, **changed).within_reach()
+
+
+def is_source(value: Any) -> TypeGuard[str]:
+    """Return whether it can be the name that a page has given itself."""
+    return isinstance(value, str) and 0 < len(value) <= _LONGEST_SOURCE
+
+
+def _numbers(value: dict[str, Any], key: str) -> dict[str, tuple[float, ...]]:
+    """Read the numbers of one part of a command."""
+    given, sizes = value.get(key, {}), _SIZES[key]
+    if not isinstance(given, dict) or not given.keys() <= sizes.keys():
+        raise MessageError(f"{key}: {shown(given)} is no object of {', '.join(sizes)}")
+    numbers = {}
+    for name, listed in given.items():
+        values = listed if isinstance(listed, list) else [listed]
+        limit, unit = (_FULL, "rad") if name in ANGLES else (_FARTHEST, "m")
+        if len(values) != sizes[name] or not all(
+            type(n) in (int, float) and abs(n) <= limit for n in values
+        ):
+            raise MessageError(
+                f"{name}: {shown(listed)} is not {sizes[name]} within ±{limit:.3g} {unit}"
+            )
+        numbers[name] = tuple(map(float, values))
+    return numbers
