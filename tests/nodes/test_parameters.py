@@ -28,7 +28,7 @@ from us_sim.scene.reading import load_scene
 from us_sim.settings.quantity import dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.share import shared_path
-from us_sim.tissue.solvers.switching import SwitchableTissue
+from us_sim.tissue import live_tissue
 
 BAG = shared_path("bags/press_and_slide.mcap")
 
@@ -220,17 +220,17 @@ def test_a_solver_s_setting_reaches_it(pressed):
 
 
 def test_tissue_twice_as_stiff_pushes_twice_as_hard_once_it_is_ready(pressed, monkeypatch):
-    go, make = threading.Event(), SwitchableTissue.make
-
-    def slowly(self, plan, progress=None, **how):
-        assert not plan.reason or go.wait(60)
-        return make(self, plan, progress, **how)
-
-    monkeypatch.setattr(SwitchableTissue, "make", slowly)
+    go, make = threading.Event(), live_tissue.compiled_solver
     node, press = pressed()
     force = press()
     assert force < 0
     assert node.health.state == "fem"
+
+    def slowly(*given):
+        assert go.wait(60)
+        return make(*given)
+
+    monkeypatch.setattr(live_tissue, "compiled_solver", slowly)
     materials = [
         name for name in node.get_parameters_by_prefix("materials") if "young_modulus" in name
     ]

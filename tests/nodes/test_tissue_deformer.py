@@ -16,14 +16,14 @@ from visualization_msgs.msg import MarkerArray
 
 from us_sim.errors import SceneError, SettingsError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes import tissue_deformer as live_tissue
+from us_sim.nodes import tissue_deformer
 from us_sim.nodes.messages import contact_model_from
 from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.recording.decoding import tetrahedra_from, vectors_from
 from us_sim.scene.building import structures_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
+from us_sim.tissue import live_tissue
 from us_sim.tissue.solvers.solver import create_solver
-from us_sim.tissue.solvers.switching import SwitchableTissue
 
 ESTIMATE = "discretisation_error_percent"
 
@@ -118,15 +118,15 @@ def test_while_no_pose_comes_diagnostics_say_what_is_being_made_and_then_what_is
     bench, small_scene, monkeypatch
 ):
     node = bench.make(TissueDeformer, scene=str(small_scene))
-    told, may_end, make = threading.Event(), threading.Event(), SwitchableTissue.make
+    told, may_end, make = threading.Event(), threading.Event(), live_tissue.compiled_solver
 
-    def slow(tissue, plan, progress, *, beside):
+    def slow(solver, model, settings, progress):
         progress(0.0, "compiling msds, kernel 7")
         told.set()
         assert may_end.wait(timeout=20)
-        return make(tissue, plan, progress, beside=beside)
+        return make(solver, model, settings, progress)
 
-    monkeypatch.setattr(SwitchableTissue, "make", slow)
+    monkeypatch.setattr(live_tissue, "compiled_solver", slow)
     assert node.set_parameters([Parameter("solver", value="msds")])[0].successful
     assert told.wait(timeout=20)
     bench.spin_until(lambda: node.health.preparing.endswith(" s, compiling msds, kernel 7"))
@@ -310,7 +310,7 @@ def test_a_broken_pose_is_survived(bench, deformer):
 def test_a_method_that_cannot_be_is_refused_before_the_volume_is_made(
     bench, small_scene, monkeypatch, name, value, fact
 ):
-    monkeypatch.setattr(live_tissue, "volume_of", None)
+    monkeypatch.setattr(tissue_deformer, "volume_of", None)
     with pytest.raises(SettingsError, match=rf"^tissue_deformer\.{name}: {fact}"):
         bench.make(TissueDeformer, scene=str(small_scene), **{name: value})
 
@@ -333,12 +333,13 @@ def test_a_late_frame_leaves_the_next_less_time_for_a_period_at_most(
     bench.spin_until(lambda: bench.peer.count_publishers("tissue/nodes") > 0)
     press(bench, bench.publisher(PoseStamped, "probe/pose"), nodes, 0.002, 1)
     limits = []
-    monkeypatch.setattr(SwitchableTissue, "limit_frames", lambda _, limit: limits.append(limit))
+    monkeypatch.setattr(node._tissue, "deform", lambda _, limit: limits.append(limit))
+    monkeypatch.setattr(node, "_publish", lambda *_: None)
     clock = SimpleNamespace(monotonic=time.monotonic, monotonic_ns=lambda: 10**12)
-    monkeypatch.setattr(live_tissue, "time", clock)
+    monkeypatch.setattr(tissue_deformer, "time", clock)
     for took in (0.0, 0.022, -1.0, 10.0, 0.0):  # s, that each frame takes
         node.arrived = 10**12 - round(1e9 * took)
-        node._deform(pose_at(0.002, 2))
+        node._on_pose(pose_at(0.002, 2))
     usual, second, third, fourth, last = limits[-5:]
     assert third <= second + 1 / 60 - 0.022
     assert fourth >= max(usual, second, third)

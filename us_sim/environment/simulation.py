@@ -45,10 +45,10 @@ from us_sim.slicing.frame import Frame
 from us_sim.slicing.strain import AxialStrain, displacement
 from us_sim.tissue.elasticity.material import kind_of
 from us_sim.tissue.elasticity.materials import LabelFractions
+from us_sim.tissue.live_tissue import compiled_solver
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.solver import TissueSolver
-from us_sim.tissue.solvers.switching import compiled_solver
 from us_sim.volume.volume import Volume
 
 _VOLUMES = 4

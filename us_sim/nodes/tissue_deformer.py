@@ -19,7 +19,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.errors import SceneError, TrackingError, UsSimError
+from us_sim.errors import SceneError, SolverError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
     cloud_message,
@@ -38,168 +38,17 @@ from us_sim.scene.building import Structure, materials_of, structures_of, tissue
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.spelling import counted
 from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import TissueMaterials
+from us_sim.tissue.live_tissue import LiveTissue, TissueMethod
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
-from us_sim.tissue.model import Deformation, TissueModel
+from us_sim.tissue.model import Deformation
 from us_sim.tissue.solvers.frame_budget import Pace, shortest
-from us_sim.tissue.solvers.switching import Failed, Plan, Preparation, Prepared, SwitchableTissue
+from us_sim.tissue.solvers.solver import TissueSolver
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
 OWN = "tissue_deformer"
-PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready, when no pose comes
-
-
-class LiveTissue:
-    """A tissue whose method, methods' settings and materials are parameters of a node.
-
-    What is set is made ready in a thread, and the tissue goes on as it was until then; the next
-    frame begins with it. What cannot be made is said, and its parameters are set back. In lockstep
-    a frame waits for it.
-
-    Args:
-        node: that gets the parameters, of a scene with tissue.
-
-    Raises:
-        UsSimError: the scene's tissue cannot be made, or a parameter's value will not do.
-    """
-
-    def __init__(self, node: SceneNode) -> None:
-        scene, tissue = node.scene, node.scene.tissue
-        assert tissue is not None
-        self._node = node
-        groups = {OWN: Group(TissueDeformerSettings(solver=tissue.solver))}
-        for name in SOLVERS.importable:
-            given = tissue.settings.get(name) or SOLVERS.settings(name)()
-            groups[name] = Group(given, prefix=f"{name}.")
-        for label, material in tissue.materials.items():
-            groups[f"materials.{label}"] = Group(material, prefix=f"materials.{label}.")
-        # Before the volume, which may take a minute to make.
-        self._live = LiveSettings(node, groups, use=self._use)
-        values = self._live.values
-        self._volume = volume_of(scene)
-        self._scene = replace(scene, tissue=replace(tissue, materials=self._materials(values)))
-        model = tissue_model_of(self._scene, self._volume, node.get_logger().info)
-        node.get_logger().info(
-            f"preparing {values[OWN].solver} for {len(model.mesh.nodes)} nodes, "
-            f"{len(model.mesh.tetrahedra)} tetrahedra"
-        )
-        show = late_progress("preparing the tissue")
-        self.tissue = SwitchableTissue(model, values[OWN].solver, _settings(values), show)
-        if values[OWN].compare_with:
-            self.tissue.compare_with(values[OWN].compare_with, show)
-        self._current = dict(values)  # what the tissue is deformed by
-        self._asked = dict(values)  # what is being made ready
-        self._preparation = Preparation(self.tissue)
-        node.create_timer(PREPARED_CHECK_S, self._tick)
-
-    @property
-    def state(self) -> str:
-        """The method in use, and the one in preparation."""
-        preparing = self._preparation.state
-        return f"{self.tissue.name}, {preparing}" if preparing else self.tissue.name
-
-    def deform(self, pose: Pose) -> Deformation:
-        """Solve a frame, applying finished setting changes.
-
-        Raises:
-            UsSimError: the pose cannot be used.
-        """
-        self._take_prepared()
-        try:
-            return self.tissue.deform(pose)
-        except UsSimError:
-            raise
-        except Exception:
-            self.tissue.reset()  # it may have been left halfway
-            raise
-
-    def _use(self, values: dict[str, Any]) -> None:
-        if values == self._asked:
-            return
-        self._asked = dict(values)
-        log = self._node.get_logger()
-        if values == self._current:
-            self._preparation.drop()
-            log.info(
-                f"set back: {self.tissue.name} goes on as it is, and what was being prepared is "
-                f"dropped"
-            )
-        else:
-            plan = self._plan(values)
-            if self._node.lockstep:
-                self._adopt(self._made(plan))
-                return
-            log.info(f"{plan.reason}: being prepared; {self.tissue.name} goes on until it is ready")
-            self._preparation.want(plan)
-        self._tell(self._preparation.state)
-
-    def _plan(self, values: Mapping[str, Any]) -> Plan:
-        own = values[OWN]
-        changed = [key for key in values if values[key] != self._current[key]]
-        materials, model = self._materials(values), self.tissue.model
-
-        def with_materials() -> TissueModel:
-            made = materials_of(self._scene, materials, model.mesh, self._volume)
-            return replace(model, materials=made)
-
-        compared = f" compared with {own.compare_with}" if own.compare_with else ""
-        reasons = [f"{own.solver}{compared}" if key == OWN else key for key in changed]
-        return Plan(
-            own.solver,
-            own.compare_with or "",
-            _settings(values),
-            with_materials if materials != self._materials(self._current) else None,
-            ", ".join(reasons),
-        )
-
-    def _materials(self, values: Mapping[str, Any]) -> dict[str, Material]:
-        tissue = self._node.scene.tissue
-        return {
-            label: values[f"materials.{label}"] for label in (tissue.materials if tissue else ())
-        }
-
-    def _made(self, plan: Plan) -> Prepared | Failed:
-        try:
-            return self.tissue.make(plan, late_progress("preparing the tissue"))
-        except UsSimError as error:
-            return Failed(plan, str(error))
-
-    def _tick(self) -> None:
-        """Apply finished preparations, and report progress, also while no pose comes."""
-        if preparing := self._preparation.state:
-            self._node.health.state, self._node.health.preparing = self.state, preparing
-        self._take_prepared()
-
-    def _tell(self, preparing: str) -> None:
-        self._node.health.state = self.state if preparing else self.tissue.name
-        self._node.health.preparing = preparing
-        self._node.health.report()
-
-    def _take_prepared(self) -> None:
-        outcome = self._preparation.take()
-        if outcome is not None:
-            self._adopt(outcome)
-
-    def _adopt(self, outcome: Prepared | Failed) -> None:
-        reason = outcome.plan.reason
-        if isinstance(outcome, Failed):
-            self._node.health.problem("setting", f"{reason}: {outcome.problem}; it is set back")
-            self._asked = dict(self._current)
-            self._live.restore(self._current)
-        else:
-            before, compared = self.tissue.name, self.tissue.compared
-            self.tissue.adopt(outcome)
-            self._current = dict(self._asked)
-            log = self._node.get_logger()
-            if self.tissue.name != before:
-                log.info(f"switched to {self.tissue.name}")
-            if self.tissue.compared != compared and self.tissue.compared:
-                log.info(f"comparing with {self.tissue.compared}")
-            log.info(f"{reason}: in use from now on")
-        self._tell("")
-
-
-def _settings(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: values[name] for name in SOLVERS.importable}
+PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready
+_MATERIALS = "materials."
 
 
 class ContactModelPublisher:
@@ -220,12 +69,12 @@ class ContactModelPublisher:
         return bool(self._publisher.get_subscription_count())
 
     def publish(
-        self, tissue: SwitchableTissue, pose: Pose, deformation: Deformation, stamp: TimeMessage
+        self, solver: TissueSolver, pose: Pose, deformation: Deformation, stamp: TimeMessage
     ) -> None:
         """Publish the model at a pose, just solved for, under its stamp."""
         wrench = wrench_in_patient(pose, deformation.force, deformation.torque)
         try:
-            stiffness = tissue.contact_stiffness()
+            stiffness = solver.contact_stiffness()
         except np.linalg.LinAlgError:
             stiffness = None
         try:
@@ -332,21 +181,32 @@ class TissueDeformer(SceneNode):
     such frames (``unbalanced``).
 
     The method, the settings of every method and the materials are parameters that may change while
-    running, see `LiveTissue`; the state is carried over. With ``compare_with`` another method runs
-    on the same poses, and diagnostics say how far its nodes are from those published. Once a second
-    they estimate how far the frame's nodes are from the continuum's
+    running, see `LiveTissue`: what is set is prepared while the tissue goes on as it was, or at
+    once in lockstep; what cannot be made is said and set back. With ``compare_with`` another method
+    runs on the same poses, and diagnostics say how far its nodes are from those published. Once a
+    second they estimate how far the frame's nodes are from the continuum's
     (``discretisation_error_percent``), where the method can.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tissue_deformer", **kwargs)
-        if self.scene.tissue is None:
-            raise SceneError(f"{self.scene.origin}: tissue: is missing, so nothing can deform")
-        self._live = LiveTissue(self)
-        mesh = self._live.tissue.model.mesh
+        scene, section = self.scene, self.scene.tissue
+        if section is None:
+            raise SceneError(f"{scene.origin}: tissue: is missing, so nothing can deform")
+        groups = {OWN: Group(TissueDeformerSettings(solver=section.solver))}
+        for name in SOLVERS.importable:
+            given = section.settings.get(name) or SOLVERS.settings(name)()
+            groups[name] = Group(given, prefix=f"{name}.")
+        for label, material in section.materials.items():
+            groups[_MATERIALS + label] = Group(material, prefix=f"{_MATERIALS}{label}.")
+        # Before the volume, which may take a minute to make.
+        self._settings = LiveSettings(self, groups, use=self._prepare)
+        self._used = dict(self._settings.values)  # what the tissue is deformed by
+        self._tissue = self._make_tissue(_method_of(self._used))
+        mesh = self._tissue.model.mesh
         self._nodes = self.stream(PointCloud2, "tissue/nodes")
         self._wrench = self.stream(WrenchStamped, "probe/wrench")
-        is_felt = self.scene.tracker.source.name == "haptic"
+        is_felt = scene.tracker.source.name == "haptic"
         self._contact = ContactModelPublisher(self) if is_felt else None
         rest = self.latched(PointCloud2, "tissue/rest")
         tetrahedra = self.latched(Int32MultiArray, "tissue/tetrahedra")
@@ -355,75 +215,128 @@ class TissueDeformer(SceneNode):
             self._pace = Pace(shortest(lambda: rest.publish(self._cloud(mesh.nodes, ALWAYS))))
             self.get_logger().info(f"a frame may take {1e3 * self._pace.limit:.1f} ms")
             self.create_timer(GO_ON_S, self._go_on)
+            self.create_timer(PREPARED_CHECK_S, self._check_prepared)
         tetrahedra.publish(tetrahedra_message(mesh.tetrahedra))
-        self._structures = StructureMarkers(self, mesh) if self.scene.structures else None
+        self._structures = StructureMarkers(self, mesh) if scene.structures else None
         self._last: PoseStamped | None = None
         self._sent = mesh.nodes  # (N, 3) m
         self._is_balanced = True  # the last frame
         self._unbalanced = 0  # frames
         self._came = 0  # poses since `_go_on` was last called
-        self.newest(PoseStamped, "probe/pose", self._deform)
+        self.newest(PoseStamped, "probe/pose", self._on_pose)
         self._estimated: dict[str, str] = {}  # of a frame since the last report
         self._is_estimate_due = True
         self.health.measure = self._take_estimate
-        self.health.state = f"ready with {self._live.tissue.name}"
+        self.health.state = f"ready with {self._tissue.solver.name}"
         self.get_logger().info(self.health.state)
 
-    def _deform(self, message: PoseStamped) -> None:
+    def _make_tissue(self, method: TissueMethod) -> LiveTissue:
+        assert self.scene.tissue is not None
+        volume = volume_of(self.scene)
+        materials = dict(method.materials)
+        scene = replace(self.scene, tissue=replace(self.scene.tissue, materials=materials))
+        model = tissue_model_of(scene, volume, self.get_logger().info)
+        self.get_logger().info(
+            f"preparing {method.solver} for {len(model.mesh.nodes)} nodes, "
+            f"{len(model.mesh.tetrahedra)} tetrahedra"
+        )
+
+        def constants(materials: Mapping[str, Material]) -> TissueMaterials:
+            return materials_of(scene, materials, model.mesh, volume)
+
+        return LiveTissue(model, method, constants, late_progress("preparing the tissue"))
+
+    def _prepare(self, values: dict[str, Any]) -> None:
+        """Prepare what parameters have been set to."""
+        method, own = _method_of(values), values[OWN]
+        compared = f" compared with {own.compare_with}" if own.compare_with else ""
+        changed = [key for key in values if values[key] != self._used[key]]
+        reason = ", ".join(f"{own.solver}{compared}" if key == OWN else key for key in changed)
+        self._tissue.prepare(method, reason, wait=self.lockstep)
+        now = f"{self._tissue.solver.name} goes on"
+        self.get_logger().info(f"{reason}: being prepared; {now}" if reason else f"set back: {now}")
+        self._check_prepared()
+        self.health.report()
+
+    def _check_prepared(self) -> None:
+        """Go on with what is ready; set parameters back where it cannot be made."""
+        tissue, before, preparing = self._tissue, self._tissue.solver.name, self._tissue.preparing
+        try:
+            adopted = tissue.adopt_prepared()
+        except SolverError as error:
+            self.health.problem("setting", f"{error}; it is set back")
+            self._settings.restore(self._used)
+        else:
+            if adopted:
+                self._used = dict(self._settings.values)
+                switched = f"switched from {before} to" if tissue.solver.name != before else "with"
+                self.get_logger().info(f"{switched} {tissue.solver.name}, as set from now on")
+        if preparing or self.health.preparing:
+            self.health.preparing = tissue.preparing
+            self.health.state = self._state
+
+    @property
+    def _state(self) -> str:
+        """The method in use, and what is being prepared."""
+        return ", ".join(filter(None, (self._tissue.solver.name, self._tissue.preparing)))
+
+    def _on_pose(self, message: PoseStamped) -> None:
         self._came += 1
         self._last = message
-        if not self.lockstep:
-            self._live.tissue.limit_frames(self._pace.limit)
-        self._frame(message)
+        if self._is_wanted(message.header.stamp):
+            pose = pose_from(message, "patient")
+            limit = None if self.lockstep else self._pace.limit
+            self._publish(self._tissue.deform(pose, limit), pose, message.header.stamp)
         self._estimate()  # now that the nodes are sent; it counts as a part of the frame
         if not self.lockstep:
             self._pace.spend(1e-9 * (time.monotonic_ns() - self.arrived))
 
     def _go_on(self) -> None:
-        """Finish the last frame while no pose comes."""
+        """Finish the last frame while no pose comes; publish it again only if that is visible."""
         idle, self._came = self._came == 0, 0
         if not idle:
             return
         self._pace.reset()
-        if self._last is not None and not self._live.tissue.is_settled:
-            self._live.tissue.limit_frames(self._pace.limit)
-            self._frame(self._last, again=True)
+        last = self._last
+        if last and not self._tissue.solver.is_settled and self._is_wanted(last.header.stamp):
+            pose, was_balanced = pose_from(last, "patient"), self._is_balanced
+            deformation = self._tissue.deform(pose, self._pace.limit)
+            is_felt_anew = deformation.is_balanced and not was_balanced
+            if is_felt_anew or np.abs(deformation.nodes - self._sent).max() >= VISIBLE_M:
+                self._publish(deformation, pose, last.header.stamp)
+            else:
+                self._describe(deformation)
         self._estimate()
 
-    def _frame(self, message: PoseStamped, again: bool = False) -> None:
-        """Deform the tissue and send topics with subscribers; ``again`` only if visible."""
-        wanted = self._nodes.get_subscription_count() > 0
-        felt = self._wrench.get_subscription_count() > 0
-        touched = self._contact is not None and self._contact.is_wanted
-        stamp = message.header.stamp
-        shown = self._structures is not None and self._structures.is_due(stamp)
-        if not (wanted or felt or touched or shown):
-            return
-        pose = pose_from(message, "patient")
-        deformation = self._live.deform(pose)
+    def _is_wanted(self, stamp: TimeMessage) -> bool:
+        """Whether somebody subscribes to what a frame yields."""
+        return bool(
+            self._nodes.get_subscription_count()
+            or self._wrench.get_subscription_count()
+            or (self._contact is not None and self._contact.is_wanted)
+            or (self._structures is not None and self._structures.is_due(stamp))
+        )
+
+    def _publish(self, deformation: Deformation, pose: Pose, stamp: TimeMessage) -> None:
+        """Publish a frame on the topics that have subscribers."""
         self._describe(deformation)
-        is_felt_anew = deformation.is_balanced and not self._is_balanced
-        self._is_balanced = deformation.is_balanced
-        is_still = bool(np.abs(deformation.nodes - self._sent).max() < VISIBLE_M)
-        if again and is_still and not is_felt_anew:
-            return
         self._sent = deformation.nodes
-        if wanted:
+        if self._nodes.get_subscription_count():
             self._nodes.publish(self._cloud(deformation.nodes, stamp))
             self.health.published("tissue/nodes", stamp)
-        if felt and deformation.is_balanced:
+        if deformation.is_balanced and self._wrench.get_subscription_count():
             self._wrench.publish(
                 wrench_message(deformation.force, deformation.torque, stamp, "probe")
             )
             self.health.published("probe/wrench")
-        if self._contact is not None and touched and deformation.is_balanced:
-            self._contact.publish(self._live.tissue, pose, deformation, stamp)
-        if self._structures is not None and shown:
+        if self._contact is not None and deformation.is_balanced and self._contact.is_wanted:
+            self._contact.publish(self._tissue.solver, pose, deformation, stamp)
+        if self._structures is not None and self._structures.is_due(stamp):
             self._structures.publish(deformation.nodes, stamp)
 
     def _describe(self, deformation: Deformation) -> None:
         if deformation.inverted:
-            self.health.problem("inside out", _inside_out(deformation, self._live.tissue.name))
+            self.health.problem("inside out", _inside_out(deformation, self._tissue.solver.name))
         self.health.warning = ""
         if not deformation.is_balanced:
             self._unbalanced += 1
@@ -432,7 +345,8 @@ class TissueDeformer(SceneNode):
                 f"no force is sent: move the probe more slowly, or give the frames more time"
             )
         force = float(np.linalg.norm(deformation.force))
-        self.health.state = self._live.state
+        self._is_balanced = deformation.is_balanced
+        self.health.state = self._state
         self.health.values = {
             "residual": f"{deformation.residual:.3g}",
             "unbalanced": str(self._unbalanced),
@@ -444,12 +358,11 @@ class TissueDeformer(SceneNode):
         }
 
     def _comparison(self) -> dict[str, str]:
-        tissue = self._live.tissue
-        apart = tissue.difference
+        apart = self._tissue.difference
         if apart is None:
             return {}
         return {
-            "compared_with": tissue.compared,
+            "compared_with": self._tissue.method.compared,
             "difference_max_mm": f"{1e3 * apart.maximum:.4g}",
             "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
         }
@@ -458,7 +371,7 @@ class TissueDeformer(SceneNode):
         """Estimate the error of the first frame after a report."""
         if self._is_estimate_due:
             self._is_estimate_due = False
-            error = self._live.tissue.discretisation_error()
+            error = self._tissue.solver.discretisation_error()
             found = {} if error is None else {"discretisation_error_percent": f"{100 * error:.2g}"}
             self._estimated = found
 
@@ -469,6 +382,15 @@ class TissueDeformer(SceneNode):
     def _cloud(self, nodes: Any, stamp: Any) -> PointCloud2:
         x, y, z = nodes.T
         return cloud_message({"x": x, "y": y, "z": z}, stamp, "patient")
+
+
+def _method_of(values: Mapping[str, Any]) -> TissueMethod:
+    """The method that the values of the node's parameters ask for, by their groups' names."""
+    label = len(_MATERIALS)
+    materials = {key[label:]: values[key] for key in values if key.startswith(_MATERIALS)}
+    settings = {name: values[name] for name in SOLVERS.importable}
+    own = values[OWN]
+    return TissueMethod(own.solver, own.compare_with or "", settings, materials)
 
 
 def _inside_out(deformation: Deformation, name: str) -> str:

@@ -173,10 +173,7 @@ class TissueSolver(ABC):
         self._last = replace(self._resting(), nodes=self.model.mesh.nodes + state.displacement)
 
     def warm_up(self) -> None:
-        """Compile the kernels on a tissue of eight cells; this solver's own state is not touched.
-
-        `us_sim.tissue.solvers.switching.compiled_solver` does it in another process.
-        """
+        """Compile the kernels on a tissue of eight cells; the solver's own state stays."""
         self.rehearse(rehearsal_model(self.model), self.settings)
 
     @classmethod
