@@ -110,8 +110,8 @@ def test_parameters_are_shown_as_ros2_param_shows_them(words, printed, capsys) -
         ("rate", "12.5", 12.5),
         ("names", "[a, b]", ["a", "b"]),
         ("on", "false", False),
-        ("word", "", ""),
         ("word", "null", "null"),
+        ("word", '{"a": 1}', '{"a": 1}'),
     ],
 )
 def test_a_value_is_set_by_its_yaml(node, name, text, value, capsys) -> None:

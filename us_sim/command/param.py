@@ -83,27 +83,18 @@ def _get(asker: _Asker, args: argparse.Namespace) -> int:
         asker.refuse_unknown(node, [args.name])
         raise UsSimError(f"{args.name} of {node} is not set")
     kind, _, is_array = _TYPES[values[0].type].partition(" ")
-    if not values[0].type:
-        print("Parameter not set.")
-    else:
-        said = f"{kind.capitalize()} {'values are' if is_array else 'value is'}:"
-        print(said, parameter_value_to_python(values[0]))
+    said = f"{kind.capitalize()} {'values are' if is_array else 'value is'}:"
+    print(said, parameter_value_to_python(values[0]))
     return 0
 
 
 def _set(asker: _Asker, args: argparse.Namespace) -> int:
-    from rclpy.parameter import Parameter
-
-    try:
+    value: Any = None
+    with contextlib.suppress(YamlError):  # a text with a colon, say
         value = load_yaml(args.value)
-    except YamlError:
-        value = args.value  # a text with a colon, say
-    try:
-        parameter = Parameter(args.name, value=args.value if value is None else value)
-    except (TypeError, ValueError):  # a mapping, or a list of several types
-        parameter = Parameter(args.name, value=args.value)
     node = asker.find(args.node)
-    (result,) = asker.ask(node, "set_parameters", [parameter]).results
+    is_text = value is None or isinstance(value, dict)
+    (result,) = asker.set(node, {args.name: args.value if is_text else value})
     reason = f": {result.reason}" if result.reason else ""
     if not result.successful:
         asker.refuse_unknown(node, [args.name])
@@ -153,12 +144,15 @@ def _dump(asker: _Asker, args: argparse.Namespace) -> int:
 
 
 def _load(asker: _Asker, args: argparse.Namespace) -> int:
-    from rclpy.parameter import Parameter
-
     node = asker.find(args.node)
-    values = _of_node(Path(args.file), node)
-    parameters = [Parameter(name, value=value) for name, value in values.items()]
-    results = asker.ask(node, "set_parameters", parameters).results
+    content = read_yaml(Path(args.file), UsSimError)
+    values: dict[str, Any] = {}
+    for key in ("/**", node.rpartition("/")[2], node):  # its own go before those of all
+        part = content.get(key) if isinstance(content, dict) else None
+        values |= _flat(part.get("ros__parameters")) if isinstance(part, dict) else {}
+    if not values:
+        raise UsSimError(f"{args.file}: has no `ros__parameters` below `{node}` or `/**`")
+    results = asker.set(node, values)
     for name, result in zip(values, results, strict=True):
         reason = f": {result.reason}" if result.reason else ""
         if result.successful:
@@ -168,26 +162,11 @@ def _load(asker: _Asker, args: argparse.Namespace) -> int:
     return int(not all(result.successful for result in results))
 
 
-def _of_node(file: Path, node: str) -> dict[str, Any]:
-    """Values by name that a parameter file has for a node; its own go before those of ``/**``."""
-    content = read_yaml(file, UsSimError)
-    found: dict[str, Any] = {}
-    for key in ("/**", node.rpartition("/")[2], node):
-        part = content.get(key) if isinstance(content, dict) else None
-        if isinstance(part, dict) and isinstance(part.get("ros__parameters"), dict):
-            found |= _flat(part["ros__parameters"])
-    if not found:
-        raise UsSimError(f"{file}: has no `ros__parameters` below `{node}` or `/**`")
-    return found
-
-
-def _flat(nested: dict[Any, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(nested: Any, prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
-    for key, value in nested.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
+    for key, value in nested.items() if isinstance(nested, dict) else ():
+        inner = _flat(value, f"{prefix}{key}.")
+        flat |= inner if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
 
 
@@ -212,33 +191,47 @@ class _Asker:
         self._executor.shutdown()
         self._node.destroy_node()
 
-    def nodes(self) -> list[str]:
-        """The full names of all nodes but hidden ones, sorted."""
-        until = time.monotonic() + ALL_S
-        while time.monotonic() < until:
+    def nodes(self, wanted: str = "", seconds: float = ALL_S) -> list[str]:
+        """Look for nodes until the time is over, or the wanted one is there.
+
+        Returns:
+            the full names of all but hidden ones, sorted.
+        """
+        until = time.monotonic() + seconds
+        while True:
+            found = self._node.get_node_names_and_namespaces()
+            seen = sorted(f"{space.rstrip('/')}/{name}" for name, space in found if name[0] != "_")
+            if wanted in seen or time.monotonic() > until:
+                return seen
             self._executor.spin_once(timeout_sec=0.05)
-        return self._seen()
 
     def find(self, name: str) -> str:
-        """The full name of a node; raises UsSimError when it is not discovered."""
+        """Return the full name of a node; raise UsSimError when it is not discovered."""
         full = name if name.startswith("/") else f"/{name}"
-        until = time.monotonic() + DISCOVERY_S
-        while full not in (seen := self._seen()):
-            if time.monotonic() > until:
-                raise UsSimError(
-                    f"node not found: {unknown(full, seen)}"
-                    if seen
-                    else f"node not found: {full}; there is no node on ROS domain "
-                    f"{self._node.context.get_domain_id()}, as far as can be seen from here"
-                )
-            self._executor.spin_once(timeout_sec=0.05)
-        return full
+        seen = self.nodes(full, DISCOVERY_S)
+        if full in seen:
+            return full
+        domain = self._node.context.get_domain_id()
+        nobody = f"{full}; there is no node on ROS domain {domain}, as far as can be seen from here"
+        raise UsSimError(f"node not found: {unknown(full, seen) if seen else nobody}")
 
     def names(self, node: str) -> list[str]:
         return sorted(self.ask(node, "list_parameters").result.names)
 
+    def set(self, node: str, values: dict[str, Any]) -> list[Any]:
+        """Set parameters; those for which ROS has no type are texts."""
+        from rclpy.parameter import Parameter
+
+        parameters = []
+        for name, value in values.items():
+            try:
+                parameters.append(Parameter(name, value=value))
+            except (TypeError, ValueError):  # a mapping, or a list of several types
+                parameters.append(Parameter(name, value=str(value)))
+        return list(self.ask(node, "set_parameters", parameters).results)
+
     def ask(self, node: str, request: str, *arguments: Any) -> Any:
-        """The response of a node; raises UsSimError when none comes."""
+        """Return a node's answer; raise UsSimError when none comes."""
         from rclpy.parameter_client import AsyncParameterClient
 
         client = AsyncParameterClient(self._node, node)
@@ -256,7 +249,3 @@ class _Asker:
         for name in names:
             if name not in known:
                 raise UsSimError(f"{node} has no such parameter: {unknown(name, known)}")
-
-    def _seen(self) -> list[str]:
-        nodes = self._node.get_node_names_and_namespaces()
-        return sorted(f"{space.rstrip('/')}/{name}" for name, space in nodes if name[0] != "_")
