@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -371,56 +370,6 @@ def numbers(request, bench, path, said_bag):
     )
 
 
-def test_a_part_is_played(bench, numbers):
-    make, sent = numbers
-    player = make(start_offset=0.04, playback_duration=0.1)
-    bench.spin_until(player.finished.done)
-    bench.spin_until(lambda: sent()[-1:] == [7])
-    assert sent() == [2, 3, 4, 5, 6, 7]
-
-
-def test_a_loop_begins_again_at_the_offset_after_the_delay(bench, numbers):
-    make, sent = numbers
-    player = make(start_offset=0.1, playback_duration=0.04, delay=0.4, loop=True)
-    began = time.monotonic()
-    bench.spin_until(lambda: len(sent()) >= 7)
-    assert sent()[:7] == [5, 6, 7, 5, 6, 7, 5]
-    assert time.monotonic() - began > 3 * 0.4
-    assert not player.finished.done()
-
-
-def test_nothing_lies_behind_the_end(numbers):
-    make, _ = numbers
-    with pytest.raises(BagError, match=r"ends after 0\.18 s, and so before `start_offset`, 0\.2 s"):
-        make(start_offset=0.2)
-
-
-def test_messages_are_asked_for_one_by_one_while_paused(bench, numbers):
-    make, sent = numbers
-    player = make(paused=True, stay=True, playback_duration=0.1)
-    bench.spin_until(lambda: player.health.state == "paused")
-    held = isinstance(player, PathPlayer)  # it sends the pose that is held again and again
-    bench.spin_until(lambda: sent() if held else player.count_subscribers("/said"))
-    for number in range(1 if held else 0, 6):
-        assert not ask(bench, player, "play_next")
-        bench.spin_until(lambda number=number: sent()[-1:] == [number])
-        assert float(player.health.values["position"]) < 0.02 * number + 0.01
-    assert ask(bench, player, "play_next") == "there is no further message"
-    assert player.health.state == "paused"
-    set_live(player, paused=False)
-    bench.spin_until(lambda: player.health.state == "finished")
-    assert sorted(set(sent())) == list(range(6))
-    assert sent() == sorted(sent())
-
-
-def test_single_messages_may_be_asked_for_only_while_paused(bench, numbers):
-    make, sent = numbers
-    player = make(rate=0.01, stay=True)
-    bench.spin_until(sent)
-    assert "only while it is paused" in ask(bench, player, "play_next")
-    assert max(sent()) <= 1
-
-
 def test_what_was_stopped_goes_on_when_its_time_is_set(bench, numbers):
     make, sent = numbers
     player = make(stay=True, loop=True, rate=0.5)
@@ -448,7 +397,7 @@ def test_a_player_that_is_stopped_ends(bench, numbers):
 def test_the_clock_is_that_of_the_recording(bench, numbers):
     make, sent = numbers
     ticks = bench.collect(Clock, "/clock")
-    player = make(clock=100.0, rate=0.5, start_offset=0.02, stay=True)
+    player = make(clock=100.0, rate=0.5, time=0.02, stay=True)
     bench.spin_until(lambda: player.health.state == "finished")
     end = stamp_message(EPOCH + 9 * STEP)
     bench.spin_until(lambda: ticks and ticks[-1].clock == end)
@@ -475,15 +424,14 @@ def test_in_lockstep_the_clock_goes_with_the_poses(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     ticks = bench.collect(Clock, "/clock")
     images = bench.peer.create_publisher(Image, "ultrasound/image", 10)
-    given = {"clock": 40.0, "start_offset": 0.04, "playback_duration": 0.04}
-    player = bench.make(PathPlayer, path=str(path), lockstep=True, **given)
+    player = bench.make(PathPlayer, path=str(path), lockstep=True, clock=40.0, time=0.14)
     for count in range(1, 4):
         bench.spin_until(lambda count=count: len(poses) == count)
         images.publish(image_message(np.zeros((2, 2), np.uint8), poses[-1].header.stamp, "probe"))
     bench.spin_until(player.finished.done)
-    assert depths(poses) == [2, 3, 4]
+    assert depths(poses) == [7, 8, 9]
     times = {Time.from_msg(tick.clock).nanoseconds - EPOCH for tick in ticks}
-    assert times == {2 * STEP, 3 * STEP, 4 * STEP}
+    assert times == {7 * STEP, 8 * STEP, 9 * STEP}
 
 
 @pytest.mark.parametrize("topic", ["/tracker/pose", "/tf:probe"])

@@ -100,20 +100,15 @@ def test_pause_and_resume(bench, quiet):
     assert texts(file, "/mesh") == ["mesh", "other mesh"]  # what came while paused still holds
 
 
-def test_a_further_file_is_begun_and_the_recording_stopped_on_command(bench, quiet, tmp_path):
+def test_the_recording_is_stopped_on_command(bench, quiet, tmp_path):
     recorder, note, _, file = quiet()
     say(bench, recorder, note, "one")
-    assert not call(bench, "split")
-    say(bench, recorder, note, "two")
-    assert "`snapshot_mode`" in call(bench, "snapshot")
     assert not call(bench, "stop")
     assert recorder.health.state == "stopped"
-    further = tmp_path / "session_1.mcap"
-    assert (texts(file), texts(further), texts(tmp_path)) == (["one"], ["two"], ["one", "two"])
+    assert texts(tmp_path) == ["one"]
     say(bench, recorder, note, "nobody records")
-    for name in ("split", "snapshot", "stop"):
-        assert call(bench, name) == "nothing is recorded any more"
-    assert texts(tmp_path) == ["one", "two"]
+    assert call(bench, "stop") == "nothing is recorded any more"
+    assert texts(file) == ["one"]
 
 
 def test_what_waits_at_the_end_is_recorded(bench, tmp_path):
@@ -128,19 +123,6 @@ def test_what_waits_at_the_end_is_recorded(bench, tmp_path):
     bench.context.shutdown()  # as a signal does
     recorder.destroy_node()
     assert texts(file) == [str(k) for k in range(50)]
-
-
-def test_a_snapshot_holds_what_was_before_it(bench, quiet):
-    recorder, note, _mesh, file = quiet(snapshot_mode=True, max_cache_size=200)
-    said = [f"{k:010}" for k in range(30)]  # 19 bytes each
-    say(bench, recorder, note, *said)
-    pause(recorder, True)
-    pause(recorder, False)  # which is no snapshot
-    assert not call(bench, "snapshot")
-    say(bench, recorder, note, "not written")
-    end(bench, recorder)
-    assert texts(file) == said[-10:]
-    assert texts(file, "/mesh") == ["mesh"]
 
 
 def test_markers(bench, tmp_path):

@@ -9,7 +9,7 @@ from session_files import EPOCH, STRING
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
-from us_sim.recording.write_behind import Message, PreRoll, WriteBehind
+from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
 
 
@@ -106,15 +106,6 @@ def test_a_failure_of_any_kind_is_counted_and_ends_nothing(tmp_path):
     assert read_bag(tmp_path).lost() == {"/a": 1}
 
 
-def test_a_pre_roll_keeps_the_last_seconds_and_latched_messages_of_any_age():
-    kept = PreRoll(max_bytes=1000, duration=2.0)
-    kept.add(Message("/mesh", b"....", 0, 0), latched=True)
-    for second in range(5):
-        kept.add(Message("/note", b"....", second * 10**9, 0))
-    assert [m.topic for m in kept.take()] == ["/mesh", *["/note"] * 3]
-    assert kept.take() == []
-
-
 def test_without_a_queue_whoever_puts_waits_and_nothing_is_lost(tmp_path, slow_disk):
     bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=0)
     bag.add_topic("/a", STRING)
@@ -125,12 +116,3 @@ def test_without_a_queue_whoever_puts_waits_and_nothing_is_lost(tmp_path, slow_d
     bag.close()
     assert read_bag(tmp_path).message_count == 30
     assert not [thread for thread in threading.enumerate() if thread.name == "bag writer"]
-
-
-def test_what_was_kept_in_memory_always_fits(tmp_path, slow_disk):
-    bag = WriteBehind(BagWriter(tmp_path / "session.mcap"), max_cache_size=100)
-    bag.add_topic("/a", STRING)
-    bag.put_all([Message("/a", bytes(100), EPOCH + k, EPOCH) for k in range(5)])
-    slow_disk.set()
-    bag.close()
-    assert read_bag(tmp_path).message_count == 5

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from us_sim.errors import BagError
+from us_sim.evaluation.hand.hand_motion import hand_motion, shipped_hand_path
 from us_sim.geometry.pose import Pose
-from us_sim.recording.hand_motion import hand_motion, shipped_hand_path
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.run.contact_sheet import _moments, _place, colour_pictures, strain_pictures
 from us_sim.run.session_summary import Session

@@ -118,7 +118,6 @@ def test_a_player_at_its_end_is_no_loss(session):
         ({"topics": ["/probe/pose"]}, False),
         ({"topics": ["/ultrasound/image"]}, True),
         ({"paused": True}, False),
-        ({"snapshot_mode": True}, False),
     ],
 )
 def test_images_that_were_not_to_be_recorded_are_not_lost(tmp_path, settings, lost):

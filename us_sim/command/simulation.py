@@ -250,7 +250,7 @@ def _view(args: argparse.Namespace) -> int:
     return run(request, **following)
 
 
-_OF_THE_PLAYER = ("rate", "loop", "start_offset", "playback_duration", "delay")
+_OF_THE_PLAYER = ("rate", "loop", "time")
 
 
 def play_options(parser: argparse.ArgumentParser) -> None:

@@ -66,7 +66,6 @@ class PathPlayer(GuardedNode):
             int(self._path.log_times[0]),
             int(self._ages[-1]),
             self._go_to,
-            self._step,
             self._end,
             self._say_progress,
         )
@@ -91,14 +90,14 @@ class PathPlayer(GuardedNode):
             return
         self._starting.cancel()
         self.health.state = "playing"
-        now, start = self._playback.now, self._playback.start
+        now = self._playback.now
         if self._settings.lockstep:
             self._playback.has_begun = True
             self._playhead.pause(now)
-            self._go_to(start)
+            self._go_to(round(1e9 * self._settings.time))
             return
-        begun = self._begun if 0 < self._begun < now else now + self._playback.delay
-        self._go_to(max(start, round(1e9 * self._settings.time)), begun)
+        begun = self._begun if 0 < self._begun < now else now
+        self._go_to(round(1e9 * self._settings.time), begun)
         self._skip(now)
         self.get_logger().info(f"playing from pose {self._next}")
         self._ticking.reset()
@@ -118,13 +117,12 @@ class PathPlayer(GuardedNode):
 
     def _skip(self, now: int) -> None:
         """Go where the playhead is by now; round and round if the path loops."""
-        start, position = self._playback.start, self._playhead.position(now)
-        turn = int(self._playback.until - start + self._period * self._settings.rate)
-        if self._settings.loop and 0 < turn < position - start:
-            self._playhead.go_to(start + (position - start) % turn, now)
+        position = self._playhead.position(now)
+        turn = int(self._ages[-1] + self._period * self._settings.rate)
+        if self._settings.loop and 0 < turn < position:
+            self._playhead.go_to(position % turn, now)
         due = self._ages <= self._playhead.position(now) - 0.5 * self._period * self._settings.rate
-        first = int(np.searchsorted(self._ages, start))
-        self._next = min(max(int(due.sum()), first), self.pose_count - 1)
+        self._next = min(int(due.sum()), self.pose_count - 1)
 
     def _say_progress(self) -> None:
         self.health.values = {
@@ -148,17 +146,6 @@ class PathPlayer(GuardedNode):
         self._next = min(int(np.searchsorted(self._ages, position)), self.pose_count - 1)
         if at is None:
             self._send(self._next)
-
-    def _step(self) -> bool:
-        """Send the pose after the one that is held."""
-        held = self._next
-        self._next += self._sent == held
-        if self._is_over():
-            self._next = held
-            return False
-        self._playhead.go_to(int(self._ages[self._next]), self._playback.now)
-        self._send(self._next)
-        return True
 
     def _tick(self) -> None:
         """Send each pose whose time has come, to the nearest half period."""
@@ -189,7 +176,7 @@ class PathPlayer(GuardedNode):
             self._send(pose)
 
     def _is_over(self) -> bool:
-        return self._next >= self.pose_count or self._ages[self._next] > self._playback.until
+        return self._next >= self.pose_count
 
     def _is_due(self) -> bool:
         half = 0.5 * self._period * self._settings.rate

@@ -35,7 +35,7 @@ _SHOWN = 100_000_000
 class SessionPlayer(GuardedNode):
     """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace.
 
-    Its parameters are those of `SessionPlayerSettings`, its services those of `Playback`.
+    Its parameters are those of `SessionPlayerSettings`, its service that of `Playback`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -75,7 +75,6 @@ class SessionPlayer(GuardedNode):
             self._first,
             (self._bag.end or 0) - self._first,
             self._go_to,
-            self._step,
             lambda: self._end(early=True),
             self._say_progress,
         )
@@ -124,10 +123,10 @@ class SessionPlayer(GuardedNode):
         elapsed = self._shown
         if not self._settings.paused:  # then nothing is sent by itself
             elapsed = max(elapsed, self._playhead.position(self._playback.now))
-        while self._age() <= elapsed and self._step():
-            pass
+        while self._waiting is not None and self._age() <= elapsed:
+            self._send(self._waiting)
         self._say_progress()
-        if self._age() <= self._playback.until or self._settings.paused:
+        if self._waiting is not None or self._settings.paused:
             return
         if self._playback.loops:
             self._playback.restart()
@@ -138,17 +137,11 @@ class SessionPlayer(GuardedNode):
         """ns from the start of the recording to the next message; infinite after the last."""
         return self._waiting.log_time - self._first if self._waiting else math.inf
 
-    def _step(self) -> bool:
-        """Send the next message."""
-        if self._waiting is None or self._age() > self._playback.until:
-            return False
-        if self._settings.paused and self._age() > self._shown:  # it was asked for
-            self._playhead.go_to(int(self._age()), self._playback.now)
-        self._topics[self._waiting.topic].publish(self._waiting.data)
-        self.health.published(self._waiting.topic)
+    def _send(self, message: BagMessage) -> None:
+        self._topics[message.topic].publish(message.data)
+        self.health.published(message.topic)
         self._sent += 1
         self._waiting = self._next()
-        return True
 
     def _end(self, *, early: bool = False) -> None:
         self._playback.finish()

@@ -29,7 +29,7 @@ from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.nodes.topics import MARKERS, TOPICS
 from us_sim.recording.schemas import normalized_type, type_hash
 from us_sim.recording.topic import MARKER
-from us_sim.recording.write_behind import Message, PreRoll, WriteBehind
+from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
@@ -38,15 +38,14 @@ _WITHOUT_METADATA = (
     "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
     "be read and played without"
 )
-_STOPPED = "nothing is recorded any more"
 
 
 class SessionRecorder(GuardedNode):
     """Subscribes to each topic as soon as it appears, with the quality its publishers offer.
 
-    Its parameters are those of `SessionRecorderSettings`, its services ``~/split``, ``~/snapshot``
-    and ``~/stop``. Topics that are made on demand, such as ``ultrasound/image_annotated``, are
-    recorded only where ``topics`` or ``also`` names them: they are large, and follow from others.
+    Its parameters are those of `SessionRecorderSettings`, its service is ``~/stop``.
+    Topics that are made on demand, such as ``ultrasound/image_annotated``, are recorded only where
+    ``topics`` or ``also`` names them: they are large, and follow from others.
 
     A text on ``session/marker`` marks a moment of the recording.
     """
@@ -69,10 +68,9 @@ class SessionRecorder(GuardedNode):
         self._types: dict[str, str] = {}
         self._told: Counter[str] = Counter()  # losses of which a person was told
         self._bag: WriteBehind | None = None  # None once it was stopped
+        self._latched: dict[str, tuple[str, bytes, int, int]] = {}  # that came while it was paused
         self.health = Health(self, settings.file)
         self._begin()
-        offer(self, "split", self._split)
-        offer(self, "snapshot", self._snapshot)
         offer(self, "stop", self._stop)
         self.create_timer(0.1, self._discover)
         self.create_timer(1.0, self._follow_publishers)
@@ -84,27 +82,15 @@ class SessionRecorder(GuardedNode):
 
     def _use(self) -> None:
         """Pause or go on, as the parameter says."""
-        if self._bag is not None and self._settings.at_once:
-            self._bag.put_all(self._kept.take())
+        if self._bag is not None and not self._settings.paused:
+            for kept in self._latched.values():
+                self._bag.put(*kept)
+            self._latched.clear()
         self._tell_state()
-
-    def _split(self) -> str:
-        if self._bag is None:
-            return _STOPPED
-        self._bag.split()
-        return ""
-
-    def _snapshot(self) -> str:
-        if self._bag is None:
-            return _STOPPED
-        if not self._settings.snapshot_mode:
-            return "nothing is kept in memory: that is what `snapshot_mode` is for"
-        self._bag.put_all(self._kept.take())
-        return ""
 
     def _stop(self) -> str:
         if self._bag is None:
-            return _STOPPED
+            return "nothing is recorded any more"
         self.stop()
         return ""
 
@@ -144,15 +130,10 @@ class SessionRecorder(GuardedNode):
         bag = BagWriter(
             settings.file,
             compression=compression,
-            max_size=settings.max_bagfile_size,
-            max_duration=settings.max_bagfile_duration,
             sidecar=not taken,
             further=further,
         )
         self._bag = WriteBehind(bag, settings.max_cache_size)
-        self._kept = PreRoll(
-            settings.max_cache_size if settings.snapshot_mode else 0, settings.snapshot_duration
-        )
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
             self._bag.attach(name, media_type, data, now)
@@ -196,15 +177,16 @@ class SessionRecorder(GuardedNode):
         self.health.received += 1
         now = self._time_of_arrival(info)
         sent = info["source_timestamp"]
-        message = Message(topic, data, now, sent if sent > 0 else now)
+        message = topic, data, now, sent if sent > 0 else now
         if self._bag is None:
             return
         if topic == self._marker_topic:
             self._mark(data, now)
-        if not self._settings.at_once:
-            self._kept.add(message, latched=self._topics[topic].is_latched)
-        elif self._bag.put(topic, data, now, message.publish_time):
-            self.health.published(topic)
+        if not self._settings.paused:
+            if self._bag.put(*message):
+                self.health.published(topic)
+        elif self._topics[topic].is_latched:
+            self._latched[topic] = message
 
     def _time_of_arrival(self, info: Mapping[str, Any]) -> int:
         """ns: when the middleware had a message; a recorder that starves takes it later."""
@@ -250,10 +232,8 @@ class SessionRecorder(GuardedNode):
     def _tell_state(self) -> None:
         if self._bag is None:
             self.health.state = "stopped"
-        elif self._settings.paused:
-            self.health.state = "paused"
         else:
-            self.health.state = "waiting" if self._settings.snapshot_mode else "recording"
+            self.health.state = "paused" if self._settings.paused else "recording"
 
 
 def _load_types() -> None:

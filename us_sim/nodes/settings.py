@@ -158,11 +158,6 @@ class PlayerSettings(Settings):
     time: float = setting(
         _SPAN, "from the start, where to play on each time this is set", default=0.0, live=True
     )
-    start_offset: float = setting(_SPAN, "from the start, where playing begins", default=0.0)
-    playback_duration: float = setting(
-        Quantity("time", -1.0, 1e6), "of the recording that is played; -1: all", default=-1.0
-    )
-    delay: float = setting(_SPAN, "before playing begins, and begins again", default=0.0)
     clock: float = setting(
         Quantity("frequency", 0.0, 1000.0),
         "of `/clock`, which tells the time of the recording; poses have its stamps then; 0: none",
@@ -234,22 +229,11 @@ class SessionRecorderSettings(Settings):
         "bytes of messages that may wait for the disk; 0: whoever publishes in this process waits",
         default=100 * 1024 * 1024,
     )
-    max_bagfile_size: int = setting(
-        _BYTES, "bytes after which a further file is begun; 0: never", default=0
-    )
-    max_bagfile_duration: float = setting(
-        _SPAN, "after which a further file is begun; 0: never", default=0.0
-    )
     paused: bool = setting(
         description="record nothing, but keep the newest of latched messages for when it goes on",
         default=False,
         live=True,
     )
-    snapshot_mode: bool = setting(
-        description="keep messages in memory, max_cache_size at most, until ~/snapshot writes them",
-        default=False,
-    )
-    snapshot_duration: float = setting(_SPAN, "how old they may be; 0: any", default=0.0)
     scene: str | None = setting(
         description="scene that is recorded, to be attached with the files that it names",
         default=None,
@@ -287,7 +271,7 @@ class SessionRecorderSettings(Settings):
     @property
     def at_once(self) -> bool:
         """Whether it records from its start, and not only when told to."""
-        return not (self.paused or self.snapshot_mode)
+        return not self.paused
 
 
 @dataclass(frozen=True)

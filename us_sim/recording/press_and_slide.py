@@ -1,14 +1,9 @@
-"""The probe path of the demo: come down, press, hold, slide and rock, release, lift.
-
-``python -m us_sim.recording.press_and_slide FILE.mcap`` writes it as a bag.
-"""
+"""The probe path of the demo: come down, press, hold, slide and rock, release, lift."""
 
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,25 +12,6 @@ from numpy.typing import NDArray
 from us_sim.cache import cache_folder
 from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath, write_path
-
-
-def write_where_asked(arguments: Sequence[str], module: str, make: Callable[[], ProbePath]) -> int:
-    """Write a path to the file that the one argument of a module's command line names.
-
-    Returns:
-        The exit status: 0, 1 where the file cannot be written, 2 for other arguments than one.
-    """
-    if len(arguments) != 1:
-        print(f"usage: python -m {module} FILE.mcap", file=sys.stderr)
-        return 2
-    try:
-        # The folder of the project's paths holds one bag per file, so none may claim it.
-        write_path(arguments[0], make(), sidecar=False)
-    except BagError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
-
 
 EPOCH = 1_700_000_000 * 10**9  # ns
 
@@ -123,12 +99,3 @@ def pressing_path(depth: float, slide: float = 0.008) -> Path:
             f"a folder that can be written"
         ) from error
     return file
-
-
-def main(arguments: list[str]) -> int:
-    """Writes the path where the one argument says; returns the exit status."""
-    return write_where_asked(arguments, "us_sim.recording.press_and_slide", press_and_slide)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

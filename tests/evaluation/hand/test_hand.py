@@ -9,6 +9,7 @@ import pytest
 
 from us_sim.evaluation.hand import measure as following
 from us_sim.evaluation.hand import report as hand
+from us_sim.evaluation.hand.hand_motion import HASTES, Room
 from us_sim.evaluation.hand.measure import (
     APPROACH,
     CONVERGED,
@@ -24,7 +25,6 @@ from us_sim.evaluation.hand.measure import (
 from us_sim.evaluation.hand.report import evaluate_hand
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
-from us_sim.recording.hand_motion import HASTES, Room
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_cg import FemCg
 

@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.evaluation.block import EXTENT, MESHES
+from us_sim.evaluation.hand.hand_motion import HASTES, KINDS, RATE, Room, hand_motion
 from us_sim.evaluation.report import Row, percentile, words_of
 from us_sim.evaluation.timing import frames_until
 from us_sim.evaluation.tissue.cases import SCENES
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
-from us_sim.recording.hand_motion import HASTES, KINDS, RATE, Room, hand_motion
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import find_scene, load_scene
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
@@ -125,8 +125,8 @@ class Motion:
     """A motion on a tissue."""
 
     tissue: str
-    kind: str  # of `us_sim.recording.hand_motion.KINDS`
-    haste: str  # of `us_sim.recording.hand_motion.HASTES`
+    kind: str  # of `us_sim.evaluation.hand.hand_motion.KINDS`
+    haste: str  # of `us_sim.evaluation.hand.hand_motion.HASTES`
     seed: int
     duration: float  # s, without the approach
 

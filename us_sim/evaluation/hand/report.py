@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from us_sim.evaluation.hand.hand_motion import HASTES, KINDS, RATE
 from us_sim.evaluation.hand.measure import (
     APPROACH,
     AWAY,
@@ -47,7 +48,6 @@ from us_sim.evaluation.report import (
 from us_sim.evaluation.settings import HandSettings
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.progress import Progress
-from us_sim.recording.hand_motion import HASTES, KINDS, RATE
 
 JUDGED = "fem_nonlinear"  # the method that the targets are for
 

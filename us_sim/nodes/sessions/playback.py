@@ -1,4 +1,4 @@
-"""Playing a recording: waiting for whoever needs it, rate, pause and seeking."""
+"""Playing a recording: waiting for whoever needs it, rate, pause and place."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.messages import stamp_message
 from us_sim.nodes.parameters import declared
@@ -75,7 +74,7 @@ class Awaited:
 
 
 class Playback:
-    """Does as a player's parameters say, and its services ``~/play_next`` and ``~/stop``.
+    """Does as a player's parameters say, and its service ``~/stop``.
 
     The player publishes ``/clock`` where its parameter ``clock`` asks for it, and then goes by the
     computer's clock itself; else by its node's, also where that is set back.
@@ -87,7 +86,6 @@ class Playback:
         length: of the recording, ns.
         go_to: has the node play on at a time of the recording, ns, from a time of `now` on; without
             that at once, and then what is there is shown even if it is paused.
-        step: sends the next message before ``until``; False where there is none.
         stop: ends playing early.
         say: puts into the node's health how far it is.
     """
@@ -99,7 +97,6 @@ class Playback:
         first: int,
         length: int,
         go_to: Callable[[int, int | None], None],
-        step: Callable[[], bool],
         stop: Callable[[], None],
         say: Callable[[], None],
     ) -> None:
@@ -108,22 +105,12 @@ class Playback:
         self.head = Playhead(settings().rate)
         self.has_begun = self.is_stopped = False
         self._latest = 0  # ns, of `now`
-        self.delay = round(1e9 * settings().delay)
-        self.start, self.until = round(1e9 * settings().start_offset), length  # ns, of the part
-        if settings().playback_duration >= 0.0:
-            self.until = self.start + round(1e9 * settings().playback_duration)
-        if self.start > length:
-            raise BagError(
-                f"{settings().path} ends after {1e-9 * length:g} s, and so before `start_offset`, "
-                f"{settings().start_offset:g} s"
-            )
         self.clock = Clock() if settings().clock else node.get_clock()
         if settings().clock:
             self._clock = node.stream(ClockMessage, "/clock")
             node.create_timer(1.0 / settings().clock, self.tell_time)
         node.add_post_set_parameters_callback(self._seek)
         if not getattr(settings(), "lockstep", False):
-            offer(node, "play_next", lambda: self._play_next(step))
             offer(node, "stop", lambda: self._stop(stop))
 
     @property
@@ -137,8 +124,8 @@ class Playback:
 
     @property
     def position(self) -> int:
-        """ns from the recording's start, within what is played."""
-        return min(max(self.head.position(self.now), self.start), max(self.start, self.until))
+        """ns from the recording's start, within it."""
+        return min(max(self.head.position(self.now), 0), self.length)
 
     def tell_time(self) -> TimeMessage:
         """The present time: of the recording where ``/clock`` is, which is published then."""
@@ -171,19 +158,14 @@ class Playback:
         return self._settings().loop and not self.is_stopped
 
     def restart(self, gap: int = 0) -> None:
-        """Play from the start on, after the delay and a gap, ns."""
+        """Play from the start on, after a gap, ns."""
         self._node.health.state = "paused" if self._settings().paused else "playing"
-        self._go_to(self.start, self.now + self.delay + gap)
+        self._go_to(0, self.now + gap)
 
     def finish(self) -> None:
         """Be at the end."""
         self._node.health.state = "finished"
         self._report()
-
-    def _play_next(self, step: Callable[[], bool]) -> str:
-        if not self.has_begun or self._node.health.state != "paused":
-            return "single messages may be asked for only while it is paused"
-        return "" if step() else "there is no further message"
 
     def _stop(self, stop: Callable[[], None]) -> str:
         if not self.has_begun or self._node.health.state == "finished":

@@ -5,7 +5,7 @@ a line tells of half and twice the value, both were tried on 264 poses of a hand
 leaps, under a rounded box and under a sphere on 1,040 nodes (Poisson's ratio 0.49, no time limit).
 That took 21,519 iterations in 2,402 Newton steps, and every frame ended at a residual of at most
 0.003. "No change" is one of less than 2 percent. Damping and `late_forcing_term` were found later,
-on five motions of `us_sim.recording.hand_motion`, brisk and violent, on 2,000 and 5,040 nodes.
+on five motions of `evaluation.hand.hand_motion`, brisk and violent, on 2,000 and 5,040 nodes.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Probe paths as a free hand moves them: smooth, random, as fast as asked, the same for a seed.
 
-``python -m us_sim.recording.hand_motion FILE.mcap`` writes the one that the project ships.
+`shipped_hand_path` is the one that the project ships as ``bags/hand.mcap``.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from scipy.special import erf
 
 from us_sim.errors import BagError
 from us_sim.recording.path import ProbePath
-from us_sim.recording.press_and_slide import EPOCH, write_where_asked
+from us_sim.recording.press_and_slide import EPOCH
 from us_sim.settings.spelling import unknown
 
 RATE = 60.0
@@ -329,12 +328,3 @@ def _from_above(present: _Array, positions: _Array, orientations: _Array) -> tup
 def _path(times: _Array, positions: _Array, orientations: _Array) -> ProbePath:
     stamps = EPOCH + np.round(times * 1e9).astype(np.int64)
     return ProbePath("/tracker/pose", "patient", stamps, positions, orientations)
-
-
-def main(arguments: list[str]) -> int:
-    """Writes the shipped path where the one argument says; returns the exit status."""
-    return write_where_asked(arguments, "us_sim.recording.hand_motion", shipped_hand_path)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
