@@ -11,7 +11,7 @@ from hypothesis import settings
 
 import us_sim
 
-settings.register_profile("busy machine", deadline=None)
+settings.register_profile("busy machine", deadline=None, max_examples=50)
 settings.load_profile("busy machine")
 
 # Programs that tests start import the package from where it is tested, and not from the folder that

@@ -43,7 +43,7 @@ def pressed(probe, strain, seed=0):
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda p: type(p).__name__)
-@pytest.mark.parametrize("strain", [-0.02, -0.005, 0.01])
+@pytest.mark.parametrize("strain", [-0.02, 0.01])
 def test_an_even_strain_along_the_beams_is_found(probe, strain):
     found = estimate_strain(*pressed(probe, strain), probe, SETTINGS)
     there = np.isfinite(found.strain)

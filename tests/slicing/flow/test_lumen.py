@@ -18,8 +18,9 @@ def lumen_in(volume):
     return lumen_of(volume.labels == 1, volume.index_to_patient)
 
 
-@pytest.mark.parametrize("radius", [2e-3, 3e-3, 5e-3])
-@pytest.mark.parametrize("direction", [(0, 1, 0), (0.25, 1, -0.15)])
+@pytest.mark.parametrize(
+    ("radius", "direction"), [(2e-3, (0.25, 1, -0.15)), (3e-3, (0, 1, 0)), (5e-3, (0.25, 1, -0.15))]
+)
 def test_sections_of_a_cylinder_have_its_area_across_it(radius, direction):
     volume = tube_volume(radius, direction)
     lumen = lumen_in(volume)

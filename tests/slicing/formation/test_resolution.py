@@ -62,8 +62,7 @@ def width_along(probe, picture, at, direction, reach=8e-3):
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX, SECTOR], ids=["linear", "convex", "sector"])
-@pytest.mark.parametrize("part", [0.35, 0.7, 1.4])
-@pytest.mark.parametrize("line", [0.5, 0.25])
+@pytest.mark.parametrize(("part", "line"), [(0.35, 0.25), (0.7, 0.5), (1.4, 0.25)])
 def test_the_lateral_width_is_as_asked_and_grows_away_from_the_focus(probe, part, line):
     depth = part * probe.focus
     asked = 1.5e-3 * np.sqrt(1 + (part - 1) ** 2)
@@ -76,7 +75,7 @@ def test_the_lateral_width_is_as_asked_and_grows_away_from_the_focus(probe, part
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX, SECTOR], ids=["linear", "convex", "sector"])
-@pytest.mark.parametrize("depth", [0.01, 0.03, 0.05])
+@pytest.mark.parametrize("depth", [0.01, 0.05])
 def test_the_axial_length_is_as_asked_and_grows_a_tenth_each_centimetre(probe, depth):
     picture, at, along = picture_of_point(probe, 0.4, depth, Imaging(axial_resolution=1e-3))
     found = width_along(probe, picture, at, along)

