@@ -201,7 +201,6 @@ def test_a_line_that_moves_sideways_sweeps_a_rectangle():
         ([0.0, 1.0], np.zeros((3, 3)), [[0, 0, 0, 1]] * 2),
         ([0.0, 1.0], [[0, 0, 0], [0, np.nan, 0]], [[0, 0, 0, 1]] * 2),
         ([0.0, 1.0], np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 0]]),
-        ([], np.zeros((0, 3)), np.zeros((0, 4))),
     ],
 )
 def test_what_is_no_motion_is_refused(times, positions, orientations):

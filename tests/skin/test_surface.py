@@ -92,13 +92,10 @@ def test_a_real_head_with_texture_coordinates_is_read(shared_data):
     ("name", "text", "words"),
     [
         ("broken.stl", "solid nothing\nfacet", "not a surface"),
-        ("what.xyzzy", "?", "not a surface"),
         ("points.obj", "v 0 0 0\nv 1 0 0\n", "no triangles"),
         ("nan.obj", "v 0 0 0\nv 1 nan 0\nv 0 0 1\nf 1 2 3\n", "not finite"),
         ("flat.obj", "v 0 0\n", "line 1: 'v 0 0'"),
-        ("word.obj", "v 0 0 zero\n", "line 1: 'v 0 0 zero'"),
         ("far.obj", "v 0 0 0\nf 1 2 3\n", "line 2: 'f 1 2 3': .*vertex 2"),
-        ("zero.obj", "v 0 0 0\nf 0 1 1\n", "vertex 0"),
         ("line.obj", "v 0 0 0\nv 1 0 0\nf 1 2\n", "three vertices"),
     ],
 )
@@ -130,9 +127,7 @@ def test_without_meshio_the_way_out_is_said(tmp_path, monkeypatch):
         (np.eye(3)[:, :2], [[0, 1, 2]], r"give \(N, 3\)"),
         (np.eye(3) * np.nan, [[0, 1, 2]], "vertex 0"),
         (np.eye(3), [[0, 1, 3]], "vertices 0 to 3"),
-        (np.eye(3), [[0, 1, -1]], "vertices -1"),
         (np.eye(3), [[0, 1]], r"give \(T, 3\) integers"),
-        (np.eye(3), [[0.5, 1, 2]], r"give \(T, 3\) integers"),
         (np.eye(3), np.empty((0, 3), int), "no triangle"),
         (np.eye(3), [[0, 1, 2], [0, 1, 1]], "triangle 1 "),
         (np.vstack([np.eye(3), [[0, 0, 0]]]), [[0, 1, 2]], "vertex 3 "),
@@ -150,7 +145,6 @@ def test_a_surface_that_cannot_be_is_refused(vertices, triangles, words):
         (lambda: plane_surface((0.1, 0.1), 0.0), "spacing .*0.0 m"),
         (lambda: plane_surface((1.0, 0.1), 1e-5), "spacing"),
         (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.2, radius=0.1), "flat_width"),
-        (lambda: bent_surface((0.1, 0.1), 0.01, flat_width=0.0, radius=0.0), "radius"),
         (lambda: bent_surface((0.5, 0.1), 0.01, flat_width=0.0, radius=0.05), "half a circle"),
     ],
 )

@@ -171,12 +171,9 @@ def test_every_kind_of_pose_is_understood(listen, plain, sent):
     [
         (message("TRANSFORM", columns(MATRIX), checksum=1), "message", "checksum"),
         (message("TRANSFORM", columns(0 * MATRIX)), "pose", "not rigid"),
-        (message("TRANSFORM", columns(np.nan * MATRIX)), "pose", "finite"),
         (message("TRANSFORM", columns(0.2 * MATRIX)), "pose", "not rigid"),
         (message("TRANSFORM", b"short"), "message", "5 bytes"),
         (message("POSITION", quaternion(0, 0, 0, 0)), "pose", "finite"),
-        (message("POSITION", quaternion()[:20]), "message", "20 bytes"),
-        (message("TDATA", TOOL), "message", "22 bytes"),
         (message("TRANSFORM", b"", version=2), "message", "0 bytes"),
         (message("TRANSFORM", b"\xff" * 30, version=3), "message", "30 bytes"),
         (version_2(b"MISSING"), "message", "MISSING"),

@@ -56,17 +56,13 @@ def test_edges_satisfy_eulers_formula():
     ("nodes", "tetrahedra", "words"),
     [
         (CORNER[:, :2], ONE, r"nodes .*\(4, 2\)"),
-        (CORNER, [[0, 1, 2]], r"tetrahedra .*\(1, 3\)"),
         (CORNER, np.empty((0, 4), int), "M > 0"),
         (CORNER, ONE.astype(float), "float64"),
         (np.where(CORNER == 1, np.nan, CORNER), ONE, "3 .*not finite.* node 1"),
-        (CORNER * 1e300, ONE, "3 .*farther.* node 1"),
         (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
-        (CORNER, [[-1, 1, 2, 3]], "nodes -1 to 3"),
         (np.vstack([CORNER, [5.0, 5, 5]]), ONE, "no tetrahedron.* node 4"),
         (CORNER, [[0, 2, 1, 3]], "inverted.* tetrahedron 0"),
         (FLAT, ONE, "flat.* tetrahedron 0"),
-        (CORNER, [[0, 1, 2, 2]], "no tetrahedron.* node 3"),
         (CORNER[[0, 1, 2, 3, 3]], [[0, 1, 2, 3], [0, 1, 2, 4]], "node 4 on node 3"),
         (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "repeated.* tetrahedron 1"),
         (TWO_ABOVE, [[0, 1, 2, 3], [0, 1, 2, 4]], "same side.* such as 0"),
@@ -146,9 +142,7 @@ def test_a_tetrahedron_pulled_inside_out_is_refused():
 @pytest.mark.parametrize(
     ("nodes", "tetrahedra", "words"),
     [
-        (np.where(CORNER == 1, np.nan, CORNER), [[0, 1, 2, 3]], "not finite.* node 1"),
         (CORNER, [[0, 1, 2, 4]], "nodes 0 to 3"),
-        (CORNER, [[0.0, 1, 2, 3]], "float64"),
         ([*CORNER[:3], [1.0, 1, 0]], [[0, 1, 2, 3]], "flat"),
         (CORNER[[0, 0, 0, 0]], [[0, 1, 2, 3]], "M > 0"),
     ],

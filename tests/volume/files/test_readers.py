@@ -171,18 +171,13 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
     ("fields", "data", "message"),
     [
         ({}, b"\0" * 60, "holds 60 bytes .* 120"),
-        ({}, b"\0" * 121, "holds 121 bytes .* 120"),
         ({"CompressedData": "True"}, zlib.compress(bytes(60)), "60 bytes .* 120"),
-        ({"CompressedData": "True"}, zlib.compress(bytes(1 << 20)), "121 or more"),
         ({"CompressedData": "True"}, zlib.compress(bytes(120))[:-5], "broken or cut"),
         ({"ElementType": "MET_SHORT"}, None, "header says 240"),
         ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
-        ({"ElementSpacing": "1 -2 1"}, None, "spacing 1 × -2 × 1 mm"),
         ({"ElementSpacing": "1 nan 1"}, None, "ElementSpacing"),
         ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular"),
         ({"TransformMatrix": "1 0 0 0.5 1 0 0 0 1"}, None, "27°"),
-        ({"TransformMatrix": "2 0 0 0 2 0 0 0 2"}, None, "scaled"),
-        ({"Offset": "0 0"}, None, "Offset"),
         ({"Offset": "0 0 1e9"}, None, "1e\\+06 m"),
         ({"DistanceUnits": "furlong"}, None, "furlong"),
         ({"DimSize": "4 5 1"}, b"\0" * 20, "each axis"),
@@ -200,10 +195,8 @@ def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, messag
     [
         (["sizes: 4 5 7"], "holds 240 bytes .* 280"),
         (["encoding: hex"], "'hex'"),
-        (["encoding: raw", "byte skip: 9"], "holds 231 bytes"),
         (["encoding: bzip2"], "broken"),
         (["space: scanner-xyz"], "scanner-xyz"),
-        (["space units: furlong mm mm"], "furlong"),
     ],
 )
 def test_an_nrrd_header_that_does_not_fit_is_refused(tmp_path, lines, message):
