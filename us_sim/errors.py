@@ -54,6 +54,10 @@ class MessageError(UsSimError):
     """A message that came in cannot be read, or is not for where it was sent."""
 
 
+class FrameError(MessageError):
+    """A message is in another coordinate frame than it must be."""
+
+
 class StampError(UsSimError):
     """A stamp is no time."""
 

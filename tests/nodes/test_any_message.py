@@ -28,7 +28,6 @@ from std_msgs.msg import Bool
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes import messages
-from us_sim.nodes.guarded_node import Health
 from us_sim.nodes.haptic_renderer import HapticRenderer
 from us_sim.nodes.image_writer import ImageWriter
 from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
@@ -353,7 +352,6 @@ def test_a_folder_for_images_that_cannot_be_made_is_refused(bench, tmp_path):
 
 def test_no_image_ends_the_writing_of_images(bench, tmp_path):
     node = bench.make(ImageWriter, folder=str(tmp_path))
-    node.health = Health(node, "images")
     attack(bench, node, {"ultrasound/image": grey}, 40)
     count = node.count
     send(node, "ultrasound/image", grey())
@@ -365,7 +363,6 @@ def test_no_image_ends_the_writing_of_images(bench, tmp_path):
 def test_no_message_ends_the_writing_of_what_is_known_of_images(bench, tmp_path):
     folders = {name: str(tmp_path / name) for name in ("folder", "labels", "displacement")}
     node = bench.make(ImageWriter, **folders)
-    node.health = Health(node, "images")
     inputs = {"ultrasound/image": grey, "ultrasound/labels": grey, "ultrasound/displacement": moved}
     attack(bench, node, inputs, 60)
     count = node.truth.count

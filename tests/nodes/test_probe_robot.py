@@ -68,7 +68,7 @@ def test_a_wanted_force_is_reached_on_a_spring(bench, commands):
             wrench_message(np.full(3, math.inf), np.zeros(3), Time(), "probe"),
             "message",
         ),
-        ("robot/force", wrench_message(np.ones(3), np.zeros(3), Time(), "map"), "message"),
+        ("robot/force", wrench_message(np.ones(3), np.zeros(3), Time(), "map"), "frame"),
         ("robot/force", wrench_message(np.full(3, 90.0), np.zeros(3), Time(), "probe"), "force"),
     ],
 )

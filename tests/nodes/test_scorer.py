@@ -46,7 +46,8 @@ def scanned(bench, node, small_scene):
         wrench = wrench_message(np.array([0, 3.0, -4.0]), np.zeros(3), pose.header.stamp, "probe")
         wrenches.publish(wrench)
     bench.spin_until(lambda: bool(scores) and is_whole(scores[-1]))
-    for count, second in enumerate(range(0, 11, 2), 1):  # at the pose where they were found
+    came = node.health.received
+    for count, second in enumerate(range(0, 11, 2), came + 1):  # at the pose where they were found
         stamp = pose_at(0.0, second + 1).header.stamp
         images.publish(image_message(half if second > 4 else labels, stamp, "probe"))
         bench.spin_until(lambda count=count: node.health.received == count)

@@ -343,14 +343,14 @@ def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):
         bench.spin_until(lambda: node.health.problems(kind) == count)
 
     wrong(images, image(view, "mono8", 1), "camera", 1)  # nobody described the camera
-    wrong(infos, CameraInfo(width=640, height=480), "camera", 2)  # not calibrated
+    wrong(infos, CameraInfo(width=640, height=480), "tracking", 1)  # not calibrated
     infos.publish(camera_info())
     bench.spin_for(5)
-    wrong(images, image(view, "jpeg2000", 2), "image", 1)
+    wrong(images, image(view, "jpeg2000", 2), "tracking", 2)
     short = image(view, "mono8", 3)
     short.data = short.data[:1000]
-    wrong(images, short, "image", 2)
-    wrong(images, image(view[::2, ::2].copy(), "mono8", 4), "image", 3)  # another size
+    wrong(images, short, "tracking", 3)
+    wrong(images, image(view[::2, ::2].copy(), "mono8", 4), "tracking", 4)  # another size
     wrong(images, image(np.zeros_like(view), "mono8", 5), "markers", 1)  # black
     images.publish(image(view, "mono8", 6))
     bench.spin_until(lambda: poses)

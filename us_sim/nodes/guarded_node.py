@@ -1,11 +1,8 @@
-"""A node that goes on whatever comes in, refuses bad input, and reports its health.
-
-The report, once a second: rate, latency, drops, state.
-"""
+"""A node that goes on whatever comes in, refuses bad input, and reports its health."""
 
 from __future__ import annotations
 
-import inspect
+import functools
 import os
 import time
 import traceback
@@ -21,44 +18,43 @@ from rclpy.clock import Clock, ClockType, ROSClock
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.subscription import Subscription
 
 from us_sim.errors import UsSimError, printable
 from us_sim.nodes import ros_refusal
-from us_sim.nodes.qos import LATCHED, SENT, overridable
-from us_sim.recording.decoding import nanoseconds_of, require_stamp
+from us_sim.nodes.qos import EVERY, LATCHED, SENT, STREAM, overridable
+from us_sim.recording.decoding import nanoseconds_of
 
 CLOCK_S = 5.0  # for simulated time to begin, before it is said that it does not
-SAY_S = 1.0  # how long the same failure is not said again
 FAILED = "it failed; see the node's log"
-_DONE, _CODE, _REASON = ("success", "successful"), ("return_code",), ("error_string", "message")
-"""Fields by which responses usually say whether what was asked for was done, and why not."""
 LONGEST = 500  # characters of a sentence: an error may quote all of a message
+REPEAT_S, SAY_AT_LEAST_S = 5.0, 300.0
+"""How long a problem is not said again at first, twice as long each time, and at most."""
 
 
 class GuardedNode(Node):
     """A node whose callbacks are guarded: an exception ends neither this node nor others.
 
     Bad input, an error of this package, is *refused*: said, and counted by its kind. Any other
-    exception is a *failure*: counted by where it happened, said once a second at most, its
-    traceback at log level debug. `Health` puts both in diagnostics.
-
-    Messages whose stamps are no time are refused, too, but for those that are asked for ``raw``.
+    exception is a *failure*: said, counted by where it happened, its traceback at log level debug.
+    `Health` puts both in diagnostics.
     """
 
-    health: Health  # where the node has one
+    lockstep = False  # every message is worked on, in order
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         self.failures: Counter[str] = Counter()
         self.last_failure = ""
         self.arrived = time.monotonic_ns()
         """When what is being worked on came, ns of the monotonic clock."""
-        self._said: dict[str, float] = {}
+        self._due: dict[str, tuple[float, float]] = {}  # s: when to say it again, and then when
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         try:
             super().__init__(name, **kwargs)
         except RuntimeError as error:  # an RCLError
             raise ros_refusal(error) from error
+        self.health = Health(self)
         if self.time_is_simulated:
             self._clockless = self.create_timer(CLOCK_S, self._look_for_a_clock)
 
@@ -77,24 +73,83 @@ class GuardedNode(Node):
                 "0; start what publishes it, or set use_sim_time to false"
             )
 
+    def subscribe(
+        self,
+        message_type: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile = STREAM,
+        *,
+        newest: bool = False,
+        raw: bool = False,
+    ) -> Subscription:
+        """Call ``callback``, guarded, with the messages of ``topic``.
+
+        An executor takes one message of a subscription per turn, so a slow callback would fall
+        behind a fast publisher. With ``newest`` all that waits is taken at once, and what is not
+        the last of it is counted as dropped. In lockstep the callback gets every message.
+
+        Args:
+            message_type: of rclpy.
+            topic: its quality of service may be overridden by parameters.
+            callback: what it raises is said and counted under the topic's name.
+            qos: in lockstep, but for latched topics, it is `EVERY`.
+            newest: whether older messages are skipped.
+            raw: whether the callback gets serialized messages.
+        """
+        is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        if self.lockstep and not is_latched:
+            qos = EVERY
+        where = self.resolve_topic_name(topic)
+        queue = Queue(self) if newest and not self.lockstep else None
+
+        def on_message(message: Any) -> None:
+            self.arrived = time.monotonic_ns()
+            self.health.received += not is_latched
+            try:
+                callback(queue.take_last(subscription, message) if queue else message)
+            except Exception as error:
+                self.report(where, error)
+
+        subscription: Subscription = self.create_subscription(
+            *(message_type, topic, on_message, qos),
+            raw=raw,
+            qos_overriding_options=overridable(),
+        )
+        return subscription
+
+    def report(self, where: str, error: Exception) -> None:
+        """Refuse what came in, or count a failure; raise the error on while the node is ended."""
+        if isinstance(error, ExternalShutdownException) or not self.context.ok():
+            raise error
+        if isinstance(error, UsSimError):
+            self.refused(where, error)
+        else:
+            self.failed(where, error)
+
     def refused(self, where: str, error: UsSimError) -> None:
         """Count and say that something which came in cannot be used."""
-        sentence = shown(f"{where}: {error}; it is not used")
-        if hasattr(self, "health"):
-            self.health.problem(kind_of(error), sentence)
-        elif self._is_time_to_say(where):
-            self.get_logger().warning(sentence)
+        self.health.problem(kind_of(error), f"{where}: {error}; it is not used")
 
     def failed(self, where: str, error: Exception) -> None:
         """Count and say an exception that nobody expected; any thread may."""
         self.failures[where] += 1
         self.last_failure = shown(f"{where}: {type(error).__name__}: {error}")
-        if self._is_time_to_say(where):
+        if self.is_time_to_say(where):
             self.get_logger().error(
                 f"{self.last_failure}; the node goes on (failure {self.failures[where]} of this "
                 f"kind; the traceback is at log level debug)"
             )
             self.get_logger().debug("".join(traceback.format_exception(error)))
+
+    def is_time_to_say(self, kind: str) -> bool:
+        """Return whether to log a problem of this kind: one that goes on ever more rarely."""
+        now = time.monotonic()
+        due, wait = self._due.get(kind, (now, REPEAT_S))
+        if now < due:
+            return False
+        self._due[kind] = now + wait, min(2 * wait, SAY_AT_LEAST_S)
+        return True
 
     def guarded(
         self,
@@ -102,26 +157,21 @@ class GuardedNode(Node):
         callback: Callable[..., Any],
         otherwise: Callable[..., Any] = lambda *_: None,
     ) -> Callable[..., Any]:
-        """The callback, which raises no more, unless the node is being ended.
+        """Return the callback, which raises no more, unless the node is being ended.
 
         Args:
-            where: the topic, or what else a person knows it by.
+            where: the service, or what else a person knows it by.
             callback: takes what it takes.
             otherwise: gives what is returned when the callback raises, from the same arguments.
         """
 
+        @functools.wraps(callback)  # rclpy looks at its arguments
         def call(*arguments: Any) -> Any:
+            self.arrived = time.monotonic_ns()
             try:
                 return callback(*arguments)
-            except ExternalShutdownException:
-                raise
             except Exception as error:
-                if not self.context.ok():
-                    raise  # whatever was broken off by the end
-                if isinstance(error, UsSimError):
-                    self.refused(where, error)
-                else:
-                    self.failed(where, error)
+                self.report(where, error)
                 return otherwise(*arguments)
 
         return call
@@ -131,43 +181,32 @@ class GuardedNode(Node):
         return self.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
 
     def latched(self, message_type: Any, topic: str) -> Publisher:
-        """Likewise, of messages that are kept for later subscribers."""
+        """Create a publisher of messages that are kept for later subscribers."""
         return self.stream(message_type, topic, LATCHED)
-
-    def create_subscription(
-        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
-    ) -> Any:
-        """As `rclpy.node.Node.create_subscription`, guarded.
-
-        The quality of service of a relative topic may be overridden by parameters; absolute ones
-        are ROS's own, and what a recorder adopts.
-        """
-        if not topic.startswith("/"):
-            options.setdefault("qos_overriding_options", overridable())
-        if not options.get("raw"):
-            callback = _with_a_stamp(callback)
-        entered = self._entered(self.resolve_topic_name(topic), callback)
-        return super().create_subscription(msg_type, topic, entered, qos_profile, **options)
 
     def create_timer(self, timer_period_sec: float, callback: Any, *args: Any, **kw: Any) -> Any:
         """As `rclpy.node.Node.create_timer`, guarded, and by real time unless a clock is given.
 
         Reports and whatever else serves the node itself go on while simulated time stands.
         """
-        entered = self._entered(f"timer {_name(callback)}", callback)
-        return super().create_timer(
-            timer_period_sec, entered, *args, **{"clock": self._steady, **kw}
-        )
+        call = self.guarded(f"timer {_name(callback)}", callback)
+        return super().create_timer(timer_period_sec, call, *args, **{"clock": self._steady, **kw})
 
-    def call_soon(self, callback: Callable[[], Any]) -> None:
+    def call_soon(self, callback: Callable[[], Any], where: str = "") -> None:
         """Have the executor call ``callback``, guarded; any thread may ask for that."""
         if self.executor is not None:  # else it has ended, or has not begun
-            self.executor.create_task(self._entered(_name(callback), callback))
+            self.executor.create_task(self.guarded(where or _name(callback), callback))
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, **options: Any) -> Any:
         """As `rclpy.node.Node.create_service`, guarded: a request that fails is told that."""
-        entered = self._entered(f"service {srv_name}", callback, _refusing)
-        return super().create_service(srv_type, srv_name, entered, **options)
+
+        def refuse(_: Any, response: Any) -> Any:
+            if hasattr(response, "success") and hasattr(response, "message"):
+                response.success, response.message = False, FAILED
+            return response
+
+        call = self.guarded(f"service {srv_name}", callback, refuse)
+        return super().create_service(srv_type, srv_name, call, **options)
 
     def add_on_set_parameters_callback(self, callback: Any) -> None:
         """As `rclpy.node.Node.add_on_set_parameters_callback`; an exception refuses the change."""
@@ -181,25 +220,44 @@ class GuardedNode(Node):
         """As `rclpy.node.Node.add_post_set_parameters_callback`, guarded."""
         super().add_post_set_parameters_callback(self.guarded("parameters", callback))
 
-    def _entered(
-        self, where: str, callback: Any, otherwise: Callable[..., Any] = lambda *_: None
-    ) -> Callable[..., Any]:
-        """The guarded callback, which says when it began; rclpy looks at its arguments."""
-        guarded = self.guarded(where, callback, otherwise)
 
-        def enter(*arguments: Any) -> Any:
-            self.arrived = time.monotonic_ns()
-            return guarded(*arguments)
+class Queue:
+    """The queue of a subscription whose newest message alone is worked on.
 
-        enter.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
-        return enter
+    Messages that a full queue has overwritten are counted by the numbers that a publisher gives.
+    rclpy's EventsExecutor does not tell a callback its message's number, but one that is taken
+    from the queue has it, and a queue that was full has several.
+    """
 
-    def _is_time_to_say(self, where: str) -> bool:
-        now = time.monotonic()
-        if now - self._said.get(where, -SAY_S) < SAY_S:
-            return False
-        self._said[where] = now
-        return True
+    def __init__(self, node: GuardedNode) -> None:
+        self._node = node
+        self._taken = 0  # messages so far
+        self._last: tuple[int, int] | None = None  # a number, and how many were taken by then
+
+    def take_last(self, subscription: Subscription, message: Any) -> Any:
+        """Take all that waits behind ``message``, and return the last; count what is skipped."""
+        self._taken += 1
+        health = self._node.health
+        newest: tuple[Any, dict[str, Any]] = message, {}
+        with subscription.handle:
+            for _ in range(subscription.qos_profile.depth):
+                further = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if further is None:
+                    break
+                newest = further
+                self._taken += 1
+                health.received += 1
+                health.dropped += 1
+        message, info = newest
+        number = info.get("publication_sequence_number")  # not every middleware has it
+        if number is not None:
+            before, self._last = self._last, (number, self._taken)
+            if before and number > before[0] and self._has_one_publisher(subscription):
+                health.dropped += max(number - before[0] - (self._taken - before[1]), 0)
+        return message
+
+    def _has_one_publisher(self, subscription: Subscription) -> bool:
+        return bool(self._node.count_publishers(subscription.topic_name) == 1)
 
 
 class Subscriptions:
@@ -221,44 +279,14 @@ class Subscriptions:
         for subscription in self._there:
             self._node.destroy_subscription(subscription)
         self._there = []
-        if is_wanted:
-            self._there = [
-                self._node.create_subscription(kind, topic, take, qos, raw=raw)
-                for kind, topic, take, qos, raw in self._wanted
-            ]
+        for kind, topic, callback, qos, raw in self._wanted if is_wanted else ():
+            self._there.append(self._node.subscribe(kind, topic, callback, qos, raw=raw))
         return True
 
 
-def _with_a_stamp(work: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return ``work``, which raises StampError for messages whose stamps are no time."""
-
-    def take(message: Any) -> Any:
-        require_stamp(message)
-        return work(message)
-
-    return take
-
-
 def kind_of(error: UsSimError) -> str:
-    """The kind that an error is counted as: ``pose`` of a PoseError."""
+    """Return the kind that an error is counted as: ``pose`` of a PoseError."""
     return type(error).__name__.removesuffix("Error").lower()
-
-
-def _refusing(request: Any, response: Any) -> Any:
-    """The response, which states the failure where it has a field for it."""
-    refused = SetParametersResult(successful=False, reason=FAILED)
-    if hasattr(response, "results") and hasattr(request, "parameters"):
-        response.results = [refused for _ in request.parameters]
-    if hasattr(getattr(response, "result", None), "successful"):
-        response.result = refused
-    for name in response.get_fields_and_field_types():
-        if name in _DONE:
-            setattr(response, name, False)
-        elif name in _CODE:
-            setattr(response, name, 1)
-        elif name in _REASON:
-            setattr(response, name, FAILED)
-    return response
 
 
 def _name(callback: Any) -> str:
@@ -266,13 +294,10 @@ def _name(callback: Any) -> str:
 
 
 def shown(sentence: str) -> str:
-    """The sentence as it may be logged: it may quote a message."""
+    """Return the sentence as it may be logged: it may quote a message."""
     return printable(" ".join(sentence[: LONGEST + 1].split()), LONGEST)
 
 
-REPEAT_S = 5.0
-"""How long a problem of the same kind is not said again; each time it is twice as long."""
-SAY_AT_LEAST_S = 300.0  # how long at most
 ANOTHER_CLOCK_S = 10.0
 """From the present to a stamp: from there on it is of another clock, or of an earlier day."""
 
@@ -290,38 +315,34 @@ class Health:
 
     Args:
         node: whose clock, logger and timer are used.
-        hardware_id: the scene's name, or what else the node works on.
+        hardware_id: the scene's name, or what else the node works on; None publishes nothing.
     """
 
-    def __init__(self, node: GuardedNode, hardware_id: str) -> None:
+    def __init__(self, node: GuardedNode, hardware_id: str | None = None) -> None:
         self._node = node
         self._hardware_id = hardware_id
-        self._latencies: deque[float] = deque(maxlen=1000)
+        self._latencies: deque[float] = deque(maxlen=1000)  # ms
         self._published: Counter[str] = Counter()
         self._problems: Counter[str] = Counter()
-        self._next: dict[str, tuple[float, float]] = {}  # s, when to say it again, and then when
         self._last_problem = self._last_kind = ""
         self.warning = ""  # what is wrong for as long as it is
         self.fault = ""  # likewise, where it keeps the node from its work
         self._failures_told = 0
         self._clock_differs = False
-        self._last_total = 0
-        self._last_time = time.monotonic()
+        self._last_total, self._last_time = 0, time.monotonic()
         self.state = "starting"
-        self.received = 0
-        self.dropped = 0
+        self.received = self.dropped = 0  # messages
         self.values: dict[str, str] = {}
         self.measure: Callable[[], dict[str, str]] = dict  # values found for each report
         self.preparing = ""  # what it goes on without until that is ready
         self.scheduling = ""  # how its process goes before others, if that was asked for
-        self._publisher = node.create_publisher(
-            DiagnosticArray, "diagnostics", SENT, qos_overriding_options=overridable()
-        )
-        node.create_timer(1.0, self.report)
-        self._first = node.create_timer(0.01, self._report_first)
+        if hardware_id is not None:
+            self._publisher = node.stream(DiagnosticArray, "diagnostics")
+            node.create_timer(1.0, self.report)
+            self._first = node.create_timer(0.01, self._report_first)
 
     def published(self, topic: str, stamp: TimeMessage | None = None) -> None:
-        """One message went out on ``topic``; with a stamp, its age counts as latency."""
+        """Count a message that went out on ``topic``; with a stamp, its age is a latency."""
         self._published[topic] += 1
         if stamp is not None:
             self._latencies.append(1e3 * self._age(nanoseconds_of(stamp)))
@@ -342,16 +363,12 @@ class Health:
     def problem(self, kind: str, sentence: str) -> None:
         """Count a problem of that kind; one that goes on is logged ever more rarely."""
         self._problems[kind] += 1
-        self._last_problem = sentence = shown(sentence)
-        self._last_kind = kind
-        now = time.monotonic()
-        due, wait = self._next.get(kind, (now, REPEAT_S))
-        if now >= due:
-            self._next[kind] = now + wait, min(2 * wait, SAY_AT_LEAST_S)
-            self._node.get_logger().warning(sentence)
+        self._last_problem, self._last_kind = shown(sentence), kind
+        if self._node.is_time_to_say(kind):
+            self._node.get_logger().warning(self._last_problem)
 
     def problems(self, kind: str) -> int:
-        """How many of that kind there were."""
+        """Return how many of that kind there were."""
         return self._problems[kind]
 
     def _report_first(self) -> None:
@@ -360,11 +377,10 @@ class Health:
 
     def report(self) -> None:
         """Publish the report: once a second, and at once when it is urgent."""
-        now = time.monotonic()
+        node, now = self._node, time.monotonic()
         total = max(self._published.values(), default=0)
         rate = (total - self._last_total) / max(now - self._last_time, 1e-9)
         self._last_time, self._last_total = now, total
-        failures = self._node.failures
         values = {
             "state": self.state,
             "pid": str(os.getpid()),
@@ -376,32 +392,31 @@ class Health:
             **({"scheduling": self.scheduling} if self.scheduling else {}),
             **{f"published {topic}": str(n) for topic, n in self._published.items()},
             **{f"rejected {kind}": str(n) for kind, n in self._problems.items()},
-            **{f"failed {where}": str(n) for where, n in failures.items()},
+            **{f"failed {where}": str(n) for where, n in node.failures.items()},
             **self.values,
             **self.measure(),
         }
         if self._latencies:
             p50, p99 = np.percentile(self._latencies, [50, 99])
             values |= {"latency_p50_ms": f"{p50:.2f}", "latency_p99_ms": f"{p99:.2f}"}
-        ahead = -min(self._latencies, default=0.0)
+        ahead = -min(self._latencies, default=0.0)  # on a local network chrony does better than 1
         skew = (
             f"stamps are up to {ahead:.1f} ms ahead of this computer's clock, so no latency is "
             f"right: synchronise the computers' clocks, with chrony or PTP"
         )
-        synchronous = ahead < 1.0  # ms; on a local network chrony does better
-        wrong = self.fault or self._last_problem or self.warning or ("" if synchronous else skew)
+        wrong = self.fault or self._last_problem or self.warning or (skew if ahead >= 1.0 else "")
         level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
+        if node.failures.total() > self._failures_told:
+            self._failures_told, wrong = node.failures.total(), node.last_failure
+            level = DiagnosticStatus.ERROR
         status = DiagnosticStatus(
             level=DiagnosticStatus.ERROR if self.fault else level,
-            name=self._node.get_fully_qualified_name(),
+            name=node.get_fully_qualified_name(),
+            message=wrong or self.state,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-        if failures.total() > self._failures_told:
-            self._failures_told, wrong = failures.total(), self._node.last_failure
-            status.level = DiagnosticStatus.ERROR
-        status.message = wrong or self.state
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = node.get_clock().now().to_msg()
         self._publisher.publish(message)
         self._last_problem = ""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import gc
-import os
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,8 +24,6 @@ from us_sim.recording.decoding import nanoseconds_of, pose_from
 from us_sim.scene.building import haptic_rendering_of, source_settings
 
 _MEASURED = 2000  # ticks of which the jitter is told
-
-TICK_PRIORITY = 20  # among real-time threads: ordinary ones are at 0, the kernel's at 50
 
 
 class PeriodicThread:
@@ -64,7 +60,6 @@ class PeriodicThread:
         return 1e-9 * float(np.percentile(np.abs(np.diff(late)), 99)) if len(late) > 1 else 0.0
 
     def _run(self) -> None:
-        be_punctual()
         due = time.monotonic_ns()
         while not self._ending.is_set():
             due += self._period
@@ -79,19 +74,11 @@ class PeriodicThread:
             self._late.append(time.monotonic_ns() - due)
 
 
-def be_punctual(priority: int = TICK_PRIORITY) -> None:
-    """Let this thread run before the machine's other ones, where the system allows that."""
-    with contextlib.suppress(AttributeError, OSError):
-        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO, os.sched_param(priority))
-
-
 CHECKS, REPORTS = 5.0, 1.0
 """Times a second that it is seen who listens, and that diagnostics are told how regular it is.
 
 The latter keeps the interpreter from rendering for two ticks.
 """
-
-_PRIORITY = 10  # of the executor, among real-time threads: below the one that renders
 
 
 class HapticRenderer(SceneNode):
@@ -101,6 +88,8 @@ class HapticRenderer(SceneNode):
     the axes of the pose's frame, with the newest pose's stamp. It is zero at any doubt, which the
     state tells, and grows slowly after it, as it does for whoever subscribes first.
     """
+
+    live_priority = 20  # its thread goes before other nodes; the kernel's are at 50
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("haptic_renderer", **kwargs)
@@ -112,9 +101,9 @@ class HapticRenderer(SceneNode):
         self._is_taken = False
         self._stops = 0
         self._wrenches = self.stream(WrenchStamped, "haptic/wrench")
-        self.listen(PoseStamped, "haptic/pose", self._take_pose, FOREIGN)
-        self.listen(Bool, "haptic/clutch", self._take_clutch, FOREIGN)
-        self.listen(Float64MultiArray, "tissue/contact_model", self._take_model)
+        self.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
+        self.subscribe(Bool, "haptic/clutch", self._on_clutch, FOREIGN)
+        self.subscribe(Float64MultiArray, "tissue/contact_model", self._on_model)
         self._thread = PeriodicThread(settings.rate, self.guarded("rendering", self._render))
         self._check_doubt()
         self._report()
@@ -128,27 +117,16 @@ class HapticRenderer(SceneNode):
         self._publish(np.zeros(6))
         super().destroy_node()
 
-    def _take_pose(self, message: PoseStamped) -> None:
-        now = time.monotonic_ns()
-        self.health.received += 1
-        frame = message.header.frame_id
-        if frame != self._frame:
-            sentence = (
-                f"haptic/pose is in frame '{frame}', not '{self._frame}', so nothing is felt: set "
-                f"the arm's frame, or tracker.frame in the scene"
-            )
-            self.health.problem("frame", sentence)
-            self._rendering.distrust(sentence)
-            return
-        pose, stamp = pose_from(message), nanoseconds_of(message.header.stamp)
+    def _on_pose(self, message: PoseStamped) -> None:
+        pose, stamp = pose_from(message, self._frame), nanoseconds_of(message.header.stamp)
         if stamp == 0:
             raise StampError("there is no stamp: let the arm's driver set it")
-        self._rendering.pose(stamp, pose, now)
+        self._rendering.pose(stamp, pose, time.monotonic_ns())
 
-    def _take_clutch(self, message: Bool) -> None:
+    def _on_clutch(self, message: Bool) -> None:
         self._rendering.clutch(message.data)
 
-    def _take_model(self, message: Float64MultiArray) -> None:
+    def _on_model(self, message: Float64MultiArray) -> None:
         self._rendering.model(contact_model_from(message), time.monotonic_ns())
 
     def refused(self, where: str, error: UsSimError) -> None:
@@ -203,22 +181,7 @@ class HapticRenderer(SceneNode):
         }
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node until it is interrupted."""
-    # The thread that renders waits for the interpreter: who has it must not be kept waiting either.
-    be_punctual(_PRIORITY)
-    return run_node(_prepared, args)
-
-
-def _prepared() -> HapticRenderer:
-    """The node, with all that was needed to make it put aside for good.
-
-    Looking through it for what nobody uses any more would take tens of milliseconds, now and then.
-    """
-    node = HapticRenderer()
-    gc.collect()
-    gc.freeze()
-    return node
+main = partial(run_node, HapticRenderer)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +37,7 @@ class TruthFiles:
         self._early: dict[tuple[str, int], Image] = {}
         self._folders = folders
         for topic in folders:
-            node.create_subscription(Image, topic, self._taking(topic), EVERY)
+            node.subscribe(Image, topic, partial(self._on_truth, topic), EVERY)
 
     def image_came(self, number: int, stamp: int) -> None:
         """The image with that stamp (ns) has that number."""
@@ -51,16 +50,13 @@ class TruthFiles:
             if message is not None:
                 self._write(topic, message, number)
 
-    def _taking(self, topic: str) -> Callable[[Image], None]:
-        def take(message: Image) -> None:
-            stamp = nanoseconds_of(message.header.stamp)
-            if stamp in self._numbers:
-                self._write(topic, message, self._numbers[stamp])
-            else:
-                self._early[topic, stamp] = message
-                _forget(self._early)
-
-        return take
+    def _on_truth(self, topic: str, message: Image) -> None:
+        stamp = nanoseconds_of(message.header.stamp)
+        if stamp in self._numbers:
+            self._write(topic, message, self._numbers[stamp])
+        else:
+            self._early[topic, stamp] = message
+            _forget(self._early)
 
     def _write(self, topic: str, message: Image, number: int) -> None:
         stem = self._folders[topic] / f"{number:06d}"
@@ -94,12 +90,12 @@ class ImageWriter(GuardedNode):
             "ultrasound/displacement": settings.displacement,
         }
         self.count = 0
-        self.create_subscription(Image, "ultrasound/image", self._write, EVERY)
+        self.subscribe(Image, "ultrasound/image", self._on_image, EVERY)
         self.truth = TruthFiles(
             self, {topic: _made(name) for topic, name in wanted.items() if name}
         )
 
-    def _write(self, message: Image) -> None:
+    def _on_image(self, message: Image) -> None:
         file = self._folder / f"{self.count:06d}.png"
         if not cv2.imwrite(str(file), pixels_from(message)):
             raise OSError(f"{file} cannot be written; choose another folder")

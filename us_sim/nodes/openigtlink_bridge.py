@@ -48,9 +48,9 @@ class OpenIGTLinkBridge(SceneNode):
         self._image: Image | None = None
         self._connected = -1
         self._server = OpenIGTLinkServer(settings.host or "", settings.port)
-        self.listen(Float64MultiArray, "ultrasound/image_to_probe", self._take_place, LATCHED)
-        self.listen(PoseStamped, "probe/pose", self._take_pose)
-        self.newest(Image, "ultrasound/image", self._take_image)
+        self.subscribe(Float64MultiArray, "ultrasound/image_to_probe", self._on_place, LATCHED)
+        self.subscribe(PoseStamped, "probe/pose", self._on_pose)
+        self.subscribe(Image, "ultrasound/image", self._on_image, newest=True)
         self.create_timer(CLIENTS_S, self._count_clients)
         self.get_logger().info(f"serving OpenIGTLink on port {self.port}")
 
@@ -71,7 +71,7 @@ class OpenIGTLinkBridge(SceneNode):
             self.health.state = f"{clients} connected" if clients else "waiting for a client"
             self.get_logger().info(self.health.state)
 
-    def _take_place(self, message: Float64MultiArray) -> None:
+    def _on_place(self, message: Float64MultiArray) -> None:
         matrix = affine_from(message)
         # As thick as a pixel is wide: the simulation's own matrix has a slice a metre thick.
         normal, step = np.linalg.norm(matrix[:3, 2]), np.linalg.norm(matrix[:3, 0])
@@ -80,7 +80,7 @@ class OpenIGTLinkBridge(SceneNode):
         matrix[:3, 2] *= step / normal
         self._image_to_probe = matrix
 
-    def _take_pose(self, message: PoseStamped) -> None:
+    def _on_pose(self, message: PoseStamped) -> None:
         pose = pose_from(message, "patient")
         stamp = nanoseconds_of(message.header.stamp)
         matrix = self._from_patient @ pose.matrix
@@ -89,9 +89,9 @@ class OpenIGTLinkBridge(SceneNode):
             del self._poses[next(iter(self._poses))]
         self._send_transform("ProbeToReference", stamp, matrix)
         if self._image is not None:
-            self._take_image(self._image)
+            self._on_image(self._image)
 
-    def _take_image(self, message: Image) -> None:
+    def _on_image(self, message: Image) -> None:
         stamp = nanoseconds_of(message.header.stamp)
         self._image = None
         if self._image_to_probe is None or not self._server.clients:

@@ -57,7 +57,7 @@ class PathPlayer(GuardedNode):
         self.health = Health(self, str(path))
         self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else SENT)
         if lockstep:
-            self.create_subscription(Image, "ultrasound/image", self._imaged, EVERY)
+            self.subscribe(Image, "ultrasound/image", self._on_image, EVERY)
         self._awaited = Awaited(self, self._poses)
         self.health.state = "waiting"
         self._playback = Playback(
@@ -182,7 +182,7 @@ class PathPlayer(GuardedNode):
         half = 0.5 * self._period * self._settings.rate
         return bool(self._ages[self._next] <= self._playhead.position(self._playback.now) + half)
 
-    def _imaged(self, image: Image) -> None:
+    def _on_image(self, image: Image) -> None:
         stamp = nanoseconds_of(image.header.stamp)
         if self.health.state != "playing" or stamp != self._stamps[self._next]:
             return

@@ -14,7 +14,7 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import pose_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import MEASURING, run_node
-from us_sim.nodes.qos import FOREIGN, STREAM
+from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.scene_node import LEAD_TOPIC
 from us_sim.recording.decoding import twist_from, wrench_from
 from us_sim.tracking.robot import Robot, RobotSettings
@@ -34,18 +34,18 @@ class ProbeRobot(GuardedNode):
         self.health = Health(self, "robot arm")
         self.health.state = self._robot.action
         self._poses = self.stream(PoseStamped, LEAD_TOPIC)
-        self.create_subscription(TwistStamped, "robot/twist", self._take_twist, FOREIGN)
-        self.create_subscription(WrenchStamped, "robot/force", self._take_force, FOREIGN)
-        self.create_subscription(WrenchStamped, "probe/wrench", self._feel, STREAM)
+        self.subscribe(TwistStamped, "robot/twist", self._on_twist, FOREIGN)
+        self.subscribe(WrenchStamped, "robot/force", self._on_force, FOREIGN)
+        self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench)
         self.create_timer(1.0 / self._settings.rate, self._move)
 
-    def _take_twist(self, message: TwistStamped) -> None:
+    def _on_twist(self, message: TwistStamped) -> None:
         twist, frame = twist_from(message), message.header.frame_id
         if frame not in ("probe", "patient"):
             raise MessageError(f"is in frame '{frame}', neither 'probe' nor 'patient'")
         self._robot.ask_velocity(time.monotonic(), twist, in_patient=frame == "patient")
 
-    def _take_force(self, message: WrenchStamped) -> None:
+    def _on_force(self, message: WrenchStamped) -> None:
         wanted, most = float(wrench_from(message, "probe")[2]), self._settings.force
         if not 0.0 <= wanted <= most:
             self.health.problem(
@@ -53,7 +53,7 @@ class ProbeRobot(GuardedNode):
             )
         self._robot.ask_force(time.monotonic(), wanted)
 
-    def _feel(self, message: WrenchStamped) -> None:
+    def _on_wrench(self, message: WrenchStamped) -> None:
         self._robot.feel(time.monotonic(), -float(wrench_from(message, "probe")[2]))
 
     def _move(self) -> None:

@@ -116,7 +116,6 @@ class ProbeTracker(Device):
 
     def take(self, measurement: Measurement) -> None:
         """Publish the probe's pose, if the measurement can be believed."""
-        stamp_message(measurement.stamp)  # before it is taken: it may be later than can be said
         distance = float(abs(measurement.pose.position).max())
         if distance > FARTHEST:
             self.refuse(

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.qos import EVERY, LATCHED, overridable
+from us_sim.nodes.qos import EVERY
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.settings import ScorerSettings
 from us_sim.recording.decoding import nanoseconds_of, pixels_from, pose_from, wrench_from
@@ -53,23 +53,19 @@ class Scorer(SceneNode):
         self._is_drawn = False  # since the last step was done
         self._poses: dict[int, Pose] = {}
         self._begin = self._measured = 0  # ns
-        self._score = self.create_publisher(
-            DiagnosticArray, "score", LATCHED, qos_overriding_options=overridable()
-        )
-        self._picture = self.create_publisher(
-            CompressedImage, "score/picture", LATCHED, qos_overriding_options=overridable()
-        )
+        self._score = self.latched(DiagnosticArray, "score")
+        self._picture = self.latched(CompressedImage, "score/picture")
         self._picture.publish(CompressedImage())  # what a page has may be of a node before
-        self.listen(PoseStamped, "probe/pose", self._take_pose, EVERY)
-        self.listen(WrenchStamped, "probe/wrench", self._take_wrench, EVERY)
+        self.subscribe(PoseStamped, "probe/pose", self._on_pose, EVERY)
+        self.subscribe(WrenchStamped, "probe/wrench", self._on_wrench, EVERY)
         if self._live.lines:
-            self.newest(Image, "ultrasound/labels", self._take_labels)
+            self.subscribe(Image, "ultrasound/labels", self._on_labels, newest=True)
         self.create_service(Trigger, "~/clear", self._clear)
         self.create_service(Trigger, "~/draw", self._draw)
         self.create_timer(1.0, self._tell)
         self.health.state = "following"
 
-    def _take_pose(self, message: PoseStamped) -> None:
+    def _on_pose(self, message: PoseStamped) -> None:
         stamp, pose = nanoseconds_of(message.header.stamp), pose_from(message, "patient")
         self._begin = self._begin or stamp
         self._live.add_pose(self._seconds(stamp), pose)
@@ -77,12 +73,12 @@ class Scorer(SceneNode):
         if len(self._poses) > _REMEMBERED:
             del self._poses[next(iter(self._poses))]
 
-    def _take_wrench(self, message: WrenchStamped) -> None:
+    def _on_wrench(self, message: WrenchStamped) -> None:
         if self._begin:
             time = self._seconds(nanoseconds_of(message.header.stamp))
             self._live.add_force(time, wrench_from(message)[:3])
 
-    def _take_labels(self, message: Image) -> None:
+    def _on_labels(self, message: Image) -> None:
         stamp = nanoseconds_of(message.header.stamp)
         pose = self._poses.get(stamp)
         if pose is not None and abs(stamp - self._measured) >= _PERIOD:

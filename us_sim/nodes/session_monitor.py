@@ -35,9 +35,9 @@ class SessionMonitor(GuardedNode):
         self._published: dict[tuple[str, int], dict[str, int]] = {}
         self.health = Health(self, run)
         self.health.state = "following"
-        self.create_subscription(DiagnosticArray, "diagnostics", self._take, EVERY)
+        self.subscribe(DiagnosticArray, "diagnostics", self._take, EVERY)
         self._set: dict[str, dict[str, object]] = {}
-        self.create_subscription(ParameterEvent, "/parameter_events", self._note_set, EVERY)
+        self.subscribe(ParameterEvent, "/parameter_events", self._note_set, EVERY)
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:

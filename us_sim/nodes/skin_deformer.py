@@ -11,7 +11,6 @@ from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh
 from visualization_msgs.msg import Marker
 
-from us_sim.errors import UsSimError
 from us_sim.nodes.messages import cloud_message, mesh_message, surface_marker
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
@@ -46,7 +45,7 @@ class SkinDeformer(SceneNode):
         self._nodes = self.stream(PointCloud2, "skin/nodes")
         self._marker = self.stream(Marker, "skin/marker")
         self.latched(Mesh, "skin/mesh").publish(mesh_message(surface.vertices, surface.triangles))
-        self.newest(PoseStamped, "probe/pose", self._deform)
+        self.subscribe(PoseStamped, "probe/pose", self._on_pose, newest=True)
         self.health.state = "ready"
         self.get_logger().info("ready")
 
@@ -54,20 +53,18 @@ class SkinDeformer(SceneNode):
         if values["skin"] != self._membrane.settings:
             self._membrane = self._membrane.with_settings(values["skin"])
 
-    def _deform(self, message: PoseStamped) -> None:
+    def failed(self, where: str, error: Exception) -> None:
+        """Begin anew, too: the membrane may have been left halfway."""
+        super().failed(where, error)
+        self._membrane.reset()
+
+    def _on_pose(self, message: PoseStamped) -> None:
         wanted = self._nodes.get_subscription_count() > 0
         shown = self._marker.get_subscription_count() > 0 and self._is_marker_due(message)
         if not (wanted or shown):
             return
         stamp = message.header.stamp
-        pose = pose_from(message, "patient")
-        try:
-            skin = self._membrane.deform(pose)
-        except UsSimError:
-            raise
-        except Exception:
-            self._membrane.reset()  # it may have been left halfway
-            raise
+        skin = self._membrane.deform(pose_from(message, "patient"))
         if wanted:
             columns = [*skin.vertices.T, *skin.normals.T]
             names = ["x", "y", "z", "normal_x", "normal_y", "normal_z"]

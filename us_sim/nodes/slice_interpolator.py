@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -25,40 +24,27 @@ from us_sim.nodes.streams import frame_streams
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.recording.decoding import nanoseconds_of, pose_from, tetrahedra_from, vectors_from
 from us_sim.scene.building import probe_of, scanner_of, skin_surface_of, volume_of
+from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
 from us_sim.slicing.acoustics.settings import Acoustics, SoundSettings
-from us_sim.slicing.b_mode import BMode
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import TISSUE_PARAMETERS, Imaging
 
-Console = Callable[[Probe, Imaging, Acoustics], None]
 
-
-class ScannerConsole:
-    """The probe's live settings, those of image formation, and those of sound, also by tissue.
-
-    Args:
-        node: that gets the parameters.
-        prepare: called with them before a change is taken; what it raises refuses it.
-        use: called with them when parameters have been set.
-    """
-
-    def __init__(self, node: SceneNode, prepare: Console, use: Console) -> None:
-        probe, imaging = probe_of(node.scene), node.scene.imaging
-        live = [name for name in rules_of(type(probe)) if is_live(type(probe), name)]
-        groups = {
-            "probe": Group(probe, names=live),
-            "imaging": Group(imaging, names=rules_of(Imaging)),
-            "acoustics": Group(imaging.acoustics, "acoustics.", rules_of(SoundSettings)),
-        }
-        for label, tissue in imaging.acoustics.tissues.items():
-            prefix = f"{TISSUE_PARAMETERS}{label}."
-            groups[prefix] = Group(tissue, prefix)
-        console = LiveSettings(
-            node, groups, lambda to: prepare(*_together(to)), lambda to: use(*_together(to))
-        )
-        self.values = _together(console.values)
+def _console_of(scene: Scene) -> dict[str, Group]:
+    """Return what a sonographer sets: of the probe, the image, and the sound, also by tissue."""
+    probe, imaging = probe_of(scene), scene.imaging
+    live = [name for name in rules_of(type(probe)) if is_live(type(probe), name)]
+    groups = {
+        "probe": Group(probe, names=live),
+        "imaging": Group(imaging, names=rules_of(Imaging)),
+        "acoustics": Group(imaging.acoustics, "acoustics.", rules_of(SoundSettings)),
+    }
+    for label, tissue in imaging.acoustics.tissues.items():
+        prefix = f"{TISSUE_PARAMETERS}{label}."
+        groups[prefix] = Group(tissue, prefix)
+    return groups
 
 
 def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
@@ -71,53 +57,6 @@ def _together(values: dict[str, Any]) -> tuple[Probe, Imaging, Acoustics]:
     return values["probe"], values["imaging"], acoustics
 
 
-SKINS_REMEMBERED = 64
-
-
-class SkinShapes:
-    """``skin/nodes``, by their stamps.
-
-    Live, an image does not wait for the skin, which is there before the tissue all but always; in
-    lockstep it does, so that it is the same every time.
-
-    Args:
-        node: that makes the images.
-        scanner: is told of the skin at rest.
-        came: called when there is skin for a pose, in lockstep.
-    """
-
-    def __init__(self, node: SceneNode, scanner: BMode, came: Callable[[], None]) -> None:
-        surface = skin_surface_of(node.scene)
-        scanner.touch(surface.vertices, surface.triangles)
-        self._node, self._came = node, came
-        self._shape = surface.vertices.shape
-        self._shapes: dict[int, NDArray[np.float64]] = {}
-        node.listen(PointCloud2, "skin/nodes", self._take)
-
-    def at(self, stamp: int) -> NDArray[np.float64] | None:
-        """(V, 3) m, of a pose's stamp (ns); None where it has not come."""
-        return self._shapes.get(stamp)
-
-    def is_awaited(self, stamp: int) -> bool:
-        """Whether an image of that stamp has to wait."""
-        return self._node.lockstep and stamp not in self._shapes
-
-    def _take(self, message: PointCloud2) -> None:
-        vertices = vectors_from(message, "patient")
-        if vertices.shape != self._shape:
-            self._node.health.problem(
-                "skin",
-                f"skin/nodes has {len(vertices)} vertices, and the scene's skin {self._shape[0]}: "
-                f"contact is with the tissue; start both with the same scene",
-            )
-            return
-        self._shapes[nanoseconds_of(message.header.stamp)] = vertices
-        while len(self._shapes) > SKINS_REMEMBERED:
-            del self._shapes[next(iter(self._shapes))]
-        if self._node.lockstep:
-            self._came()
-
-
 _BEYOND = 1e-3  # m, by which an image may be too deep before that is said
 
 _NONE, _POOR = 0.02, 0.5  # coupling, averaged over the face, below which contact is none or poor
@@ -125,6 +64,7 @@ _SEEN = ("contact", "no_colour", "no_spectrum")
 """Diagnostics that are sent at once when they change: they say why an image shows nothing."""
 
 REMEMBERED = 256  # poses kept for the deformed nodes that carry their stamps
+SKINS_REMEMBERED = 64
 
 
 class SliceInterpolator(SceneNode):
@@ -134,13 +74,18 @@ class SliceInterpolator(SceneNode):
     for every pose, through the volume as it is. ``ultrasound/image_to_probe``, latched, says where
     its pixels are. ``ultrasound/image_annotated`` is for the eye, see `AnnotatedImage`, and
     `frame_streams` are further topics, each made of the same frame for those who subscribe. What a
-    sonographer sets are parameters, see `ScannerConsole`.
+    sonographer sets are parameters.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("slice_interpolator", **kwargs)
         # Before the volume, which may take a minute to make.
-        probe, imaging, acoustics = ScannerConsole(self, self._prepare, self._use).values
+        console = LiveSettings(
+            *(self, _console_of(self.scene)),
+            prepare=lambda to: self._prepare(*_together(to)),
+            use=lambda to: self._use(*_together(to)),
+        )
+        probe, imaging, acoustics = _together(console.values)
         volume = volume_of(self.scene)
         self._scanner = scanner_of(self.scene, volume, threads=self.threads)
         self.get_logger().info(f"preparing {self.scene.slice.name} on {self.scene.volume.name}")
@@ -154,20 +99,23 @@ class SliceInterpolator(SceneNode):
         self._seen: dict[str, str] = {}  # `_SEEN` in the diagnostics that were sent
         self._number = 0  # of what images are made from
         self._unpaired: PointCloud2 | None = None
-        self._skin: SkinShapes | None = None
+        self._skins: dict[int, NDArray[np.float64]] | None = None  # (V, 3) m, by stamps
         self._streams = frame_streams(self, volume, probe)
         self._places = self.latched(Float64MultiArray, "ultrasound/image_to_probe")
         self._places.publish(affine_message(probe.image_to_probe))
         self._annotated = AnnotatedImage(self, probe, volume.label_names, self._streams)
         if self.scene.tissue is None:
-            self.newest(PoseStamped, "probe/pose", self._image_rigid)
+            self.subscribe(PoseStamped, "probe/pose", self._on_rigid_pose, newest=True)
         else:
-            self.listen(PointCloud2, "tissue/rest", self._take_rest, LATCHED)
-            self.listen(Int32MultiArray, "tissue/tetrahedra", self._take_tetrahedra, LATCHED)
+            self.subscribe(PointCloud2, "tissue/rest", self._on_rest, LATCHED)
+            self.subscribe(Int32MultiArray, "tissue/tetrahedra", self._on_tetrahedra, LATCHED)
             if self.scene.skin is not None and imaging.contact:
-                self._skin = SkinShapes(self, self._scanner, self._image_unpaired)
-            self.listen(PoseStamped, "probe/pose", self._remember)
-            self.newest(PointCloud2, "tissue/nodes", self._image_deformed)
+                surface = skin_surface_of(self.scene)
+                self._scanner.touch(surface.vertices, surface.triangles)
+                self._skins, self._vertices = {}, len(surface.vertices)
+                self.subscribe(PointCloud2, "skin/nodes", self._on_skin)
+            self.subscribe(PoseStamped, "probe/pose", self._on_pose)
+            self.subscribe(PointCloud2, "tissue/nodes", self._on_nodes, newest=True)
         self.health.state = "ready"
         self.get_logger().info("ready")
 
@@ -184,11 +132,11 @@ class SliceInterpolator(SceneNode):
             self._places.publish(affine_message(probe.image_to_probe))
             self._annotated.show_probe(probe)
 
-    def _take_rest(self, message: PointCloud2) -> None:
+    def _on_rest(self, message: PointCloud2) -> None:
         self._rest = message
         self._take_mesh()
 
-    def _take_tetrahedra(self, message: Int32MultiArray) -> None:
+    def _on_tetrahedra(self, message: Int32MultiArray) -> None:
         self._tetrahedra = message
         self._take_mesh()
 
@@ -199,11 +147,22 @@ class SliceInterpolator(SceneNode):
         self._scanner.carry(nodes, tetrahedra_from(self._tetrahedra))
         self._carried = True
 
-    def _remember(self, message: PoseStamped) -> None:
-        self._poses[_nanoseconds(message)] = self._pose(message)
-        while len(self._poses) > REMEMBERED:
-            del self._poses[next(iter(self._poses))]
+    def _on_pose(self, message: PoseStamped) -> None:
+        _remember(self._poses, message, self._pose(message), REMEMBERED)
         self._image_unpaired()
+
+    def _on_skin(self, message: PointCloud2) -> None:
+        vertices = vectors_from(message, "patient")
+        if len(vertices) != self._vertices:
+            self.health.problem(
+                "skin",
+                f"skin/nodes has {len(vertices)} vertices, and the scene's skin {self._vertices}: "
+                f"contact is with the tissue; start both with the same scene",
+            )
+        elif self._skins is not None:
+            _remember(self._skins, message, vertices, SKINS_REMEMBERED)
+            if self.lockstep:
+                self._image_unpaired()
 
     def _pose(self, message: PoseStamped) -> Pose:
         pose = pose_from(message, "patient")
@@ -213,19 +172,20 @@ class SliceInterpolator(SceneNode):
     def _image_unpaired(self) -> None:
         """Make the image whose other half may have come."""
         if self._unpaired is not None and _nanoseconds(self._unpaired) in self._poses:
-            self._image_deformed(self._unpaired)
+            self._on_nodes(self._unpaired)
 
-    def _image_deformed(self, message: PointCloud2) -> None:
+    def _on_nodes(self, message: PointCloud2) -> None:
         stamp = _nanoseconds(message)
         pose = self._poses.get(stamp)
-        awaited = self._skin is not None and self._skin.is_awaited(stamp)
-        if pose is None or not self._carried or awaited:
+        # Live, the skin is there before the tissue all but always, and is not waited for.
+        has_skin = self._skins is None or not self.lockstep or stamp in self._skins
+        if pose is None or not self._carried or not has_skin:
             self._unpaired = message
             return
         self._unpaired = None
         self._image(message, pose, message)
 
-    def _image_rigid(self, message: PoseStamped) -> None:
+    def _on_rigid_pose(self, message: PoseStamped) -> None:
         self._image(message, self._pose(message), None)
 
     def _image(
@@ -238,7 +198,7 @@ class SliceInterpolator(SceneNode):
         stamp = source.header.stamp
         nodes = None if tissue is None else vectors_from(tissue, "patient")
         came = nanoseconds_of(stamp)
-        skin = None if self._skin is None else self._skin.at(came)
+        skin = None if self._skins is None else self._skins.get(came)
         frame = self._scanner.frame(pose, nodes, skin=skin, number=self._number, time=1e-9 * came)
         self.health.values = self._reach(pose)  # what streams say of this frame comes on top
         for stream in wanted:
@@ -279,6 +239,14 @@ def _contact(frame: Frame) -> dict[str, str]:
     coupling = float(frame.contact[0].mean())
     word = "none" if coupling < _NONE else "poor" if coupling < _POOR else "good"
     return {"contact": word, "coupling": f"{coupling:.2f}"}
+
+
+def _remember(
+    values: dict[int, Any], message: PoseStamped | PointCloud2, value: Any, most: int
+) -> None:
+    values[_nanoseconds(message)] = value
+    while len(values) > most:
+        del values[next(iter(values))]
 
 
 def _nanoseconds(message: PoseStamped | PointCloud2) -> int:

@@ -223,7 +223,7 @@ class TissueDeformer(SceneNode):
         self._is_balanced = True  # the last frame
         self._unbalanced = 0  # frames
         self._came = 0  # poses since `_go_on` was last called
-        self.newest(PoseStamped, "probe/pose", self._on_pose)
+        self.subscribe(PoseStamped, "probe/pose", self._on_pose, newest=True)
         self._estimated: dict[str, str] = {}  # of a frame since the last report
         self._is_estimate_due = True
         self.health.measure = self._take_estimate

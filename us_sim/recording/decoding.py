@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
+from us_sim.errors import (
+    FrameError,
+    MeshError,
+    MessageError,
+    PoseError,
+    ProbeError,
+    StampError,
+    VolumeError,
+)
 from us_sim.geometry.pose import Pose
 
 SECOND = 1_000_000_000  # ns
@@ -24,7 +32,7 @@ _TRIANGLE_LIST, _LINE_STRIP, _ADD = 11, 4, 0  # of visualization_msgs/Marker
 
 
 def nanoseconds_of(stamp: Any) -> int:
-    """The ns since 1970 of a stamp; 0 for one that was never set.
+    """Return the ns since 1970 of a stamp; 0 for one that was never set.
 
     Raises:
         StampError: it is no time: before 1970, with a second's worth of nanoseconds or more, or
@@ -34,7 +42,11 @@ def nanoseconds_of(stamp: Any) -> int:
 
 
 def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
-    """Likewise, of a stamp's two parts."""
+    """Return the ns since 1970 of a stamp's two parts.
+
+    Raises:
+        StampError: it is no time.
+    """
     if not 0 <= seconds <= LAST_SECOND or not 0 <= nanoseconds < SECOND:
         raise StampError(
             f"the stamp of {seconds} s and {nanoseconds} ns is no time: let the sender stamp its "
@@ -44,25 +56,23 @@ def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
 
 
 def require_stamp(message: Any) -> None:
-    """Check the stamp that a message has in its header, or as a clock.
+    """Check the stamp that a message has in its header.
 
     Raises:
         StampError: there is one, and it is no time.
     """
-    header = getattr(message, "header", None)
-    stamp = getattr(message, "clock", None) if header is None else header.stamp
-    if stamp is not None:
-        nanoseconds_of(stamp)
+    if hasattr(message, "header"):
+        nanoseconds_of(message.header.stamp)
 
 
 def require_frame(header: Any, frame: str | None) -> None:
     """Check the frame of a message; None is any.
 
     Raises:
-        MessageError: it is another one.
+        FrameError: it is another one.
     """
     if frame is not None and header.frame_id != frame:
-        raise MessageError(f"is in frame '{header.frame_id}', not '{frame}'")
+        raise FrameError(f"is in frame '{header.frame_id}', not '{frame}'")
 
 
 _FARTHEST_POSE = 1e7
@@ -70,7 +80,7 @@ _FARTHEST_POSE = 1e7
 
 
 def pose_from(message: Any, frame: str | None = None) -> Pose:
-    """The pose in a message.
+    """Return the pose in a message.
 
     Args:
         message: of any device or node.
@@ -78,7 +88,7 @@ def pose_from(message: Any, frame: str | None = None) -> Pose:
 
     Raises:
         PoseError: it is not finite, beyond any place, or its quaternion has no length to speak of.
-        MessageError: it is in another frame.
+        FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
     return _pose(message.pose.position, message.pose.orientation)
@@ -122,7 +132,8 @@ def wrench_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
     """Force and torque (6,) N, N m about the origin of the message's frame.
 
     Raises:
-        MessageError: a number is not finite, or it is in another frame.
+        MessageError: a number is not finite.
+        FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
     f, t = message.wrench.force, message.wrench.torque
@@ -160,7 +171,7 @@ def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
     Raises:
         MeshError: a field is missing, no float, or outside of its point; the data do not fill the
             stated size; a coordinate is not finite, or too large to be one.
-        MessageError: it is in another frame.
+        FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
     # In Python's integers, which are as wide as need be.
@@ -335,7 +346,7 @@ def triangles_from(message: Any, frame: str) -> list[MarkedTriangles]:
 
     Raises:
         MeshError: corners do not make whole triangles, or one is not finite.
-        MessageError: a marker is in another frame.
+        FrameError: a marker is in another frame.
     """
     corners: dict[str, list[NDArray[np.float64]]] = {}
     colours: dict[str, tuple[float, float, float]] = {}
@@ -358,7 +369,7 @@ def line_from(message: Any, frame: str) -> NDArray[np.float64]:
 
     Raises:
         MeshError: a point is not finite.
-        MessageError: the marker is in another frame.
+        FrameError: the marker is in another frame.
     """
     for marker in message.markers:
         if marker.type == _LINE_STRIP and marker.action == _ADD and marker.points:

@@ -137,7 +137,7 @@ def image_feeds(
     def place(message: Float64MultiArray) -> None:
         places[:] = [affine_from(message)]
 
-    node.create_subscription(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
+    node.subscribe(Float64MultiArray, "ultrasound/image_to_probe", place, LATCHED)
 
     def telling(make: Callable[[Image, int, bool], Packet]) -> Make:
         def tell(message: Image, sequence: int) -> Packet:

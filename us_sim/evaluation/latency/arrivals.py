@@ -40,10 +40,10 @@ class Arrivals(GuardedNode):
         super().__init__("arrivals", **kwargs)
         self._heard: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
         for topic, kind in HOPS.items():
-            self.create_subscription(kind, topic, self._noted(self._heard[topic]), EVERY, raw=True)
+            self.subscribe(kind, topic, self._noted(self._heard[topic]), EVERY, raw=True)
         if viewer:
             for topic, kind in EYE.items():
-                self.create_subscription(kind, topic, lambda _: None, EVERY, raw=True)
+                self.subscribe(kind, topic, lambda _: None, EVERY, raw=True)
 
     def heard(self, topic: str) -> Sequence[tuple[int, int]]:
         """Stamp and time of arrival of every message so far, ns."""

@@ -100,7 +100,7 @@ class RecordedTopic:
         return self._node.create_subscription(
             self._type,
             self.name,
-            self._receive_all,
+            self._node.guarded(self.name, self._receive_all),
             self._adopted,
             raw=True,
             event_callbacks=events,

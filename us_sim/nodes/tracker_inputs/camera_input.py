@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from us_sim.errors import TrackingError
+from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.scene.building import camera_body_of
 from us_sim.tracking.camera.encodings import decode_image, decompress_image
@@ -52,54 +53,45 @@ class CameraInput(TrackerInput):
         practice(self._body)
         self._source: CameraSource | None = None
         self._described: CameraInfo | None = None
-        device.listen_to_newest(CameraInfo, "camera/camera_info", self._describe)
+        device.subscribe(
+            CameraInfo, "camera/camera_info", self._on_description, FOREIGN, newest=True
+        )
         for message_type, topic, decode in (
             (Image, "camera/image_raw", grey_from),
             (CompressedImage, "camera/image_raw/compressed", grey_from_compressed),
         ):
-            device.listen_to_newest(message_type, topic, self._measuring(topic, decode))
+            callback = partial(self._on_image, topic, decode)
+            device.subscribe(message_type, topic, callback, FOREIGN, newest=True)
 
     def reset(self) -> None:
         """Forget where the probe was; the camera stays."""
         if self._source is not None:
             self._source.reset()
 
-    def _describe(self, message: CameraInfo) -> None:
-        if self._described is not None and _is_same(message, self._described):
-            return
-        self._described = message
-        try:
+    def _on_description(self, message: CameraInfo) -> None:
+        if self._described is None or not _is_same(message, self._described):
+            self._described, self._source = message, None
             self._source = CameraSource(camera_from(message), self._body, self._settings)
-        except TrackingError as error:
-            self._source = None
-            self._device.refuse("camera", f"camera/camera_info: {error}")
 
-    def _measuring(
-        self, topic: str, decode: Callable[[Any], NDArray[Any]]
-    ) -> Callable[[Image | CompressedImage], None]:
-        def measure(message: Image | CompressedImage) -> None:
-            if self._source is None:
-                if self._described is None:
-                    self._device.refuse(
-                        "camera",
-                        "no camera/camera_info has come, so no pose can be measured: calibrate the "
-                        "camera (us-sim calibrate camera) and give its driver the file",
-                    )
-                return
-            stamp = self._device.stamp_of(message.header, topic)
-            try:
-                measurement = self._source.measure(decode(message), stamp)
-            except TrackingError as error:
-                self._device.refuse("image", f"{topic}: {error}; it is not used")
-                return
-            if measurement is None:
-                self._device.refuse("markers", f"{topic}: {self._source.last_problem}")
-            else:
-                left_out = self._source.last_problem
-                self._device.health.values["markers"] = left_out or "all that are seen are used"
-                self._device.take(measurement)
-
-        return measure
+    def _on_image(
+        self, topic: str, decode: Callable[[Any], NDArray[Any]], message: Image | CompressedImage
+    ) -> None:
+        if self._source is None:
+            if self._described is None:
+                self._device.refuse(
+                    "camera",
+                    "no camera/camera_info has come, so no pose can be measured: calibrate the "
+                    "camera (us-sim calibrate camera) and give its driver the file",
+                )
+            return
+        stamp = self._device.stamp_of(message.header, topic)
+        measurement = self._source.measure(decode(message), stamp)
+        if measurement is None:
+            self._device.refuse("markers", f"{topic}: {self._source.last_problem}")
+            return
+        left_out = self._source.last_problem
+        self._device.health.values["markers"] = left_out or "all that are seen are used"
+        self._device.take(measurement)
 
 
 def _is_same(a: CameraInfo, b: CameraInfo) -> bool:

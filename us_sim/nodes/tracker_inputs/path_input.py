@@ -39,13 +39,13 @@ class PathInput(TrackerInput):
             )
         self._path = path_of(scene, Path(scene.tracker.file))
         if self._path.note:
-            device.warn(self._path.note)
+            device.get_logger().warning(self._path.note)
         # A recorder's clock may have been set back; what was recorded before is sent before.
         self._due = np.maximum.accumulate(self._path.log_times - self._path.log_times[0])
         self._next = 0
         self._begun = self._checks = 0
-        device.say("waiting for the simulation")
-        self._timer = device.every(CHECK_S, self._begin)
+        device.get_logger().info("waiting for the simulation")
+        self._timer = device.create_timer(CHECK_S, self._begin)
 
     def _begin(self) -> None:
         device = self._device
@@ -54,10 +54,12 @@ class PathInput(TrackerInput):
             return
         self._timer.cancel()
         self._begun = device.now()
-        device.say(f"playing {counted(len(self._path), 'pose')} of {self._path.topic}")
+        device.get_logger().info(
+            f"playing {counted(len(self._path), 'pose')} of {self._path.topic}"
+        )
         steps = np.diff(self._due)
         period = 0.5e-9 * float(np.median(steps)) if len(steps) else LONGEST_S
-        self._timer = device.every(float(np.clip(period, SHORTEST_S, LONGEST_S)), self._tick)
+        self._timer = device.create_timer(float(np.clip(period, SHORTEST_S, LONGEST_S)), self._tick)
 
     def _tick(self) -> None:
         """Hand on each pose whose time has come."""
@@ -67,7 +69,7 @@ class PathInput(TrackerInput):
             self._next += 1
         if self._next == len(self._path):
             self._timer.cancel()
-            self._device.say("the path is at its end")
+            self._device.get_logger().info("the path is at its end")
 
     def _send(self, stamp: int) -> None:
         self._device.health.received += 1

@@ -12,6 +12,7 @@ from std_msgs.msg import Bool, Header
 
 from us_sim.errors import PoseError, SceneError
 from us_sim.geometry.pose import Pose
+from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.tf import TFMessage, require_tf
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.recording.decoding import transform_from
@@ -33,15 +34,14 @@ class PoseInput(TrackerInput):
     def __init__(self, device: Device, settings: Any) -> None:
         super().__init__(device, settings)
         self._frame = device.scene.tracker.frame
-        device.listen_to_device(PoseStamped, "tracker/pose", self._take)
+        device.subscribe(PoseStamped, "tracker/pose", self.on_pose, FOREIGN)
 
-    def _take(self, message: PoseStamped) -> None:
+    def on_pose(self, message: PoseStamped) -> None:
+        """Hand on the measurement in a message."""
         of_probe = message.header.frame_id == PATIENT != self._frame
         frame = PATIENT if of_probe else self._frame
-        pose = self._device.pose_in(message, "tracker/pose", frame)
-        if pose is not None:
-            stamp = self._device.stamp_of(message.header, "tracker/pose")
-            self._device.take(Measurement(stamp, pose, of_probe=of_probe))
+        stamp, pose = self._device.measured(message, "tracker/pose", frame)
+        self._device.take(Measurement(stamp, pose, of_probe=of_probe))
 
 
 class PoseArrayInput(TrackerInput):
@@ -50,9 +50,9 @@ class PoseArrayInput(TrackerInput):
     def __init__(self, device: Device, settings: Any) -> None:
         super().__init__(device, settings)
         self._entry = device.scene.tracker.entry
-        device.listen_to_device(PoseArray, "tracker/poses", self._take)
+        device.subscribe(PoseArray, "tracker/poses", self._on_poses, FOREIGN)
 
-    def _take(self, message: PoseArray) -> None:
+    def _on_poses(self, message: PoseArray) -> None:
         if self._entry >= len(message.poses):
             self._device.refuse(
                 "entry",
@@ -61,10 +61,7 @@ class PoseArrayInput(TrackerInput):
             )
             return
         entry = PoseStamped(header=message.header, pose=message.poses[self._entry])
-        pose = self._device.pose_in(entry, "tracker/poses")
-        if pose is not None:
-            stamp = self._device.stamp_of(message.header, "tracker/poses")
-            self._device.take(Measurement(stamp, pose))
+        self._device.take(Measurement(*self._device.measured(entry, "tracker/poses")))
 
 
 class HapticInput(TrackerInput):
@@ -73,21 +70,18 @@ class HapticInput(TrackerInput):
     def __init__(self, device: Device, settings: HapticSettings) -> None:
         super().__init__(device, settings)
         self._handle = HapticDevice(settings)
-        device.listen_to_device(PoseStamped, "haptic/pose", self._take)
-        device.listen_to_device(Bool, "haptic/clutch", self._clutch)
+        device.subscribe(PoseStamped, "haptic/pose", self._on_pose, FOREIGN)
+        device.subscribe(Bool, "haptic/clutch", self._on_clutch, FOREIGN)
 
     def reset(self) -> None:
         """Forget the clutch."""
         self._handle.reset()
 
-    def _take(self, message: PoseStamped) -> None:
-        pose = self._device.pose_in(message, "haptic/pose")
-        if pose is None:
-            return
-        stamp = self._device.stamp_of(message.header, "haptic/pose")
+    def _on_pose(self, message: PoseStamped) -> None:
+        stamp, pose = self._device.measured(message, "haptic/pose")
         self._device.take(self._handle.take(pose, stamp))
 
-    def _clutch(self, message: Bool) -> None:
+    def _on_clutch(self, message: Bool) -> None:
         self._handle.clutch(message.data)
 
 
@@ -98,19 +92,19 @@ class SixDofMouseInput(TrackerInput):
         super().__init__(device, settings)
         self._mouse = SixDofMouse(settings)
         self._has_joy = False
-        device.listen_to_device(Joy, "spacenav/joy", self._take_joy)
-        device.listen_to_device(Twist, "spacenav/twist", self._take_twist)
+        device.subscribe(Joy, "spacenav/joy", self._on_joy, FOREIGN)
+        device.subscribe(Twist, "spacenav/twist", self._on_twist, FOREIGN)
 
     def reset(self) -> None:
         """Bring the probe home."""
         self._mouse.reset()
 
-    def _take_joy(self, message: Joy) -> None:
+    def _on_joy(self, message: Joy) -> None:
         self._has_joy = True
         stamp = self._device.stamp_of(message.header, "spacenav/joy")
         self._take(list(message.axes), list(message.buttons), stamp, "spacenav/joy")
 
-    def _take_twist(self, message: Twist) -> None:
+    def _on_twist(self, message: Twist) -> None:
         """The same deflections without buttons; a driver that sends both is heard once."""
         if self._has_joy:
             return
@@ -156,14 +150,14 @@ class TfInput(TrackerInput):
             )
         self._frame, self._body = tracker.frame, tracker.body
         self._chain = FrameChain(self._body, self._frame)
-        device.listen_to_device(TFMessage, "tf", self._take, MOVING)
-        device.listen(TFMessage, "tf_static", self._take_static, STATIC)
+        device.subscribe(TFMessage, "tf", self._on_tf, MOVING)
+        device.subscribe(TFMessage, "tf_static", self._on_static, STATIC)
 
     def reset(self) -> None:
         """Forget what moved; what is fixed is told once."""
         self._chain.restart()
 
-    def _take_static(self, message: TFMessage) -> None:
+    def _on_static(self, message: TFMessage) -> None:
         """Keep static transforms; a chain of these alone makes no poses."""
         for child, parent, pose, _ in self._transforms(message):
             self._chain.fix(child, parent, pose)
@@ -184,7 +178,7 @@ class TfInput(TrackerInput):
             except PoseError as error:
                 self._device.refuse("pose", f"tf from {parent} to {child}: {error}; it is not used")
 
-    def _take(self, message: TFMessage) -> None:
+    def _on_tf(self, message: TFMessage) -> None:
         for child, parent, pose, header in self._transforms(message):
             stamp = self._device.stamp_of(header, "tf")
             made = self._chain.move(child, parent, stamp, pose)
