@@ -11,12 +11,12 @@ import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
 from numpy.typing import NDArray
 from rclpy.task import Future
-from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.messages import bgr_image_message, image_message
+from us_sim.nodes.mailbox import Mailbox
+from us_sim.nodes.messages import bgr_image_message, image_message, stamp_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited
@@ -59,10 +59,8 @@ class CameraDriver(GuardedNode):
                 "images without a calibration: no pose can be measured in them; make one with "
                 "us-sim calibrate camera and name it with the parameter camera_info"
             )
-        self._lock = threading.Lock()
-        self._newest: tuple[int, NDArray[np.uint8]] | None = None
-        self._problem = ""
-        self._state = "opening"
+        self.health.state = "opening"
+        self._taken = Mailbox(self, self._publish, "camera")
         self._ended = False
         self._closing = threading.Event()
         if self._video.is_file and not self._video.open():
@@ -102,16 +100,16 @@ class CameraDriver(GuardedNode):
                         break
             self._video.close()
             if not self._closing.is_set():
-                self._tell(
-                    "no camera",
+                problem = (
                     f"camera {self._video.name} gives no images: see that it is there and that "
-                    f"nothing else uses it, or set the parameter source; it is tried again",
+                    f"nothing else uses it, or set the parameter source; it is tried again"
                 )
+                self.call_soon(partial(self._miss, problem))
                 self._closing.wait(RETRY_S)
 
     def _play(self) -> None:
         """A file, as fast as it was recorded."""
-        self._tell("waiting for a subscriber")
+        self.health.state = "waiting for a subscriber"
         while not self._awaited.has_come():
             if self._closing.wait(CHECK_S):
                 return
@@ -134,7 +132,7 @@ class CameraDriver(GuardedNode):
                 continue
             number += 1
         self._ended = True
-        self.call_soon(self._work)
+        self.call_soon(self._end)
 
     def _keep(self, taken: int) -> bool:
         """Decode the newest image, for the node's thread to publish.
@@ -146,39 +144,23 @@ class CameraDriver(GuardedNode):
         pixels = self._video.pixels(grey=self._grey)
         if pixels is None:
             return False
-        with self._lock:
-            self.health.received += 1
-            self.health.dropped += self._newest is not None
-            self._newest = stamp, pixels
-            self._state = "publishing"
-        self.call_soon(self._work)
+        self._taken.put((stamp, pixels))
         return True
-
-    def _tell(self, state: str, problem: str = "") -> None:
-        with self._lock:
-            self._state, self._problem = state, problem
-        self.call_soon(self._work)
 
     # In the node's thread.
 
-    def _work(self) -> None:
-        with self._lock:
-            newest, self._newest = self._newest, None
-            problem, self._problem = self._problem, ""
-            self.health.state = self._state
-        if problem:
-            self.health.problem("camera", problem)
-            self.health.fault = problem
-        if newest is not None:
-            self.health.fault = ""
-            self._publish(*newest)
-        if self._ended and not self.finished.done():
-            self.health.state = "finished"
-            self.get_logger().info("the video is at its end")
-            self.finished.set_result(None)
+    def _miss(self, problem: str) -> None:
+        self.health.state, self.health.fault = "no camera", problem
+        self.health.problem("camera", problem)
 
-    def _publish(self, nanoseconds: int, pixels: NDArray[np.uint8]) -> None:
-        stamp = Time(nanoseconds=max(nanoseconds, 0)).to_msg()
+    def _end(self) -> None:
+        self.health.state = "finished"
+        self.get_logger().info("the video is at its end")
+        self.finished.set_result(None)
+
+    def _publish(self, taken: tuple[int, NDArray[np.uint8]]) -> None:
+        self.health.state, self.health.fault = "publishing", ""
+        stamp, pixels = stamp_message(taken[0]), taken[1]
         rows, columns = pixels.shape[:2]
         camera = self._camera
         if camera is not None and (columns, rows) != (camera.width, camera.height):

@@ -10,7 +10,7 @@ import posixpath
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import get_args
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.topics import TOPICS
@@ -580,36 +580,35 @@ def checked_parameters(
         for name in rules_of(settings):
             if not of_probe or is_live(settings, name):
                 known.setdefault(prefix + name, (settings, name))
-    return {
-        name: value if known.get(name) is None else _checked(node, name, value, *known[name])
-        for name, value in ((n, _plain(node, n, t, known)) for n, t in given.items())
-    }
+    return {name: _checked(f"--param {node}.{name}", name, given[name], known) for name in given}
 
 
-def _plain(node: str, name: str, text: str, known: Mapping[str, Any]) -> object:
+def _checked(
+    option: str, name: str, text: str, known: Mapping[str, tuple[type[Settings], str]]
+) -> object:
     if name not in known and not name.startswith(_ROS_OWN):
         if len(known) <= _MOST_LISTED or nearest(name, known):
-            raise UsSimError(f"--param {node}.{name}: {unknown(name, known)}")
+            raise UsSimError(f"{option}: {unknown(name, known)}")
+        node = option.split()[-1].partition(".")[0]
         raise UsSimError(
-            f"--param {node}.{name}: is none of its {len(known)} parameters; "
-            f"`us-sim reference {node}` lists them"
+            f"{option}: is none of its {len(known)} parameters; `us-sim reference {node}` lists "
+            f"them"
         )
     try:
-        return load_yaml(text)
+        value = load_yaml(text)
     except YamlError as error:
         what = re.sub("^line [0-9]+: ", "", str(error))
-        raise UsSimError(f"--param {node}.{name}={text[:80]}: {what}") from error
-
-
-def _checked(node: str, name: str, value: object, settings: type[Settings], field: str) -> object:
+        raise UsSimError(f"{option}={text[:80]}: {what}") from error
+    if name not in known:
+        return value
+    settings, field = known[name]
     rule, kind = rules_of(settings)[field], kinds_of(settings)[field]
     if kind is str and isinstance(value, int | float):
         value = str(value)  # a camera's number, say
-    nothing = {int: 0, float: 0.0}
     if type(None) in get_args(kind) and value in (None, 0, ""):
-        return next(nothing.get(each, "") for each in get_args(kind))
+        return next({int: 0, float: 0.0}.get(each, "") for each in get_args(kind))
     try:
         made = convert(kind, value, rule)
     except (Refusal, SettingsError) as refusal:
-        raise UsSimError(f"--param {node}.{name}: {refusal}") from refusal
+        raise UsSimError(f"{option}: {refusal}") from refusal
     return list(made) if isinstance(made, tuple) else made

@@ -7,11 +7,12 @@ import threading
 from functools import partial
 from typing import Any
 
-from rclpy.time import Time
 from sensor_msgs.msg import Joy
 
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
+from us_sim.nodes.mailbox import Mailbox
+from us_sim.nodes.messages import stamp_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.settings import SpaceMouseDriverSettings
@@ -35,9 +36,7 @@ class SpaceMouseDriver(GuardedNode):
         self.health = Health(self, "SpaceMouse")
         self.health.state = "opening"
         self._joys = self.stream(Joy, "spacenav/joy")
-        self._lock = threading.Lock()
-        self._newest: tuple[int, list[float], list[int]] | None = None
-        self._problem, self._name = "", ""
+        self._moved = Mailbox(self, self._publish, "SpaceMouse")
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="space mouse", daemon=True)
         self._thread.start()
@@ -57,9 +56,7 @@ class SpaceMouseDriver(GuardedNode):
                 finally:
                     mouse.close()
             except TrackingError as error:
-                with self._lock:
-                    self._problem = f"{error}; it is tried again"
-                self.call_soon(self._work)
+                self.call_soon(partial(self._miss, f"{error}; it is tried again"))
                 self._closing.wait(RETRY_S)
             except Exception as error:  # so that the thread does not end silently
                 self.failed("SpaceMouse", error)
@@ -69,26 +66,22 @@ class SpaceMouseDriver(GuardedNode):
         while not self._closing.is_set():
             mouse.wait(self._patience)
             now = self.get_clock().now().nanoseconds
-            with self._lock:
-                self._name = mouse.name
-                self._newest = now, mouse.axes, mouse.buttons
-            self.call_soon(self._work)
+            self._moved.put((now, mouse.name, mouse.axes, mouse.buttons))
 
-    def _work(self) -> None:
-        with self._lock:
-            newest, self._newest = self._newest, None
-            problem, self._problem = self._problem, ""
-        if newest is not None:
-            stamp, axes, buttons = newest
-            message = Joy(axes=axes, buttons=buttons)
-            message.header.stamp = Time(nanoseconds=stamp).to_msg()
-            message.header.frame_id = self._frame
-            self._joys.publish(message)
-            self.health.published("spacenav/joy", message.header.stamp)
-            self.health.state, self.health.fault = self._name, ""
-        if problem:
-            self.health.state, self.health.fault = "no device", problem
-            self.health.problem("device", problem)
+    # In the node's thread.
+
+    def _publish(self, moved: tuple[int, str, list[float], list[int]]) -> None:
+        stamp, self.health.state, axes, buttons = moved
+        self.health.fault = ""
+        message = Joy(axes=axes, buttons=buttons)
+        message.header.stamp = stamp_message(stamp)
+        message.header.frame_id = self._frame
+        self._joys.publish(message)
+        self.health.published("spacenav/joy", message.header.stamp)
+
+    def _miss(self, problem: str) -> None:
+        self.health.state, self.health.fault = "no device", problem
+        self.health.problem("device", problem)
 
 
 main = partial(run_node, SpaceMouseDriver)
