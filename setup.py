@@ -95,7 +95,6 @@ setup(
         "zstandard>=0.22",
     ],
     extras_require={
-        "conforming": ["fast-simplification>=0.1.7", "pytetwild>=0.4,<0.5"],
         "dicom": [
             "pillow>=10",
             "pydicom>=3.0",
@@ -128,7 +127,6 @@ setup(
             "pytest>=7.4",
             "pytest-timeout>=2.2",
             "pytest-xdist>=3.6",
-            "pytetwild>=0.4,<0.5",
             "python-gdcm>=3.0.20",
             "ruff>=0.12",
             "scikit-fem>=10",

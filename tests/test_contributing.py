@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 
 from us_sim.command.main import main
-from us_sim.evaluation.independent_residual import SpringSettings
+from us_sim.evaluation.independent_residual import MsdsSettings
 from us_sim.evaluation.tissue_methods import TissueMethod
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.tissue_deformer import TissueDeformer
@@ -101,7 +101,7 @@ def test_the_solvers_equations_hold_and_its_entry_can_be_made():
     method = eval(entry, known)
     for setting in method.settings:
         solver = create_solver(method.name, TissueModel.block(nodes=(21, 21, 6)), **setting)
-        check = method.residual(solver.model, SpringSettings())
+        check = method.residual(solver.model, MsdsSettings())
         for depth in (0.004, 0.008):
             pose = Pose(position=[0.003, 0.0, depth])
             deformation = solver.deform(pose)

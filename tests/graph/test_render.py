@@ -149,7 +149,7 @@ def test_a_live_session_gives_an_image_for_every_pose_that_came(demo, tmp_path):
 
 def test_a_parameter_that_is_given_counts(first, tmp_path, capsys):
     out = tmp_path / "other"
-    options = ["--param", "tissue_deformer.solver=msds_implicit", "--out", out]
+    options = ["--param", "tissue_deformer.solver=msds", "--out", out]
     result = us_sim("render", "--session", first / "session.mcap", *options)
     assert result.returncode == 0, result.stderr
     one, other = payloads(first), payloads(out)

@@ -3,9 +3,12 @@
 A scene's flows: blood in its vessels, and a sentence for what cannot flow.
 """
 
+import shutil
+
 import numpy as np
 import pytest
 import yaml
+from old_gmsh import as_vtu
 
 from us_sim.errors import MeshError, SceneError
 from us_sim.scene.building import (
@@ -30,7 +33,7 @@ DOCUMENT = {
     "tissue": {
         # 35.6 long, 7.6 across: laid into the arm, across the middle of the block.
         "mesh": {
-            "file": "truthcylinder1.msh",
+            "file": "truthcylinder1.vtu",
             "unit": "1.5 mm",
             "pose": {"position": [0, "15 mm", "20 mm"]},
             "margin": "3 mm",
@@ -46,8 +49,16 @@ DOCUMENT = {
 
 
 @pytest.fixture(scope="module")
-def organ(shared_data):
-    return parse_scene(DOCUMENT, folders=[shared_data / "meshes-sofa"])
+def folder(shared_data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("organs")
+    as_vtu(shared_data / "meshes-sofa" / "truthcylinder1.msh", folder)
+    shutil.copy(shared_data / "meshes-sofa" / "liver.vtk", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def organ(folder):
+    return parse_scene(DOCUMENT, folders=[folder])
 
 
 def test_a_mesh_from_a_file_takes_the_place_of_the_box(organ):
@@ -121,15 +132,13 @@ def test_labels_that_are_not_there_are_named(organ):
         require_labels(unknown, volume)
 
 
-def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, shared_data):
+def test_a_mesh_in_the_wrong_unit_or_of_a_surface_is_refused(organ, folder):
     def scene(mesh):
-        return parse_scene(
-            DOCUMENT | {"tissue": DOCUMENT["tissue"] | {"mesh": mesh}},
-            folders=[shared_data / "meshes-sofa"],
-        )
+        tissue = DOCUMENT["tissue"] | {"mesh": mesh}
+        return parse_scene(DOCUMENT | {"tissue": tissue}, folders=[folder])
 
-    with pytest.raises(MeshError, match=r"truthcylinder1\.msh: .*35\.6 m"):
-        tissue_model_of(scene({"file": "truthcylinder1.msh"}), volume_of(organ))
+    with pytest.raises(MeshError, match=r"truthcylinder1\.vtu: .*35\.6 m"):
+        tissue_model_of(scene({"file": "truthcylinder1.vtu"}), volume_of(organ))
     with pytest.raises(MeshError, match=r"liver\.vtk: .*tetrahedral"):
         tissue_model_of(scene({"file": "liver.vtk"}), volume_of(organ))
 

@@ -12,8 +12,9 @@ from us_sim.scene.reading import check_files, load_scene, parse_scene
 from us_sim.share import shared_path
 from us_sim.tracking.calibration.transform_file import write_transform
 
-TETRAHEDRON = "$NOD\n4\n1 0 0 0\n2 50 0 0\n3 0 50 0\n4 0 0 50\n$ENDNOD\n"
-TETRAHEDRON += "$ELM\n1\n1 4 1 1 4 1 2 3 4\n$ENDELM\n"
+TETRAHEDRON = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
+TETRAHEDRON += "$Nodes\n4\n1 0 0 0\n2 50 0 0\n3 0 50 0\n4 0 0 50\n$EndNodes\n"
+TETRAHEDRON += "$Elements\n1\n1 4 2 0 1 1 2 3 4\n$EndElements\n"
 
 
 @pytest.fixture

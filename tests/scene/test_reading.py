@@ -256,8 +256,9 @@ def test_another_kind_of_probe_does_not_inherit_the_dimensions_of_the_base_s(tmp
     assert collider_of(scene) == Sphere(0.03)
 
 
-TETRAHEDRON = "$NOD\n4\n1 0 0 0\n2 90 0 0\n3 0 90 0\n4 0 0 90\n$ENDNOD\n"
-TETRAHEDRON += "$ELM\n1\n1 4 1 1 4 1 2 3 4\n$ENDELM\n"
+TETRAHEDRON = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
+TETRAHEDRON += "$Nodes\n4\n1 0 0 0\n2 90 0 0\n3 0 90 0\n4 0 0 90\n$EndNodes\n"
+TETRAHEDRON += "$Elements\n1\n1 4 2 0 1 1 2 3 4\n$EndElements\n"
 
 
 def based_on(base, says, folder):

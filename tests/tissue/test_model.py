@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from old_gmsh import as_vtu
 from tissue_block import SOFT, block, block_mesh
 
 from us_sim.errors import MeshError
@@ -36,8 +37,8 @@ def test_faces_are_the_planes_they_are_named_after(face, axis, value):
     assert nodes.dtype == np.int32
 
 
-def test_faces_of_an_organ_are_its_boundary_near_its_bounding_box(shared_data):
-    organ, _ = read_mesh(shared_data / "meshes-sofa" / "liver2.msh", metres_per_unit=0.03)
+def test_faces_of_an_organ_are_its_boundary_near_its_bounding_box(shared_data, tmp_path):
+    organ, _ = read_mesh(as_vtu(shared_data / "meshes-sofa" / "liver2.msh", tmp_path), 0.03)
     low, high = organ.nodes.min(axis=0), organ.nodes.max(axis=0)
     bottom = face_nodes(organ, "bottom")
     deepest = organ.nodes[organ.boundary].reshape(-1, 3)[:, 2] > high[2] - 0.05 * (high - low)[2]
@@ -46,8 +47,9 @@ def test_faces_of_an_organ_are_its_boundary_near_its_bounding_box(shared_data):
     assert len(face_nodes(organ, "bottom", margin=1e-9)) == 1
 
 
-def test_what_looks_at_the_probe_is_the_near_half_of_an_organ(shared_data):
-    cylinder, _ = read_mesh(shared_data / "meshes-sofa" / "truthcylinder1.msh", 1e-3)
+def test_what_looks_at_the_probe_is_the_near_half_of_an_organ(shared_data, tmp_path):
+    file = as_vtu(shared_data / "meshes-sofa" / "truthcylinder1.msh", tmp_path)
+    cylinder, _ = read_mesh(file, 1e-3)
     x, _, z = (cylinder.nodes - cylinder.nodes.mean(axis=0))[facing_nodes(cylinder)].T
     radius = np.ptp(cylinder.nodes[:, 2]) / 2
     # Its axis is y: what looks at the probe is the half of the mantle with z < 0.

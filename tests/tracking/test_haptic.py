@@ -129,10 +129,9 @@ def test_a_secant_is_the_springs_along_the_push():
     np.testing.assert_array_equal(at(0.001, 0.0), 0.0)
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("fem_cg", 0.1), ("msds_implicit", 0.2)])
-def test_secants_come_near_the_tangent_of_solvers_that_know_none(name, tolerance):
+def test_secants_come_near_the_tangent_of_a_solver_that_knows_none():
     """Of the push when pressed deeper, against a difference of the settled wrenches."""
-    solver, secant = create_solver(name, block()), SecantStiffness()
+    solver, secant = create_solver("fem_cg", block()), SecantStiffness()
 
     def settled(depth, frames):
         for _ in range(frames):
@@ -143,7 +142,7 @@ def test_secants_come_near_the_tangent_of_solvers_that_know_none(name, tolerance
         found = secant.at(Pose([0.0, 0.0, depth]), settled(depth, 20))
     measured = (settled(0.0095, 60) - settled(0.0105, 60))[2] / 0.001
     assert measured > 200  # N/m
-    assert found[2, 2] == pytest.approx(measured, rel=tolerance)
+    assert found[2, 2] == pytest.approx(measured, rel=0.1)
 
 
 def test_a_solver_that_swings_makes_no_absurd_stiffness():

@@ -5,7 +5,7 @@ omissions of a solver show; directions of the probe's contact forces are written
 
 >>> from us_sim.evaluation.independent_forces import hooke_forces
 >>> from us_sim.geometry.collider import RoundedBox, Sphere
->>> solid_residual(hooke_forces)(TissueModel.block(), SpringSettings()).is_least
+>>> solid_residual(hooke_forces)(TissueModel.block(), MsdsSettings()).is_least
 False
 >>> contact_directions(Sphere(0.03), Pose(), np.array([[0.0, 0.0, 0.0]]), 0.005)
 array([[0., 0., 1.]])
@@ -41,7 +41,7 @@ _PARTS = 12  # parts of a triangle's sides, between which places of contact are 
 
 
 @dataclass(frozen=True)
-class SpringSettings:
+class MsdsSettings:
     """Settings of methods with springs, by their names."""
 
     stiffness: str = "algorithm_1"
@@ -178,7 +178,7 @@ class IndependentResidual:
         return contact
 
 
-Residual = Callable[[TissueModel, SpringSettings], IndependentResidual]
+Residual = Callable[[TissueModel, MsdsSettings], IndependentResidual]
 """Makes the independent residual of one method on a model."""
 
 
@@ -190,7 +190,7 @@ def solid_residual(
     ``surface`` says whether its surface is pushed, or its nodes, as for `IndependentResidual`.
     """
 
-    def residual(model: TissueModel, _: SpringSettings) -> IndependentResidual:
+    def residual(model: TissueModel, _: MsdsSettings) -> IndependentResidual:
         mesh, materials = model.mesh, model.materials
         shear = materials.young_modulus / (2 * (1 + materials.poisson_ratio))
         stiffest = shear / (1 - 2 * materials.poisson_ratio) + shear
@@ -204,30 +204,24 @@ def solid_residual(
     return residual
 
 
-def spring_residual(*, yielding: bool) -> Residual:
-    """For a method of springs, whose volume term yields as `volume_forces` says, or does not."""
+def spring_residual(model: TissueModel, settings: MsdsSettings) -> IndependentResidual:
+    """For `msds`, whose volume term yields as `volume_forces` says."""
+    mesh, materials = model.mesh, model.materials
+    made = springs_of if settings.stiffness == "algorithm_1" else fitted_springs
+    springs = made(mesh, materials)
+    term = volume_term(mesh, materials, springs) if settings.volume else None
 
-    def residual(model: TissueModel, settings: SpringSettings) -> IndependentResidual:
-        mesh, materials = model.mesh, model.materials
-        made = springs_of if settings.stiffness == "algorithm_1" else fitted_springs
-        springs = made(mesh, materials)
-        term = volume_term(mesh, materials, springs) if settings.volume else None
-
-        def forces(displacement: Array) -> Array:
-            force = spring_forces(springs.edges, springs.stiffness, mesh.nodes, displacement)
-            if term is not None:
-                force += volume_forces(
-                    mesh, term.element, term.nodal, displacement, yielding=yielding
-                )
-            return force
-
-        digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
-        rounding = 4 * digit * float(np.linalg.norm(springs.stiffness))
+    def forces(displacement: Array) -> Array:
+        force = spring_forces(springs.edges, springs.stiffness, mesh.nodes, displacement)
         if term is not None:
-            rounding += rounding_of_forces(mesh, term.element + term.nodal)
-        return IndependentResidual(model, forces, rounding)
+            force += volume_forces(mesh, term.element, term.nodal, displacement, yielding=True)
+        return force
 
-    return residual
+    digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
+    rounding = 4 * digit * float(np.linalg.norm(springs.stiffness))
+    if term is not None:
+        rounding += rounding_of_forces(mesh, term.element + term.nodal)
+    return IndependentResidual(model, forces, rounding)
 
 
 def _touchable(model: TissueModel) -> NDArray[np.integer]:

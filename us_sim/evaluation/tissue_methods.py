@@ -99,7 +99,7 @@ _ALL = (
         "msds",
         colour="#009E73",
         mark="^",
-        residual=spring_residual(yielding=True),
+        residual=spring_residual,
         patient={"steps": 100, "rest_tolerance": 1e-8},
         tried=(
             {"steps": 5},
@@ -111,22 +111,6 @@ _ALL = (
         has_springs=True,
         is_quasi_static=False,
         is_explicit=True,
-        families=_OF_SPRINGS,
-    ),
-    TissueMethod(
-        "msds_implicit",
-        colour="#CC79A7",
-        mark="v",
-        residual=spring_residual(yielding=False),
-        patient={"iterations": 50, "tolerance": 1e-8, "rest_tolerance": 1e-8},
-        tried=(
-            {"iterations": 1},
-            {"iterations": 10},
-            {"iterations": 30},
-            {"stiffness": "algorithm_1", "volume": False},
-        ),
-        has_springs=True,
-        is_quasi_static=False,
         families=_OF_SPRINGS,
     ),
 )

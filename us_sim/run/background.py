@@ -99,7 +99,7 @@ def make_scene(name: str, volume: str = "") -> None:
         text = f"making {scene.volume.name}" if scene.volume.phantom else "reading the volume"
         _tell(fraction=0.0, text=text)
         read = volume_of(scene, _telling(text))
-        keep_tissue(scene, read, _telling("making the tissue"))
+        keep_tissue(scene, read)
     except UsSimError as error:
         _tell(refused=str(error))
     except MemoryError:

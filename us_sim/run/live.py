@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
-from us_sim.progress import Progress, late_progress
+from us_sim.progress import Progress
 from us_sim.run.losses import IMAGES, Outcome
 from us_sim.run.monitored import Monitored, alone_on_domain, domain
 from us_sim.run.plan import (
@@ -424,7 +424,7 @@ def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = N
         if scene.volume.case is not None:
             from us_sim.scene.case_tissue import keep_tissue
 
-            keep_tissue(scene, volume, late_progress("making the tissue"))
+            keep_tissue(scene, volume)
     finally:
         for shown in bar:
             shown.__exit__()

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -113,10 +112,11 @@ def _mesh(case: Case, probe: ProbeSettings, pose: Placement) -> dict[str, Any]:
     cut[0, 2] = 0.0
     thin = cut[1] - cut[0] < _THINNEST
     box = np.where(thin, box, cut)
-    document: dict[str, Any] = {"lower": _rounded(box[0]), "upper": _rounded(box[1])}
-    if case.settings.mesh != "grid":
-        document["kind"] = case.settings.mesh
-    return document | {"nodes": case.settings.nodes}
+    return {
+        "lower": _rounded(box[0]),
+        "upper": _rounded(box[1]),
+        "nodes": case.settings.nodes,
+    }
 
 
 def _rounded(corner: NDArray[np.float64]) -> list[float]:
@@ -192,13 +192,8 @@ def kept_tissue(scene: Scene) -> CaseTissue | None:
     return kept if kept.made_from == _made_from(scene) else None
 
 
-def keep_tissue(
-    scene: Scene, volume: Volume, progress: Callable[[float, str], None] | None = None
-) -> None:
+def keep_tissue(scene: Scene, volume: Volume) -> None:
     """Make the tissue and keep it in the scene's case, unless it is there or cannot be kept.
-
-    Args:
-        progress: called with the fraction done and what is being done.
 
     Raises:
         MeshError: no mesh can be made.
@@ -206,26 +201,19 @@ def keep_tissue(
     if scene.volume.case is None or not _is_fitted(scene) or kept_tissue(scene) is not None:
         return
     try:
-        write_tissue(Path(scene.volume.case) / TISSUE, box_tissue(scene, volume, progress))
+        write_tissue(Path(scene.volume.case) / TISSUE, box_tissue(scene, volume))
     except CaseError as error:
         _logger.warning("%s; it is made in every run", error)
 
 
-def box_tissue(
-    scene: Scene, volume: Volume, progress: Callable[[float, str], None] | None = None
-) -> CaseTissue:
+def box_tissue(scene: Scene, volume: Volume) -> CaseTissue:
     """The box of a scene whose nodes are put where they count, and the labels in it.
 
     Raises:
-        MeshError: no mesh can be made of so few nodes, or by fTetWild.
+        MeshError: no mesh can be made of so few nodes.
     """
     assert scene.tissue is not None
     made_from = _made_from(scene) if scene.volume.case is not None else {}
-    if scene.tissue.mesh.kind == "conforming":
-        from us_sim.scene.conforming_tissue import conforming_tissue
-
-        mesh, fractions_by_label = conforming_tissue(scene, volume, progress)
-        return CaseTissue(mesh, *fractions_by_label, made_from)
     mesh = box_mesh(*box_planes(scene, volume))
     if volume.labels is None:
         labels, fractions = np.zeros(1, np.uint8), np.ones((len(mesh.tetrahedra), 1))
@@ -251,8 +239,7 @@ def _made_from(scene: Scene) -> dict[str, Any]:
     if (folder / LABELS).is_file():
         with (folder / LABELS).open("rb") as stream:
             checksum = hashlib.file_digest(stream, "sha256").hexdigest()
-    kind = {} if mesh.kind == "grid" else {"kind": mesh.kind}
-    return kind | {
+    return {
         "lower": list(mesh.lower or ()),
         "upper": list(mesh.upper or ()),
         "nodes": mesh.nodes,

@@ -24,7 +24,6 @@ SOLVERS = Choice(
     fem_nonlinear="us_sim.tissue.solvers.fem_nonlinear:FemNonlinear",
     fem_cg="us_sim.tissue.solvers.fem_cg:FemCg",
     msds="us_sim.tissue.solvers.msds:Msds",
-    msds_implicit="us_sim.tissue.solvers.msds_implicit:MsdsImplicit",
 )
 
 SLICERS = Choice(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from old_gmsh import as_vtu
 from sphere_surface import sphere
 from tissue_block import block_mesh
 
@@ -132,8 +133,8 @@ def test_points_made_inside_real_tetrahedra_are_found_in_them(shared_data):
     np.testing.assert_allclose(where.weights, weights, atol=1e-9)
 
 
-def test_outside_an_organ_it_is_the_nearest_tetrahedron(shared_data):
-    mesh, _ = read_mesh(shared_data / "meshes-sofa" / "liver2.msh", 0.01)
+def test_outside_an_organ_it_is_the_nearest_tetrahedron(shared_data, tmp_path):
+    mesh, _ = read_mesh(as_vtu(shared_data / "meshes-sofa" / "liver2.msh", tmp_path), 0.01)
     a, b, c = np.moveaxis(mesh.nodes[mesh.boundary], 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1)[:, None]

@@ -97,7 +97,7 @@ def cases(quick: bool) -> list[Case]:
         replace(base, image=(768, 768)),
         *(replace(base, placed=placed) for placed in PLACED[1:]),
         replace(base, busy=True),
-        *(replace(base, solver=solver) for solver in ("fem_cg", "msds", "msds_implicit")),
+        *(replace(base, solver=solver) for solver in ("fem_cg", "msds")),
         DEMO,
         replace(DEMO, viewer=True),
         *_beside(DEMO),

@@ -36,7 +36,6 @@ from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.tissue.model import TissueModel
 from us_sim.tissue.solvers.msds import MsdsSettings, spring_tissue
-from us_sim.tissue.solvers.msds_implicit import MsdsImplicitSettings
 from us_sim.tissue.solvers.newton import Newton
 
 Array = NDArray[np.float64]
@@ -137,13 +136,13 @@ class PrescribedBox:
         return newton.displacement.T.copy()
 
     def springs(self, ratio: float, softening: float = 0.0, *, volume: bool = False) -> Array:
-        """(N, 3) m, equilibrium of springs: those of `msds`, or with volume of `msds_implicit`.
+        """(N, 3) m, equilibrium of springs: those of `msds`, or fitted ones with volume.
 
         The other arguments are those of `nonlinear`, and its error.
         """
         nodes, still = self.mesh.nodes, np.zeros_like(self.faces)
-        chosen = MsdsImplicitSettings() if volume else MsdsSettings()
-        springs, term = spring_tissue(self._model(ratio, softening), chosen)
+        chosen = MsdsSettings(stiffness="fitted", volume=True) if volume else MsdsSettings()
+        springs, term = spring_tissue(self._model(ratio, softening), chosen, yielding=False)
         free = np.repeat(~self.fixed, 3)
 
         def residual(field: Array) -> Array:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.independent_residual import IndependentResidual, SpringSettings
+from us_sim.evaluation.independent_residual import IndependentResidual, MsdsSettings
 from us_sim.evaluation.report import Row
 from us_sim.evaluation.stability.cases import (
     LIFTED,
@@ -275,10 +275,10 @@ def equations_of(method: str, case: StabilityCase, model: TissueModel) -> Indepe
     return TISSUE_METHODS[method].residual(model, spring_settings(case))
 
 
-def spring_settings(case: StabilityCase) -> SpringSettings:
+def spring_settings(case: StabilityCase) -> MsdsSettings:
     """Settings of methods with springs for a case's ``springs``."""
     stiffness = "algorithm_1" if case.springs == "algorithm_1" else "fitted"
-    return SpringSettings(stiffness, volume=case.springs == "fitted with volume")
+    return MsdsSettings(stiffness, volume=case.springs == "fitted with volume")
 
 
 def _settings(method: str, case: StabilityCase, model: TissueModel) -> dict[str, Any]:

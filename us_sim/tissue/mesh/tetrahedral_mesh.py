@@ -27,7 +27,6 @@ from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
 
 # Boxes of cells between planes, and boxes of tetrahedra whose faces follow the structures.
-KINDS = ("grid", "conforming")
 _LEAST_NODES = 64
 _MOST_ALONG = 400
 
@@ -39,7 +38,7 @@ class MeshSettings(Settings):
     section = "mesh"
     error = MeshError
     alternatives = MappingProxyType(
-        {"file": ("unit", "pose", "margin"), "lower": ("upper", "nodes", "planes", "kind")}
+        {"file": ("unit", "pose", "margin"), "lower": ("upper", "nodes", "planes")}
     )
 
     lower: tuple[float, float, float] | None = setting(
@@ -59,12 +58,6 @@ class MeshSettings(Settings):
         "coordinates of the box's nodes along x, y or z one by one, to put them where they count",
         default_factory=dict,
     )
-    kind: str = setting(
-        description="of the box: cells between planes, or tetrahedra whose faces follow the "
-        "structures' surfaces, which needs the extra `conforming` and one number of `nodes`",
-        choices=KINDS,
-        default="grid",
-    )
     file: str | None = setting(
         description="mesh in place of the box: Gmsh, VTK, or what else meshio reads",
         default=None,
@@ -83,8 +76,7 @@ class MeshSettings(Settings):
 
     def check(self) -> None:
         """A file, or a box whose corners and planes go together."""
-        box: dict[str, object] = {"lower": self.lower, "upper": self.upper}
-        box |= {"planes": self.planes or None, "kind": self.kind if self.kind != "grid" else None}
+        box = {"lower": self.lower, "upper": self.upper, "planes": self.planes or None}
         if self.file is not None:
             for key, value in box.items():
                 if value is not None:
@@ -97,11 +89,6 @@ class MeshSettings(Settings):
             )
         if self.unit != 1.0 or self.pose != Placement() or self.margin is not None:
             raise self.refused("", "`unit`, `pose` and `margin` are for a mesh from a `file` only")
-        if self.kind != "grid" and not isinstance(self.nodes, int):
-            raise self.refused(
-                "nodes",
-                f"must be one number, how many there are at most, where kind is {self.kind}",
-            )
         if isinstance(self.nodes, int):
             if self.planes:
                 raise self.refused(

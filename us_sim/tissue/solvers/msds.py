@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,35 +48,27 @@ _NEARLY_RESTING = 1e-4
 """Distance from its rest state up to which a released, settled tissue is put to rest, m."""
 
 
-def spring_stiffness(default: str) -> Any:
-    """The setting of the springs' stiffness."""
-    return setting(
-        choices=("algorithm_1", "fitted"),
-        default=default,
-        description="how springs get their stiffness: algorithm_1 is the paper's; fitted fits them "
-        "to the elasticity of the same mesh, and needs no stiffness_factor",
-    )
-
-
-def spring_volume(default: bool) -> Any:
-    """The setting of the tetrahedra's resistance."""
-    return setting(
-        default=default,
-        description="whether tetrahedra resist changes of volume as the material does, and not "
-        "only as springs do, which have Poisson's ratio 1/4",
-    )
-
-
 @dataclass(frozen=True)
-class SpringSettings(SolverSettings):
-    """The settings of every mass-spring solver.
+class MsdsSettings(SolverSettings):
+    """The settings of the solver ``msds``.
 
     Raises:
         SolverError: a value is out of range, with its name and the range.
     """
 
-    stiffness: str = spring_stiffness("algorithm_1")
-    volume: bool = spring_volume(False)
+    section = "msds"
+
+    stiffness: str = setting(
+        choices=("algorithm_1", "fitted"),
+        default="algorithm_1",
+        description="how springs get their stiffness: algorithm_1 is the paper's; fitted fits them "
+        "to the elasticity of the same mesh, and needs no stiffness_factor",
+    )
+    volume: bool = setting(
+        default=False,
+        description="whether tetrahedra resist changes of volume as the material does, and not "
+        "only as springs do, which have Poisson's ratio 1/4",
+    )
     stiffness_factor: float = setting(
         Quantity("length", 1e-9, 1e3),
         "spring constant over Young's modulus, for algorithm_1",
@@ -91,10 +83,19 @@ class SpringSettings(SolverSettings):
         "tissue counts as settled",
         default=1e-6,
     )
+    steps: int = setting(COUNT, "time steps in a frame", default=20)
+    time_step: float = setting(Quantity("time", 1e-18, 10.0), "of one step", default=0.01)
+    stabilisation: str = setting(
+        choices=("mass_scaling", "substeps", "none"),
+        default="mass_scaling",
+        description="what makes a step beyond the limit stable; with none it ends in frames of "
+        "which only the last good state is kept",
+    )
+    maximum_substeps: int = setting(COUNT, "of one step; more are refused", default=100)
 
 
 def spring_tissue(
-    model: TissueModel, settings: SpringSettings, *, yielding: bool = False
+    model: TissueModel, settings: MsdsSettings, *, yielding: bool = True
 ) -> tuple[SpringNetwork, VolumeTerm]:
     """The springs, without those between fixed nodes, and the volume term, as the settings say.
 
@@ -147,84 +148,7 @@ class Contact(NamedTuple):
         return cls(reachable, np.zeros(count, bool), np.zeros((count, 3)), np.zeros((2, 3)))
 
 
-class SpringTissue(TissueSolver):
-    """State, residual and rest that every mass-spring solver has."""
-
-    def __init__(
-        self,
-        model: TissueModel,
-        settings: SpringSettings,
-        progress: Progress | None,
-        *,
-        yielding: bool = False,
-    ) -> None:
-        super().__init__(model, settings, progress)
-        self._springs, self._volume = spring_tissue(model, settings, yielding=yielding)
-        self._residual_norm = ElasticResidual.of(self._springs, self._volume, model.mesh.nodes)
-        self._inversion = InversionWatch(model)
-        self._positions = model.mesh.nodes.copy()
-        self._velocity = np.zeros_like(self._positions)
-
-    @property
-    def state(self) -> TissueState:
-        """Where the tissue is and how fast it moves."""
-        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
-
-    def _restore(self, state: TissueState) -> None:
-        self._positions[:] = self.model.mesh.nodes + state.displacement
-        self._velocity[:] = state.velocity
-        self._velocity[self.model.fixed] = 0.0
-        self._residual_norm.reset()
-        self._inversion.reset()
-
-    def _untangle(self, touched: bool) -> tuple[int, tuple[str, ...], Intervention]:
-        """Put tissue to rest that stayed inside out without a probe.
-
-        Returns:
-            How many tetrahedra are inside out now, remarks, and these as a code.
-        """
-        inverted, hopeless = self._inversion.check(self._positions, touched)
-        if not hopeless:
-            words = f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out"
-            return inverted, (words,) if inverted else (), Intervention.NONE
-        self._positions[:] = self.model.mesh.nodes
-        self._velocity[:] = 0.0
-        self._residual_norm.reset()
-        words = (
-            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
-            f"was put back to rest"
-        )
-        return 0, (words,), Intervention.PUT_TO_REST
-
-    def _stop(self, touched: bool) -> bool:
-        """End the motion of settled tissue; returns whether it was put to rest entirely."""
-        self._velocity[:] = 0.0
-        displaced = np.abs(self._positions - self.model.mesh.nodes).max()
-        if touched or not self.model.fixed.any() or not displaced < _NEARLY_RESTING:
-            return False
-        self._positions[:] = self.model.mesh.nodes
-        self._residual_norm.reset()
-        return True
-
-
-@dataclass(frozen=True)
-class MsdsSettings(SpringSettings):
-    """The settings of the solver ``msds``."""
-
-    section = "msds"
-
-    steps: int = setting(COUNT, "time steps in a frame", default=20)
-    time_step: float = setting(Quantity("time", 1e-18, 10.0), "of one step", default=0.01)
-    stabilisation: str = setting(
-        choices=("mass_scaling", "substeps", "none"),
-        default="mass_scaling",
-        description="what makes a step beyond the limit stable; with none it ends in frames of "
-        "which only the last good state is kept",
-    )
-    maximum_substeps: int = setting(COUNT, "of one step; more are refused", default=100)
-
-
-class Msds(SpringTissue):
+class Msds(TissueSolver):
     """Point masses joined by Voigt elements (the paper's eqs. 1 to 5).
 
     With the tissue's own masses the paper's damping is stable only for steps of some microseconds,
@@ -259,7 +183,12 @@ class Msds(SpringTissue):
         progress: Progress | None = None,
     ) -> None:
         settings = settings or MsdsSettings()
-        super().__init__(model, settings, progress, yielding=True)
+        super().__init__(model, settings, progress)
+        self._springs, self._volume = spring_tissue(model, settings)
+        self._residual_norm = ElasticResidual.of(self._springs, self._volume, model.mesh.nodes)
+        self._inversion = InversionWatch(model)
+        self._positions = model.mesh.nodes.copy()
+        self._velocity = np.zeros_like(self._positions)
         self._steps = settings.steps
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
@@ -283,6 +212,11 @@ class Msds(SpringTissue):
         self._restore(self.state)
 
     @property
+    def state(self) -> TissueState:
+        """Where the tissue is and how fast it moves."""
+        return TissueState(self._positions - self.model.mesh.nodes, self._velocity.copy())
+
+    @property
     def step_limit(self) -> float:
         """s, the longest stable step of small oscillations with the masses as simulated."""
         if self.model.fixed.all():
@@ -291,7 +225,11 @@ class Msds(SpringTissue):
         return step_limit(frequency, self._damping_factor)
 
     def _restore(self, state: TissueState) -> None:
-        super()._restore(state)
+        self._positions[:] = self.model.mesh.nodes + state.displacement
+        self._velocity[:] = state.velocity
+        self._velocity[self.model.fixed] = 0.0
+        self._residual_norm.reset()
+        self._inversion.reset()
         self._contact.touched[:] = False
 
     def _advance(self, pose: Pose | None) -> Deformation:
@@ -317,6 +255,35 @@ class Msds(SpringTissue):
             self._steps,
         )
         return self._outcome(pose, *self._contact.wrench.copy())
+
+    def _untangle(self, touched: bool) -> tuple[int, tuple[str, ...], Intervention]:
+        """Put tissue to rest that stayed inside out without a probe.
+
+        Returns:
+            How many tetrahedra are inside out now, remarks, and these as a code.
+        """
+        inverted, hopeless = self._inversion.check(self._positions, touched)
+        if not hopeless:
+            words = f"{counted(inverted, 'tetrahedron is', 'tetrahedra are')} inside out"
+            return inverted, (words,) if inverted else (), Intervention.NONE
+        self._positions[:] = self.model.mesh.nodes
+        self._velocity[:] = 0.0
+        self._residual_norm.reset()
+        words = (
+            f"{counted(inverted, 'tetrahedron', 'tetrahedra')} stayed inside out, so the tissue "
+            f"was put back to rest"
+        )
+        return 0, (words,), Intervention.PUT_TO_REST
+
+    def _stop(self, touched: bool) -> bool:
+        """End the motion of settled tissue; returns whether it was put to rest entirely."""
+        self._velocity[:] = 0.0
+        displaced = np.abs(self._positions - self.model.mesh.nodes).max()
+        if touched or not self.model.fixed.any() or not displaced < _NEARLY_RESTING:
+            return False
+        self._positions[:] = self.model.mesh.nodes
+        self._residual_norm.reset()
+        return True
 
     def _gap(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return push_out(

@@ -12,7 +12,6 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import shown, unknown
 from us_sim.tissue.elasticity.material import KINDS, Material, kind_of
-from us_sim.tissue.mesh.tetrahedral_mesh import KINDS as KINDS_OF_MESH
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
 AROUND = "tissue"  # name of what is in no structure: label 0, or all of a volume without labels
@@ -105,12 +104,6 @@ class CaseSettings(Settings):
     )
     nodes: int = setting(
         Quantity("number", 64, 200_000), "that the mesh of its tissue has at most", default=3000
-    )
-    mesh: str = setting(
-        description="of its tissue: grid, or conforming, whose faces follow the structures' "
-        "surfaces (extra `conforming`)",
-        choices=KINDS_OF_MESH,
-        default=KINDS_OF_MESH[0],
     )
     fixed: tuple[str, ...] = setting(
         description="faces (bottom, sides, ...) and structures that are held; not given: the "
