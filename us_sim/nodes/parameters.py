@@ -89,8 +89,8 @@ class LiveSettings:
             for key, group in groups.items()
         }
         self._checked = self.values  # of the change that is about to be made
-        node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._take_over)
+        node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._on_post_set)
 
     def restore(self, values: Mapping[str, Any]) -> None:
         """Set parameters back to former settings, by the groups' names."""
@@ -103,7 +103,7 @@ class LiveSettings:
         if back:
             self._node.set_parameters_atomically(back)  # one alone may not go with another
 
-    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Make the settings as they would be; what refuses that refuses the parameters."""
         try:
             checked = {
@@ -117,7 +117,7 @@ class LiveSettings:
         self._checked = checked
         return SetParametersResult(successful=True)
 
-    def _take_over(self, _: list[Parameter]) -> None:
+    def _on_post_set(self, _: list[Parameter]) -> None:
         """Use the settings that were checked, now that the parameters have been set."""
         if self._checked != self.values:
             self.values = self._checked

@@ -51,10 +51,7 @@ class NodeParameters:
     """
 
     def __init__(
-        self,
-        name: str,
-        client: AsyncParameterClient | None = None,
-        door: Door | None = None,
+        self, name: str, client: AsyncParameterClient | None = None, door: Door | None = None
     ) -> None:
         self.name = name
         self.state = ABSENT
@@ -123,8 +120,7 @@ class NodeParameters:
                 there = {
                     tuple(each.endpoint_gid)
                     for each in client.node.get_publishers_info_by_topic("/parameter_events")
-                    if f"{each.node_namespace.rstrip('/')}/{each.node_name}"
-                    == client.remote_node_name
+                    if f"{each.node_namespace.rstrip('/')}/{each.node_name}" == name
                 }
                 if there != known:
                     known, self.parameters, self.state = there, {}, ASKED if there else ABSENT
@@ -185,11 +181,7 @@ class RemoteParameters:
         doors: by the names of nodes, functions that set their parameters in place of them.
     """
 
-    def __init__(
-        self,
-        node: Node | None = None,
-        doors: Mapping[str, Callable[..., Future[str]]] | None = None,
-    ) -> None:
+    def __init__(self, node: Node | None = None, doors: Mapping[str, Door] | None = None) -> None:
         self._node, self._doors = node, doors or {}
         self._nodes: dict[str, NodeParameters] = {}
 

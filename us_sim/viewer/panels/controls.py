@@ -146,7 +146,7 @@ class Control(Element):
         self.props.update({"label": label or parameter.label, "tip": tip_of(parameter)})
         self.props.update({"reason": "", "seen": 0})
         self.props["data-parameter"] = f"{parameter.node}.{parameter.name}"
-        self.on("change", self._changed)
+        self.on("change", self._on_change)
 
     def show(self, parameter: Parameter) -> None:
         """Show another value, or another range."""
@@ -160,7 +160,7 @@ class Control(Element):
     def _show(self) -> None:
         raise NotImplementedError
 
-    async def _changed(self, event: GenericEventArguments) -> None:
+    async def _on_change(self, event: GenericEventArguments) -> None:
         self._wanted = event.args["value"], int(event.args["turn"])
         if self._is_asking:
             return
