@@ -97,9 +97,9 @@ class NodeParameters:
             return f"{self.name} offers no parameters at present"
         wanted = RosParameter(name, parameter.kind.value, raw)
         async with asyncio.timeout(ANSWER_S):
-            (result,) = (await _answer(self._client.set_parameters([wanted]))).results
-        if not result.successful:
-            return result.reason or f"{self.name} refuses it"
+            results = (await _answer(self._client.set_parameters([wanted]))).results
+        if not results or not results[0].successful:
+            return (results and results[0].reason) or f"{self.name} refuses it"
         if self.parameters.get(name) is parameter:  # nothing newer has come meanwhile
             self.parameters = {**self.parameters, name: parameter.with_raw(raw)}
         return ""
