@@ -89,6 +89,7 @@ setup(
         "rosbags>=0.10.9",
         "scikit-image>=0.22",
         "scipy>=1.11.4",
+        "setproctitle>=1.3.3",
         "SimpleITK>=2.3",
         "threadpoolctl>=3",
         "tqdm>=4.66",

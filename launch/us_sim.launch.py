@@ -1,7 +1,7 @@
 """Launch the nodes that a scene needs: ``ros2 launch us_sim us_sim.launch.py scene:=upper_arm``.
 
-A node that ends or hangs is said and started again, as often as ``restarts`` and
-``restarts_per_minute`` allow; a launch that lost one ends with status 1.
+A node that ends or hangs is said and started again, as often as ``restarts`` allows; a launch that
+lost one ends with status 1.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from launch_ros.actions import Node
 from us_sim.errors import UsSimError
 from us_sim.run.monitored import Monitored, alone_on_domain
 from us_sim.run.plan import RECORDER, Request, enclave_of, plan_of
-from us_sim.run.processes import HUNG_STOP_S, INTERRUPTED, ending
+from us_sim.run.processes import INTERRUPTED, STOP_S, ending
 from us_sim.run.shared_memory import remove_abandoned_segments
 from us_sim.run.supervision import going_on
 from us_sim.run.watch import Restarts, SupervisionSettings, Watch
@@ -91,7 +91,7 @@ class Supervised:
         self.lost = []
         self.resources = contextlib.ExitStack()
         self.resources.enter_context(alone_on_domain(namespace))
-        self.monitor = Monitored(plan.nodes, supervised=True, namespace=namespace)
+        self.monitor = Monitored(plan.nodes, namespace=namespace)
         self.resources.callback(remove_abandoned_segments)
         self.resources.callback(self.monitor.close)
         self.monitor.refuse_company(plan.nodes)
@@ -155,7 +155,7 @@ class Supervised:
         """Let one that hangs end by itself for a moment, then end it."""
         for number in (signal.SIGTERM, signal.SIGCONT):
             await self.send(action, number, context)
-        for _ in range(round(HUNG_STOP_S / LOOK_S)):
+        for _ in range(round(STOP_S / LOOK_S)):
             if action in self.actions.values():
                 await asyncio.sleep(LOOK_S)
         await self.send(action, signal.SIGKILL, context)

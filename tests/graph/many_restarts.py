@@ -109,18 +109,18 @@ class Listener:
 
 
 def nodes_of(parent):
-    """The process of each node that a process has started."""
+    """The process of each node that a process has started, which bears the node's name."""
+    from us_sim.nodes.settings import NODES
+
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            words = (folder / "cmdline").read_bytes().split(b"\0")
+            title = (folder / "cmdline").read_bytes().partition(b"\0")[0].decode()
         except OSError:
             continue
-        starts = b"us_sim.nodes.", b"us_sim.viewer.viewer"
-        modules = [word.decode() for word in words if word.startswith(starts)]
-        if int(fields[1]) == parent and fields[0] != "Z" and modules:
-            found[modules[0].rpartition(".")[2]] = int(folder.name)
+        if int(fields[1]) == parent and fields[0] != "Z" and title in NODES:
+            found[title] = int(folder.name)
     return found
 
 
@@ -150,7 +150,7 @@ def start(folder, scene, path):
     """`us-sim run` with a path that begins again at its end, recorded; it may restart for ever."""
     command = [sys.executable, "-m", "us_sim", "run", str(scene), "--path", str(path)]
     command += ["--record", str(folder / "session.mcap"), "--param", "path_player.loop=true"]
-    command += ["--restarts", "1000000", "--restarts-per-minute", "1000000"]
+    command += ["--restarts", "1000000"]
     with (folder / "said.txt").open("w") as said:
         return subprocess.Popen(command, stderr=said, stdout=said)
 

@@ -21,17 +21,13 @@ class Supervisor:
     """Runs plans on paper: all nodes are ready at once, unless the test says why they fail."""
 
     def __init__(self, plan):
-        self.plan, self.why, self.waiting, self.kept = plan, "", [], {}
-        self.player_kept = {}
+        self.plan, self.why, self.waiting = plan, "", []
         self.recordings = Recordings()
-        self.started = set(plan.nodes)
         self.plans = [plan]
 
     def change(self, plan, anew=()):
         assert set(anew) <= set(self.plan.nodes)
         self.plan = plan
-        self.kept = {process.node: process.kept for process in plan.processes}
-        self.started = set(plan.nodes)
         self.plans.append(plan)
 
     def update(self):
@@ -41,9 +37,6 @@ class Supervisor:
 
     def failed(self):
         return ""
-
-    def keep(self, node, values):
-        self.player_kept[node] = values
 
 
 class Control:
@@ -109,7 +102,6 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     assert control.to_player[-1] == ("path_player", {"time": 3.0})
     ask(simulation, control, replay_paused=True)
     assert control.to_player[-1] == ("path_player", {"paused": True})
-    assert supervisor.player_kept["path_player"] == {"paused": True}
     simulation.update()
     assert control.told[-1][1]["replay"] == PATH
     ask(simulation, control, record=None, replay=None)
@@ -126,37 +118,6 @@ def test_a_whole_recording_takes_the_place_of_the_nodes_until_it_ends(running, t
     control.values = replace(control.values, record=None)
     ask(simulation, control, replay=None)
     assert supervisor.plan.processes == before
-
-
-SET = {"tissue_deformer": {"materials.fat.young_modulus": 45e3, "solver": "xpbd"}}
-
-
-def test_what_was_set_is_given_back_and_what_cannot_be_is_said(running):
-    simulation, supervisor, control = running
-    of = lambda: {each.node: each.kept for each in supervisor.plan.processes if each.kept}  # noqa: E731
-    problem = lambda: (simulation.update(), control.told[-1][2])[1]  # noqa: E731
-    supervisor.kept = SET
-    assert problem() == ""
-    # All as recorded takes the nodes' place, and they come back.
-    ask(simulation, control, replay=PATH, replay_as="recording")
-    assert supervisor.plan.nodes == ["session_player"]
-    ask(simulation, control, replay=None)
-    assert of() == SET
-    # Another scene has its own; it is said, and what was set is there again in the first.
-    for name, kept in (("upper_arm", {}), (simulation._request.scene.origin, SET)):
-        simulation._asked = name, None
-        simulation._begin("")
-        assert of() == kept
-        assert ("is not set in upper_arm" in problem()) is not bool(kept)
-    # What a node cannot run with is kept no longer; to load the scene anew leaves nothing.
-    supervisor.kept["tissue_deformer"] = {}
-    assert "ended twice" in problem()
-    supervisor.kept["slice_interpolator"] = {"gain": 3.0}
-    simulation.update()
-    assert simulation._kept_here == {"slice_interpolator": {"gain": 3.0}}
-    simulation._begin("")
-    assert of() == {}
-    assert "gain" in problem()
 
 
 @pytest.mark.parametrize(

@@ -142,9 +142,6 @@ def _name(pid: int) -> str:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return "gone"
-    for word in words:
-        if word.startswith(("us_sim.nodes.", "us_sim.viewer.viewer")):
-            return word.rpartition(".")[2]
     return "browser" if "chrom" in words[0] else Path(words[0]).name
 
 

@@ -18,6 +18,8 @@ import threading
 import time
 from pathlib import Path
 
+from setproctitle import setproctitle
+
 from us_sim.errors import UsSimError
 
 # Before NumPy loads its BLAS: several node processes share few cores, and small dense solves are
@@ -99,9 +101,11 @@ def ros_refusal(error: Exception) -> UsSimError:
 
 
 def prepare_process() -> None:
-    """Where this process is a node, require rclpy, and end at once on Ctrl-C from now on."""
-    if not is_node(sys.orig_argv):
+    """Where this process is a node, bear its name, require rclpy, and end at once on Ctrl-C."""
+    name = node_name(sys.orig_argv)
+    if not name:
         return
+    setproctitle(name)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:
@@ -110,24 +114,25 @@ def prepare_process() -> None:
         sys.exit(f"us_sim: {error}")
 
 
-def is_node(command: list[str]) -> bool:
-    """Return whether a command line runs a node: as a module, or by the script of colcon.
+def node_name(command: list[str]) -> str:
+    """Return the node that a command line runs, as a module or by colcon's script, or nothing.
 
-    >>> is_node(["python3", "-X", "dev", "-m", "us_sim.nodes.path_player", "--ros-args"])
-    True
-    >>> is_node(["/usr/bin/python3", "/ws/install/us_sim/lib/us_sim/path_player"])
-    True
-    >>> is_node(["python3", "-m", "pytest", "tests/nodes"]), is_node(["python3", "my_script.py"])
-    (False, False)
+    >>> node_name(["python3", "-X", "dev", "-m", "us_sim.nodes.path_player", "--ros-args"])
+    'path_player'
+    >>> node_name(["/usr/bin/python3", "/ws/install/us_sim/lib/us_sim/path_player"])
+    'path_player'
+    >>> node_name(["python3", "-m", "pytest", "tests/nodes"]), node_name(["python3", "script.py"])
+    ('', '')
     """
     for option, value in itertools.pairwise(command):
         if option == "-m":
-            return value.startswith((f"{__name__}.", "us_sim.viewer.viewer"))
+            is_own = value.startswith((f"{__name__}.", "us_sim.viewer.viewer"))
+            return value.rpartition(".")[2] if is_own else ""
         if not value.startswith("-") and option not in ("-X", "-W"):  # which a value follows
             name = Path(value).name
-            of_package = name.isidentifier() and (Path(__file__).parent / f"{name}.py").is_file()
-            return of_package or name == "viewer"
-    return False
+            is_own = name.isidentifier() and (Path(__file__).parent / f"{name}.py").is_file()
+            return name if is_own or name == "viewer" else ""
+    return ""
 
 
 prepare_process()  # before the imports that take a second

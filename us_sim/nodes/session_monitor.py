@@ -7,8 +7,6 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import ParameterEvent
-from rclpy.parameter import Parameter
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.qos import EVERY
@@ -22,28 +20,22 @@ class SessionMonitor(GuardedNode):
 
     Args:
         nodes: that are followed.
-        run: a name for the run that this monitor is of, which no other has.
     """
 
-    def __init__(self, nodes: Collection[str] = (), run: str = "", **kwargs: Any) -> None:
+    def __init__(self, nodes: Collection[str] = (), **kwargs: Any) -> None:
         super().__init__("session_monitor", **kwargs)
-        self._nodes, self._run = frozenset(nodes), run
+        self._nodes = frozenset(nodes)
         self.reports: dict[str, dict[str, str]] = {}  # the last of each node
         self.messages: dict[str, str] = {}  # likewise
         self.heard: Counter[tuple[str, int]] = Counter()  # reports by node and process
-        self.other_runs: set[str] = set()
         self._published: dict[tuple[str, int], dict[str, int]] = {}
-        self.health = Health(self, run)
+        self.health = Health(self, "")
         self.health.state = "following"
         self.subscribe(DiagnosticArray, "diagnostics", self._take, EVERY)
-        self._set: dict[str, dict[str, object]] = {}
-        self.subscribe(ParameterEvent, "/parameter_events", self._note_set, EVERY)
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name = status.name.rsplit("/", 1)[-1]
-            if name == self.get_name() and status.hardware_id not in ("", self._run):
-                self.other_runs.add(status.hardware_id)
             if name not in self._nodes:
                 continue
             report = {item.key: item.value for item in status.values}
@@ -52,21 +44,6 @@ class SessionMonitor(GuardedNode):
             process = name, _number(report.get("pid", ""))
             self.heard[process] += 1
             self._published[process] = published_counts(report)
-
-    def _note_set(self, event: ParameterEvent) -> None:
-        space, _, name = event.node.rpartition("/")
-        if name not in self._nodes or space != self.get_namespace().rstrip("/"):
-            return
-        for each in event.changed_parameters:
-            value = Parameter.from_parameter_msg(each).value
-            if value is not None:
-                value = value if isinstance(value, bool | int | float | str) else list(value)
-                self._set.setdefault(name, {})[each.name] = value
-
-    def take_set(self) -> dict[str, dict[str, object]]:
-        """Parameters that were set since this was asked last: values by names, by node."""
-        taken, self._set = self._set, {}
-        return taken
 
     def follow(self, nodes: Collection[str]) -> None:
         """Follow these nodes from now on."""

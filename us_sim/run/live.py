@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from us_sim.errors import UsSimError, VolumeError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
 from us_sim.progress import Progress
-from us_sim.run.losses import IMAGES, Outcome
+from us_sim.run.losses import IMAGER, IMAGES, Outcome
 from us_sim.run.monitored import Monitored, alone_on_domain, domain
 from us_sim.run.plan import (
     NodeProcess,
@@ -25,7 +25,7 @@ from us_sim.run.plan import (
 from us_sim.run.processes import ProcessGroup, prepare_ros
 from us_sim.run.ros_arguments import ros_arguments
 from us_sim.run.simulation import Simulation
-from us_sim.run.supervision import IMAGER, Supervisor, say
+from us_sim.run.supervision import Supervisor, say
 from us_sim.run.watch import SupervisionSettings, Watch
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 
 SETTLE_S = 1.2  # after the path's end: for the last images and each node's last report
-RIVALRY_S = 5.0  # after all nodes are ready: to see a simulation elsewhere that began just before
 
 
 def follow(
@@ -69,8 +68,7 @@ def follow(
         try:
             group.start(early)
             # The monitor goes first: it would wait for what a killed node never acknowledges.
-            supervised = request is not None
-            with contextlib.closing(Monitored(plan.nodes, supervised=supervised)) as monitor:
+            with contextlib.closing(Monitored(plan.nodes)) as monitor:
                 monitor.refuse_company(set(plan.nodes) - {each.node for each in early})
                 began = time.monotonic()
                 supervisor = Supervisor(plan, group, monitor, settings)
@@ -78,8 +76,7 @@ def follow(
                 if request is not None:
                     simulation = Simulation(request, supervisor, monitor)
                     update = simulation.update
-                _await_all(update, supervisor, monitor)
-                monitor.refuse_unknown(plan.processes)
+                _await_all(update, supervisor)
                 startup = time.monotonic() - began
                 _stay(update, supervisor, monitor)
         except KeyboardInterrupt:
@@ -99,13 +96,12 @@ def follow(
 _LONG_START_S = 15.0  # longer than a start takes whose kernels are all kept
 
 
-def _await_all(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
+def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
     count = len(supervisor.plan.nodes)
     began = time.monotonic()
     with Progress("starting", count, "nodes") as bar:
         while waiting := supervisor.waiting:
             update()
-            monitor.refuse_earlier_run()
             more = f" and {len(waiting) - 2} more" if len(waiting) > 2 else ""
             is_long = time.monotonic() - began > _LONG_START_S
             why = "a first run compiles for minutes: " if is_long else ""  # what is behind is cut
@@ -125,8 +121,6 @@ def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored
             while _shown(plan) == (total, unit):
                 update()
                 plan, now = supervisor.plan, time.monotonic()
-                if now - began < RIVALRY_S:
-                    monitor.refuse_earlier_run()
                 played = monitor.node.reports.get(plan.player, {}).get("played", "")
                 is_known = played.isdecimal() and len(played) < 12
                 done = now - began if plan.poses is None else float(played) if is_known else 0.0

@@ -15,7 +15,7 @@ from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER
 from us_sim.progress import Progress
 from us_sim.run.live import prepare_volume
-from us_sim.run.monitored import refuse_unknown, ros_context
+from us_sim.run.monitored import ros_context
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
@@ -155,7 +155,6 @@ def render(
         for process in _processes(scene, path, topic, out, parameters or {}, truth or {}):
             nodes.append(node_in_process(process.node, process.all_parameters, context))
             executor.add_node(nodes[-1])
-            refuse_unknown(process, nodes[-1].list_parameters([], 0).names)
         return _spin(executor, nodes, progress, [*(truth or {})])
     finally:
         for node in reversed(nodes):

@@ -15,7 +15,7 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.run.plan import NodeProcess
 
-IMAGES = "ultrasound/image"
+IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
 TOLD = 4  # losses that are told one by one in a sentence
 
 

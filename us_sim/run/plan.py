@@ -56,7 +56,6 @@ class NodeProcess:
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     given: dict[str, object] = field(default_factory=dict)  # by a person; take precedence
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
-    kept: dict[str, object] = field(default_factory=dict)  # set while it ran; take precedence
     parts: tuple[NodeProcess, ...] = ()  # other nodes in the same process
 
     def __post_init__(self) -> None:
@@ -84,8 +83,8 @@ class NodeProcess:
 
     @property
     def all_parameters(self) -> dict[str, object]:
-        """Parameters by name, those set last in place of the others."""
-        return self.parameters | self.given | self.kept
+        """Parameters by name, those given by a person in place of the others."""
+        return self.parameters | self.given
 
 
 def require_texts(parameters: Mapping[str, object]) -> None:
@@ -120,7 +119,6 @@ class Request:
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
     composed: bool = False  # the scene's nodes are in one process
-    kept: Mapping[str, Mapping[str, object]] = field(default_factory=dict)  # set as nodes ran
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
 
     def with_scene(self, scene: Scene) -> Request:
@@ -209,12 +207,8 @@ def plan_of(request: Request) -> Plan:
             settings["exclude"] = ["camera/image_raw"]  # the video is there already
         processes.append(NodeProcess(RECORDER, settings, recorder))
     driver = taken("camera_driver") if request.video is not None else {}
-    nodes = [
-        replace(process, kept=dict(request.kept.get(process.node, {})))
-        for process in simulation_nodes(
-            scene, parameters, played=request.by_hand or request.path is not None
-        )
-    ]
+    is_played = request.by_hand or request.path is not None
+    nodes = simulation_nodes(scene, parameters, played=is_played)
     if request.composed:
         names = [part.node for part in nodes]
         nodes = [NodeProcess("composed", {"nodes": names}, parts=tuple(nodes))]

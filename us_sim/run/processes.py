@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import IO
 
@@ -23,17 +23,32 @@ from us_sim.run.shared_memory import remove_abandoned_segments, remove_unused_po
 
 LIFELINE, _OTHER_END = os.pipe()
 """Standard input of what is started from here: it ends with this process, whatever ends that."""
+COMPLAINT = "us_sim: "  # with which a node begins to say why it cannot work
+STOP_S = 1.0  # how long a node may take to end before it is killed
+RECORDER_STOP_S = 10.0  # likewise the recorder, which writes what it still holds
+
+
+def prepare_ros(*, network: bool) -> None:
+    """Require rclpy, and keep what is started from here on this host.
+
+    Nobody on a hospital's network should meet a simulator by accident.
+
+    Args:
+        network: talk beyond this host, as the environment says.
+
+    Raises:
+        UsSimError: rclpy is not installed.
+    """
+    require_rclpy()
+    if not network:
+        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 def child_environment() -> dict[str, str]:
-    """Environment of a program that finds this very package, and ends with its standard input."""
+    """Return the environment of a program that finds this package, and ends with its input."""
     package = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
     return os.environ | {"PYTHONPATH": path, ENDS_WITH_INPUT: "1"}
-
-
-COMPLAINT = "us_sim: "  # with which a node begins to say why it cannot work
-STOP_S = 0.8  # how long nodes may take to end before the recorder is told to
 
 
 class RunningNode:
@@ -54,68 +69,23 @@ class RunningNode:
             text=True,
             errors="replace",
             env=child_environment() | node.secrets,
-            start_new_session=True,
+            start_new_session=True,  # so that Ctrl-C is for this process alone
         )
         self.complaint = ""  # why it cannot work
-        self.said = ""
-        self.told = False  # that it has ended
+        self.last_words = ""
+        self.is_noted = False  # that it has ended
         self._show = show
         self.reader = threading.Thread(target=self._read, daemon=True)
-        try:
-            self.reader.start()
-        except RuntimeError as error:
-            self.process.kill()
-            self.process.wait()
-            told = [f"{node.node} cannot be followed: {error}", memory_limit()]
-            raise UsSimError("; ".join(filter(None, told))) from None
+        self.reader.start()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             if line.strip():
-                self.said = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
+                self.last_words = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
             if line.startswith(COMPLAINT):
-                self.complaint = self.said
+                self.complaint = self.last_words
             self._show(line)
-
-    def tell_to_end(self) -> None:
-        """SIGTERM, which one that was stopped gets, too."""
-        if self.process.poll() is None:
-            self.process.terminate()
-            self.process.send_signal(signal.SIGCONT)
-
-    def wait(self, seconds: float) -> None:
-        """Wait for its end, at most so long."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(max(seconds, 0.0))
-
-    def kill(self) -> bool:
-        """End it for certain; whether it had not ended by itself."""
-        if self.process.poll() is not None:
-            return False
-        self.process.kill()
-        self.wait(STOP_S)  # one that waits for a disk ends when that answers
-        return True
-
-
-RECORDER_STOP_S = 10.0  # how long the recorder may take to write what it still holds
-HUNG_STOP_S = 2.0  # how long a node that hangs may take to end by itself, before it is killed
-
-
-def prepare_ros(*, network: bool) -> None:
-    """Require rclpy, and keep what is started from here on this host.
-
-    Nobody on a hospital's network should meet a simulator by accident.
-
-    Args:
-        network: talk beyond this host, as the environment says.
-
-    Raises:
-        UsSimError: rclpy is not installed.
-    """
-    require_rclpy()
-    if not network:
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 class ProcessGroup:
@@ -127,7 +97,6 @@ class ProcessGroup:
 
     def __init__(self, log: Path | None = None) -> None:
         self._running: dict[str, RunningNode] = {}
-        self._leaving: list[tuple[str, RunningNode, float]] = []  # and until when they may take
         self._log_path = log
         self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
 
@@ -138,16 +107,9 @@ class ProcessGroup:
         """
         remove_abandoned_segments()  # of one that is replaced
         for process in processes:
-            if self.is_running(process.node) and self._running[process.node].node == process:
-                continue
-            show = self._tell if process.node == VIEWER else self._show
-            self._running[process.node] = RunningNode(process, show)
-
-    def _tell(self, line: str) -> None:
-        """Show a line to the person, too, whom it tells where the page is."""
-        self._show(line)
-        if self._log is not None and not line.startswith(COMPLAINT):
-            tqdm.write(printable(line.rstrip()), file=sys.stderr)
+            if not (self.is_running(process.node) and self._running[process.node].node == process):
+                show = self._show_to_person if process.node == VIEWER else self._show
+                self._running[process.node] = RunningNode(process, show)
 
     def _show(self, line: str) -> None:
         if self._log is not None:
@@ -157,30 +119,36 @@ class ProcessGroup:
         elif not line.startswith(COMPLAINT):  # which is said when the node has ended
             tqdm.write(printable(line.rstrip()), file=sys.stderr)
 
+    def _show_to_person(self, line: str) -> None:
+        """Show a line that says where the page is on the terminal, too."""
+        self._show(line)
+        if self._log is not None and not line.startswith(COMPLAINT):
+            tqdm.write(printable(line.rstrip()), file=sys.stderr)
+
     @property
     def pids(self) -> dict[str, int]:
         """The processes' numbers by node, also of those that have ended."""
         return {node: running.process.pid for node, running in self._running.items()}
 
     def is_running(self, node: str) -> bool:
-        """Whether that node was started and has not ended."""
+        """Return whether that node was started and has not ended."""
         running = self._running.get(node)
         return running is not None and running.process.poll() is None
 
     def take_ended(self) -> dict[str, int]:
-        """The exit status of each node that has ended; it is told once."""
+        """Return the exit status of each node that has ended; it is told once."""
         ended = {}
         for node, running in self._running.items():
             status = running.process.poll()
-            if status is not None and not running.told:
-                running.told = True
+            if status is not None and not running.is_noted:
+                running.is_noted = True
                 running.reader.join(STOP_S)
                 ended[node] = status
         return ended
 
     def last_words(self, node: str) -> str:
-        """The last line of a node's output, without its logger's prefix."""
-        return self._running[node].said
+        """Return the last line of a node's output, without its logger's prefix."""
+        return self._running[node].last_words
 
     def check(self) -> None:
         """Raise UsSimError, in the node's own words, when one has ended with an error."""
@@ -189,64 +157,40 @@ class ProcessGroup:
                 raise self.failure(node, status)
 
     def failure(self, node: str, status: int) -> UsSimError:
-        """Why a node cannot work, in its own words where it has said so."""
+        """Return why a node cannot work, in its own words where it has said so."""
         see = f"; see {self._log_path}" if self._log_path else ""
-        complaint = self._running[node].complaint
         limit = f"; {hint}" if (hint := memory_limit()) else ""
+        complaint = self._running[node].complaint
         return UsSimError(complaint or f"{node} {ending(status)}{see}{limit}")
 
-    def end(self, node: str) -> None:
-        """End one that hangs: it may do so by itself for a moment, also if it was stopped."""
-        running = self._running[node]
-        running.tell_to_end()
-        running.wait(HUNG_STOP_S)
-        running.kill()
-        running.told = True
-
-    def dismiss(self, node: str) -> None:
-        """Tell one to end, without waiting for that: `leaving` says when it has."""
-        running = self._running.pop(node, None)
-        if running is not None:
-            limit = RECORDER_STOP_S if node == RECORDER else STOP_S
-            running.tell_to_end()
-            self._leaving.append((node, running, time.monotonic() + limit))
-
-    def leaving(self) -> dict[str, bool]:
-        """Nodes that were dismissed and are not gone, or were killed since this was asked last.
-
-        The value says the latter: such a node has taken longer than it may.
-        """
-        now, there, still = time.monotonic(), {}, []
-        for node, running, until in self._leaving:
-            if running.process.poll() is not None:
-                continue
-            there[node] = now > until and running.kill()
-            if not there[node]:
-                still.append((node, running, until))
-        self._leaving = still
-        return there
-
-    def stop(self) -> list[str]:
-        """End every process; the names of those that had to be killed.
+    def end(self, nodes: Collection[str]) -> list[str]:
+        """End these nodes; the names of those that had to be killed.
 
         SIGTERM first, the recorder after the others, SIGKILL at the last. Unlike SIGINT, SIGTERM
         ends a process without a word while it is still importing.
         """
-        others = [running for node, running in self._running.items() if node != RECORDER]
-        deadline = time.monotonic() + STOP_S
-        for running in others:
-            running.tell_to_end()
-        for running in others:
-            running.wait(deadline - time.monotonic())
-        if RECORDER in self._running:
-            self._running[RECORDER].tell_to_end()
-            self._running[RECORDER].wait(RECORDER_STOP_S)
-        for _, running, until in self._leaving:
-            running.wait(until - time.monotonic())
-        every = [*self._running.items(), *((node, running) for node, running, _ in self._leaving)]
-        killed = [node for node, running in every if running.kill()]
-        for _, running in every:
-            running.reader.join(STOP_S)
+        killed = []
+        recorder = {RECORDER} & {*nodes}
+        for names, limit in ({*nodes} - recorder, STOP_S), (recorder, RECORDER_STOP_S):
+            ending_now = {n: self._running[n].process for n in names if self.is_running(n)}
+            for process in ending_now.values():
+                process.terminate()
+                process.send_signal(signal.SIGCONT)  # it may be stopped
+            deadline = time.monotonic() + limit
+            for node, process in ending_now.items():
+                try:
+                    process.wait(max(deadline - time.monotonic(), 0.0))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    killed.append(node)
+        for node in nodes:
+            self._running[node].is_noted = True
+            self._running[node].reader.join(STOP_S)
+        return killed
+
+    def stop(self) -> list[str]:
+        """End every process, and remove what they leave; the names of those that were killed."""
+        killed = self.end(list(self._running))
         remove_abandoned_segments()
         remove_unused_ports()
         if self._log is not None:
@@ -256,12 +200,14 @@ class ProcessGroup:
 
 
 def ending(status: int) -> str:
-    """An exit status in words; negative ones are signals."""
+    """Return an exit status in words; negative ones are signals.
+
+    >>> ending(-9), ending(3)
+    ('was ended by SIGKILL', 'ended with status 3')
+    """
     if status == INTERRUPTED:
         return "was told to end by a signal"
     if status >= 0:
         return f"ended with status {status}"
-    try:
-        return f"was ended by {signal.Signals(-status).name}"
-    except ValueError:
-        return f"was ended by signal {-status}"
+    name = signal.Signals(-status).name if -status in {*signal.Signals} else f"signal {-status}"
+    return f"was ended by {name}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Collection
 from dataclasses import replace
@@ -15,8 +14,8 @@ from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSetti
 from us_sim.recording.reader import read_bag
 from us_sim.run.background import Background, bags_in_reach
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import Plan, Request, plan_of
-from us_sim.run.supervision import Kept, Supervisor, say
+from us_sim.run.plan import Request, plan_of
+from us_sim.run.supervision import Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene
 from us_sim.scene.reading import load_scene
@@ -30,8 +29,6 @@ _RECORDING_EVERY_S = 1.0
 _OF_SCENE = {"scene", "volume"}
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
 """Parameters that go on to the node that plays."""
-_LOSS_SHOWN_S = 30.0  # how long it is said that what was set is lost, or belongs to another scene
-_LISTED = 6
 
 
 class Simulation:
@@ -58,9 +55,6 @@ class Simulation:
         self._recording: dict[str, str] = {}  # how far it is
         self._bags: dict[str, str] = {}
         self._problem = ""
-        self._kept: dict[tuple[str, str | None], Kept] = {}  # by scenes and their volumes
-        self._lost = ""  # what was set and is not any more
-        self._lost_until = math.inf  # s, monotonic: when that has been said for long enough
         self._control = monitor.control(self, self._shown())
 
     def update(self) -> None:
@@ -81,7 +75,6 @@ class Simulation:
         if not self._supervisor.waiting:
             self._settled = self._request
             self._ready_since = self._ready_since or time.monotonic()
-        self._take_what_was_set()
         self._follow_making()
         self._publish_catalogue()
         self._report()
@@ -152,34 +145,12 @@ class Simulation:
         values: dict[str, object] = {
             name: getattr(wanted, key) for key, name in _OF_PLAYER.items() if key in named
         }
-        for player in PLAYERS:
-            self._supervisor.keep(player, values)
         if "replay_time" in named:
             values["time"] = wanted.replay_time
         elif "replay" in named:
             values["time"] = 0.0
         if values and wanted.replay:
             self._control.tell_player(self._supervisor.plan.player, values)
-
-    @property
-    def _kept_here(self) -> Kept:
-        """Parameters set of the nodes of this scene, which get them back when they start again."""
-        return self._kept.setdefault(_identity(self._request.scene), {})
-
-    def _take_what_was_set(self) -> None:
-        """Keep all values that were set, by whomever, but for those that a node died of."""
-        for node, values in self._supervisor.kept.items():
-            before = self._kept_here.pop(node, {})
-            if values:
-                self._kept_here[node] = values
-            elif before:
-                self._tell_lost(
-                    f"{node} ended twice, so it runs without what was set since its start: "
-                    f"{_listed(list(before))}"
-                )
-
-    def _tell_lost(self, sentence: str) -> None:
-        self._lost, self._lost_until = sentence, math.inf
 
     def _make(self, name: str, volume: str | None) -> None:
         if self._making is not None:
@@ -208,17 +179,9 @@ class Simulation:
         if not refused:
             try:
                 scene = load_scene(name, volume=volume)
-                before, kept = self._request.scene, self._kept_here
-                request = self._request.with_scene(scene)
-                if _identity(scene) == _identity(before):
-                    kept = self._kept.pop(_identity(scene))
-                self._change(request, anew=set(self._supervisor.plan.nodes) - {VIEWER})
+                anew = set(self._supervisor.plan.nodes) - {VIEWER}
+                self._change(self._request.with_scene(scene), anew)
                 say(f"loading {scene.name}")
-                names = _listed([name for values in kept.values() for name in values])
-                then = f"is not set in {scene.name}, but again when {before.name} is loaded"
-                if _identity(scene) == _identity(before):
-                    then = "is not any more, since it was loaded anew"
-                self._tell_lost(names and f"what was set in {before.name} ({names}) {then}")
             except UsSimError as error:
                 refused = str(error)
         if refused:
@@ -227,27 +190,23 @@ class Simulation:
         self._control.show(self._shown())
 
     def _change(self, request: Request, anew: Collection[str] = ()) -> None:
-        plan = self._plan(request)
+        plan = plan_of(request)
         self._request = request
         if anew or plan.processes != self._supervisor.plan.processes:
             self._supervisor.change(plan, anew)
-
-    def _plan(self, request: Request) -> Plan:
-        return plan_of(replace(request, kept=self._kept.get(_identity(request.scene), {})))
 
     def _go_back(self, why: str) -> None:
         """Return to the former scene; a recording and a replay ended for it do not come back."""
         assert self._settled is not None
         before = self._settled
-        if RECORDER not in self._supervisor.started:
+        if RECORDER not in self._supervisor.plan.nodes:
             before = replace(before, record=None, is_changed=True)
-        if not set(PLAYERS) & self._supervisor.started:
+        if not {*PLAYERS} & {*self._supervisor.plan.nodes}:
             before = before.without_replay()
-        self._tell_lost("")
         self._problem = f"{why}; {before.scene.name} runs as before"
         say(self._problem)
         self._settled = self._request = before
-        self._supervisor.change(self._plan(before))
+        self._supervisor.change(plan_of(before))
         self._control.show(self._shown())
 
     def _publish_catalogue(self) -> None:
@@ -307,11 +266,7 @@ class Simulation:
             "replay_paused": str(self._control.values.replay_paused).lower(),
             **playing,
         }
-        lost = self._lost if fraction == 1.0 else ""
-        if lost:
-            self._lost_until = min(self._lost_until, time.monotonic() + _LOSS_SHOWN_S)
-            self._lost = lost if time.monotonic() < self._lost_until else ""
-        self._control.tell(state, values, "; ".join(filter(None, (self._problem, lost))))
+        self._control.tell(state, values, self._problem)
 
     def _shown(self) -> SessionControlSettings:
         """The control's parameters as things are."""
@@ -330,15 +285,6 @@ class Simulation:
             replay_as="recording" if request.everything else "path",
             **changes,
         )
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more
-
-
-def _identity(scene: Scene) -> tuple[str, str | None]:
-    return scene.origin, scene.volume.file
 
 
 def _volume_of(scene: Scene) -> str | None:
