@@ -83,6 +83,7 @@ setup(
         "numba>=0.59",
         "numpy>=1.26.4",
         "opencv-python-headless>=4.8",
+        "pandas>=2.1.4",
         "platformdirs>=4",
         "pynrrd>=1.1",
         "PyYAML>=6.0.1",

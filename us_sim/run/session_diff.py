@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from us_sim.errors import BagError, UsSimError, printable
 from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
-from us_sim.recording.topic import BagMessage
+from us_sim.recording.topic import BagMessage, BagTopic
 from us_sim.run.resimulation import scene_of
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scoring.lumen import VESSELS
@@ -26,14 +26,7 @@ from us_sim.tissue.elasticity.material import kind_of
 
 AREAS = 40  # pairs of which areas are compared, evenly over the session
 Progress = Callable[[float, str], None]
-Measured = tuple[float, ...]
-
-
-class Quantity(NamedTuple):
-    """How far apart two messages of a type are."""
-
-    names: tuple[str, ...]  # with their units
-    measure: Callable[[Any, Any], Measured]  # of two decoded messages
+Measured = tuple[float, float]
 
 
 def _pose_apart(one: Any, other: Any) -> Measured:
@@ -75,12 +68,14 @@ def _wrench_apart(one: Any, other: Any) -> Measured:
 
 
 IMAGE = "sensor_msgs/msg/Image"
-QUANTITIES = {
-    "geometry_msgs/msg/PoseStamped": Quantity(("position (mm)", "angle (°)"), _pose_apart),
-    "sensor_msgs/msg/PointCloud2": Quantity(("nodes, rms (mm)", "nodes, worst (mm)"), _nodes_apart),
-    "geometry_msgs/msg/WrenchStamped": Quantity(("force (N)", "torque (N mm)"), _wrench_apart),
-    IMAGE: Quantity(("grey levels, mean", "grey levels, worst"), _image_apart),
+QUANTITIES: dict[str, tuple[list[str], Callable[[Any, Any], Measured]]] = {
+    "geometry_msgs/msg/PoseStamped": (["position (mm)", "angle (°)"], _pose_apart),
+    "sensor_msgs/msg/PointCloud2": (["nodes, rms (mm)", "nodes, worst (mm)"], _nodes_apart),
+    "geometry_msgs/msg/WrenchStamped": (["force (N)", "torque (N mm)"], _wrench_apart),
+    IMAGE: (["grey levels, mean", "grey levels, worst"], _image_apart),
 }
+"""How far apart two decoded messages of a type are."""
+HEAD = ("topic", "difference", "pairs", "same", "only A", "only B", "median", "worst", "at (s)")
 
 
 @dataclass
@@ -88,36 +83,27 @@ class Difference:
     """One topic of both recordings."""
 
     topic: str
-    names: tuple[str, ...]  # of the quantities, with units
-    stamps: list[int] = field(default_factory=list)  # (K,) ns, of the pairs
-    apart: list[Measured] = field(default_factory=list)  # (K,) one of each quantity
-    identical: int = 0  # pairs of the same bytes
+    apart: pd.DataFrame  # quantities, with units, by the stamps of the pairs (ns)
+    identical: int  # pairs of the same bytes
     only: tuple[int, int] = (0, 0)  # messages that the other one has not
     refused: str = ""  # why a pair could not be compared
+    worst: tuple[Any, Any] | None = None  # messages that are furthest apart
 
     @property
     def is_none(self) -> bool:
         """Whether there is none: every message has its pair, of the same bytes."""
-        return self.only == (0, 0) and self.identical == len(self.stamps)
+        return self.only == (0, 0) and self.identical == len(self.apart)
 
     @property
-    def rows(self) -> list[tuple[str, ...]]:
-        """Topic, quantity, pairs, identical pairs, only in one, only in the other, median, worst,
-        and the time of the worst in s since the first pair."""
-        rows = []
-        for k, name in enumerate(self.names):
-            values = np.array([each[k] for each in self.apart])
-            told = ("-", "-", "-")
-            if np.isfinite(values).any():
-                at = int(np.nanargmax(values))
-                since = (self.stamps[at] - self.stamps[0]) * 1e-9
-                told = (f"{np.nanmedian(values):.4g}", f"{values[at]:.4g}", f"{since:.3f}")
-            counts = (len(self.stamps), self.identical, *self.only)
-            rows.append((self.topic, name, *map(str, counts), *told))
-        return rows
-
-
-HEAD = ("topic", "difference", "pairs", "same", "only A", "only B", "median", "worst", "at (s)")
+    def rows(self) -> Iterator[tuple[str, ...]]:
+        """The numbers below `HEAD`; the time of the worst is since the first pair."""
+        counts = [str(n) for n in (len(self.apart), self.identical, *self.only)]
+        for name, values in self.apart.items():
+            told = ["-", "-", "-"]
+            if values.notna().any():
+                since = (values.idxmax() - self.apart.index[0]) * 1e-9
+                told = [f"{values.median():.4g}", f"{values.max():.4g}", f"{since:.3f}"]
+            yield (self.topic, str(name), *counts, *told)
 
 
 @dataclass(frozen=True)
@@ -126,7 +112,6 @@ class SessionDiff:
 
     paths: tuple[Path, Path]
     topics: list[Difference]
-    images: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None  # that differ most
     notes: list[str]  # sentences on what differs otherwise, or could not be compared
     left_out: list[str]  # topics of both, of types that are not compared
 
@@ -140,11 +125,16 @@ class SessionDiff:
         """The numbers below `HEAD`."""
         return [row for each in self.topics for row in each.rows]
 
+    @property
+    def images(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+        """The two that differ most, of the first topic whose images do."""
+        shown = (each.worst for each in self.topics if "grey levels, mean" in each.apart)
+        pair = next(filter(None, shown), None)
+        return (pixels_from(pair[0]), pixels_from(pair[1])) if pair else None
+
 
 def diff(one: Bag, other: Bag, progress: Progress = lambda *_: None) -> SessionDiff:
     """Compare poses, nodes, wrenches and images of equal stamps, and areas of vessels.
-
-    Stamps are taken to rise, as they do in a session that `us-sim bag check` finds whole.
 
     Args:
         one: recording A, whose scene says where vessels are.
@@ -158,10 +148,13 @@ def diff(one: Bag, other: Bag, progress: Progress = lambda *_: None) -> SessionD
         {topic.name: topic.type_name for topic in bag.topics if topic.message_count}
         for bag in (one, other)
     ]
+    both = types[0].keys() & types[1].keys()
     names = sorted(
         name
-        for name, kind in types[0].items()
-        if kind in QUANTITIES and types[1].get(name) == kind and _is_compared(one, name)
+        for name in both
+        if types[0][name] in QUANTITIES
+        and types[1][name] == types[0][name]
+        and stamp_reader(one, one.topic(name)) is not None
     )
     if not names:
         raise BagError(
@@ -170,38 +163,27 @@ def diff(one: Bag, other: Bag, progress: Progress = lambda *_: None) -> SessionD
         )
     notes: list[str] = []
     topics: list[Difference] = []
-    images = None
-    for bag, mine, yours in ((one, types[0], types[1]), (other, types[1], types[0])):
-        if alone := sorted(mine.keys() - yours.keys()):
+    for bag, mine in zip((one, other), types, strict=True):
+        if alone := sorted(mine.keys() - both):
             notes.append(f"in {bag.path} alone: {', '.join(alone)}")
-    left_out = sorted((types[0].keys() & types[1].keys()) - {*names})
     for k, name in enumerate(names):
         progress(k / (len(names) + 1), name)
-        found, worst = _compare(one, other, name, QUANTITIES[types[0][name]])
-        topics.append(found)
-        if types[0][name] == IMAGE and worst is not None and images is None:
-            images = pixels_from(worst[0]), pixels_from(worst[1])
-        if found.refused:
-            notes.append(f"pairs on {name} cannot be compared: {found.refused}")
-    if not any(each.stamps for each in topics):
+        topics.append(_compare(one, other, one.topic(name)))
+        if topics[-1].refused:
+            notes.append(f"pairs on {name} cannot be compared: {topics[-1].refused}")
+    if not any(len(each.apart) for each in topics):
         raise BagError(
             f"{one.path} and {other.path} have no stamp in common, so that nothing can be paired: "
             f"they are of different runs; `us-sim render --session` keeps the stamps"
         )
     progress(len(names) / (len(names) + 1), "areas")
     try:
-        areas = _areas(one, other)
-        if areas is not None:
-            topics.append(areas)
+        topics += _areas(one, other)
     except UsSimError as error:
         if not all(each.is_none for each in topics):  # else the areas are the same, too
             notes.append(f"areas of vessels are not compared: {error}")
     progress(1.0, "")
-    return SessionDiff((one.path, other.path), topics, images, notes, left_out)
-
-
-def _is_compared(bag: Bag, name: str) -> bool:
-    return stamp_reader(bag, bag.topic(name)) is not None
+    return SessionDiff((one.path, other.path), topics, notes, sorted(both - {*names}))
 
 
 def _messages(bag: Bag, name: str) -> Iterator[tuple[int, BagMessage]]:
@@ -213,37 +195,46 @@ def _messages(bag: Bag, name: str) -> Iterator[tuple[int, BagMessage]]:
             yield read(message.data) or 0, message
 
 
-def _compare(
-    one: Bag, other: Bag, name: str, quantity: Quantity
-) -> tuple[Difference, tuple[Any, Any] | None]:
-    """One topic, and the two messages that are furthest apart by the last quantity's first."""
-    found = Difference(name, quantity.names)
-    first, second = _messages(one, name), _messages(other, name)
-    a, b = next(first, None), next(second, None)
-    only, worst, furthest = [0, 0], None, 0.0
-    while a is not None or b is not None:
-        if b is None or (a is not None and a[0] < b[0]):
-            only[0], a = only[0] + 1, next(first, None)
+def _places(bag: Bag, name: str) -> pd.DataFrame:
+    """The stamps of a topic; each once, or with the number of its repetition."""
+    found = pd.DataFrame({"stamp": [stamp for stamp, _ in _messages(bag, name)]}, dtype="int64")
+    return found.assign(again=found.groupby("stamp").cumcount())
+
+
+def _compare(one: Bag, other: Bag, topic: BagTopic) -> Difference:
+    """Pair the messages of a topic by their stamps, in the order of recording A."""
+    columns, measure = QUANTITIES[topic.type_name]
+    mine, yours = _places(one, topic.name), _places(other, topic.name)
+    yours["place"] = yours.index
+    pairs = mine.merge(yours, "outer", on=["stamp", "again"], indicator="where")
+    only = tuple(int((pairs["where"] == side).sum()) for side in ("left_only", "right_only"))
+    found = Difference(topic.name, pd.DataFrame(), 0, (only[0], only[1]))
+    partner = mine.merge(yours, "left", on=["stamp", "again"])["place"]
+    waiting: dict[int, BagMessage] = {}  # of B, that come in another order than in A
+    later = enumerate(message for _, message in _messages(other, topic.name))
+    stamps, apart, furthest = [], [], 0.0
+    for (stamp, a), place in zip(_messages(one, topic.name), partner, strict=True):
+        if np.isnan(place):
             continue
-        if a is None or b[0] < a[0]:
-            only[1], b = only[1] + 1, next(second, None)
-            continue
-        found.stamps.append(a[0])
-        if _are_equal(a[1].data, b[1].data):
+        while place not in waiting:
+            number, message = next(later)
+            waiting[number] = message
+        b = waiting.pop(int(place))
+        stamps.append(stamp)
+        apart.append((0.0, 0.0))
+        if _are_equal(a.data, b.data):
             found.identical += 1
-            found.apart.append((0.0,) * len(quantity.names))
-        else:
-            pair = one.deserialize(a[1]), other.deserialize(b[1])
-            try:
-                found.apart.append(quantity.measure(*pair))
-                if found.apart[-1][0] > furthest:
-                    worst, furthest = pair, found.apart[-1][0]
-            except UsSimError as error:
-                found.apart.append((np.nan,) * len(quantity.names))
-                found.refused = found.refused or str(error)
-        a, b = next(first, None), next(second, None)
-    found.only = only[0], only[1]
-    return found, worst
+            continue
+        pair = one.deserialize(a), other.deserialize(b)
+        try:
+            apart[-1] = measure(*pair)
+            if apart[-1][0] > furthest:
+                found.worst, furthest = pair, apart[-1][0]
+        except UsSimError as error:
+            apart[-1] = (np.nan, np.nan)
+            found.refused = found.refused or str(error)
+    found.apart = pd.DataFrame(apart, index=stamps, columns=columns, dtype=float)
+    return found
 
 
 def _are_equal(one: bytes, other: bytes) -> bool:
@@ -259,10 +250,10 @@ def _are_equal(one: bytes, other: bytes) -> bool:
 _NODES, _POSES = "/tissue/nodes", "/probe/pose"
 
 
-def _areas(one: Bag, other: Bag) -> Difference | None:
+def _areas(one: Bag, other: Bag) -> list[Difference]:
     """Areas of vessels in the image plane, as both recordings' nodes carry them.
 
-    None where there is no tissue, or the volume has no vessels.
+    Nothing where there is no tissue, or the volume has no vessels.
 
     Raises:
         UsSimError: the scene is not there, or of other files.
@@ -270,14 +261,14 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
     names = {topic.name for topic in one.topics} & {topic.name for topic in other.topics}
     needed = {_NODES, _POSES, "/tissue/rest", "/tissue/tetrahedra"}
     if not needed <= names:
-        return None
+        return []
     with scene_of(one) as scene:
         volume = volume_of(scene)
         vessels = {
             label: name for label, name in volume.label_names.items() if kind_of(name) in VESSELS
         }
         if volume.labels is None or not vessels:
-            return None
+            return []
         scanner = scanner_of(scene, volume)
     latched: dict[str, Any] = {
         message.topic: one.deserialize(message)
@@ -288,49 +279,32 @@ def _areas(one: Bag, other: Bag) -> Difference | None:
     scanner.carry(
         vectors_from(latched["/tissue/rest"]), tetrahedra_from(latched["/tissue/tetrahedra"])
     )
-    common = sorted(_stamps(one, _NODES) & _stamps(other, _NODES) & _stamps(one, _POSES))
+    stamps = [{stamp for stamp, _ in _messages(bag, _NODES)} for bag in (one, other)]
+    common = sorted(stamps[0] & stamps[1] & {stamp for stamp, _ in _messages(one, _POSES)})
     picked = np.unique(np.linspace(0, len(common) - 1, min(AREAS, len(common))).astype(int))
-    chosen = {common[k] for k in picked}
+    chosen = [common[k] for k in picked]
     if not chosen:
-        return None
+        return []
     poses, mine, yours = (
-        _decoded(bag, topic, chosen)
+        {s: bag.deserialize(message) for s, message in _messages(bag, topic) if s in {*chosen}}
         for bag, topic in ((one, _POSES), (one, _NODES), (other, _NODES))
     )
     pixel = 1e6 * float(np.prod(scanner.probe.pixel_spacing))
-    found = Difference("areas of vessels", tuple(f"{name} (mm²)" for name in vessels.values()))
-    for stamp in sorted(chosen):
+    areas = []
+    for stamp in chosen:
         pose = pose_from(poses[stamp])
-        if mine[stamp].data.tobytes() == yours[stamp].data.tobytes():
-            apart = (0.0,) * len(vessels)
-        else:
-            seen = [scanner.labels(pose, vectors_from(each[stamp])) for each in (mine, yours)]
-            apart = tuple(
-                pixel * abs(int((seen[0] == k).sum()) - int((seen[1] == k).sum())) for k in vessels
-            )
-        found.stamps.append(stamp)
-        found.apart.append(apart)
-        found.identical += not any(apart)
-    return found
-
-
-def _stamps(bag: Bag, topic: str) -> set[int]:
-    return {stamp for stamp, _ in _messages(bag, topic)}
-
-
-def _decoded(bag: Bag, topic: str, stamps: set[int]) -> dict[int, Any]:
-    return {
-        stamp: bag.deserialize(message)
-        for stamp, message in _messages(bag, topic)
-        if stamp in stamps
-    }
+        seen = [scanner.labels(pose, vectors_from(each[stamp])) for each in (mine, yours)]
+        counts = [np.array([(labels == k).sum() for k in vessels]) for labels in seen]
+        areas.append(pixel * np.abs(counts[0] - counts[1]))
+    apart = pd.DataFrame(areas, chosen, [f"{name} (mm²)" for name in vessels.values()])
+    return [Difference("areas of vessels", apart, int((apart == 0).all(axis=1).sum()))]
 
 
 def table(found: SessionDiff) -> str:
     """The numbers below each other, and what could not be compared."""
     rows = [HEAD, *found.rows]
     lines = [f"A {found.paths[0]}", f"B {found.paths[1]}", "", *aligned(rows, left=(0, 1))]
-    pairs = sum(len(each.stamps) for each in found.topics)
+    pairs = sum(len(each.apart) for each in found.topics)
     lines += ["", *found.notes]
     if found.left_out:
         lines.append(f"not compared: {', '.join(found.left_out)}")
@@ -351,8 +325,7 @@ def write(found: SessionDiff, folder: Path) -> list[Path]:
         for file in files:
             if file.exists():
                 raise BagError(f"{file} exists already: choose another folder with --out")
-        with files[0].open("w", encoding="utf-8", newline="") as stream:
-            csv.writer(stream).writerows([HEAD, *found.rows])
+        pd.DataFrame(found.rows, columns=list(HEAD)).to_csv(files[0], index=False)
         _draw(found, files[1])
     except OSError as error:
         raise BagError(f"{folder} cannot be written to: {error.strerror}") from None
@@ -362,10 +335,10 @@ def write(found: SessionDiff, folder: Path) -> list[Path]:
 def _draw(found: SessionDiff, file: Path) -> None:
     """Each quantity that differs over time, and the images that differ most."""
     panels = [
-        (each, k)
+        (f"{each.topic}: {name}", values)
         for each in found.topics
-        for k in range(len(each.names))
-        if len(each.stamps) > 1 and any(values[k] for values in each.apart)
+        for name, values in each.apart.items()
+        if len(values) > 1 and values.any()
     ]
     columns = 3
     rows = -(-len(panels) // columns) or 1
@@ -375,13 +348,18 @@ def _draw(found: SessionDiff, file: Path) -> None:
     figure.suptitle(f"A {found.paths[0]}\nB {found.paths[1]}", fontsize=9, x=0.01, ha="left")
     grid = figure.add_gridspec(len(heights), columns, height_ratios=heights)
     if not panels:
-        figure.text(0.02, 0.5, "nothing differs over time")
-    first = min((each.stamps[0] for each, _ in panels), default=0)
-    for place, (each, k) in enumerate(panels):
+        alone = [
+            f"{each.topic}: {each.only[0]} messages in A alone, {each.only[1]} in B alone"
+            for each in found.topics
+            if any(each.only)
+        ]
+        told = "\n".join(["no pair differs over time", *alone, *found.notes])
+        figure.text(0.02, 0.5, told, va="center", wrap=True)
+    first = min((values.index[0] for _, values in panels), default=0)
+    for place, (title, values) in enumerate(panels):
         axes = figure.add_subplot(grid[place // columns, place % columns])
-        times = (np.array(each.stamps) - first) * 1e-9
-        axes.plot(times, [values[k] for values in each.apart], ".-", ms=2, lw=0.7)
-        axes.set_title(f"{each.topic}: {each.names[k]}", fontsize=8.5, loc="left")
+        axes.plot((values.index - first) * 1e-9, values, ".-", ms=2, lw=0.7)
+        axes.set_title(title, fontsize=8.5, loc="left")
         axes.set_ylim(bottom=0.0)
         axes.grid(True, color="0.93")
         axes.spines[["top", "right"]].set_visible(False)
