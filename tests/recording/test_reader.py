@@ -285,7 +285,7 @@ def test_messages_of_the_same_time_come_in_the_order_of_the_file(tmp_path):
 def test_the_description(tmp_path):
     write_session(tmp_path / "session.mcap")
     lines = [line.split() for line in describe(read_bag(tmp_path / "session.mcap")).splitlines()]
-    for words in ("duration 1.990 s", "messages 200", f"/a {STRING} 160 79.9 -"):
+    for words in ("duration 1.990 s", "messages 200", f"/a {STRING} 160 80.3 -"):
         assert words.split() in lines
 
 
@@ -417,3 +417,13 @@ def test_a_database_that_is_no_bag(tmp_path):
         database.execute("CREATE TABLE things(id)")
     with pytest.raises(BagError, match="rosbag2 database"):
         read_bag(tmp_path / "other.db3")
+
+
+def test_a_rate_is_that_between_a_topics_own_messages(tmp_path):
+    with BagWriter(tmp_path / "late.mcap", sidecar=False) as bag:
+        for topic in ("/a", "/late"):
+            bag.add_topic(topic, STRING)
+        for k in range(100):
+            bag.write("/a" if k < 50 else "/late", HI, EPOCH + k * 10**8)
+    lines = [line.split() for line in describe(read_bag(tmp_path / "late.mcap")).splitlines()]
+    assert f"/late {STRING} 50 10.0 -".split() in lines

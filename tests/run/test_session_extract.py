@@ -145,7 +145,7 @@ def test_real_images_have_no_scale_that_nobody_recorded(shared_data, tmp_path):
         ("--poses", "holds no poses"),
         ("--wrench", "holds no wrench"),
         ("--images", "holds no image"),
-        ("--areas", "has no scene attached"),
+        ("--areas", "holds no scene attached"),
     ],
 )
 def test_what_a_recording_has_not(tmp_path, capsys, option, said):
@@ -153,6 +153,13 @@ def test_what_a_recording_has_not(tmp_path, capsys, option, said):
         bag.add_topic("/note", "std_msgs/msg/String")
     assert extracted(tmp_path / "s.mcap", tmp_path / "out", option) == 1
     assert said in capsys.readouterr().err
+
+
+def test_all_that_a_recording_lacks_is_named_and_nothing_written(tmp_path, capsys):
+    session = write(tmp_path / "s.mcap", [each for each in press(3) if each[0] == "/probe/pose"])
+    assert extracted(session, tmp_path / "out", "--poses", "--wrench", "--images") == 1
+    assert "no wrench and no image; leave out --wrench and --images" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_images_that_are_no_pictures(tmp_path, capsys):

@@ -118,7 +118,8 @@ def _diff(args: argparse.Namespace) -> int:
 def _extract(args: argparse.Namespace) -> int:
     from us_sim.recording.repair import extract
 
-    if not any(vars(args)[name] for name in _EXTRACTED):
+    asked = [name for name in _EXTRACTED if vars(args)[name]]
+    if not asked:
         for file in extract(args.file, args.out):
             print(file)
         return 0
@@ -127,6 +128,7 @@ def _extract(args: argparse.Namespace) -> int:
     from us_sim.run import session_extract as parts
 
     bag, out = read_bag(args.file), args.out
+    parts.require_parts(bag, asked)
     show = late_progress(f"bag extract {args.file.name}")
     if args.poses:
         _print_all(parts.write_poses(bag, out))

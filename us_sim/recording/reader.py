@@ -302,17 +302,22 @@ def describe(bag: Bag) -> str:
 
     The times of marks are those since the start. All of the bag is read, for its faults.
     """
-    start = bag.start
+    start, faults = bag.start, list[Fault]()
+    times: dict[str, tuple[int, int]] = {}  # ns, first and last of a topic
+    for message in bag.all_messages(faults):
+        first, _ = times.get(message.topic, (message.log_time, 0))
+        times[message.topic] = first, message.log_time
     seconds = (bag.end - start) * 1e-9 if start is not None and bag.end is not None else 0.0
     lines = [f"file      {bag.path}"]
-    lines += [f"note      {fault.text}" for fault in bag.faults()]
+    lines += [f"note      {fault.text}" for fault in faults]
     if start is not None:
         lines.append(f"start     {_date(start)}")
     lines += [f"duration  {seconds:.3f} s", f"messages  {bag.message_count}", ""]
     table = [("topic", "type", "count", "Hz", "quality of service")]
     for topic in sorted(bag.topics, key=lambda topic: topic.name):
         count = topic.message_count
-        rate = f"{(count - 1) / seconds:.1f}" if seconds and count > 1 else "-"
+        first, last = times.get(topic.name, (0, 0))
+        rate = f"{(count - 1) / (last - first) * 1e9:.1f}" if last > first else "-"
         quality = "; ".join(dict.fromkeys(profile.summary for profile in topic.qos)) or "-"
         encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
         table.append((topic.name, topic.type_name + encoding, str(count), rate, quality))

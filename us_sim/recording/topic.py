@@ -5,32 +5,19 @@ Quality of service is in the YAML of rosbag2: policies by name since Jazzy, by n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from enum import Enum
 from typing import Any, NamedTuple
 
 import yaml
+from rosbags.interfaces import QosTime
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.metadata import parse_qos
 
 from us_sim.errors import BagError
-from us_sim.settings.text_files import YamlError, load_yaml
 
 INFINITE = 2**63 - 1  # ns, what rmw calls RMW_DURATION_INFINITE
-
-_POLICIES = {
-    "history": ("system_default", "keep_last", "keep_all", "unknown"),
-    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
-    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
-    "liveliness": (
-        "system_default",
-        "automatic",
-        "manual_by_node",
-        "manual_by_topic",
-        "unknown",
-        "best_available",
-    ),
-}
-"""Policies in the order of their numbers in rmw/types.h, which rosbag2 before Jazzy wrote."""
-
 _DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 
@@ -39,9 +26,6 @@ class QosProfile:
     """The quality of service that a publisher offered; the defaults are rclpy's.
 
     Policies are named as rmw names them in lower case.
-
-    Raises:
-        BagError: a policy has no such name.
     """
 
     history: str = "keep_last"
@@ -54,42 +38,19 @@ class QosProfile:
     liveliness_lease_duration: int = INFINITE  # ns
     avoid_ros_namespace_conventions: bool = False
 
-    def __post_init__(self) -> None:
-        for policy, names in _POLICIES.items():
-            if getattr(self, policy) not in names:
-                raise BagError(
-                    f"QoS {policy} cannot be {getattr(self, policy)!r}: use one of "
-                    f"{', '.join(names)}"
-                )
-
     @classmethod
-    def of(cls, profile: object) -> QosProfile:
-        """The profile that ``profile`` describes.
-
-        Args:
-            profile: a QosProfile, a mapping as in a bag's YAML, or an object with the attributes
-                of ``rclpy.qos.QoSProfile``.
-
-        Raises:
-            BagError: it is none of these, or holds a policy that does not exist.
-        """
+    def of(cls, profile: Any) -> QosProfile:
+        """Return the profile that one of rclpy or rosbags is."""
         if isinstance(profile, QosProfile):
             return profile
-        try:
-            if isinstance(profile, Mapping):
-                values = {name: profile[name] for name in cls.__dataclass_fields__}
-            else:
-                values = {name: getattr(profile, name) for name in cls.__dataclass_fields__}
-        except (KeyError, AttributeError) as error:
-            raise BagError(f"{repr(profile)[:200]} is no QoS profile: it lacks {error}") from None
-        for policy in _POLICIES:
-            values[policy] = _policy_name(policy, values[policy])
-        for duration in _DURATIONS:
-            values[duration] = _nanoseconds(duration, values[duration])
-        try:
-            values["depth"] = int(values["depth"])
-        except (TypeError, ValueError, OverflowError):
-            raise BagError(f"QoS depth is no whole number: {values['depth']!r}") from None
+        values = {}
+        for each in fields(cls):
+            value = getattr(profile, each.name)
+            if isinstance(value, Enum):
+                value = value.name.lower()
+            elif isinstance(value, QosTime):
+                value = value.sec * 10**9 + value.nsec
+            values[each.name] = getattr(value, "nanoseconds", value)
         return cls(**values)
 
     @property
@@ -99,8 +60,8 @@ class QosProfile:
         return " ".join(f"{name}: {getattr(self, name)}" for name in names)
 
     def document(self) -> dict[str, Any]:
-        """This profile as rosbag2 0.26 writes it."""
-        values = dict(vars(self))
+        """Return this profile as rosbag2 0.26 writes it."""
+        values = asdict(self)
         for name in _DURATIONS:
             seconds, rest = divmod(values[name], 10**9)
             values[name] = {"sec": seconds, "nsec": rest}
@@ -108,17 +69,17 @@ class QosProfile:
 
 
 def as_yaml(document: object) -> str:
-    """A document as YAML, its keys in their order."""
+    """Write a document as YAML, its keys in their order."""
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
 
 
 def qos_to_yaml(profiles: Sequence[QosProfile]) -> str:
-    """The YAML list that rosbag2 puts in a channel's ``offered_qos_profiles``."""
+    """Write the YAML list that rosbag2 puts in a channel's ``offered_qos_profiles``."""
     return as_yaml([profile.document() for profile in profiles]).rstrip()
 
 
-def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tuple[QosProfile, ...]:
-    """The profiles of a bag of any version: YAML text, or the list that it parses to.
+def qos_from_yaml(document: Any, where: str = "offered_qos_profiles") -> tuple[QosProfile, ...]:
+    """Read the profiles of a bag of any version: YAML text, or the list that it parses to.
 
     Args:
         document: the text or the list; None or an empty text means no profiles.
@@ -128,38 +89,10 @@ def qos_from_yaml(document: object, where: str = "offered_qos_profiles") -> tupl
         BagError: the text is not YAML, or not a list of profiles.
     """
     try:
-        if isinstance(document, str):
-            document = load_yaml(document)
-        if document is None or document == "":
-            return ()
-        if not isinstance(document, list):
-            raise BagError("this is not a list of QoS profiles")
-        return tuple(QosProfile.of(item) for item in document)
-    except YamlError as error:
-        raise BagError(f"{where}: the QoS profiles are not YAML: {error}") from None
-    except BagError as error:
-        raise BagError(f"{where}: {error}") from None
-
-
-def _policy_name(policy: str, value: Any) -> str:
-    """Lower-case name of a policy that is a name, a number or an enum member."""
-    names = _POLICIES[policy]
-    name = getattr(value, "name", value)
-    if isinstance(name, str):
-        return name.lower()
-    if isinstance(name, int) and 0 <= name < len(names):
-        return names[name]
-    raise BagError(f"QoS {policy} cannot be {value!r}: use one of {', '.join(names)}")
-
-
-def _nanoseconds(duration: str, value: Any) -> int:
-    """Nanoseconds of an integer, of ``{sec, nsec}``, or of an rclpy Duration."""
-    try:
-        if isinstance(value, Mapping):
-            return int(value["sec"]) * 10**9 + int(value["nsec"])
-        return int(getattr(value, "nanoseconds", value))
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise BagError(f"QoS {duration} is not a duration: {value!r}") from None
+        return tuple(map(QosProfile.of, parse_qos(document or [])))
+    except (ReaderError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise BagError(f"{where}: this is not a list of QoS profiles: {reason}") from None
 
 
 LOST = "messages_lost"

@@ -160,10 +160,10 @@ def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) ->
         findings += _losses(each, bag.lost()[each.topic.name], origin, one_counter)
         name = each.derived.name if each.derived else ""
         poses = topics.get(f"{each.topic.name.removesuffix(name)}{POSES}") if name else None
-        findings += _gaps(each, poses, origin)
+        findings += _gaps(each, poses, origin, is_cut=bool(bag.opening_faults))
         findings += _latency(each, origin)
         if poses is not None and poses.read_stamp and len(poses.stamps):
-            findings += _pairing(each, poses, origin)
+            findings += _pairing(each, poses, origin, is_cut=bool(bag.opening_faults))
     damaged = sum(fault.messages for fault in faults)
     if damaged > 0 and sum(each.missing or 0 for each in held) <= damaged:
         # The damaged parts held what is missing, and the poses of these stamps.
@@ -293,7 +293,9 @@ def _losses(each: TopicCheck, said: int, origin: int, one_counter: bool) -> Iter
         yield Finding("loss", f"{lost}, as the recorder says: {remedy}")
 
 
-def _gaps(each: TopicCheck, poses: TopicCheck | None, origin: int) -> Iterator[Finding]:
+def _gaps(
+    each: TopicCheck, poses: TopicCheck | None, origin: int, *, is_cut: bool
+) -> Iterator[Finding]:
     sent, interval = np.sort(_times(each.sent)), each.interval
     name = each.topic.name
     if poses is not None and len(poses.sent) > 1 and not len(sent):
@@ -306,7 +308,8 @@ def _gaps(each: TopicCheck, poses: TopicCheck | None, origin: int) -> Iterator[F
     if poses is not None and len(poses.sent) and len(sent):
         # What follows from poses is missed where poses came, and at the end, too.
         came = np.sort(_times(poses.sent))
-        begins, ends = sent, np.append(sent[1:], max(came[-1], sent[-1]))
+        end = sent[-1] if is_cut else max(came[-1], sent[-1])
+        begins, ends = sent, np.append(sent[1:], end)
         between = np.searchsorted(came, ends) - np.searchsorted(came, begins, "right")
         lengths = ends - begins
         gaps = np.flatnonzero((lengths > STALE) & (between > 1))
@@ -377,11 +380,18 @@ def _latency(each: TopicCheck, origin: int) -> Iterator[Finding]:
         )
 
 
-def _pairing(each: TopicCheck, poses: TopicCheck, origin: int) -> Iterator[Finding]:
-    """Messages without their pose; of those before the first recorded one nobody can know."""
+def _pairing(
+    each: TopicCheck, poses: TopicCheck, origin: int, *, is_cut: bool
+) -> Iterator[Finding]:
+    """Find messages without their pose.
+
+    Of those before the first recorded one, and after the last where the bag was cut, nobody knows.
+    """
     stamps, known = _times(each.stamps), _times(poses.stamps)
-    before = (stamps < known.min()) & (stamps > known.min() - 10**9)
-    alone = np.flatnonzero(~np.isin(stamps, known) & ~before)
+    unknown = (stamps < known.min()) & (stamps > known.min() - 10**9)
+    if is_cut:
+        unknown |= stamps > known.max()
+    alone = np.flatnonzero(~np.isin(stamps, known) & ~unknown)
     each.unpaired = len(alone)
     if len(alone):
         yield Finding(

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from us_sim.errors import BagError, TrackingError
-from us_sim.recording.path import POSE_STAMPED, bodies_in, is_pose, pose_rows
+from us_sim.recording.path import POSE_STAMPED, Row, bodies_in, is_pose, pose_rows
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagTopic
@@ -44,26 +44,54 @@ def write_poses(bag: Bag, folder: Path) -> Iterator[Path | str]:
     TUM's has not, and stamps that go back, are said in sentences among the files.
 
     Raises:
-        BagError: there are no poses, a file exists, or cannot be written.
+        BagError: a file exists, or cannot be written.
     """
-    stamped = [topic.name for topic in bag.topics if topic.type_name == POSE_STAMPED]
-    bodies = stamped or [name for names in bodies_in(bag).values() for name in names]
-    if not bodies:
-        raise BagError(f"{bag.path} holds no poses; leave out --poses")
-    for name in bodies:
-        rows = list(pose_rows(bag, name))
-        head = ("stamp_s", "recorded_s", "frame", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-        table = [(_s(row.stamp), _s(row.log_time), row.frame_id, *row.pose) for row in rows]
-        yield _write_csv(folder / f"{_file_name(name)}.csv", head, table)
-        usable = is_pose(np.array([row.pose for row in rows]).reshape(-1, 7))
-        kept = [row for row, is_one in zip(rows, usable, strict=True) if is_one]
-        lines = [" ".join([_s(row.stamp), *map(repr, row.pose)]) for row in kept]
+    for name in _bodies(bag):
+        rows = pd.DataFrame(list(pose_rows(bag, name)), columns=list(Row._fields))
+        poses = pd.DataFrame(rows.pop("pose").tolist(), columns=_POSE, dtype=float)
+        stamps, logged = rows["stamp"].map(_s), rows["log_time"].map(_s)
+        head = {"stamp_s": stamps, "recorded_s": logged, "frame": rows["frame_id"]}
+        yield _write_csv(
+            folder / f"{_file_name(name)}.csv", pd.DataFrame(head).join(poses), na_rep="nan"
+        )
+        usable = is_pose(poses.to_numpy())
+        kept = poses[usable].map(repr)
+        kept.insert(0, "stamp", stamps[usable])
         file = folder / f"{_file_name(name)}.tum"
-        yield _written(file, "".join(f"{line}\n" for line in lines))
-        if rejected := len(rows) - len(kept):
+        yield _write_csv(file, kept, sep=" ", header=False)
+        if rejected := int((~usable).sum()):
             are = counted(rejected, "pose is", "poses are")
             yield f"{name}: {are} not finite or without an orientation, and not in {file.name}"
-        yield from _times_told(name, [row.stamp for row in kept], file.name)
+        yield from _times_told(name, rows["stamp"][usable].tolist(), file.name)
+
+
+_POSE = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+
+
+def _bodies(bag: Bag) -> list[str]:
+    stamped = [topic.name for topic in bag.topics if topic.type_name == POSE_STAMPED]
+    return stamped or [name for names in bodies_in(bag).values() for name in names]
+
+
+def require_parts(bag: Bag, options: Collection[str]) -> None:
+    """Refuse at once all options whose parts a bag lacks.
+
+    Raises:
+        BagError: it lacks some.
+    """
+    types = {topic.type_name for topic in bag.topics if topic.message_count}
+    is_there = {
+        "poses": bool(_bodies(bag)),
+        "wrench": WRENCH_STAMPED in types,
+        "images": not types.isdisjoint(_DECODE),
+        "video": not types.isdisjoint(_DECODE),
+        "areas": "scene.yaml" in bag.attachments([]),
+    }
+    names = {"wrench": "wrench", "images": "image", "video": "image", "areas": "scene attached"}
+    if lacking := [option for option in options if not is_there[option]]:
+        parts = " and ".join(dict.fromkeys(f"no {names.get(o, o)}" for o in lacking))
+        leave = " and ".join(f"--{option}" for option in lacking)
+        raise BagError(f"{bag.path} holds {parts}; leave out {leave}")
 
 
 def _times_told(name: str, stamps: list[int], where: str, remedy: str = "") -> Iterator[str]:
@@ -83,17 +111,17 @@ def write_wrenches(bag: Bag, folder: Path) -> Iterator[Path]:
     """Every WrenchStamped topic as CSV, N and N m.
 
     Raises:
-        BagError: there is none, a file exists, or cannot be written.
+        BagError: there is no wrench on a topic, a file exists, or cannot be written.
     """
-    names = [topic.name for topic in bag.topics if topic.type_name == WRENCH_STAMPED]
-    if not names:
-        raise BagError(f"{bag.path} holds no wrench; leave out --wrench")
-    for name in names:
+    for name in [topic.name for topic in bag.topics if topic.type_name == WRENCH_STAMPED]:
         record = read_wrenches(bag.path, name)
-        head = ("stamp_s", "frame", *(f"f{axis}_n" for axis in "xyz"), "tx_nm", "ty_nm", "tz_nm")
-        rows = zip(record.stamps.tolist(), record.wrenches.tolist(), strict=True)
-        table = [(_s(stamp), record.frame_id, *wrench) for stamp, wrench in rows]
-        yield _write_csv(folder / f"{_file_name(name)}.csv", head, table)
+        table = pd.DataFrame(record.wrenches, columns=_WRENCH)
+        table.insert(0, "stamp_s", pd.Series(record.stamps).map(_s))
+        table.insert(1, "frame", record.frame_id)
+        yield _write_csv(folder / f"{_file_name(name)}.csv", table)
+
+
+_WRENCH = ["fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"]
 
 
 def write_images(
@@ -116,11 +144,10 @@ def write_images(
     Raises:
         BagError: there is no image that can be decoded, a file exists, or cannot be written.
     """
-    topics = [topic for topic in bag.topics if topic.type_name in _DECODE and topic.message_count]
-    if not topics:
-        raise BagError(f"{bag.path} holds no image; leave out --images and --video")
     is_written = False
-    for topic in topics:
+    for topic in bag.topics:
+        if topic.type_name not in _DECODE or not topic.message_count:
+            continue
         for made in _write_topic(bag, topic, folder, progress, pictures, video):
             is_written = is_written or isinstance(made, Path)
             yield made
@@ -162,8 +189,8 @@ def _write_topic(
         yield f"{topic.name}: {counted(len(odd), 'image')} skipped: {odd[0]}"
     if not rows:
         return
-    head = ("image", "stamp_s", "column_spacing_mm", "row_spacing_mm")
-    yield _write_csv(stem.with_suffix(".csv"), head, rows)
+    head = ["image", "stamp_s", "column_spacing_mm", "row_spacing_mm"]
+    yield _write_csv(stem.with_suffix(".csv"), pd.DataFrame(rows, columns=head))
     remedy = ": the times are those of the recording"
     yield from _times_told(topic.name, stamps, stem.with_suffix(".csv").name, remedy)
     if pictures:
@@ -184,15 +211,13 @@ def write_areas(bag: Bag, folder: Path, progress: Progress) -> Iterator[Path]:
         areas = session.lumen_areas(scene, AREAS, lambda done: progress(done, "areas"))
     if areas is None:
         raise BagError(f"{bag.path}: no image of it cuts a vessel that can be measured")
-    head = ["time_s", "depth_mm"]
-    columns: list[NDArray[np.float64]] = [areas.time, 1e3 * areas.depth]
+    first = min(session.poses)
+    stamps = [_s(first + round(1e9 * time)) for time in areas.time]
+    table = pd.DataFrame({"stamp_s": stamps, "depth_mm": (1e3 * areas.depth).round(6)})
     for name in areas.area:
-        head += [f"{name}_mm2", f"{name}_at_rest_mm2"]
-        columns += [1e6 * areas.area[name], 1e6 * areas.at_rest[name]]
-    table = np.column_stack(columns).tolist()
-    yield _write_csv(
-        folder / "areas.csv", head, [["" if v != v else round(v, 6) for v in row] for row in table]
-    )
+        table[f"{name}_mm2"] = (1e6 * areas.area[name]).round(6)
+        table[f"{name}_at_rest_mm2"] = (1e6 * areas.at_rest[name]).round(6)
+    yield _write_csv(folder / "areas.csv", table)
 
 
 def _file_name(topic: str) -> str:
@@ -206,15 +231,9 @@ def _s(nanoseconds: int) -> str:
     return f"{sign}{abs(nanoseconds) // 10**9}.{abs(nanoseconds) % 10**9:09d}"
 
 
-def _write_csv(file: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> Path:
+def _write_csv(file: Path, table: pd.DataFrame, **options: Any) -> Path:
     with _new(file, encoding="utf-8", newline="") as stream:
-        csv.writer(stream).writerows([head, *rows])
-    return file
-
-
-def _written(file: Path, text: str) -> Path:
-    with _new(file, encoding="utf-8") as stream:
-        stream.write(text)
+        table.to_csv(stream, index=False, lineterminator="\n", **options)
     return file
 
 
