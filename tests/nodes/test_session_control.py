@@ -97,7 +97,11 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
         ("", "volume: is missing"),
     ]
     assert [each.structures for each in board.scenes] == [("vein", "artery"), ()]
-    assert (board.state.rate, board.state.loop, board.state.is_busy) == (0.5, True, True)
+    assert (board.state.replay_rate, board.state.replay_loop, board.state.is_busy) == (
+        0.5,
+        True,
+        True,
+    )
     assert board.state.problem == "nothing came"
     assert board.state.record_note == "it lies beside another"
     bench.spin_until(lambda: session._client.services_are_ready())

@@ -161,7 +161,7 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
     board.bags = {"hand.mcap": "/bags/hand.mcap"}
     opened(page, "Session")
     kind = page.get_by_role("button", name="All as recorded")
-    page.get_by_title("start again, with what was set before").wait_for()
+    page.get_by_title("when you end it the nodes start again").wait_for()
     page.get_by_label("recording or path").click()
     page.get_by_role("option", name="hand.mcap").click()
     kind.click()
@@ -176,12 +176,12 @@ def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recor
 def test_how_long_and_how_large_a_recording_is_and_what_room_is_left_is_said(page, session):
     board, _ = session
     state = dataclasses.replace(RUNNING, record="/a.mcap", record_seconds=61.0, record_bytes=61e6)
-    board.state = dataclasses.replace(state, record_room=36e9)
+    board.state = dataclasses.replace(state, record_room_bytes=36e9)
     opened(page, "Session")
     recorded = page.get_by_text("recording to /a.mcap: 1:01 min, 61 MB, room for 10 h")
     recorded.wait_for()
     assert "us-wrong" not in recorded.get_attribute("class")
-    board.state = dataclasses.replace(state, record_room=5e8)
+    board.state = dataclasses.replace(state, record_room_bytes=5e8)
     page.locator(".us-wrong", has_text="room for 8 min").wait_for()
 
 

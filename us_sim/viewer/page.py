@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -76,10 +76,8 @@ class _Modes:
         self._mark()
         self._remarks: list[str] = []
         node, status = simulator.nodes.of(NODE), simulator.status
-        node.watch()
-        ui.context.client.on_delete(node.unwatch)
-        status.watch()
-        ui.context.client.on_delete(status.unwatch)
+        _while_connected(node.watch, node.unwatch)
+        _while_connected(status.watch, status.unwatch)
         ui.timer(0.3, self._refresh)
 
     async def _choose(self, mode: str) -> None:
@@ -258,11 +256,23 @@ def build_headline(simulator: Simulator) -> None:
         words.set_text(" · ".join(filter(None, (*known, told))))
         problem.set_text(board.state.problem)
 
-    board.watch()
-    nodes.watch()
-    ui.context.client.on_delete(board.unwatch)
-    ui.context.client.on_delete(nodes.unwatch)
+    _while_connected(board.watch, board.unwatch)
+    _while_connected(nodes.watch, nodes.unwatch)
     ui.timer(0.5, refresh)
+
+
+def _while_connected(begin: Callable[[], None], end: Callable[[], None]) -> None:
+    """Have ``begin`` called when the browser comes, and ``end`` when it goes, also for a moment."""
+    connections = 0
+
+    def change(by: int) -> None:
+        nonlocal connections
+        before, connections = connections, connections + by
+        if bool(before) != bool(connections):
+            (end if before else begin)()
+
+    ui.context.client.on_connect(lambda: change(1))
+    ui.context.client.on_disconnect(lambda: change(-1))
 
 
 _HEAD = """<link rel="stylesheet" href="/us_sim/assets/viewer.css">
@@ -396,6 +406,8 @@ def application(simulator: Simulator) -> Any:
         gzip_middleware_factory=None,
         binding_refresh_interval=None,
         show_welcome_message=False,
+        # Of a busy computer a page misses beats: it would be loaded anew, with its panels closed.
+        reconnect_timeout=30.0,
         favicon=ASSETS / "probe.svg",
     )
     return app

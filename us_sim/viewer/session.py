@@ -8,11 +8,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import PurePath
 from typing import Any
 
@@ -31,33 +32,50 @@ NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or re
 
 @dataclass(frozen=True)
 class SessionState:
-    """State of the simulation: its scene, recording and replay."""
+    """State of the simulation: its scene, recording and replay, named as in its report."""
 
     is_there: bool = False  # whether somebody answers for it
     state: str = ""  # for a person
     scene: str = ""
     origin: str = ""  # what loads it
-    loading: str = ""  # the origin of another scene that is being made
     fraction: float = 1.0  # of loading or starting that is done
     problem: str = ""  # why the last thing that was asked for came to nothing
     record: str = ""  # file that is recorded to, with its folder
     record_note: str = ""  # what is to be known of that file
     record_seconds: float = 0.0  # since when
     record_bytes: float = 0.0  # its size so far
-    record_room: float = 0.0  # bytes that are left
+    record_room_bytes: float = 0.0  # what is left
     replay: str = ""  # bag that is played
     replay_as: str = "path"
     replay_state: str = ""
+    replay_rate: float = 1.0  # speed factor
+    replay_loop: bool = False
     position: float = 0.0  # s, in the replay
     duration: float = 0.0  # s
-    rate: float = 1.0  # speed factor
-    loop: bool = False
-    paused: bool = False
 
     @property
     def is_busy(self) -> bool:
         """Whether a scene is being loaded, or nodes are starting."""
         return self.fraction < 1.0
+
+    @classmethod
+    def of(cls, status: DiagnosticStatus) -> SessionState:
+        """Read the report of `session_control`."""
+        said = {each.key: each.value for each in status.values}
+        values: dict[str, Any] = {"is_there": True, "state": said.get("state", status.message)}
+        values["problem"] = status.message if status.level != DiagnosticStatus.OK else ""
+        for each in fields(cls):
+            text = said.get(each.name)
+            if text is None or each.name in values:
+                continue
+            if isinstance(each.default, bool):
+                values[each.name] = text == "true"
+            elif isinstance(each.default, str):
+                values[each.name] = text
+            else:
+                with contextlib.suppress(ValueError):
+                    values[each.name] = float(text)
+        return cls(**values)
 
 
 class SessionBoard(Watched):
@@ -155,12 +173,6 @@ class ViewerSession(SessionBoard):
         self._heard = 0.0
         self._asked: list[tuple[Future[str], float]] = []  # and when that was
 
-    def close(self) -> None:
-        """Answer whoever waits."""
-        for told, _ in self._asked:
-            if not told.done():
-                told.set_result("the viewer ends")
-
     def _listen(self) -> None:
         if self.is_watched and self._client is None:
             self._client = AsyncParameterClient(self._node, CONTROL)
@@ -171,7 +183,7 @@ class ViewerSession(SessionBoard):
         for status in message.status:
             if status.name == self._name:
                 self._heard = time.monotonic()
-                self.state = _state_of(status)
+                self.state = SessionState.of(status)
 
     def _take_scenes(self, message: DiagnosticArray) -> None:
         self.scenes = tuple(map(_scene_of, message.status))
@@ -194,19 +206,17 @@ class ViewerSession(SessionBoard):
 
     def _send(self, values: Mapping[str, object]) -> Future[str]:
         told: Future[str] = Future()
-
-        def ask() -> None:
-            if self._client is None or not self._client.services_are_ready():
-                told.set_result(NOT_THERE)
-                return
-            self._asked.append((told, time.monotonic()))
-            parameters = [Parameter(name, value=value) for name, value in values.items()]
-            answer = self._client.set_parameters_atomically(parameters)
-            answer.add_done_callback(lambda done: _tell(told, done))
-
-        if self._post(ask).cancelled():
-            told.set_result("the viewer ends")
+        self._post(lambda: self._ask(values, told))
         return told
+
+    def _ask(self, values: Mapping[str, object], told: Future[str]) -> None:
+        if self._client is None or not self._client.services_are_ready():
+            told.set_result(NOT_THERE)
+            return
+        self._asked.append((told, time.monotonic()))
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        answer = self._client.set_parameters_atomically(parameters)
+        answer.add_done_callback(lambda done: _tell(told, done))
 
 
 def _tell(told: Future[str], answer: Any) -> None:
@@ -242,36 +252,3 @@ def _names(text: str) -> tuple[str, ...]:
     except (ValueError, RecursionError):
         return ()
     return tuple(map(str, listed)) if isinstance(listed, list) else ()
-
-
-def _state_of(status: DiagnosticStatus) -> SessionState:
-    said = {each.key: each.value for each in status.values}
-
-    def number(key: str, otherwise: float) -> float:
-        try:
-            return float(said[key])
-        except (KeyError, ValueError):
-            return otherwise
-
-    return SessionState(
-        is_there=True,
-        state=said.get("state", status.message),
-        scene=said.get("scene", ""),
-        origin=said.get("origin", ""),
-        loading=said.get("loading", ""),
-        fraction=number("fraction", 1.0),
-        problem=status.message if status.level != DiagnosticStatus.OK else "",
-        record=said.get("record", ""),
-        record_note=said.get("record_note", ""),
-        record_seconds=number("record_seconds", 0.0),
-        record_bytes=number("record_bytes", 0.0),
-        record_room=number("record_room_bytes", 0.0),
-        replay=said.get("replay", ""),
-        replay_as=said.get("replay_as", "path"),
-        replay_state=said.get("replay_state", ""),
-        position=number("position", 0.0),
-        duration=number("duration", 0.0),
-        rate=number("replay_rate", 1.0),
-        loop=said.get("replay_loop", "") == "true",
-        paused=said.get("replay_paused", "") == "true",
-    )

@@ -22,10 +22,9 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.slicing.settings import STRIPS
@@ -254,43 +253,25 @@ class PageStream:
         return packets, later
 
 
-T = TypeVar("T")
-
-
 class Posted:
     """Runs calls from any thread in the node's thread, in order.
 
     Args:
-        node: that is spun.
+        node: that is spun, or will be.
     """
 
     def __init__(self, node: GuardedNode) -> None:
-        self._work: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._node = node
-        self._closed = False
+        self._work: deque[Callable[[], object]] = deque()
 
-    def __call__(self, work: Callable[[], T]) -> Future[T]:
-        """Run it soon; the future holds its result or exception."""
-        future: Future[T] = Future()
-        if self._closed:
-            future.cancel()
-            return future
-        self._work.append((work, future))
-        self._node.call_soon(self._turn)
-        return future
+    def __call__(self, work: Callable[[], object]) -> None:
+        """Run it soon."""
+        self._work.append(work)
+        self._node.call_soon(self._run)
 
-    def close(self) -> None:
-        """Cancel all waiting calls, as the node ends."""
-        self._closed = True
-        while self._work:
-            self._work.popleft()[1].cancel()
-
-    def _turn(self) -> None:
-        for _ in range(len(self._work)):
-            work, future = self._work.popleft()
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                future.set_result(work())
-            except Exception as error:
-                future.set_exception(error)
+    def _run(self) -> None:
+        if self._work:
+            work = self._work.popleft()
+            if self._work:  # such as what was asked for before the node was spun
+                self._node.call_soon(self._run)
+            work()

@@ -1,17 +1,15 @@
 """Surfaces as they go to a page: told once at rest, after which only positions travel.
 
 >>> import numpy as np
->>> from us_sim.viewer.surfaces import Offsets, RestSurface, clustered, welded
+>>> from us_sim.viewer.surfaces import RestSurface, welded
 >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
 >>> vertices, triangles = welded(corners)
 >>> len(vertices), triangles
-(4, array([[0, 2, 3], [0, 3, 1]]))
+(4, array([[0, 1, 3], [0, 3, 2]]))
 >>> surface = RestSurface(vertices, triangles)
 >>> packet = surface.moved(vertices + [0, 0, 0.001], kind="skin", sequence=1, stamp=0)
 >>> packet.header["resolution"], len(packet.payload)
 (1e-06, 24)
->>> Offsets.between(np.array([[0.0, 0.0, 0.012]]), np.zeros((1, 3))).steps
-array([[    0,     0, 12000]], dtype=int16)
 """
 
 from __future__ import annotations
@@ -28,6 +26,10 @@ from us_sim.errors import MeshError
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.viewer.stream import Packet
 
+FINEST = 1e-6
+"""m, of a step: tissue may move by 33 mm before steps must be longer. Whole steps are half the
+bytes of single precision."""
+
 
 @dataclass(frozen=True, eq=False)
 class ColouredSurface:
@@ -39,31 +41,18 @@ class ColouredSurface:
     triangles: NDArray[np.integer]  # (T, 3)
 
 
-def welded(
-    corners: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def welded(corners: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Vertices (V, 3), each once, and triangles (T, 3), without those that have no area left.
 
     Args:
         corners: (3 T, 3) m, three of each triangle in a row.
-
-    Raises:
-        MeshError: they do not make whole triangles, or one is not finite.
     """
-    corners = np.ascontiguousarray(corners, dtype=np.float64) + 0.0  # -0 is 0
-    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) % 3:
-        raise MeshError(f"corners of shape {corners.shape} do not make whole triangles")
-    if not np.isfinite(corners).all():
-        raise MeshError("a corner of a triangle is not finite")
-    order = np.lexsort(corners.T[::-1])
+    order = np.lexsort(corners.T)  # a seventh of the time of `numpy.unique`
     ordered = corners[order]
-    is_new = np.ones(len(corners), dtype=bool)
-    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    is_new = np.insert((ordered[1:] != ordered[:-1]).any(axis=1), 0, values=True)
     numbers = np.empty(len(corners), dtype=np.intp)
     numbers[order] = np.cumsum(is_new) - 1
-    triangles = numbers.reshape(-1, 3)
-    apart = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
-    return ordered[is_new], triangles[apart]
+    return ordered[is_new], _with_area(numbers.reshape(-1, 3))
 
 
 def clustered(
@@ -72,9 +61,9 @@ def clustered(
     """(F, 3) triangles of the same vertices that are left when vertices are merged.
 
     Vertices are merged in the cells of a grid (J. Rossignac and P. Borrel, "Multi-resolution 3D
-    approximations for rendering complex scenes", 1993), each cell into the vertex nearest to their
-    mean: they are vertices of the surface itself, also in a deformed state. A closed surface stays
-    closed: as a sum of oriented triangles it has no edge left over.
+    approximations for rendering complex scenes", 1993), each cell into one of them: so they are
+    vertices of the surface itself, also in a deformed state. A closed surface stays closed: as a
+    sum of oriented triangles it has no edge left over.
 
     Args:
         vertices: (V, 3) m. triangles: (T, 3).
@@ -83,19 +72,8 @@ def clustered(
     used, corners = np.unique(triangles, return_inverse=True)
     points = vertices[used]
     grid = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    shape = grid.max(axis=0) + 1
-    strides = np.array([shape[1] * shape[2], shape[2], 1])  # which number every cell
-    _, cells = np.unique(grid @ strides, return_inverse=True)
-    cells = cells.ravel()
-    count = np.bincount(cells)
-    mean = np.column_stack([np.bincount(cells, points[:, axis]) / count for axis in range(3)])
-    distance = np.linalg.norm(points - mean[cells], axis=1)
-    order = np.lexsort((distance, cells))
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    kept = used[order[first]]  # of each cell the vertex nearest to the mean
-    merged = kept[cells[corners.ravel()]].reshape(-1, 3)
-    apart = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
-    return _without_pairs(merged[apart])
+    _, first, cells = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    return _with_area(used[first][cells.ravel()][corners.ravel()].reshape(-1, 3))
 
 
 def at_most(
@@ -106,56 +84,17 @@ def at_most(
     Args:
         vertices: (V, 3) m. triangles: (T, 3).
     """
-    if len(triangles) <= count:
-        return triangles
     sides = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
-    length = float(np.linalg.norm(sides, axis=2).mean())
-    low, high = np.log(0.2 * length), np.log(20.0 * length)  # of the cells' size
-    best = clustered(vertices, triangles, float(np.exp(high)))
-    for _ in range(12):  # bisection
-        middle = (low + high) / 2
-        tried = clustered(vertices, triangles, float(np.exp(middle)))
-        if len(tried) > count:
-            low = middle
-        else:
-            best, high = tried, middle
-    return best
+    cell, fewer = 0.5 * float(np.linalg.norm(sides, axis=2).mean()), triangles
+    while len(fewer) > count:
+        fewer = clustered(vertices, triangles, cell)
+        cell *= 1.15
+    return fewer
 
 
-def _without_pairs(triangles: NDArray[np.integer]) -> NDArray[np.integer]:
-    """Triangles without those that lie on each other and face opposite ways, first node smallest.
-
-    So many of the same three nodes are left as face one way more than the other.
-    """
-    smallest = triangles.argmin(axis=1)[:, None]
-    turned = np.take_along_axis(triangles, (smallest + np.arange(3)) % 3, axis=1)
-    is_even = turned[:, 1] < turned[:, 2]
-    nodes = np.column_stack([turned[:, 0], np.sort(turned[:, 1:], axis=1)])
-    nodes, which = np.unique(nodes, axis=0, return_inverse=True)
-    balance = np.bincount(which.ravel(), np.where(is_even, 1, -1), minlength=len(nodes)).astype(int)
-    nodes[balance < 0, 1:] = nodes[balance < 0, :0:-1]
-    return np.repeat(nodes, np.abs(balance), axis=0)
-
-
-@dataclass(frozen=True, eq=False)
-class Offsets:
-    """Displacements of points in whole steps: half the bytes of single precision."""
-
-    steps: NDArray[np.int16]  # (N, 3)
-    resolution: float  # m, of a step
-
-    @classmethod
-    def between(cls, positions: NDArray[np.floating], rest: NDArray[np.floating]) -> Offsets:
-        """Of positions (N, 3) from rest (N, 3), m, to half a step of the shortest that suffices."""
-        moved = np.subtract(positions, rest, dtype=np.float64)
-        finest = 1e-6  # m: tissue may move by 33 mm before steps must be longer
-        farthest = float(np.abs(moved).max(initial=0.0))
-        resolution = finest * max(1, math.ceil(farthest / (finest * np.iinfo(np.int16).max)))
-        return cls(np.rint(moved / resolution).astype(np.int16), resolution)
-
-    def positions(self, rest: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(N, 3) m, as the page has them."""
-        return rest + self.resolution * self.steps.astype(np.float64)
+def _with_area(triangles: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The triangles of three different vertices."""
+    return triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
 
 
 class RestSurface:
@@ -165,9 +104,6 @@ class RestSurface:
         points: (N, 3) m, at rest.
         triangles: (T, 3) indices into points.
         edges: (E, 2) likewise, of lines to draw.
-
-    Raises:
-        MeshError: an index is of no point, a coordinate is not finite, or the shapes are wrong.
     """
 
     def __init__(
@@ -177,15 +113,6 @@ class RestSurface:
         edges: NDArray[np.integer] | None = None,
     ) -> None:
         lines = np.zeros((0, 2), dtype=np.uint32) if edges is None else edges
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise MeshError(f"points of shape {points.shape} are no (N, 3) finite positions")
-        for name, indices, corners in (("triangle", triangles, 3), ("edge", lines, 2)):
-            if indices.ndim != 2 or indices.shape[1] != corners:
-                raise MeshError(f"{name}s have shape {indices.shape}: give (…, {corners})")
-            if indices.size and not 0 <= indices.min() <= indices.max() < len(points):
-                raise MeshError(
-                    f"a {name} names point {indices.max()}, but there are only {len(points)}"
-                )
         #: (N, 3) m, as the page has them: in single precision.
         self.points = np.ascontiguousarray(points, dtype=np.float32)
         self._triangles = np.ascontiguousarray(triangles, dtype=np.uint32)
@@ -225,14 +152,17 @@ class RestSurface:
                 f"{len(positions)} points came, and the mesh has {len(self.points)}: start all "
                 f"nodes with the same scene"
             )
-        offsets = Offsets.between(positions, self.points)
+        offsets = np.subtract(positions, self.points, dtype=np.float64)
+        farthest = float(np.abs(offsets).max(initial=0.0))
+        resolution = FINEST * max(1, math.ceil(farthest / (FINEST * np.iinfo(np.int16).max)))
         header = {
             "stamp": str(stamp),  # more digits than a number of JavaScript has
             "mesh": self.number,
             "points": len(self.points),
-            "resolution": offsets.resolution,
+            "resolution": resolution,
         }
-        return Packet(kind, sequence, header, offsets.steps.tobytes())
+        steps = np.rint(offsets / resolution).astype(np.int16)
+        return Packet(kind, sequence, header, steps.tobytes())
 
 
 class CarriedSurfaces:
@@ -299,20 +229,15 @@ class CarriedSurfaces:
         Args:
             mesh: the number of the tissue's mesh, whose nodes move them.
         """
-        header = {
-            "mesh": mesh,
-            "vertices": len(self.nodes),
-            "moving": self.moving,
-            "parts": [
-                {"name": name, "colour": list(colour), "fine": len(fine), "coarse": len(coarse)}
-                for (name, colour), fine, coarse in zip(
-                    self._surfaces, self.fine, self.coarse, strict=True
-                )
-            ],
-        }
+        parts = [
+            {"name": name, "colour": list(colour), "fine": len(fine), "coarse": len(coarse)}
+            for (name, colour), fine, coarse in zip(
+                self._surfaces, self.fine, self.coarse, strict=True
+            )
+        ]
+        header = {"mesh": mesh, "vertices": len(self.nodes), "moving": self.moving, "parts": parts}
         lists = [part for pair in zip(self.fine, self.coarse, strict=True) for part in pair]
-        arrays = [self.nodes, self.weights, *lists]
-        payload = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+        payload = b"".join(array.tobytes() for array in (self.nodes, self.weights, *lists))
         return Packet(kind, sequence, header, payload)
 
 
@@ -328,24 +253,13 @@ def transducer_packet(
         parts: in frame ``probe``.
         outline: (P, 3) m, as of `us_sim.slicing.probe.probe.image_outline`.
     """
-    header = {
-        "parts": [
-            {
-                "name": part.name,
-                "colour": list(part.colour),
-                "vertices": len(part.vertices),
-                "triangles": len(part.triangles),
-            }
-            for part in parts
-        ],
-        "outline": len(outline),
-    }
-    arrays: list[NDArray[np.generic]] = []
+    told, arrays = [], list[NDArray[np.generic]]()
     for part in parts:
+        sizes = {"vertices": len(part.vertices), "triangles": len(part.triangles)}
+        told.append({"name": part.name, "colour": list(part.colour), **sizes})
         arrays += [part.vertices.astype(np.float32), part.triangles.astype(np.uint32)]
-    arrays.append(outline.astype(np.float32))
-    payload = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
-    return Packet(kind, sequence, header, payload)
+    payload = b"".join(array.tobytes() for array in (*arrays, outline.astype(np.float32)))
+    return Packet(kind, sequence, {"parts": told, "outline": len(outline)}, payload)
 
 
 class EquivalentStrain:

@@ -45,7 +45,7 @@ class Viewer(GuardedNode):
         super().__init__("viewer", **kwargs)
         settings = declared(self, ViewerSettings())
         self.health = Health(self, f"{settings.host}:{settings.port}")
-        self.post = post = Posted(self)
+        post = Posted(self)
         folder = os.path.abspath(os.path.expanduser(settings.recordings or ""))
         self._session = ViewerSession(
             self,
@@ -113,8 +113,6 @@ class Viewer(GuardedNode):
 
     def destroy_node(self) -> None:
         """End the web server first."""
-        self.post.close()
-        self._session.close()
         self._server.close()
         super().destroy_node()
 

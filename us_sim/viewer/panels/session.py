@@ -18,10 +18,7 @@ from us_sim.viewer.session import NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
 
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
-ANOTHER = (
-    "Ends the scene that runs, and starts this one; what was set in either comes back when it is "
-    "loaded"
-)
+ANOTHER = "Ends the scene that runs, and starts this one, without what was set in that"
 EVERY_S = 0.3  # how often the panels are brought up to date
 BY_HAND = ("", "pose")  # trackers of scenes that differ from others in more than their tracker
 
@@ -137,20 +134,22 @@ def build_cases(simulator: Simulator) -> None:
     _Cases(simulator)
 
 
-SETTLE_S = 1.5  # for what a person asked for to be so; until then controls stay as they were set
+SETTLE_S = 1.5  # from an answer until it is so; meanwhile controls stay as a person has set them
 RATES = {0.1: "0.1 ×", 0.25: "0.25 ×", 0.5: "0.5 ×", 1.0: "1 ×", 2.0: "2 ×", 4.0: "4 ×"}
 KINDS = {"path": "Probe's path", "recording": "All as recorded"}
 KINDS_TOLD = (
     "The probe's path moves the probe of the simulation. All as recorded takes the simulation's "
-    "place; when you end it the nodes start again, with what was set before"
+    "place; when you end it the nodes start again, without what was set in them"
 )
 
 
 class _Session:
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
-        self._dragged_to: float | None = None  # s, while a person holds the slider
-        self._touched = 0.0  # s, monotonic: when a person last asked for something
+        self._sought: float | None = None  # s, where a person points at, until the replay is there
+        self._is_pointing = False
+        self._asking = 0  # what has not been answered yet
+        self._answered = 0.0  # s, monotonic: when the last answer came
         self._is_following = False  # while controls are set to what is so
         self._shown_record = ""  # the recording whose name the field shows
         self._proposed = _proposed()
@@ -250,20 +249,23 @@ class _Session:
         end = round(state.duration, 2)
         if end not in (0.0, self._time.props["max"]):
             self._time.props["max"] = end
-        if self._dragged_to is None:
+        is_settled = not self._asking and time.monotonic() - self._answered > SETTLE_S
+        if is_settled and not self._is_pointing:
+            self._sought = None
+        if self._sought is None:
             self._time.set_value(min(state.position, state.duration) if plays else 0.0)
         told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}"
         self._where.set_text(told if plays else "nothing is replayed")
-        if time.monotonic() - self._touched < SETTLE_S:
+        if not is_settled:
             return
         self._is_following = True
         try:
             if plays:
                 self._bag.set_value(state.replay)
                 self._kind.set_value(state.replay_as)
-            self._loop.set_value(state.loop)
-            if state.rate in RATES:
-                self._rate.set_value(state.rate)
+            self._loop.set_value(state.replay_loop)
+            if state.replay_rate in RATES:
+                self._rate.set_value(state.replay_rate)
         finally:
             self._is_following = False
 
@@ -316,16 +318,20 @@ class _Session:
 
     def _drag(self, event: Any) -> None:
         """Keep the time that a person points at; the replay's may come before the button is up."""
-        self._dragged_to = float(event.args)
+        self._sought, self._is_pointing = float(event.args), True
 
     async def _seek(self, event: Any) -> None:
-        wanted, self._dragged_to = self._dragged_to, None
-        await self._ask(replay_time=float(event.args) if wanted is None else wanted)
+        self._is_pointing = False
+        await self._ask(replay_time=float(event.args) if self._sought is None else self._sought)
 
     async def _ask(self, **values: object) -> bool:
         """Ask for it; whether that was taken."""
-        self._touched = time.monotonic()
-        refused = await asyncio.wrap_future(self._board.ask(**values))
+        self._asking += 1
+        try:
+            refused = await asyncio.wrap_future(self._board.ask(**values))
+        finally:
+            self._asking -= 1
+            self._answered = time.monotonic()
         if refused:
             ui.notify(refused, type="warning", multi_line=True)
         return not refused
@@ -334,12 +340,12 @@ class _Session:
 def recorded(state: SessionState) -> tuple[str, bool]:
     """How long, how large, and how much longer it may become; and whether that is little.
 
-    >>> recorded(SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room=9e9))
+    >>> recorded(SessionState(record_seconds=72.0, record_bytes=3.6e8, record_room_bytes=9e9))
     (': 1:12 min, 360 MB, room for 30 min', False)
-    >>> recorded(SessionState(record_seconds=10.0, record_bytes=1e9, record_room=5e9))
+    >>> recorded(SessionState(record_seconds=10.0, record_bytes=1e9, record_room_bytes=5e9))
     (': 0:10 min, 1.0 GB, room for 1 min', True)
     """
-    seconds, size, room = state.record_seconds, state.record_bytes, state.record_room
+    seconds, size, room = state.record_seconds, state.record_bytes, state.record_room_bytes
     if not room:
         return "", False
     minutes, rest = divmod(int(seconds), 60)
