@@ -7,7 +7,6 @@ page's thread. The node reports a message that cannot be used.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -58,7 +57,7 @@ _QUALITY = 90  # of JPEG: 512 × 512 pixels of speckle are 60 kB then, a quarter
 _STRAIN_RATE = 12.0
 """Hz: strain takes longer than positions, and its colours are read and not followed."""
 _NODES, _STRUCTURES = "tissue/nodes", "tissue/structures"
-_POSE, _WRENCH = "probe/pose", "probe/wrench"
+_UNIMAGED, _UNPAIRED = 16, 32  # poses and forces, and states of the tissue, that are kept
 
 Make = Callable[[Any, int], Packet | None]
 """The packet of a message and a number; None while none can be made."""
@@ -98,16 +97,10 @@ def topic_feed(
         rate: Hz, at most, for each page; None is all.
     """
 
-    def take(data: bytes) -> None:
-        def pack(sequence: int) -> Packet | None:
-            packet: Packet | None = made_of(
-                node, message_type, topic, data, lambda message: make(message, sequence)
-            )
-            return packet
+    def offer(data: bytes) -> None:
+        feed.offer(lambda n: made_of(node, message_type, topic, data, lambda m: make(m, n)))
 
-        feed.offer(pack)
-
-    subscription = Subscriptions(node, (message_type, topic, take, qos, True))
+    subscription = Subscriptions(node, (message_type, topic, offer, qos, True))
     # As it is once that is done: the page may have gone meanwhile.
     feed = Feed(kind, lambda _: post(lambda: subscription.keep(feed.is_watched)), rate)
     return feed
@@ -228,70 +221,66 @@ class ProbeFeeds:
     """The streams ``probe_mesh``, of ``probe/marker``, and ``probe``, of pose and wrench."""
 
     def __init__(self, node: GuardedNode, post: Posted, rate: float) -> None:
-        self._node = node
         self._feed = Feed("probe", lambda _: post(self._listen), rate)
-        # Until the image of their stamp is made.
-        self._poses: deque[bytes] = deque(maxlen=16)
-        self._wrenches: deque[bytes] = deque(maxlen=16)
+        # By stamp, ns, until its image is made.
+        self._poses: dict[str, dict[str, Any]] = {}
+        self._forces: dict[str, dict[str, Any]] = {}
         self._subscriptions = Subscriptions(
             node,
-            (PoseStamped, _POSE, partial(self._take, self._poses), STREAM, True),
-            (WrenchStamped, _WRENCH, partial(self._take, self._wrenches), STREAM, True),
+            (PoseStamped, "probe/pose", self._on_pose, STREAM, False),
+            (WrenchStamped, "probe/wrench", self._on_wrench, STREAM, False),
         )
         told = topic_feed(
             node, post, MarkerArray, "probe/marker", _shape, "probe_mesh", None, LATCHED
         )
         self.feeds: list[Feed] = [told, self._feed]
 
-    def _listen(self) -> None:
-        if self._subscriptions.keep(self._feed.is_watched) and self._feed.is_watched:
-            self._wrenches.clear()  # of the time before
-
-    def _take(self, kept: deque[bytes], data: bytes) -> None:
-        kept.append(data)
-        if self._poses:
-            wrench = self._wrenches[-1] if self._wrenches else None
-            self._feed.offer(partial(self._pack, self._poses[-1], wrench))
-
     def at(self, stamp: str) -> dict[str, Any]:
         """Position, quaternion, force and torque of a stamp, ns, as far as they are known.
 
         They are not while nobody watches the stream ``probe``.
         """
-        found: dict[str, Any] = {}
-        for kind, topic, kept, make, key in (
-            (PoseStamped, _POSE, self._poses, _pose_header, "stamp"),
-            (WrenchStamped, _WRENCH, self._wrenches, _wrench_header, "force_stamp"),
-        ):
-            headers = (made_of(self._node, kind, topic, each, make) for each in reversed([*kept]))
-            found |= next((each for each in headers if each and each[key] == stamp), {})
-        return found
+        return self._poses.get(stamp, {}) | self._forces.get(stamp, {})
 
-    def _pack(self, pose: bytes, wrench: bytes | None, sequence: int) -> Packet | None:
-        header = made_of(self._node, PoseStamped, _POSE, pose, _pose_header)
-        if header is None:
-            return None
-        force = wrench and made_of(self._node, WrenchStamped, _WRENCH, wrench, _wrench_header)
-        if force:
-            age = 1e-9 * (int(header["stamp"]) - int(force["force_stamp"]))
-            header |= force | {"force_age": round(age, 3)}
-        return Packet("probe", sequence, header, b"")
+    def _listen(self) -> None:
+        if self._subscriptions.keep(self._feed.is_watched) and self._feed.is_watched:
+            self._forces.clear()  # of the time before
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        pose = pose_from(message, "patient")
+        place = {"position": pose.position.tolist(), "quaternion": pose.orientation.tolist()}
+        _keep(self._poses, _stamp(message), place, _UNIMAGED)
+        self._offer()
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        wrench = wrench_from(message, "probe").tolist()
+        forces = {"force": wrench[:3], "torque": wrench[3:]}
+        _keep(self._forces, _stamp(message), forces, _UNIMAGED)
+        self._offer()
+
+    def _offer(self) -> None:
+        if not self._poses:
+            return
+        stamp, place = next(reversed(self._poses.items()))
+        header = {"stamp": stamp, **place}
+        if self._forces:
+            of_force, force = next(reversed(self._forces.items()))
+            age = round(1e-9 * (int(stamp) - int(of_force)), 3)
+            header |= force | {"force_stamp": of_force, "force_age": age}
+        self._feed.offer(lambda sequence: Packet("probe", sequence, header, b""))
+
+
+def _keep(kept: dict[Any, Any], key: Any, value: Any, most: int) -> None:
+    """Keep a value as the newest of at most so many."""
+    kept.pop(key, None)
+    kept[key] = value
+    if len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def _shape(message: MarkerArray, sequence: int) -> Packet:
     parts = surfaces_of(message, "probe")
     return transducer_packet("probe_mesh", sequence, parts, line_from(message, "probe"))
-
-
-def _pose_header(message: PoseStamped) -> dict[str, Any]:
-    pose = pose_from(message, "patient")
-    place = {"position": pose.position.tolist(), "quaternion": pose.orientation.tolist()}
-    return {"stamp": _stamp(message), **place}
-
-
-def _wrench_header(message: WrenchStamped) -> dict[str, Any]:
-    wrench = wrench_from(message, "probe").tolist()
-    return {"force": wrench[:3], "torque": wrench[3:], "force_stamp": _stamp(message)}
 
 
 class SkinFeeds:
@@ -465,12 +454,9 @@ class StructuresFeed:
         stamp = made_of(
             self._node, PointCloud2, _NODES, data, lambda m: nanoseconds_of(m.header.stamp)
         )
-        if stamp is None:
-            return
-        self._nodes[stamp] = data
-        while len(self._nodes) > 32:
-            del self._nodes[next(iter(self._nodes))]
-        self._try()
+        if stamp is not None:
+            _keep(self._nodes, stamp, data, _UNPAIRED)
+            self._try()
 
     def _take_structures(self, data: bytes) -> None:
         stamp = markers_stamp(data)
@@ -479,35 +465,34 @@ class StructuresFeed:
             self._try()
 
     def _try(self) -> None:
-        if self._structures is None or self._making is not None:
+        """Have the structures made once they and the tissue's nodes of their stamp are there."""
+        stamp, data = self._structures or (-1, b"")
+        nodes, mesh, surface = self._nodes.get(stamp), self._rest.mesh, self._rest.surface
+        if nodes is None or mesh is None or surface is None or self._making is not None:
             return
-        nodes = self._nodes.get(self._structures[0])
-        mesh, surface = self._rest.mesh, self._rest.surface
-        if nodes is None or mesh is None or surface is None:
-            return
-        arguments = (mesh, surface.number, nodes, self._structures[1])
         self._making = threading.Thread(
-            target=self._make, args=arguments, daemon=True, name="structures"
+            target=self._make,
+            args=(mesh, surface.number, nodes, data),
+            daemon=True,
+            name="structures",
         )
         self._making.start()
         self._listen()
 
     def _make(self, mesh: TetrahedralMesh, number: int, nodes: bytes, structures: bytes) -> None:
-        def deformed(message: PointCloud2) -> TetrahedralMesh:
-            return TetrahedralMesh(vectors_from(message, "patient"), mesh.tetrahedra)
-
-        def carried_by(now: TetrahedralMesh, message: MarkerArray) -> CarriedSurfaces:
+        def carried_by(message: MarkerArray) -> CarriedSurfaces:
             surfaces = surfaces_of(message, "patient")
             if not surfaces:
                 raise MeshError("there is no triangle in it")
-            return CarriedSurfaces(now, surfaces)
+            return CarriedSurfaces(TetrahedralMesh(deformed, mesh.tetrahedra), surfaces)
 
+        deformed = made_of(
+            self._node, PointCloud2, _NODES, nodes, lambda m: vectors_from(m, "patient")
+        )
         carried = None
-        made = made_of(self._node, PointCloud2, _NODES, nodes, deformed)
-        if made is not None:
-            make = partial(carried_by, made)
-            carried = made_of(self._node, MarkerArray, _STRUCTURES, structures, make)
-        self._post(lambda: self._end(number, carried, is_wrong=made is not None))
+        if deformed is not None:
+            carried = made_of(self._node, MarkerArray, _STRUCTURES, structures, carried_by)
+        self._post(lambda: self._end(number, carried, is_wrong=deformed is not None))
 
     def _end(self, number: int, carried: CarriedSurfaces | None, is_wrong: bool) -> None:
         """Offer the structures. Those that cannot be used are not tried again."""
