@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import ConvexHull
 
 from us_sim.errors import PoseError
 from us_sim.geometry.se3 import rotation_between
@@ -79,19 +78,6 @@ def test_on_a_cylinder_the_foot_is_on_the_radius(angle, y, height):
     np.testing.assert_allclose(foot.point, axis + RADIUS * outwards, atol=beside)
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.floats(0.3, 2.8), st.floats(-3, 3), st.floats(-0.02, 0.02))
-def test_under_finds_the_normal_through_a_place(polar, turn, press):
-    outwards = [math.sin(polar) * math.cos(turn), math.sin(polar) * math.sin(turn)]
-    radius = np.array([*outwards, math.cos(polar)])
-    foot, inwards = SPHERE.under((RADIUS - press) * radius)
-    assert inwards == pytest.approx(press, abs=2 * FACET)
-    np.testing.assert_allclose(foot.normal, radius, atol=0.012)  # skewed cells
-    np.testing.assert_allclose(
-        foot.point - inwards * foot.normal, (RADIUS - press) * radius, atol=1e-7
-    )
-
-
 def test_the_normal_does_not_jump_at_the_edges_of_facets():
     way = np.linspace(-1.2, 1.2, 4001)
     normals = np.array(
@@ -128,35 +114,6 @@ def test_the_closest_point_is_that_of_all_triangles_tried_one_by_one():
         distance = np.linalg.norm(surface.closest(point).point - point)
         assert distance <= least + 1e-12
         assert distance == pytest.approx(least, abs=3e-4)
-
-
-def cube(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Corners and outward triangles of a cube of 2 cm about the origin, turned about y (rad)."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.01
-    hull = ConvexHull(corners)
-    a, b, c = (corners[hull.simplices[:, k]] for k in range(3))
-    inwards = np.einsum("tx,tx->t", np.cross(b - a, c - a), a) < 0  # about the origin
-    triangles = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
-    cosine, sine = math.cos(turn), math.sin(turn)
-    return corners @ [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]], triangles
-
-
-def test_the_upper_side_of_a_cube_is_its_face_at_the_least_z():
-    surface = RestSurface.upper_side(*cube())
-    np.testing.assert_allclose(surface.lower, [-0.01, -0.01, -0.01])
-    np.testing.assert_allclose(surface.upper, [0.01, 0.01, -0.01])
-    foot = surface.closest(np.array([0.003, 0.004, 0.02]))  # nearer to the lower face
-    np.testing.assert_allclose(foot.point, [0.003, 0.004, -0.01])
-    np.testing.assert_allclose(foot.normal, [0, 0, -1])
-
-
-@pytest.mark.parametrize(("degrees", "is_upper"), [(15, False), (20, True)])
-def test_a_side_that_is_steeper_than_the_limit_is_not_of_the_upper_side(degrees, is_upper):
-    turn = math.radians(degrees)  # the side faces up by sin(turn): 0.26, and 0.34
-    surface = RestSurface.upper_side(*cube(turn))
-    of_the_top = 0.01 * (math.sin(turn) - math.cos(turn))
-    of_the_side = 0.01 * (math.cos(turn) - math.sin(turn))
-    assert surface.upper[2] == pytest.approx(of_the_side if is_upper else of_the_top)
 
 
 SPEED, TAU = 0.25, 0.02
@@ -299,16 +256,6 @@ def test_the_way_back_from_a_pose(polar, turn, press, rotation, fan, rock):
     assert found.press == pytest.approx(press, abs=1e-5)
     assert math.remainder(found.rotation - rotation, math.tau) == pytest.approx(0, abs=2e-3)
     assert (found.fan, found.rock) == pytest.approx((fan, rock), abs=2e-3)
-
-
-def test_sliding_is_along_the_probes_own_axes():
-    turned = Stance(rotation=math.pi / 2)
-    np.testing.assert_allclose(turned.slid(PLANE, 0.01, 0.0).point, [0, 0.01, 0], atol=1e-12)
-    np.testing.assert_allclose(turned.slid(PLANE, 0.0, 0.01).point, [-0.01, 0, 0], atol=1e-12)
-    bent = Stance().slid(CYLINDER, RADIUS * 0.5, 0.0).point
-    np.testing.assert_allclose(
-        bent, [RADIUS * math.sin(0.5), 0, RADIUS * (1 - math.cos(0.5))], atol=2e-4
-    )
 
 
 def test_no_hand_presses_or_turns_without_end():

@@ -13,7 +13,6 @@ from us_sim.evaluation.hand.hand_motion import HASTES, Room
 from us_sim.evaluation.hand.measure import (
     APPROACH,
     CONVERGED,
-    HOLD,
     RATE,
     TISSUES,
     Converged,
@@ -88,20 +87,6 @@ def test_what_knows_the_answer_has_no_error_and_skips_nothing(monkeypatch):
     assert point.values["hold_inverted"] is False
 
 
-def test_errors_are_of_the_worst_node_and_of_all():
-    free = int(np.flatnonzero(~MODEL.fixed)[0])
-
-    def one_off(nodes):
-        nodes[free] += [0.0, 0.003, -0.004]
-        return nodes
-
-    values = measure(Oracle(answer(), spoil=one_off), MOTION, answer()).values
-    assert values["error_mm_p50"] == pytest.approx(5.0)
-    assert values["error_mm_worst"] == pytest.approx(5.0)
-    assert values["rms_mm_p99"] == pytest.approx(5.0 / np.sqrt(len(MODEL.mesh.nodes)))
-    assert values["fixed_nodes_moved_mm"] == 0.0
-
-
 def test_what_has_not_converged_is_compared_with_nothing():
     known = answer()
     known.residual[BEGINS + 4 :] = 0.1
@@ -146,17 +131,6 @@ def test_live_the_newest_pose_wins(monkeypatch):
     waits = [1e3 * (0.040 * (k + 1) - expected[k] / 60) for k in range(25)]
     assert point.live.latency == pytest.approx(waits[-len(counted) :])
     assert set(point.live.frames.error) == {0.0}
-
-
-def test_the_probe_is_held_where_it_pressed_last():
-    solver = Oracle(answer(45))
-    solver.residuals = [0.5] * 47 + [0.1, 0.02, 0.005, 0.02, 1e-4, 5e-3, 1e-4]
-    point = measure(solver, MOTION, answer(45))
-    assert point.frames.number.tolist() == list(range(BEGINS, 46))
-    assert point.held.residual[:4].tolist() == [0.5, 0.1, 0.02, 0.005]
-    assert len(point.held.residual) == HOLD + 1
-    assert point.held.frames_to(1e-2) == 5.0  # and not 3, after which it rose again
-    assert point.held.frames_to(1e-3) == 7.0
 
 
 def test_the_converged_answer_does_not_depend_on_the_way():

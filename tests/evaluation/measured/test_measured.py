@@ -57,9 +57,3 @@ def test_no_data_at_all_is_refused_before_anything_is_written(tmp_path, found, m
         )
     assert not found
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("found")
-def test_a_folder_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(UsSimError, match="measured data, is no folder"):
-        report.evaluate_measured(tmp_path / "out", True, MeasuredData(data=tmp_path / "nowhere"))

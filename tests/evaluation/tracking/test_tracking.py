@@ -7,12 +7,10 @@ import pytest
 
 from us_sim.command.main import main
 from us_sim.evaluation.tracking import report as tracking
-from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, RIGID_BODY, SINGLE, Case
+from us_sim.evaluation.tracking.cases import CONDITIONS, RIGID_BODY, SINGLE, Case
 from us_sim.evaluation.tracking.filters import FILTER_METHODS, delay, filter_point, filter_trials
-from us_sim.evaluation.tracking.measure import Bench, mirrored
-from us_sim.geometry.pose import Pose
+from us_sim.evaluation.tracking.measure import Bench
 from us_sim.settings.registry import FILTERS
-from us_sim.tracking.camera.body_pose import rotation_angle
 
 ASKED = [
     *("marker", "image_size", "distance_m", "angle_deg", "condition", "views", "detected"),
@@ -23,29 +21,6 @@ ASKED = [
 @pytest.fixture(scope="module")
 def bench():
     return Bench()
-
-
-@pytest.mark.parametrize("name", MARKERS)
-@pytest.mark.parametrize(("distance", "angle"), [(0.4, 0.0), (0.9, 60.0)])
-def test_a_case_looks_from_where_it_says(name, distance, angle):
-    body = MARKERS[name].body
-    pose = Case(name, "640x480", distance, angle).sequence(3)[2]
-    middle = pose.apply(body.centres.mean(axis=0)[None])[0]
-    assert np.linalg.norm(middle) == pytest.approx(distance)
-    cosine = -(pose.rotation @ MARKERS[name].front) @ middle / distance
-    assert np.degrees(np.arccos(min(1.0, cosine))) == pytest.approx(angle, abs=1e-4)
-
-
-def test_the_mirror_image_of_a_tilted_plane_is_tilted_the_other_way():
-    front = np.array([0.0, 0.0, -1.0])
-    tilt = Pose([0.0, 0.0, 0.5], [np.sin(0.2), 0.0, 0.0, np.cos(0.2)])
-    other = mirrored(tilt, np.zeros(3), front)
-    assert rotation_angle(tilt, other) == pytest.approx(0.8)
-    # From afar both put the plane's points at the same pixels.
-    points = np.array([[0.02, 0.01, 0.0], [-0.02, 0.015, 0.0]])
-    np.testing.assert_allclose(tilt.apply(points)[:, :2], other.apply(points)[:, :2], atol=1e-12)
-    again = mirrored(other, np.zeros(3), front)
-    assert rotation_angle(tilt, again) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_rigid_body_is_tracked_as_well_as_asked(bench):

@@ -352,6 +352,20 @@ def test_nodes_that_are_not_finite_are_refused_and_the_next_good_frame_is_right(
 
 
 @every_method
+@pytest.mark.parametrize(
+    ("nodes", "tetrahedra", "words"),
+    [
+        (np.full((4, 3), np.inf), [[0, 1, 2, 3]], "node 0"),
+        (np.eye(4)[:, :3], [[0, 1, 2, 4]], "4 nodes"),
+        (np.eye(4)[:, :3], [[0, 1, 2, -1]], "-1"),
+    ],
+)
+def test_a_rest_mesh_that_cannot_be_is_refused(method, nodes, tetrahedra, words):
+    with pytest.raises(MeshError, match=words):
+        create_slicer(method, around_the_box(), nodes, np.array(tetrahedra))
+
+
+@every_method
 def test_nodes_out_of_all_proportion_do_no_harm(method):
     """A solver that has blown up, but not to infinity: no crash, and the next frame is right."""
     mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(np.random.default_rng(4))

@@ -63,17 +63,6 @@ def test_a_problem_that_takes_too_many_pivots_is_solved_by_relaxation():
     np.testing.assert_array_equal(active, force > 0.0)
 
 
-def test_does_not_depend_on_the_guess():
-    random = np.random.default_rng(3)
-    points = random.uniform(-1, 1, (60, 2))
-    apart = np.linalg.norm(points[:, None] - points, axis=2)
-    delassus = 1 / (apart + 0.05)
-    gap = np.linalg.norm(points, axis=1) ** 2 - 0.4
-    cold, _ = unilateral(delassus, gap, np.zeros(60, dtype=bool))
-    for guess in (np.ones(60, dtype=bool), random.random(60) < 0.5, cold > 0):
-        np.testing.assert_allclose(unilateral(delassus, gap, guess)[0], cold, atol=1e-9)
-
-
 def test_nobody_is_pushed_where_nothing_is_entered():
     push, active = unilateral(np.eye(3), np.array([0.0, 1.0, 2.0]), np.ones(3, dtype=bool))
     assert not push.any()

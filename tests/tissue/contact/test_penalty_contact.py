@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import brentq
 
 from us_sim.geometry.collider import Capsule, Convex, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
@@ -89,24 +88,6 @@ def test_the_push_rises_faster_and_faster_up_to_the_greatest(gap, stiff, strong)
     law = stiff * depth * (1 + (depth / STIFFENING) ** 2)
     assert contact.normal_force[0] == pytest.approx(min(law, strong), rel=1e-9)
     np.testing.assert_array_equal(contact.normal_force_at(contact.gap), contact.normal_force)
-
-
-@pytest.mark.slow
-@EXAMPLES
-@given(moduli, moduli)
-def test_the_energy_goes_on_at_the_greatest_push(stiff, strong):
-    contact = contact_of(FlaredProbe(Sphere(0.03), COARSE), 1, stiff, strong)
-
-    def law(depth):
-        return stiff * depth * (1 + (depth / STIFFENING) ** 2)
-
-    deepest = brentq(lambda depth: law(depth) - strong, 0.0, strong / stiff, xtol=1e-18)
-    assume(deepest < 0.01)  # lest the sphere ends
-    held = 0.5 * stiff * deepest**2 + 0.25 * stiff * deepest**4 / STIFFENING**2
-    contact.set_pose(Pose(), np.array([[0.0, 0.0, -deepest - 0.003]]))
-    assert contact.normal_force[0] == pytest.approx(strong)
-    assert contact.energy == pytest.approx(held + 0.003 * strong)
-    assert len(contact.springs_after(np.zeros((1, 3)))[0]) == 0  # it falls no more
 
 
 @EXAMPLES

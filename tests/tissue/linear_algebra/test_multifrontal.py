@@ -12,7 +12,7 @@ from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.linear_algebra import multifrontal
-from us_sim.tissue.linear_algebra.multifrontal import eliminate, nested_dissection
+from us_sim.tissue.linear_algebra.multifrontal import eliminate
 
 
 def sparse_fields(system, fixed, nodes):
@@ -67,22 +67,6 @@ def test_single_precision_and_a_file_that_may_be_full_change_little(monkeypatch,
         assert full or file.tell() > 100_000
     expected = sparse_fields(system, model.fixed, nodes[:5])
     np.testing.assert_allclose(found, expected, atol=1e-5 * abs(expected).max())
-
-
-def test_every_node_is_in_one_part_whose_boundary_separates_it():
-    mesh = block_mesh((11, 6, 7))
-    above = np.zeros(len(mesh.nodes), dtype=int)
-
-    def walk(part, outside):
-        above[part.own] += 1
-        assert np.isin(part.boundary, outside).all()
-        for below in part.parts:
-            walk(below, np.union1d(outside, part.own))
-
-    root = nested_dissection(mesh.nodes, mesh.edges, largest=20)
-    walk(root, np.empty(0, int))
-    np.testing.assert_array_equal(above, 1)
-    assert len(root.boundary) == 0
 
 
 @pytest.mark.parametrize("ratio", [0.3, 0.45, 0.4999])

@@ -77,19 +77,6 @@ def test_load_steps_leave_time_and_iterations_for_the_pose_itself():
     assert not budget.allows_load_step
 
 
-def test_a_probe_at_rest_is_not_hurried_after_a_while():
-    budget = FrameBudget()
-    hurried = []
-    for frame in range(32):
-        budget.begin(440, 0.01, moved=frame == 0)
-        hurried.append(budget.is_hurried)
-    assert hurried == [True] * 30 + [False] * 2
-    budget.begin(440, 0.01, moved=True)
-    assert budget.is_hurried
-    budget.begin(440, moved=True)
-    assert not budget.is_hurried
-
-
 @pytest.mark.parametrize(("hurried", "frames"), [(True, 1), (False, 11)])
 def test_tissue_inside_out_is_begun_anew_after_its_time(hurried, frames):
     recovery = Recovery(IDENTITY)
