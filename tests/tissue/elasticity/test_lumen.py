@@ -249,7 +249,7 @@ def lame(inwards):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inwards", [0.02e-3, 0.05e-3, 0.1e-3])
+@pytest.mark.parametrize("inwards", [0.02e-3, 0.1e-3])
 def test_a_tube_in_tissue_narrows_as_lame_says(inwards):
     ratio, outside = tube(inwards, 0.4)
     expected_ratio, expected_outside = lame(inwards)
@@ -258,7 +258,7 @@ def test_a_tube_in_tissue_narrows_as_lame_says(inwards):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inwards", [0.1e-3, 0.2e-3, 0.25e-3])
+@pytest.mark.parametrize("inwards", [0.1e-3, 0.25e-3])
 def test_a_tube_in_incompressible_tissue_closes_at_the_pressure_of_the_blood_and_of_the_tissue(
     inwards,
 ):

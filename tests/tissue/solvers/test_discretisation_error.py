@@ -79,7 +79,6 @@ def tilted(x, z, degrees):
 
 CASES = {  # none of which the estimate was made with: probe, poses, Poisson's ratio, nodes
     "sphere": (Sphere(0.03), [Pose([0, 0, 0.005]), Pose([0, 0, 0.01])], 0.45, (9, 9, 7)),
-    "deep": (Sphere(0.025), [Pose([0.01, 0, 0.006]), Pose([0.01, 0, 0.012])], 0.4, (11, 11, 8)),
     "capsule": (Capsule(0.025, 0.03), [tilted(0, 0.004, 8), tilted(0, 0.008, 8)], 0.3, (10, 9, 8)),
 }
 
