@@ -115,6 +115,21 @@ def test_each_structure_is_outlined_in_its_colour_and_named_once():
     np.testing.assert_array_equal(both[:300], blue_once[:300])
 
 
+def test_the_badge_stands_in_a_frame_of_its_colour_and_the_image_stays():
+    annotation = Annotation(LINEAR, {})
+    image = np.random.default_rng(1).integers(0, 256, (512, 512), dtype=np.uint8)
+    before = image.copy()
+    live = annotation.draw(image)
+    stale = annotation.draw(image, badge=Badge("STALE 0.6 s", AMBER))
+    for edge in (stale[:3], stale[-3:], stale[:, :3], stale[:, -3:]):
+        assert (edge == AMBER).all()
+    text = stale[4:40, 100:412].astype(int)
+    assert (np.abs(text - AMBER).max(axis=-1) < 30).sum() > 300
+    np.testing.assert_array_equal(stale[50:-8, 8:-8], live[50:-8, 8:-8])
+    np.testing.assert_array_equal(image, before)
+    assert (live[100:400, 50:400] == image[100:400, 50:400, None]).all()
+
+
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
