@@ -4,19 +4,15 @@ import socket
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from us_sim.errors import SceneError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.run import live
-from us_sim.run.live import _status, demo
+from us_sim.run.live import _status
 from us_sim.run.plan import Plan, Request, viewer_process
 from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
-from us_sim.share import find_bag
-from us_sim.volume.files.writing import write_volume
-from us_sim.volume.volume import Volume
 
 
 @pytest.mark.parametrize(
@@ -53,35 +49,6 @@ def test_the_rate_of_the_last_second_is_not_said_once_the_path_is_at_its_end() -
     monitor: Any = SimpleNamespace(node=SimpleNamespace(reports=reports, count=lambda *_: 600))
     assert "21.0" in _status(Plan([], 600), monitor)
     assert "21.0" not in _status(Plan([], 600), monitor, at_end=True)
-
-
-SCENE = """
-name: elsewhere
-volume: {file: block.nrrd, pose: {position: [2 m, 0, 0]}}
-probe: {aperture: 40 mm, depth: 30 mm, image: [100, 80]}
-"""
-
-
-@pytest.mark.parametrize("mine", [False, True])
-def test_an_empty_folder_is_not_left(tmp_path, mine):
-    block = Volume(np.ones((9, 9, 9), np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
-    write_volume(tmp_path / "block.nrrd", block)
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    out = tmp_path / "some" / "press"
-    if mine:
-        out.mkdir(parents=True)
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(SceneError, match="lies beside all images"):
-        demo(
-            str(tmp_path / "scene.yaml"),
-            None,
-            out,
-            {},
-            network=False,
-            supervision=SupervisionSettings(),
-            path=find_bag("press_and_slide.mcap"),
-        )
-    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from us_sim.errors import UsSimError
-from us_sim.run import shared_memory
 from us_sim.run.monitored import alone_on_domain
 from us_sim.run.plan import NodeProcess
 from us_sim.run.processes import ProcessGroup
@@ -64,32 +63,6 @@ def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(mo
             group.stop()
 
 
-MAPS = """
-import mmap, sys
-with open(sys.argv[1], "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
-    print("mapped", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_a_port_goes_only_when_nobody_uses_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(shared_memory, "FOLDER", tmp_path)
-    unused, mapped, listened = (tmp_path / f"fastrtps_port{number}" for number in (1, 2, 3))
-    for port in (unused, mapped, listened):
-        port.write_bytes(bytes(4096))
-        (tmp_path / f"sem.{port.name}_mutex").touch()
-    (tmp_path / f"{listened.name}_el").touch()
-    command = [sys.executable, "-c", MAPS, mapped]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as user:
-        assert user.stdout.readline()
-        shared_memory.remove_unused_ports()
-        user.stdin.close()
-    assert not unused.exists()
-    assert not (tmp_path / f"sem.{unused.name}_mutex").exists()
-    assert mapped.exists()
-    assert listened.exists()
-
-
 def runs(pid):
     """Whether a process is there, and is not only waited for."""
     try:
@@ -106,7 +79,7 @@ from us_sim.run.processes import ProcessGroup
 group = ProcessGroup()
 group.start([NodeProcess("scorer")])
 work = Background("list", nice=1)
-print(group.pids["scorer"], work._process.pid, flush=True)
+print(group.pids["scorer"], work.process.pid, flush=True)
 while not group.last_words("scorer"):
     time.sleep(0.05)
 time.sleep(60)

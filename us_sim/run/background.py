@@ -1,8 +1,9 @@
 """Work beside a running simulation: making a scene, and listing scenes and bags to load.
 
 As a program it tells the process that started it how far it is, a JSON mapping a line:
-``python -m us_sim.run.background make SCENE [VOLUME]`` makes the volume and the tissue of a scene,
-which are kept; ``… list [SCENE …]`` lists those scenes and the installed ones, with thumbnails.
+``python -m us_sim.run.background NICE make SCENE [VOLUME]`` makes the volume and the tissue of a
+scene, which are kept; ``… list [SCENE …]`` lists those scenes and the installed ones, with
+thumbnails. NICE is by how much its priority is lower.
 """
 
 from __future__ import annotations
@@ -12,12 +13,10 @@ import dataclasses
 import functools
 import json
 import os
-import queue
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -41,49 +40,34 @@ class Background:
     """
 
     def __init__(self, *arguments: str, nice: int) -> None:
-        self._said: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "us_sim.run.background", *arguments],
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "us_sim.run.background", str(nice), *arguments],
             stdin=LIFELINE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            text=True,
-            errors="replace",
             env=child_environment(),
             start_new_session=True,
         )
-        with contextlib.suppress(AttributeError, OSError):
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, os.getpriority(0, 0) + nice)
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        assert self.process.stdout is not None
+        self._output = self.process.stdout
+        os.set_blocking(self._output.fileno(), False)
+        self._begun = b""  # a line that is not complete
 
     def said(self) -> list[dict[str, Any]]:
-        """Its messages since this was called last."""
-        told = []
-        with contextlib.suppress(queue.Empty):
-            while True:
-                told.append(self._said.get_nowait())
-        return told
+        """Return its messages since this was called last."""
+        *lines, self._begun = (self._begun + (self._output.read() or b"")).split(b"\n")
+        return [json.loads(line) for line in lines]
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is over, and all its messages have come."""
-        return not self._reader.is_alive() and self._process.poll() is not None
+        """Whether it says nothing more than `said` returns now."""
+        return self.process.poll() is not None
 
     def end(self) -> None:
         """End it, whatever it does."""
-        self._process.kill()
-        self._process.wait()
-        self._reader.join()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            with contextlib.suppress(ValueError):
-                said = json.loads(line)
-                if isinstance(said, dict):
-                    self._said.put(said)
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
+        self._output.close()
 
 
 def _tell(**said: Any) -> None:
@@ -135,74 +119,64 @@ def list_scenes(*names: str) -> None:
 
 
 def bags_in_reach(recordings: str | None = None) -> dict[str, str]:
-    """Bags of the working folder and installed ones: files by names, the newest first.
+    """Return bags of the working folder and installed ones: files by names, the newest first.
 
     Files in a bag's folder that do not belong to that bag are bags of their own.
 
     Args:
         recordings: folder to which pages record, wherever that is.
     """
-    bags: dict[str, str] = {}
     here = Path.cwd()
-    folders = {here: "", here / "bags": "bags/"}
-    for root in shared_roots():
-        folders.setdefault(root / "bags", "")
-    found = [(_newest_first(_bags_in(folder)), folder, name) for folder, name in folders.items()]
-    if recordings and (folder := full_path(recordings)) not in folders:
-        found.insert(1, (_newest_first(_bags_at(folder)), folder.parent, ""))
-    for files, folder, before in found:
-        for file in files:
-            bags.setdefault(f"{before}{file.relative_to(folder).as_posix()}", str(file))
+    found = [(_bags_in(here), here), (_bags_in(here / "bags"), here)]
+    if recordings:
+        folder = full_path(recordings)
+        found.insert(1, (_bags_at(folder), folder.parent))
+    found += [(_bags_in(root / "bags"), root / "bags") for root in shared_roots()]
+    bags: dict[str, str] = {}
+    for files, base in found:
+        for file in sorted(files, key=_changed_at, reverse=True)[:_MOST_BAGS]:
+            if str(file) not in bags.values():
+                bags.setdefault(file.relative_to(base).as_posix(), str(file))
     return bags
 
 
-def _newest_first(files: Iterable[Path]) -> list[Path]:
-    found = []
-    for file in files:
-        with contextlib.suppress(OSError):  # taken away meanwhile
-            found.append((file.stat().st_mtime, file))
-    return [file for _, file in sorted(found, reverse=True)[:_MOST_BAGS]]
+def _changed_at(file: Path) -> float:
+    try:
+        return file.stat().st_mtime
+    except OSError:  # taken away meanwhile
+        return 0.0
 
 
-def _is_bag(file: Path) -> bool:
-    return file.name.endswith((".mcap", ".db3", ".mcap.zstd"))
+def _files_in(folder: Path) -> Iterator[Path]:
+    return (file for file in folder.glob("*") if file.name.endswith((".mcap", ".db3", ".zstd")))
 
 
 def _bags_in(folder: Path) -> Iterator[Path]:
-    for path in _entries(folder):
-        yield from [path] if _is_bag(path) else _bags_at(path)
+    yield from _files_in(folder)
+    for metadata in folder.glob("*/metadata.yaml"):
+        yield from _bags_at(metadata.parent)
 
 
 def _bags_at(folder: Path) -> Iterator[Path]:
-    """A bag's folder, and the files in it that its metadata does not name."""
+    """Yield a bag's folder, and the files in it that its metadata does not name."""
     metadata = folder / "metadata.yaml"
-    if not os.path.isfile(metadata):
-        return
-    yield folder
-    named: Collection[str] = ()
-    with contextlib.suppress(OSError):
-        named = _named_in(metadata, metadata.stat().st_mtime_ns)
-    for file in _entries(folder):
-        if _is_bag(file) and file.name not in named:
-            yield file
+    named = _named_in(metadata, _changed_at(metadata))
+    if named:
+        yield folder
+    yield from (file for file in _files_in(folder) if file.name not in named)
 
 
 @functools.lru_cache(_MOST_BAGS)
-def _named_in(metadata: Path, _changed: int) -> Collection[str]:
-    """Names of a bag's files; none where its metadata cannot be read."""
+def _named_in(metadata: Path, _changed: float) -> frozenset[str]:
+    """Return the names of a bag's files; none where its metadata cannot be read."""
     try:
-        return {PurePosixPath(file.path).name for file in read_metadata(metadata).files}
-    except BagError:
-        return ()
-
-
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return list(folder.iterdir())
-    except OSError:
-        return []
+        return frozenset(PurePosixPath(file.path).name for file in read_metadata(metadata).files)
+    except (BagError, OSError):
+        return frozenset()
 
 
 if __name__ == "__main__":
-    job, *arguments = sys.argv[1:]
+    nice, job, *arguments = sys.argv[1:]
+    with contextlib.suppress(AttributeError):  # Windows
+        os.nice(int(nice))
     (make_scene if job == "make" else list_scenes)(*arguments)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from us_sim.errors import UsSimError, VolumeError
+from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
-from us_sim.progress import Progress
+from us_sim.progress import Progress, late_progress
 from us_sim.run.losses import IMAGER, IMAGES, Outcome
 from us_sim.run.monitored import Monitored, alone_on_domain, domain
 from us_sim.run.plan import (
@@ -280,12 +279,15 @@ def demo(
     source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
     if source == "path":
         path_of(scene, file, topic)  # before anything is made for what cannot be played
-    with _made_unless_refused(out):
-        video = _prepared_video(scene, file, topic) if source == "camera" else None
-        played = file if video is None else None
-        request = Request(scene, parameters, recording, played, topic, video=video, view=view)
-        plan = plan_of(request).with_free_port()
-        prepare_volume(scene, played, plan.topic)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    video = _prepared_video(scene, file, topic) if source == "camera" else None
+    played = file if video is None else None
+    request = Request(scene, parameters, recording, played, topic, video=video, view=view)
+    plan = plan_of(request).with_free_port()
+    prepare_volume(scene, played, plan.topic)
     started = time.monotonic()
     outcome = follow(plan, out / "nodes.log", supervision, request)
     try:
@@ -300,24 +302,6 @@ def demo(
         raise UsSimError(f"{lost}; {error}") from error
     _require_nothing_lost(outcome)
     return 0
-
-
-@contextlib.contextmanager
-def _made_unless_refused(out: Path) -> Iterator[None]:
-    """Make a folder before the work that fills it; remove it again on an error, if empty."""
-    place = out.absolute()
-    made = [folder for folder in (place, *place.parents) if not folder.exists()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
-    try:
-        yield
-    except BaseException:
-        with contextlib.suppress(OSError):  # something is in it
-            for folder in made:
-                folder.rmdir()
-        raise
 
 
 def view_running(
@@ -399,69 +383,31 @@ def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = N
     Raises:
         SceneError: no image along the path that will be played shows any of the volume.
     """
-    if path is None and _is_kept(scene):
-        return
-    bar: list[Progress] = []
+    phantom = scene.volume.phantom
+    if path is None and phantom is not None:
+        from us_sim.volume.phantom.phantom import is_phantom_kept
 
-    def show(fraction: float, text: str) -> None:
-        if not bar:
-            _require_a_cache()
-            bar.append(Progress(f"making {scene.volume.name}", 100, "%"))
-        bar[0].update(100 * fraction, text)
+        if is_phantom_kept(phantom, scene.volume.seed, scene.volume.voxel_size):
+            return
+    volume = volume_of(scene, late_progress(f"making {scene.volume.name}"))
+    if path is not None:
+        from us_sim.scene.placement import check_path_in_volume
 
-    try:
-        volume = volume_of(scene, show)
-        if path is not None:
-            from us_sim.scene.placement import check_path_in_volume
+        check_path_in_volume(scene, path, volume, topic)
+    if scene.volume.case is not None:
+        from us_sim.scene.case_tissue import keep_tissue
 
-            check_path_in_volume(scene, path, volume, topic)
-        if scene.volume.case is not None:
-            from us_sim.scene.case_tissue import keep_tissue
-
-            keep_tissue(scene, volume)
-    finally:
-        for shown in bar:
-            shown.__exit__()
-
-
-def _is_kept(scene: Scene) -> bool:
-    from us_sim.volume.phantom.phantom import is_phantom_kept
-
-    volume = scene.volume
-    return volume.phantom is not None and is_phantom_kept(
-        volume.phantom, volume.seed, volume.voxel_size
-    )
+        keep_tissue(scene, volume)
 
 
 def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
     from us_sim.recording.path import read_path
     from us_sim.run.camera_video import path_video
 
-    with contextlib.ExitStack() as stack:
-        bar: list[Progress] = []
-
-        def show(done: int, total: int) -> None:
-            if not bar:
-                bar.append(stack.enter_context(Progress("rendering the video", total, "images")))
-            bar[0].update(done)
-
-        return path_video(scene, read_path(file, topic, option="--topic"), show)
-
-
-def _require_a_cache() -> None:
-    """Raise VolumeError where a phantom cannot be kept, so that every node would make it again."""
-    from us_sim.cache import cache_folder
-
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise VolumeError(
-            f"the cache folder {folder} cannot be written ({error.strerror}): set US_SIM_CACHE to "
-            f"a folder that can"
-        ) from error
+    show = late_progress("rendering the video")
+    return path_video(
+        scene, read_path(file, topic, option="--topic"), lambda done, total: show(done / total, "")
+    )
 
 
 def _require_nothing_lost(outcome: Outcome) -> None:

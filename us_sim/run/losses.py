@@ -65,21 +65,23 @@ class Outcome:
     awaited: str = ""  # why nothing was played
 
     def sentence(self) -> str:
-        """The losses, for a person; empty when there are none."""
+        """Return the losses, for a person; nothing when there are none."""
+        lacks_images = bool(self.files) and self.recorded < self.made
+        if not (self.losses or self.awaited or lacks_images):
+            return ""
         told = [str(loss) for loss in self.losses[:TOLD]]
         if self.awaited:
             told.append(f"nothing was played: it waited for {self.awaited}")
         if len(self.losses) > TOLD:
             told.append(f"and {len(self.losses) - TOLD} more times nodes ended or hung")
-        if self.files and (self.losses or self.recorded < self.made):
+        if lacks_images:
+            told.append(f"{self.recorded} images were recorded of {self.made} that were made")
+        elif self.files and self.losses:
             of = f" of {self.poses} poses" if self.poses is not None else ""
-            if self.recorded < self.made:
-                of = f" of {self.made} that were made"
             told.append(f"{self.recorded} images were recorded{of}")
         if self.files:
             told.append(f"the recording is in {', '.join(file.name for file in self.files)}")
-        lacks_images = bool(self.files) and self.recorded < self.made
-        return "; ".join(told) if self.losses or self.awaited or lacks_images else ""
+        return "; ".join(told)
 
     def summary(self) -> dict[str, Any]:
         """As one JSON-like mapping."""
@@ -94,11 +96,9 @@ class Outcome:
 def files_of(recording: Path) -> list[Path]:
     """A recording's file and those in which it goes on: ``session.mcap``, ``session_1.mcap``, …"""
     pattern = re.compile(rf"{re.escape(recording.stem)}((?:_\d+)*){re.escape(recording.suffix)}")
-    found = []
-    for file in recording.parent.glob("*"):
-        if match := pattern.fullmatch(file.name):
-            found.append(([int(number) for number in match[1].split("_")[1:]], file))
-    return [file for _, file in sorted(found)]
+    found = {file: pattern.fullmatch(file.name) for file in recording.parent.glob("*")}
+    numbers = {file: [*map(int, match[1].split("_")[1:])] for file, match in found.items() if match}
+    return sorted(numbers, key=numbers.__getitem__)
 
 
 def images_in(files: Sequence[Path], name: str = f"/{IMAGES}") -> int:
@@ -121,31 +121,29 @@ class Recordings:
         self._begun: dict[Path, tuple[set[Path], float]] = {}
 
     def begin(self, recorder: NodeProcess) -> None:
-        """A recorder is about to be started for the first time."""
+        """Note that a recorder is about to be started."""
         file = Path(str(recorder.all_parameters["file"]))
         self._begun.setdefault(file, (set(files_of(file)), time.monotonic()))
 
     def progress(self, file: Path) -> dict[str, str]:
-        """Age and size of a recording and the room that is left, as values of diagnostics."""
+        """Return age and size of a recording and the room that is left, as in diagnostics."""
         if file not in self._begun:
             return {}
-        older, begun = self._begun[file]
         try:
-            sizes = [each.stat().st_size for each in files_of(file) if each not in older]
+            size = sum(each.stat().st_size for each in self._files(file))
             room = shutil.disk_usage(file.parent).free
         except OSError:  # the folder was taken away; the recorder says so
             return {}
+        seconds = time.monotonic() - self._begun[file][1]
         return {
-            "record_seconds": f"{time.monotonic() - begun:.0f}",
-            "record_bytes": str(sum(sizes)),
+            "record_seconds": f"{seconds:.0f}",
+            "record_bytes": str(size),
             "record_room_bytes": str(room),
         }
 
     def files(self) -> list[Path]:
-        """The files that are there by now, in the order in which they were begun."""
-        return [
-            found
-            for file, (older, _) in self._begun.items()
-            for found in files_of(file)
-            if found not in older
-        ]
+        """Return the files that are there by now, in the order in which they were begun."""
+        return [found for file in self._begun for found in self._files(file)]
+
+    def _files(self, file: Path) -> list[Path]:
+        return [found for found in files_of(file) if found not in self._begun[file][0]]

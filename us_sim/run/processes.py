@@ -19,7 +19,7 @@ from us_sim.errors import UsSimError, memory_limit, printable
 from us_sim.nodes import ENDS_WITH_INPUT, INTERRUPTED, require_rclpy
 from us_sim.nodes.settings import RECORDER, VIEWER
 from us_sim.run.plan import NodeProcess
-from us_sim.run.shared_memory import remove_abandoned_segments, remove_unused_ports
+from us_sim.run.shared_memory import remove_abandoned_segments
 
 LIFELINE, _OTHER_END = os.pipe()
 """Standard input of what is started from here: it ends with this process, whatever ends that."""
@@ -192,7 +192,6 @@ class ProcessGroup:
         """End every process, and remove what they leave; the names of those that were killed."""
         killed = self.end(list(self._running))
         remove_abandoned_segments()
-        remove_unused_ports()
         if self._log is not None:
             with contextlib.suppress(OSError):
                 self._log.close()

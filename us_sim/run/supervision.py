@@ -157,7 +157,8 @@ class Supervisor:
 
     def _on_lost(self, node: str, what: str, said: str) -> None:
         """Note a node's end, and start it again with the values that it was first started with."""
-        loss = self._note(node, what, said, self._restarts.refused(node))
+        loss = self._note(node, what, said, self._restarts.refused(node), "it is started again")
+        self._publish()
         if loss.given_up:
             self._away.pop(node, None)
             self.finished |= node == self.plan.player
@@ -176,13 +177,13 @@ class Supervisor:
             self._publish()
             say(f"{node} is back after {loss.back_after:.1f} s")
 
-    def _note(self, node: str, what: str, said: str = "", given_up: str = "") -> Loss:
+    def _note(
+        self, node: str, what: str, said: str = "", given_up: str = "", then: str = ""
+    ) -> Loss:
         loss = Loss(node, what, time.monotonic() - self._began, said, given_up=given_up)
         self.losses.append(loss)
         last = f", and last said: {said}" if said else ""
-        then = f"; {given_up or 'it is started again'}"
-        say(f"{node} {what} after {loss.at:.1f} s{last}{then}")
-        self._publish()
+        say(f"{node} {what} after {loss.at:.1f} s{last}; {given_up or then}".removesuffix("; "))
         return loss
 
     def _publish(self) -> None:
@@ -194,7 +195,8 @@ class Supervisor:
         is_noted = any(loss.what.startswith("could not") for loss in self.losses)
         if node.rejected(RECORDER, "disk") > 0 and not is_noted:
             what = f"could not write ({node.messages.get(RECORDER, '')})"
-            self._note(RECORDER, what, given_up="is tried again")
+            self._note(RECORDER, what)
+            self._publish()
 
 
 def say(sentence: str) -> None:
