@@ -33,7 +33,7 @@ class SupervisionSettings(Settings):
     silence: float = setting(
         Quantity("time", 2.0, 3600.0),
         "seconds without a report after which a node hangs",
-        default=20.0,
+        default=30.0,
     )
 
 
