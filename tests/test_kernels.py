@@ -1,160 +1,120 @@
-"""Compiled kernels that are kept: whole ones are used, all others are compiled again."""
+"""Compiled kernels are kept, and compiled again where any source of theirs changed."""
 
-import importlib.util
-import logging
+import ast
 import os
-import pickle
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numba.core import config
 
-from us_sim import kernels
+import us_sim
+from us_sim.kernels import source_files
 
+PACKAGE = Path(us_sim.__file__).parent
+CALLED = "from us_sim.kernels import njit\n\n\n@njit\ndef triple(x):\n    return 3 * x\n"
 KERNEL = """
+from us_sim.called import triple
 from us_sim.kernels import njit
 
 @njit(cache=True)
-def triple(x):
-    return 3 * x
+def thrice(x):
+    return triple(x)
 """
+CALL = "from us_sim.caller import thrice as t; print(t(7), sum(t.stats.cache_hits.values()))"
 
 
 @pytest.fixture
-def kept(tmp_path, monkeypatch):
-    """The folder where kernels are kept, empty, and nothing said yet."""
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
-    monkeypatch.setattr(kernels, "_said", set())
-    return tmp_path / "kept"
+def package(tmp_path):
+    """A copy of the package with a kernel that calls a function of another file."""
+    copy = tmp_path / "copy" / "us_sim"
+    copy.mkdir(parents=True)
+    for name in ("__init__.py", "cache.py", "errors.py", "kernels.py"):
+        shutil.copy(PACKAGE / name, copy)
+    (copy / "called.py").write_text(CALLED)
+    (copy / "caller.py").write_text(KERNEL)
+    return copy
 
 
 @pytest.fixture
-def kernel(tmp_path):
-    """Makes the kernel anew, as another process would."""
-    file = tmp_path / "triples.py"
-    file.write_text(KERNEL)
+def call(package, tmp_path):
+    """Call the kernel in a new process; returns its output and what it says."""
 
-    def make():
-        spec = importlib.util.spec_from_file_location("triples", file)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module.triple
+    def run(cache=tmp_path / "cache"):
+        unset = {"NUMBA_CACHE_DIR", "US_SIM_CACHE"}
+        environment = {name: value for name, value in os.environ.items() if name not in unset}
+        environment |= {"PYTHONPATH": str(package.parent), "US_SIM_CACHE": str(cache)}
+        command = [sys.executable, "-c", CALL]
+        ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+        return ran.stdout.split(), ran.stderr
 
-    return make
-
-
-def the_file(kept):
-    (file,) = kept.rglob("*.kernel")
-    return file
+    return run
 
 
-def hits(kernel):
-    return sum(kernel.stats.cache_hits.values())
+def test_a_second_process_compiles_nothing(call):
+    assert call() == (["21", "0"], "")
+    assert call() == (["21", "1"], "")
 
 
-def test_what_was_compiled_is_loaded(kept, kernel):
-    assert kernel()(7) == 21
-    again = kernel()
-    assert (again(7), hits(again)) == (21, 1)
-    assert the_file(kept).stat().st_mode & 0o777 == 0o600
+def test_a_called_function_that_changed_is_compiled_again(call, package):
+    call()
+    (package / "called.py").write_text(CALLED.replace("3 * x", "11 * x"))
+    assert call() == (["77", "0"], "")
+    (package / "node.py").write_text("nothing = 'of what is compiled'\n")
+    assert call() == (["77", "1"], "")
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda content: content[:-1],
-        lambda content: content[:0],
-        lambda content: content[:40] + bytes([content[40] ^ 1]) + content[41:],
-        lambda content: bytes(len(content)),
-    ],
-)
-def test_a_damaged_file_is_compiled_again_and_that_is_said_once(kept, kernel, damage, caplog):
-    kernel()(7)
-    file = the_file(kept)
-    whole = file.read_bytes()
-    file.write_bytes(damage(whole))
-    again = kernel()
-    with caplog.at_level(logging.WARNING):
-        assert (again(7), again(7.0), hits(again)) == (21, 21.0, 0)
-    (said,) = caplog.messages
-    assert said == f"{file} is not used (its checksum is wrong), so its kernel is compiled again"
-    third = kernel()
-    assert (third(7), hits(third)) == (21, 1)
+def test_where_nothing_can_be_kept_kernels_work_all_the_same(call, tmp_path):
+    (tmp_path / "file").touch()
+    for _ in range(2):
+        result, said = call(tmp_path / "file")
+        assert result == ["21", "0"]
+        assert said.count("\n") == 1
+        assert "cannot be written" in said
 
 
-def test_a_file_that_others_may_have_written_is_never_unpickled(kept, kernel, tmp_path):
-    class Planted:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "broken_in"),)
-
-    kernel()(7)
-    file = the_file(kept)
-    content = pickle.dumps(Planted())
-    file.write_bytes(kernels._checksum(file.name, content) + content)
-    file.chmod(0o620)
-    again = kernel()
-    assert (again(7), hits(again)) == (21, 0)
-    assert not (tmp_path / "broken_in").exists()
-    file.write_bytes(kernels._checksum(file.name, content) + content)
-    file.chmod(0o600)
-    assert kernel()(7) == 21  # its owner's own pickle is loaded, and is no kernel
-    assert (tmp_path / "broken_in").exists()
-
-
-def test_the_file_of_another_kernel_is_not_used(kept, kernel):
-    whole, broken = kernel(), kernel()
-    whole(7)
-    one = the_file(kept)
-    whole(7.0)
-    (other,) = set(kept.rglob("*.kernel")) - {one}
-    other.write_bytes(one.read_bytes())
-    assert (broken(7.0), hits(broken)) == (21.0, 0)
-
-
-def test_where_nothing_can_be_kept_kernels_work_all_the_same(kept, kernel, caplog):
-    kept.write_text("no folder")
-    with caplog.at_level(logging.WARNING):
-        assert kernel()(7) == 21
-    assert "kernels are not kept" in caplog.text
-
-
-def test_code_of_an_earlier_source_is_let_go(kept, kernel, tmp_path):
-    kernel()(7)
-    earlier = the_file(kept)
-    (tmp_path / "triples.py").write_text(KERNEL.replace("3 * x", "11 * x"))
-    assert kernel()(7) == 77
-    assert the_file(kept) != earlier
-
-
-@pytest.mark.slow
-@settings(max_examples=200, deadline=None)
-@given(st.data())
-def test_no_change_of_a_file_goes_unnoticed(tmp_path_factory, data):
-    folder = tmp_path_factory.mktemp("files")
-    files = kernels._CheckedFiles(folder, "f", "source")
-    files.save("key", ["anything", 1.5])
-    assert files.load("key") == ["anything", 1.5]
-    (file,) = folder.iterdir()
-    content = bytearray(file.read_bytes())
-    at = data.draw(st.integers(0, len(content) - 1))
-    if data.draw(st.booleans()):
-        content[at] ^= data.draw(st.integers(1, 255))
-    else:
-        del content[at:]
-    file.write_bytes(content)
-    assert files.load("key") is None
-    assert not file.exists()
+def test_folders_of_old_sources_are_removed_but_for_the_newest(call, tmp_path):
+    place = tmp_path / "cache" / "kernels"
+    for days in range(8):
+        folder = place / f"us_sim-0-{days}"
+        folder.mkdir(parents=True)
+        os.utime(folder, (then := time.time() - 86400 * (days + 0.5), then))
+    call()
+    kept = {folder.name for folder in place.glob("us_sim-0-*")}
+    assert kept == {f"us_sim-0-{days}" for days in range(4)}
 
 
 def test_every_kernel_of_the_package_is_kept_so():
-    from pathlib import Path
-
-    import us_sim
-
-    root = Path(us_sim.__file__).parent
-    for file in root.rglob("*.py"):
+    for file in PACKAGE.rglob("*.py"):
         if file.name != "kernels.py":
             lines = file.read_text(encoding="utf-8").splitlines()
             assert not [line for line in lines if line.startswith("from numba import njit")], file
             assert not [line for line in lines if line.startswith("import numba")], file
+
+
+def test_what_a_kernel_is_made_of_stands_in_files_whose_hash_names_the_folder():
+    root = PACKAGE.parent
+    hashed = {file.relative_to(root) for file in source_files()}
+    for file in hashed:
+        tree = ast.parse((root / file).read_text(encoding="utf-8"))
+        unhashed = {
+            name.asname or name.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            and (node.module or "").startswith("us_sim")
+            and Path(*node.module.split(".")).with_suffix(".py") not in hashed
+            for name in node.names
+        }
+        for node in tree.body:  # constants made of such
+            if isinstance(node, ast.Assign) and unhashed & names_in(node.value):
+                unhashed |= names_in(node.targets[0])
+        for node in ast.walk(tree):
+            decorators = getattr(node, "decorator_list", [])
+            if any("njit" in names_in(decorator) for decorator in decorators):
+                assert not unhashed & names_in(node), f"{file}: {node.name}: name `kernel` there"
+
+
+def names_in(tree):
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}

@@ -5,14 +5,15 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core import config
 from tissue_block import block
 
 from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
-from us_sim.kernels import kernel_folder
 from us_sim.settings.registry import SOLVERS
 from us_sim.tissue import live_tissue
 from us_sim.tissue.elasticity.material import Material
@@ -248,7 +249,7 @@ for model, method, settings in (
 @pytest.mark.slow
 def test_no_frame_meets_a_kernel_that_is_not_compiled(tmp_path, monkeypatch):
     # What is kept of a tissue is not there, so that it is made; kernels are those of all tests.
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernel_folder()))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(Path(config.CACHE_DIR).parent))
     monkeypatch.setenv("US_SIM_CACHE", str(tmp_path))
     ran = subprocess.run([sys.executable, "-c", FRAMES], capture_output=True, text=True)
     assert ran.stdout.split("\n") == ["set()"] * 4 + [""], ran.stderr

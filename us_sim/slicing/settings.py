@@ -56,7 +56,8 @@ Keller and Rubinow, Post buckling behavior of elastic tubes, SIAM J. Appl. Math.
 
 TISSUE_PARAMETERS = "acoustics.tissues."  # prefix of the parameters of a label's acoustics
 ECHO_RANGE = 60.0
-"""dB from the faintest echo that a volume holds to the strongest: grey values 0 and 255."""
+"""dB from the faintest echo that a volume holds to the strongest, grey values 0 and 255; kernels
+have it, too."""
 
 GREY_MAPS = ("linear", "soft", "contrast")
 _GAIN = Quantity("level", -60.0, 60.0)

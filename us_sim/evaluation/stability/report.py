@@ -25,7 +25,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap, LogNorm
-from numba.core import config
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import SolverError
@@ -50,7 +49,6 @@ from us_sim.evaluation.stability.measure import (
     try_case,
 )
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.kernels import kernel_folder
 from us_sim.progress import Progress
 from us_sim.tissue.solvers.solver import create_solver
 
@@ -138,7 +136,7 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
             max_workers=max(1, min(2, os.cpu_count() or 1)),
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_prepare,
-            initargs=(cache, str(kernel_folder())),
+            initargs=(cache,),
         ) as pool,
     ):
         try:
@@ -155,13 +153,12 @@ def _run(tasks: Sequence[_Task], progress: Callable[[float, str], None]) -> list
     return tried
 
 
-def _prepare(cache: str, kernels: str) -> None:
+def _prepare(cache: str) -> None:
     """In a new process: one thread for BLAS, and files of solvers in the folder ``cache``.
 
-    Kernels alone are those of every other process: in a new folder all would be compiled again.
+    Kernels alone are those of every other process: their folder was chosen by the imports above.
     """
     os.environ["US_SIM_CACHE"] = cache
-    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = kernels  # type: ignore[attr-defined]
     threadpool_limits(1)
 
 

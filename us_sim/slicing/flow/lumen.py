@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from us_sim.errors import VolumeError
 
-DIRECTIONS = 24  # directions from a section's centre in which its wall is known
+DIRECTIONS = 24  # from a section's centre in which its wall is known, in kernels as well
 _ANGLES = np.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
 _SOFTENED = 0.7  # standard deviation, in voxels, of what softens the steps of a label's surface
 _INTERPOLATED = 1 / 6  # variance, in voxels squared, of what linear interpolation averages over
