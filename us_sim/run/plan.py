@@ -40,7 +40,7 @@ def module_of(node: str) -> str:
 
 
 def enclave_of(node: str) -> str:
-    """Where ROS 2's security finds a node's keys; config/policy.xml says what it may do."""
+    """Where ROS 2's security finds a node's keys."""
     return f"/us_sim/{node}"
 
 
