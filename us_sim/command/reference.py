@@ -19,6 +19,7 @@ from us_sim.settings.tables import (
     anchor,
     default_text,
     first_sentence,
+    markdown,
     sections_of,
     table,
     values,
@@ -98,46 +99,50 @@ def _reference(args: argparse.Namespace) -> int:
 
 
 def reference_page() -> str:
-    """The whole page."""
-    return "\n".join([INTRODUCTION, *(_written(*each) for each in reference_sections())])
+    """Write the whole page."""
+    return f"{INTRODUCTION}\n{_written(reference_sections())}"
 
 
 def reference_sections() -> Iterator[tuple[int, Section]]:
-    """All sections in order, each with the level of its heading."""
+    """Make all sections in order, each with the level of its heading."""
+    from us_sim.geometry.pose import Placement
+    from us_sim.scene.scene import Scene
+
     yield 2, Section("topics", "Topics", f"{TOPICS_TEXT}\n\n{_topics()}")
     yield 2, Section("parameters", "Node parameters", PARAMETERS_TEXT)
     yield from ((3, section) for section in _nodes())
     yield 2, Section("scene", "Scene settings", SCENE_TEXT)
-    yield from ((3, section) for section in _scene_sections())
+    yield from ((3, section) for section in sections_of(Scene, "", {Placement: POSE}))
+    yield 3, Section("pose", POSE, f"{first_sentence(Placement.__doc__)}\n\n{table(Placement)}")
 
 
 def _part(name: str) -> str:
-    """Those sections that a person asks for by name.
+    """Write those sections that a person asks for by name.
 
     Raises:
         UsSimError: there are none of that name.
     """
     sections = list(reference_sections())
     found = [each for each in sections if f"{each[1].path}.".startswith(f"{name}.")]
-    if not found:  # what stands within another, such as a solver or a kind of probe
-        found = [each for each in sections if f".{name}." in f"{each[1].path}."]
+    # Or what stands within another, such as a solver or a kind of probe.
+    found = found or [each for each in sections if f".{name}." in f"{each[1].path}."]
     if not found:
-        known = list(filter(None, (section.path for _, section in sections)))
+        known = [section.path for _, section in sections if section.path]
         if nearest(name, known) is None:
             known = list(dict.fromkeys(path.split(".")[0] for path in known))
         raise UsSimError(f"reference: {unknown(name, known)}")
-    return "\n".join(_written(*each) for each in found)
+    return _written(found)
 
 
-def _written(level: int, section: Section) -> str:
-    return f"{'#' * level} {section.title}\n\n{section.text}\n"
+def _written(sections: Iterable[tuple[int, Section]]) -> str:
+    return "\n".join(f"{'#' * level} {each.title}\n\n{each.text}\n" for level, each in sections)
 
 
 def _topics() -> str:
     from us_sim.nodes.settings import NODES
     from us_sim.nodes.topics import TOPICS
 
-    lines = ["| topic | type | from | to | what it carries |", "| --- | --- | --- | --- | --- |"]
+    rows = []
     for topic in TOPICS:
         sources = _names(topic.publishers)
         if topic.from_drivers:
@@ -145,12 +150,10 @@ def _topics() -> str:
         elif len(topic.publishers) > len(NODES) / 2:
             silent = [node for node in NODES if node not in topic.publishers]
             sources = f"every node but {_names(silent)}"
-        latched = " (latched)" if topic.latched else ""
-        lines.append(
-            f"| `{topic.name}` | {topic.type_name}{latched} | {sources} | "
-            f"{_names(topic.subscribers)} | {topic.description} |"
-        )
-    return "\n".join(lines)
+        kind = f"{topic.type_name}{' (latched)' if topic.latched else ''}"
+        heard = _names(topic.subscribers)
+        rows.append((f"`{topic.name}`", kind, sources, heard, topic.description))
+    return markdown(("topic", "type", "from", "to", "what it carries"), rows)
 
 
 def _names(names: Iterable[str]) -> str:
@@ -196,27 +199,18 @@ def _of_probe() -> str:
 
 
 def _parameters(settings: type[Settings]) -> str:
-    """The parameters that settings are."""
+    """Make a table of the parameters that settings are."""
     from us_sim.nodes.settings import is_live
 
-    lines = [
-        "| parameter | value | default | while running | what it is |",
-        "| --- | --- | --- | --- | --- |",
-    ]
     kinds = kinds_of(settings)
-    for name, rule in rules_of(settings).items():
-        live = "yes" if is_live(settings, name) else ""
-        lines.append(
-            f"| `{name}` | {values(kinds[name], rule)} | {default_text(settings, name)} | {live} | "
-            f"{rule.description} |"
+    rows = [
+        (
+            f"`{name}`",
+            values(kinds[name], rule),
+            default_text(settings, name),
+            "yes" if is_live(settings, name) else "",
+            rule.description,
         )
-    return "\n".join(lines)
-
-
-def _scene_sections() -> Iterator[Section]:
-    """The keys of a scene."""
-    from us_sim.geometry.pose import Placement
-    from us_sim.scene.scene import Scene
-
-    yield from sections_of(Scene, "", {Placement: POSE})
-    yield Section("pose", POSE, f"{first_sentence(Placement.__doc__)}\n\n{table(Placement)}")
+        for name, rule in rules_of(settings).items()
+    ]
+    return markdown(("parameter", "value", "default", "while running", "what it is"), rows)

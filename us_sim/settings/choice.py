@@ -24,13 +24,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from us_sim.errors import SettingsError, UsSimError
+from us_sim.settings.setting import Settings
 from us_sim.settings.spelling import unknown
-
-if TYPE_CHECKING:
-    from us_sim.settings.setting import Settings
 
 _logger = logging.getLogger(__name__)
 
@@ -63,8 +61,6 @@ class Option:
 
     def load_settings(self) -> type[Settings]:
         """Import the settings."""
-        from us_sim.settings.setting import Settings
-
         if self.settings is not None:
             found: type[Settings] = self._imported(self.settings)
             return found

@@ -22,14 +22,11 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field
 from types import UnionType
-from typing import TYPE_CHECKING, Any, ClassVar, Union, get_args, get_origin
+from typing import Any, ClassVar, Union, get_args, get_origin
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.spelling import shown, unknown
-
-if TYPE_CHECKING:
-    from us_sim.settings.choice import Choice
 
 NUMBER = Quantity("number")
 
@@ -41,7 +38,7 @@ class Rule:
     quantity: Quantity | None = None  # unit and range of a number, or of each number of a list
     description: str = ""  # for a person, without the unit
     choices: tuple[str, ...] = ()  # the only texts that will do
-    choice: Choice | None = None  # or the names that a registry has
+    choice: Any = None  # or the names that a `settings.choice.Choice` has
     place: str = "within"  # where the keys of what is chosen are, see `setting`
     file: bool = False  # a text that names a file
     live: bool = False  # may change while what it sets is running
@@ -56,7 +53,7 @@ def setting(
     default_factory: Any = MISSING,
     kw_only: Any = MISSING,
     choices: Sequence[str] = (),
-    choice: Choice | None = None,
+    choice: Any = None,
     place: str = "within",
     file: bool = False,
     live: bool = False,
