@@ -38,6 +38,7 @@ from us_sim.errors import UsSimError
 
 Thing = TypeVar("Thing")
 
+_DAMAGE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, UsSimError)
 _WAIT = 0.5  # s, between two words to the person who waits for another process
 
 _logger = logging.getLogger(__name__)
@@ -50,10 +51,6 @@ class Form(Generic[Thing]):
     description: str  # file name of the facts and checksums
     pack: Callable[[Thing], tuple[dict[str, NDArray], dict[str, Any]]]  # arrays, facts for JSON
     unpack: Callable[[dict[str, NDArray], dict[str, Any]], Thing]
-
-
-class _DamagedError(Exception):
-    """An entry is there and cannot be used."""
 
 
 def cache_folder() -> Path:
@@ -80,12 +77,12 @@ def kept(
         waiting: called every half second while another process makes it.
     """
     entry = cache_folder() / key
-    found = _loaded(entry, form, warn=False)
+    found = _load(entry, form)
     if found is not None:
         return found
+    lock = FileLock(entry.with_name(f"{key}.lock"))
     try:
         entry.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(entry.with_name(f"{key}.lock"))
         while not lock.is_locked:
             try:
                 lock.acquire(timeout=_WAIT)
@@ -96,7 +93,7 @@ def kept(
         _logger.warning("%s cannot be written (%s), so nothing is kept there", entry.parent, error)
         return make()
     try:
-        found = _loaded(entry, form, warn=True)
+        found = _load(entry, form, warn=True)
         if found is not None:
             return found
         made = make()
@@ -105,42 +102,31 @@ def kept(
         except OSError as error:
             _logger.warning("%s cannot be written (%s), so it is not kept", entry, error)
             return made
-        found = _loaded(entry, form, warn=True)
+        found = _load(entry, form, warn=True)
         return made if found is None else found
     finally:
         lock.release()
 
 
-def _loaded(entry: Path, form: Form[Thing], *, warn: bool) -> Thing | None:
-    """The entry's thing, or None where it is absent or damaged."""
-    try:
-        return _load(entry, form)
-    except FileNotFoundError:
-        return None
-    except _DamagedError as error:
-        if warn:
-            _logger.warning("%s is damaged (%s), so it is made again", entry, error)
-        return None
-
-
-def _load(entry: Path, form: Form[Thing]) -> Thing:
+def _load(entry: Path, form: Form[Thing], *, warn: bool = False) -> Thing | None:
+    """Load the entry's thing; None where it is absent or damaged."""
     if not entry.exists():
-        raise FileNotFoundError(entry)
+        return None
     try:
         facts = json.loads((entry / form.description).read_text(encoding="utf-8"))
         arrays = {}
         for name, checksum in facts["crc32"].items():
             path = entry / f"{name}.npy"
             if zlib.crc32(np.ascontiguousarray(np.load(path, mmap_mode="r"))) != checksum:
-                raise _DamagedError(f"the checksum of {name} is wrong")
+                raise ValueError(f"the checksum of {name} is wrong")
             # Mapped anew, so that only what is used takes memory; and a plain array over the map,
             # since a subclass would slow kernels and surprise callers.
             arrays[name] = np.asarray(np.load(path, mmap_mode="r"))
         return form.unpack(arrays, facts)
-    except (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise _DamagedError(str(error)) from error
-    except UsSimError as error:
-        raise _DamagedError(str(error)) from error
+    except _DAMAGE as error:
+        if warn:
+            _logger.warning("%s is damaged (%s), so it is made again", entry, error)
+        return None
 
 
 def _store(entry: Path, form: Form[Thing], thing: Thing) -> None:
