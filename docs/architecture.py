@@ -47,11 +47,11 @@ def tree(module: str) -> ast.Module:
 
 
 @functools.cache
-def imports(module: str, *, lazy: bool = True) -> frozenset[str]:
-    """Modules of any package that a module imports at run time, and not for its types alone.
+def imports(module: str, *, types: bool = False) -> frozenset[str]:
+    """Modules of any package that a module imports, also within functions.
 
     Args:
-        lazy: also those imported within functions.
+        types: also those imported for types alone.
     """
 
     def within(nodes: list[ast.stmt]) -> Iterator[str]:
@@ -65,10 +65,8 @@ def imports(module: str, *, lazy: bool = True) -> frozenset[str]:
                 for alias in node.names:
                     inner = f"{origin}.{alias.name}"
                     yield inner if inner in FILES else origin
-            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not lazy:
-                continue
             elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-                yield from within(node.orelse)
+                yield from within([*node.orelse, *(node.body if types else [])])
             else:
                 for block in ("body", "orelse", "handlers", "finalbody", "cases"):
                     yield from within(getattr(node, block, []))

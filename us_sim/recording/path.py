@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, TrackingError
-from us_sim.geometry.pose import Pose
+from us_sim.recording.probe_path import ProbePath
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.resampling import Times, slerp
 from us_sim.recording.schemas import jazzy_definitions, stamped
@@ -220,55 +220,6 @@ def _at(track: tuple[Times, NDArray[np.float64]], stamps: Times, *, is_fixed: bo
 
 _PATHS = "give a bag (.mcap, .db3) or a tracker recording of PLUS (.igs.mha, .igs.nrrd)"
 _MOST_NAMES = 20  # bodies that are listed where one has to be named
-
-
-@dataclass(frozen=True, eq=False)
-class ProbePath:
-    """Poses in the order in which they were recorded; their stamps may go back.
-
-    Raises:
-        BagError: the arrays are not of K poses.
-    """
-
-    topic: str
-    frame_id: str
-    stamps: NDArray[np.int64]  # (K,) ns since the epoch, of the messages' headers
-    positions: NDArray[np.float64]  # (K, 3) m, frame frame_id
-    orientations: NDArray[np.float64]  # (K, 4) x, y, z, w as recorded, not normalised
-    log_times: NDArray[np.int64] = field(  # (K,) ns since the epoch; the stamps by default
-        default_factory=lambda: np.empty(0, np.int64)
-    )
-    rejected: int = 0  # poses of the topic left out: not finite, or without an orientation
-    note: str = ""  # the recording's faults, in a sentence; empty when there are none
-
-    def __post_init__(self) -> None:
-        if not len(self.log_times):
-            object.__setattr__(self, "log_times", self.stamps)
-        count = len(self.stamps)
-        shapes = [(count,), (count, 3), (count, 4), (count,)]
-        arrays = [self.stamps, self.positions, self.orientations, self.log_times]
-        if [array.shape for array in arrays] != shapes:
-            raise BagError(
-                f"a path of {count} stamps needs as many positions (K, 3), orientations (K, 4) "
-                f"and log times, not {[array.shape for array in arrays[1:]]}"
-            )
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def pose(self, index: int) -> Pose:
-        """The pose at a place in the path, its quaternion normalised."""
-        return Pose(self.positions[index], self.orientations[index])
-
-    @property
-    def poses(self) -> list[Pose]:
-        """All poses, as `pose` returns them."""
-        return [self.pose(index) for index in range(len(self))]
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first to the last recorded pose."""
-        return float(self.log_times[-1] - self.log_times[0]) / 1e9 if len(self) else 0.0
 
 
 def read_path(path: str | Path, topic: str | None = None, *, option: str = "topic") -> ProbePath:

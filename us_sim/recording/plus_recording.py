@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError, VolumeError
 from us_sim.geometry.pose import Pose
-from us_sim.recording.path import ProbePath
+from us_sim.recording.probe_path import ProbePath
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
