@@ -104,16 +104,12 @@ class _Modes:
     def _show(self, mode: str) -> None:
         self._mode = mode
         kind = "b-mode" if mode == "b-mode" else "annotated"
-        shown = f"m.setMode('{kind}', {json.dumps(MODES[mode][0])})"
-        ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {shown})")
+        _call("image.js", "setMode", kind, MODES[mode][0])
         self._mark()
 
     def _toggle(self, kind: str) -> None:
-        self._strips[kind] = on = not self._strips[kind]
-        text = "true" if on else "false"
-        ui.run_javascript(
-            f"import('/us_sim/assets/strips.js').then(m => m.showStrip('{kind}', {text}))"
-        )
+        self._strips[kind] = not self._strips[kind]
+        _call("strips.js", "showStrip", kind, self._strips[kind])
         self._mark()
 
     def _refresh(self) -> None:
@@ -121,13 +117,11 @@ class _Modes:
         remarks = self._wanted_remarks()
         if remarks != self._remarks:
             self._remarks = remarks
-            told = f"m.setRemarks({json.dumps(remarks)})"
-            ui.run_javascript(f"import('/us_sim/assets/image.js').then(m => {told})")
-        places = [] if self._probe_depth is None else list(self._dragged())
+            _call("image.js", "setRemarks", remarks)
+        places = list(self._dragged())
         if places != self._places:
             self._places = places
-            told = f"m.setPlaces({json.dumps(places)})"
-            ui.run_javascript(f"import('/us_sim/assets/image_tools/places.js').then(m => {told})")
+            _call("image_tools/places.js", "setPlaces", places)
         parameter = self._simulator.nodes.of(NODE).parameters.get(OVERLAY)
         known = parameter.raw if parameter else None
         if self._mode != "b-mode" and known in MODES and known != self._mode:
@@ -156,28 +150,18 @@ class _Modes:
             return None
         return float(parameter.raw)
 
-    @property
-    def _probe_depth(self) -> float | None:
-        return self._value("depth")
-
     def _dragged(self) -> Iterator[dict[str, Any]]:
         """The colour box, the gate and the line, which a person can drag; m and rad."""
-        deepest = self._probe_depth or 0.0
+        deepest = self._value("depth")
+        if deepest is None:
+            return
+        otherwise = {"lateral": 0.0, "depth": 0.5 * deepest, "steering": 0.0, "width": 0.0}
+        otherwise |= {"height": 0.5 * deepest, "size": 0.0}
         shown = {"colour": self._mode == "velocity", **self._strips}
-        for kind in (kind for kind, on in shown.items() if on):
-            lateral = self._value(f"{kind}.lateral")
-            if lateral is None:
-                continue
-            yield {
-                "kind": kind,
-                "lateral": lateral,
-                "deepest": deepest,
-                "depth": self._value(f"{kind}.depth") or 0.5 * deepest,
-                "steering": self._value(f"{kind}.steering") or 0.0,
-                "width": self._value(f"{kind}.width") or 0.0,
-                "height": self._value(f"{kind}.height") or 0.5 * deepest,
-                "size": self._value(f"{kind}.size") or 0.0,
-            }
+        for kind, on in shown.items():
+            if on and self._value(f"{kind}.lateral") is not None:
+                found = {key: self._value(f"{kind}.{key}") or otherwise[key] for key in otherwise}
+                yield {"kind": kind, "deepest": deepest, **found}
 
     async def _move(self, asked: Any) -> None:
         """Move the box, the gate or the line to where a person has dragged it."""
@@ -199,6 +183,12 @@ class _Modes:
             pressed = str(shown.get(name, False)).lower()
             if button.props.get("aria-pressed") != pressed:
                 button.props["aria-pressed"] = pressed
+
+
+def _call(module: str, function: str, *arguments: Any) -> None:
+    """Call a function of one of the page's modules."""
+    told = ", ".join(map(json.dumps, arguments))
+    ui.run_javascript(f"import('/us_sim/assets/{module}').then(m => m.{function}({told}))")
 
 
 def _button(label: str, title: str, on_click: Any) -> ui.button:
