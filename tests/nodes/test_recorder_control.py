@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from us_sim.errors import BagError
+from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.recording.path import ProbePath, write_path
@@ -321,7 +322,7 @@ def test_each_message_of_publishers_of_every_kind_is_recorded_once(bench, tmp_pa
 def test_gaps_in_a_publishers_numbers_are_losses(bench):
     lost = []
     topic = RecordedTopic(
-        bench.peer,
+        bench.add(GuardedNode("recorder", context=bench.context)),
         "/note",
         String,
         [QoSProfile(depth=1)],
@@ -347,7 +348,7 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
 def test_publishers_of_one_quality_are_not_taken_for_one(bench):
     lost = []
     topic = RecordedTopic(
-        bench.peer,
+        bench.add(GuardedNode("recorder", context=bench.context)),
         "/note",
         String,
         [QoSProfile(depth=1), QoSProfile(depth=1)],

@@ -21,11 +21,3 @@ def test_every_recording_of_a_folder_is_offered_once(tmp_path, monkeypatch, reco
         "rec/t2.mcap": str(folder / "t2.mcap"),
         "rec/t3.mcap": str(folder / "t3.mcap"),
     }
-
-
-def test_the_parts_of_one_recording_are_one_bag(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with BagWriter(tmp_path / "split", max_size=1) as bag:
-        bag.split()
-    assert len(list((tmp_path / "split").glob("*.mcap"))) > 1
-    assert [name for name in bags_in_reach() if "split" in name] == ["split"]
