@@ -5,6 +5,7 @@ import math
 import socket
 import warnings
 from array import array
+from functools import partial
 
 import cv2
 import numpy as np
@@ -36,10 +37,11 @@ from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.tf import TFMessage
 from us_sim.nodes.tissue_deformer import TissueDeformer
-from us_sim.nodes.tracker_inputs.camera_input import camera_from, grey_from, grey_from_compressed
+from us_sim.nodes.tracker_inputs.camera_input import camera_from
 from us_sim.recording import decoding
 from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
+from us_sim.tracking.camera.encodings import decode_image, decompress_image
 from us_sim.tracking.haptic import ContactModel
 from us_sim.tracking.openigtlink import HEADER, header_of, poses_in
 
@@ -95,8 +97,11 @@ GOOD = [
     (decoding.tetrahedra_from, messages.tetrahedra_message(np.array([[0, 1, 2, 3]]))),
     (decoding.affine_from, messages.affine_message(np.eye(4))),
     (messages.contact_model_from, contact_model()),
-    (grey_from, grey()),
-    (grey_from_compressed, CompressedImage(format="png", data=array("B", b"\x89PNG\r\n"))),
+    (partial(decode_image, colours="GRAY"), grey()),
+    (
+        partial(decompress_image, colours="GRAY"),
+        CompressedImage(format="png", data=array("B", b"\x89PNG\r\n")),
+    ),
     (camera_from, camera_info()),
 ]
 

@@ -14,7 +14,8 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from us_sim.errors import TrackingError, UsSimError
 from us_sim.nodes.camera_driver import CameraDriver
-from us_sim.nodes.tracker_inputs.camera_input import camera_from, grey_from
+from us_sim.nodes.tracker_inputs.camera_input import camera_from
+from us_sim.tracking.camera.encodings import decode_image
 from us_sim.tracking.camera.model import CameraModel, write_camera_info
 
 
@@ -62,7 +63,7 @@ def test_a_video_is_played_at_its_own_rate_with_its_calibration_and_ends(
     for image, frame in zip(images, frames_of(video), strict=True):
         assert image.encoding == encoding
         expected = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        np.testing.assert_array_equal(grey_from(image), expected)
+        np.testing.assert_array_equal(decode_image(image, "GRAY"), expected)
     camera = camera_from(infos[0])
     assert (camera.width, camera.height) == (640, 480)
     np.testing.assert_array_equal(camera.matrix, [[600, 0, 320], [0, 610, 240], [0, 0, 1]])
@@ -98,7 +99,7 @@ def test_a_video_that_began_earlier_goes_on_where_it_would_be(bench, video):
     assert number >= 6  # the first that was due since
     assert 1e-9 * nanoseconds(images[0]) - begun == pytest.approx(5 * number, abs=1e-3)
     expected = cv2.cvtColor(frames_of(video)[number], cv2.COLOR_BGR2GRAY)
-    np.testing.assert_array_equal(grey_from(images[0]), expected)
+    np.testing.assert_array_equal(decode_image(images[0], "GRAY"), expected)
 
 
 class PaperCamera:

@@ -19,8 +19,8 @@ from us_sim.errors import SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.tf import TFMessage
-from us_sim.nodes.tracker_inputs.camera_input import grey_from_compressed
 from us_sim.recording.path import ProbePath, read_path, write_path
+from us_sim.tracking.camera.encodings import decompress_image
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import SHARP, RenderedView
 from us_sim.tracking.camera.rigid_body import RigidBody
@@ -330,7 +330,7 @@ def test_a_compressed_image_larger_than_can_be_decoded_is_refused():
     header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
     png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0"))
     with pytest.raises(TrackingError, match="cannot be decoded"):
-        grey_from_compressed(CompressedImage(format="png", data=png + chunk(b"IEND", b"")))
+        decompress_image(CompressedImage(format="png", data=png + chunk(b"IEND", b"")), "GRAY")
 
 
 def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):

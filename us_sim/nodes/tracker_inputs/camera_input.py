@@ -18,6 +18,8 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.source import CameraSource, practice
 from us_sim.tracking.settings import CameraSettings
 
+Decoder = Callable[[Any, str], NDArray[np.uint8]]
+
 
 def camera_from(message: CameraInfo) -> CameraModel:
     """The camera that a driver describes.
@@ -34,16 +36,6 @@ def camera_from(message: CameraInfo) -> CameraModel:
     )
 
 
-def grey_from(message: Image) -> NDArray[np.uint8]:
-    """(rows, columns) grey pixels, as `decode_image`."""
-    return decode_image(message, "GRAY")
-
-
-def grey_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
-    """(rows, columns) grey pixels of a JPEG or PNG, as `decompress_image`."""
-    return decompress_image(message, "GRAY")
-
-
 class CameraInput(TrackerInput):
     """``camera/image_raw``, or ``camera/image_raw/compressed``, with ``camera/camera_info``."""
 
@@ -57,8 +49,8 @@ class CameraInput(TrackerInput):
             CameraInfo, "camera/camera_info", self._on_description, FOREIGN, newest=True
         )
         for message_type, topic, decode in (
-            (Image, "camera/image_raw", grey_from),
-            (CompressedImage, "camera/image_raw/compressed", grey_from_compressed),
+            (Image, "camera/image_raw", decode_image),
+            (CompressedImage, "camera/image_raw/compressed", decompress_image),
         ):
             callback = partial(self._on_image, topic, decode)
             device.subscribe(message_type, topic, callback, FOREIGN, newest=True)
@@ -73,9 +65,7 @@ class CameraInput(TrackerInput):
             self._described, self._source = message, None
             self._source = CameraSource(camera_from(message), self._body, self._settings)
 
-    def _on_image(
-        self, topic: str, decode: Callable[[Any], NDArray[Any]], message: Image | CompressedImage
-    ) -> None:
+    def _on_image(self, topic: str, decode: Decoder, message: Image | CompressedImage) -> None:
         if self._source is None:
             if self._described is None:
                 self._device.refuse(
@@ -85,7 +75,7 @@ class CameraInput(TrackerInput):
                 )
             return
         stamp = self._device.stamp_of(message.header, topic)
-        measurement = self._source.measure(decode(message), stamp)
+        measurement = self._source.measure(decode(message, "GRAY"), stamp)
         if measurement is None:
             self._device.refuse("markers", f"{topic}: {self._source.last_problem}")
             return
