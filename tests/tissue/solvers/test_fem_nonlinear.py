@@ -448,6 +448,27 @@ def test_a_held_probe_in_balance_waits_for_no_factor_where_time_is_short(
     assert bool(wanted) == factors
 
 
+def test_a_probe_at_rest_makes_few_factors_and_the_next_pose_none(
+    nearly_incompressible, monkeypatch
+):
+    made, prepare = [], FactoredStiffness.prepare
+
+    def counted(*given):
+        made.append(True)
+        return prepare(*given)
+
+    monkeypatch.setattr(FactoredStiffness, "prepare", counted)
+    solver = made_anew(nearly_incompressible)
+    solver.frame_limit = None
+    monkeypatch.setattr(newton, "TUNING", replace(TUNING, iteration_limit=1))  # all need one
+    settle(solver, at(z=0.008))
+    assert 1 <= len(made) <= TUNING.most_factors
+    monkeypatch.setattr(newton, "TUNING", TUNING)
+    made.clear()
+    settle(solver, at(z=0.009))
+    assert not made
+
+
 @pytest.fixture(scope="module")
 def nearly_incompressible():
     """A solver whose tissue takes many steps to balance; it is at rest."""

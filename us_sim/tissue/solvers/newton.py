@@ -108,7 +108,17 @@ class Newton:
         self._conditioner: Preconditioner | None = None  # of the last step
         self.iteration_limit = TUNING.first_iteration_limit  # of the next step
         self._needs_factor = False  # whether a step since has needed more iterations than allowed
+        self._give_factor_back()
         self._assemble()
+
+    def _give_factor_back(self) -> None:
+        """Precondition without a factor until a step needs one, as at every new pose.
+
+        A small tissue goes on with factors once a step has needed one: they cost it little.
+        """
+        self._needs_factor &= self.is_small
+        self._has_factor = False  # whether one was made at this pose that still serves
+        self._factors_left = TUNING.most_factors  # that may be made at this pose
 
     def depth_at_rest(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the undeformed tissue."""
@@ -127,6 +137,7 @@ class Newton:
         # Damping by nodes' own blocks would halve the first step of the smoothest modes.
         self._damping = 0.0
         self.iteration_limit = TUNING.first_iteration_limit
+        self._give_factor_back()
         self._assemble_contact()
 
     def remove_probe(self) -> None:
@@ -233,6 +244,7 @@ class Newton:
             most = TUNING.small_iteration_limit if self.is_small else TUNING.iteration_limit
             if self.iteration_limit > most and self.may_factor:
                 self._needs_factor = True
+            self._has_factor = False
         if length < 1.0 or indefinite:
             raised = max(4 * self._damping, TUNING.damping)
             self._damping = min(raised, TUNING.most_damping)
@@ -377,12 +389,19 @@ class Newton:
     ) -> Preconditioner:
         """The preconditioner of the tangent, whose blocks are (6, N) N/m, with springs.
 
-        A factor where one is needed, there is time for it, and it can be made.
+        A factor where one is needed, there is time for it, and it can be made. One serves all steps
+        at a pose until a step with it needs more iterations than allowed. It is made anew for every
+        set of springs only in a small tissue.
         """
         if self._needs_factor and self.may_factor:
             if self._factored is None:
                 self._factored = FactoredStiffness(self._model)
-            if self._factored.prepare(self.displacement, nodes, directions, stiffness):
+            if self.is_small or (not self._has_factor and self._factors_left > 0):
+                self._factors_left -= 1
+                self._has_factor = self._factored.prepare(
+                    self.displacement, nodes, directions, stiffness
+                )
+            if self._has_factor:
                 return self._factored
         self._two_level.prepare(blocks, nodes, directions, stiffness)
         return self._two_level
