@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import numpy as np
+import yaml
 
 from us_sim.command.options import add_setting_options, read_settings, scene_name
 from us_sim.errors import BagError, SceneError, StiffnessError
-from us_sim.settings.spelling import unknown
+from us_sim.settings.spelling import aligned
 from us_sim.share import full_path
-from us_sim.tissue.identification.settings import StiffnessSettings
+from us_sim.tissue.stiffness_fit import StiffnessSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     from us_sim.scene.scene import Scene
-    from us_sim.tissue.identification.press_record import PressRecord
-    from us_sim.tissue.identification.stiffness import StiffnessFit, Tissue
-
-
-_BEGIN = 0.3  # Stiffening with which a fit begins where the scene has none; a silicone's
+    from us_sim.tissue.elasticity.materials import TissueMaterials
+    from us_sim.tissue.stiffness_fit import Press, StiffnessFit
 
 
 def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
@@ -44,10 +43,10 @@ def fit_stiffness_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(args: argparse.Namespace) -> int:
-    from us_sim.command.stiffness_report import draw_fit, table, write_moduli
     from us_sim.progress import late_progress
+    from us_sim.scene.building import materials_of, tissue_model_of, volume_of
     from us_sim.scene.reading import load_scene
-    from us_sim.tissue.identification.stiffness import fit_stiffness, read_landmarks
+    from us_sim.tissue.stiffness_fit import fit_stiffness
     from us_sim.volume.cases.case import is_case
 
     settings = read_settings(args, StiffnessSettings)
@@ -57,21 +56,65 @@ def _fit(args: argparse.Namespace) -> int:
     scene = load_scene(name, volume=args.volume)
     if args.into_case and not scene.volume.case:
         raise StiffnessError("--into-case: this scene is of no case; name one with --case")
-    landmarks = read_landmarks(settings.landmarks) if settings.landmarks else None
+    section = scene.tissue
+    if section is None:
+        raise SceneError(f"{scene.origin}: tissue: is missing, so that there is nothing to press")
+    press = _read_press(args.session, settings)
+    volume = volume_of(scene)
+    model = tissue_model_of(scene, volume, print)
+
+    def constants(moduli: Mapping[str, float]) -> TissueMaterials:
+        given = section.materials
+        made = {name: replace(given[name], young_modulus=moduli[name]) for name in given}
+        return materials_of(scene, made, model.mesh, volume)
+
+    moduli = {name: material.young_modulus for name, material in section.materials.items()}
     show = late_progress("fit-stiffness")
-    show(0.0, "making the tissue")
-    tissue, remarks = _tissue(scene, settings.stiffening, show)
-    record, told = _record(args.session, tissue, settings)
-    for remark in (*remarks, *told):
-        print(remark)
-    found = fit_stiffness(tissue, record, settings, landmarks, progress=show)
-    print(table(found))
-    draw_fit(settings.picture, found, f"{scene.name}: moduli from {args.session.name}")
-    write_moduli(settings.out, found, _base(name, scene), scene.name)
-    print(f"\n{settings.out}: a scene with these moduli; {settings.picture}: how they fit")
+    found = fit_stiffness(model, constants, moduli, press, settings, show)
+    print(_table(found))
+    _write_scene(settings.out, found, _base(name, scene), scene.name)
+    _draw(settings.out.with_suffix(".png"), found)
+    print(f"{settings.out}: a scene with these moduli; its .png: how they fit")
     if args.into_case and scene.volume.case:
         _write_into_case(scene.volume.case, args.session, found, settings)
     return 0
+
+
+def _read_press(session: Path, settings: StiffnessSettings) -> Press:
+    from us_sim.recording.path import read_path
+    from us_sim.recording.reader import read_bag
+    from us_sim.recording.wrench import read_wrenches
+    from us_sim.tissue.stiffness_fit import pair_press
+
+    path = read_path(session, read_bag(session).topic(settings.pose).name)
+    felt = read_wrenches(session, settings.wrench)
+    for topic, frame, expected, option in (
+        (path.topic, path.frame_id, "patient", "--pose"),
+        (felt.topic, felt.frame_id, "probe", "--wrench"),
+    ):
+        if frame != expected:
+            raise BagError(
+                f"{session}: {topic} is in frame '{frame}': name a topic in frame '{expected}' "
+                f"with {option}"
+            )
+    return pair_press(path.stamps, path.poses, felt.stamps, felt.wrenches, settings)
+
+
+def _table(found: StiffnessFit) -> str:
+    """Structures with their moduli and intervals, and the residuals."""
+    rows = [("structure", "E (kPa)", "95 % interval (kPa)")]
+    for name, modulus in found.moduli.items():
+        factor = found.factors.get(name)
+        limits = (
+            f"{modulus / factor / 1e3:.4g} to {modulus * factor / 1e3:.4g}" if factor else "kept"
+        )
+        rows.append((name, f"{modulus / 1e3:.4g}", limits))
+    force, torque = (np.sqrt((found.left[:, k : k + 3] ** 2).mean()) for k in (0, 3))
+    left = (
+        f"left over (RMS): {force:.3g} N, {1e3 * torque:.3g} mN m at {len(found.depths)} poses "
+        f"down to {1e3 * found.depths.max():.1f} mm"
+    )
+    return "\n".join([*aligned(rows), left])
 
 
 def _base(asked: str, scene: Scene) -> dict[str, str]:
@@ -84,6 +127,33 @@ def _base(asked: str, scene: Scene) -> dict[str, str]:
     return {"based_on": str(full_path(scene.origin)) if is_file else asked}
 
 
+def _constants(found: StiffnessFit) -> dict[str, dict[str, float]]:
+    return {name: {"young_modulus": float(f"{found.moduli[name]:.6g}")} for name in found.factors}
+
+
+def _write_scene(file: Path, found: StiffnessFit, base: Mapping[str, str], name: str) -> None:
+    document = {"name": f"{name}_fitted", **base, "tissue": {"materials": _constants(found)}}
+    told = "".join(f"# {line}".rstrip() + "\n" for line in _table(found).splitlines())
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    file.write_text(f"# Fitted to a recorded press by `us-sim fit-stiffness`.\n{told}{text}")
+
+
+def _draw(file: Path, found: StiffnessFit) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    measured = found.press.wrenches - found.offset
+    panels = zip(figure.subplots(2), (0, 3), ("force (N)", "torque (N m)"), strict=True)
+    for panel, first, label in panels:
+        for k, axis in enumerate("xyz", first):
+            (line,) = panel.plot(found.press.times, measured[:, k], ".", label=axis)
+            modelled = measured[:, k] - found.left[:, k]
+            panel.plot(found.press.times, modelled, color=line.get_color())
+        panel.set(xlabel="time (s)", ylabel=label, title="measured (dots) and modelled (lines)")
+        panel.legend()
+    figure.savefig(file)
+
+
 def _write_into_case(
     case: str, session: Path, found: StiffnessFit, settings: StiffnessSettings
 ) -> None:
@@ -91,104 +161,10 @@ def _write_into_case(
     from us_sim.volume.cases.provenance import Source, Step
     from us_sim.volume.cases.writing import write_constants_into
 
-    fitted = {}
-    for name, interval in found.intervals.items():
-        constant = "stiffening" if name in found.stiffenings else "young_modulus"
-        fitted[name] = {constant: found.moduli[name], "factor": interval.factor}
+    constants = _constants(found)
+    fitted = {name: {**constants[name], "factor": found.factors[name]} for name in constants}
     sources = (Source.of(session, "recorded press"),) if session.is_file() else ()
-    said = {"confidence": settings.confidence, "kept": list(settings.keep), "moduli": fitted}
+    said = {"kept": list(settings.keep), "moduli": fitted}
     step = Step("fitted stiffness to a press", said, {"poses": len(found.depths)}, sources)
-    write_constants_into(case, found.constants, step)
+    write_constants_into(case, constants, step)
     print(f"{case}: has these moduli now")
-
-
-def _tissue(
-    scene: Scene, stiffening: Sequence[str], progress: Callable[[float, str], None]
-) -> tuple[Tissue, tuple[str, ...]]:
-    """The tissue that is pressed, of which some structures' stiffening is unknown; and remarks."""
-    from us_sim.scene.building import materials_of, tissue_model_of, volume_of
-    from us_sim.tissue.identification.stiffness import Tissue
-    from us_sim.tissue.solvers.fem_nonlinear import FemNonlinearSettings
-
-    section = scene.tissue
-    if section is None:
-        raise SceneError(f"{scene.origin}: tissue: is missing, so that there is nothing to press")
-    volume = volume_of(scene, progress)
-    remarks: list[str] = []
-    model = tissue_model_of(scene, volume, remarks.append)
-    given = scene.solver_settings("fem_nonlinear") or FemNonlinearSettings()
-    if given.contact != "frictionless" or given.viscosity > 0.0:
-        remarks.append(
-            "the fit leaves out the scene's friction and viscosity: press slowly and straight"
-        )
-    if section.solver != "fem_nonlinear":
-        remarks.append(f"the moduli are those of fem_nonlinear, not of {section.solver}")
-    materials = dict(section.materials)
-    for name in stiffening:
-        if name not in materials:
-            raise StiffnessError(f"--stiffening: {unknown(name, materials)}")
-    stiffenings = {f"stiffening of {name}": name for name in stiffening}
-
-    def materials_for(moduli: Mapping[str, float]) -> Any:
-        made = {name: replace(one, young_modulus=moduli[name]) for name, one in materials.items()}
-        for key, name in stiffenings.items():
-            made[name] = replace(made[name], stiffening=moduli[key])
-        return materials_of(scene, made, model.mesh, volume)
-
-    moduli = {name: material.young_modulus for name, material in materials.items()}
-    begin = {key: materials[name].stiffening or _BEGIN for key, name in stiffenings.items()}
-    return Tissue(model, materials_for, {**moduli, **begin}, stiffenings), tuple(remarks)
-
-
-def _record(
-    session: Path, tissue: Tissue, settings: StiffnessSettings
-) -> tuple[PressRecord, tuple[str, ...]]:
-    """The recorded press, and remarks on it."""
-    from us_sim.recording.path import read_path
-    from us_sim.recording.reader import read_bag
-    from us_sim.recording.wrench import read_wrenches
-    from us_sim.tissue.identification.press_model import PressedTissue
-    from us_sim.tissue.identification.press_record import (
-        find_delay,
-        paired,
-        stamped_alike,
-        without_wrench,
-    )
-
-    bag = read_bag(session)
-    path = read_path(session, bag.topic(settings.pose).name)
-    if path.frame_id != "patient":
-        raise BagError(
-            f"{session}: {path.topic} is in frame '{path.frame_id}': name the probe's topic in "
-            f"frame 'patient' with --pose, such as probe/pose"
-        )
-    poses = path.stamps, path.positions, path.orientations
-    remarks = [path.note] if path.note else []
-    try:
-        bag.topic(settings.wrench)
-    except BagError as error:
-        if settings.landmarks is not None:
-            return without_wrench(poses), (*remarks, f"{error}: landmarks alone are used")
-        raise StiffnessError(f"{error}: name the force on the probe with --wrench") from error
-    felt = read_wrenches(session, settings.wrench)
-    if felt.frame_id != "probe":
-        raise StiffnessError(
-            f"{session}: {felt.topic} is in frame '{felt.frame_id}': turn the force into frame "
-            f"'probe', about its origin, before it is recorded"
-        )
-    wrenches = felt.stamps, felt.wrenches
-    late = settings.time_offset or 0.0
-    if settings.time_offset is None and not stamped_alike(poses, wrenches):
-        late = find_delay(
-            poses, wrenches, PressedTissue(tissue.model).clearance, settings.largest_offset
-        )
-        remarks.append(
-            f"the wrenches are taken to be {1e3 * late:+.0f} ms late, by loading and unloading"
-        )
-    record = paired(poses, wrenches, tolerance=settings.tolerance, time_offset=late)
-    if record.unpaired:
-        remarks.append(
-            f"{record.unpaired} of {len(path)} poses have no wrench within "
-            f"{1e3 * settings.tolerance:g} ms of them and are left out"
-        )
-    return record, tuple(remarks)
