@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache, partial
 from typing import Any, Protocol
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -52,8 +53,8 @@ class SessionControl(GuardedNode):
         self._values = declared(self, SessionControlSettings())
         self._is_showing = False
         self._told: tuple[object, ...] = ()
-        self._player_clients: dict[str, AsyncParameterClient] = {}
-        self._untold: tuple[str, Mapping[str, Any]] = ("", {})  # node, and parameters for it
+        self._player = cache(partial(AsyncParameterClient, self))
+        self._untold: dict[str, dict[str, Any]] = {}  # parameters for a node that plays
         self.health = Health(self, "")
         self._scenes = self.latched(DiagnosticArray, "session/scenes")
         self._thumbnails = self.stream(CompressedImage, "session/thumbnails", CATALOGUE)
@@ -87,29 +88,25 @@ class SessionControl(GuardedNode):
 
     def tell_player(self, node: str, values: Mapping[str, Any]) -> None:
         """Set parameters of the node that plays, as soon as it is there."""
-        if node not in self._player_clients:
-            self._player_clients[node] = AsyncParameterClient(self, node)
-        self._untold = (
-            node,
-            dict(self._untold[1]) | dict(values) if self._untold[0] == node else values,
-        )
+        self._untold = {node: self._untold.get(node, {}) | dict(values)}
         self._hand_on()
 
     def _hand_on(self) -> None:
-        node, values = self._untold
-        if values and self._player_clients[node].services_are_ready():
-            self._untold = node, {}
-            self._player_clients[node].set_parameters(
-                [Parameter(name, value=each) for name, each in values.items()]
-            )
+        for node in [each for each in self._untold if self._player(each).services_are_ready()]:
+            values = self._untold.pop(node)
+            parameters = [Parameter(name, value=each) for name, each in values.items()]
+            self._player(node).set_parameters(parameters)
 
     def tell_scenes(self, scenes: Sequence[ListedScene]) -> None:
         """Publish which scenes and cases can be loaded."""
         message = self._array()
         for scene in scenes:
-            status = DiagnosticStatus(name=scene.name, hardware_id=scene.origin)
-            status.level = DiagnosticStatus.ERROR if scene.problem else DiagnosticStatus.OK
-            status.message = scene.problem or scene.description
+            status = DiagnosticStatus(
+                name=scene.name,
+                hardware_id=scene.origin,
+                level=DiagnosticStatus.ERROR if scene.problem else DiagnosticStatus.OK,
+                message=scene.problem or scene.description,
+            )
             about = {
                 "kind": scene.kind,
                 "region": scene.region,

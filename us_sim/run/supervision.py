@@ -48,6 +48,7 @@ class Supervisor:
         self._images = monitor.node.resolve_topic_name(IMAGES)  # also once the node has ended
         self._began = time.monotonic()
         self._changes = 0
+        self._is_disk_full = False
         self.change(plan)
 
     def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
@@ -192,10 +193,9 @@ class Supervisor:
     def _note_full_disk(self) -> None:
         """Note once that the recorder could not write."""
         node = self._monitor.node
-        is_noted = any(loss.what.startswith("could not") for loss in self.losses)
-        if node.rejected(RECORDER, "disk") > 0 and not is_noted:
-            what = f"could not write ({node.messages.get(RECORDER, '')})"
-            self._note(RECORDER, what)
+        if node.rejected(RECORDER, "disk") > 0 and not self._is_disk_full:
+            self._is_disk_full = True
+            self._note(RECORDER, f"could not write ({node.messages.get(RECORDER, '')})")
             self._publish()
 
 
