@@ -93,7 +93,7 @@ class PathPlayer(GuardedNode):
         now = self._playback.now
         if self._settings.lockstep:
             self._playback.has_begun = True
-            self._playhead.pause(now)
+            self._playhead.hold(True, now)
             self._go_to(round(1e9 * self._settings.time))
             return
         begun = self._begun if 0 < self._begun < now else now

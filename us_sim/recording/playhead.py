@@ -6,10 +6,10 @@
 >>> head.position(now=1050)
 200
 >>> head.run_at(1.0, now=1050)
->>> head.pause(now=1060)
+>>> head.hold(True, now=1060)
 >>> head.position(now=9999)
 210
->>> head.resume(now=9999)
+>>> head.hold(False, now=9999)
 >>> head.position(now=10009)
 220
 """
@@ -43,19 +43,8 @@ class Playhead:
         self.go_to(self.position(now), now)
         self.rate = rate
 
-    def pause(self, now: int) -> None:
-        """Stay there."""
-        self.go_to(self.position(now), now)
-        self.is_paused = True
-
-    def resume(self, now: int) -> None:
-        """Go on from there."""
-        self.is_paused = False
-        self.go_to(self._at, now)
-
     def hold(self, is_held: bool, now: int) -> None:
-        """Stay there, or go on; nothing happens where that is so already."""
-        if is_held and not self.is_paused:
-            self.pause(now)
-        elif not is_held and self.is_paused:
-            self.resume(now)
+        """Stay there, or go on from there; nothing happens where that is so already."""
+        if is_held != self.is_paused:
+            self.go_to(self.position(now), now)
+            self.is_paused = is_held

@@ -226,7 +226,9 @@ class Bag:
         try:
             data = zstandard.decompress(message.data)
         except zstandard.ZstdError as error:
-            raise BagError(f"{self.path} is damaged: {error}") from None
+            if self._decompress_messages:
+                raise BagError(f"{self.path} is damaged: {error}") from None
+            return message  # other bytes that begin so
         return message._replace(data=data)
 
     def deserialize(self, message: BagMessage) -> Any:

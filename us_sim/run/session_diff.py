@@ -206,12 +206,13 @@ def _compare(one: Bag, other: Bag, topic: BagTopic) -> Difference:
     columns, measure = QUANTITIES[topic.type_name]
     mine, yours = _places(one, topic.name), _places(other, topic.name)
     yours["place"] = yours.index
-    pairs = mine.merge(yours, "outer", on=["stamp", "again"], indicator="where")
-    only = tuple(int((pairs["where"] == side).sum()) for side in ("left_only", "right_only"))
-    found = Difference(topic.name, pd.DataFrame(), 0, (only[0], only[1]))
     partner = mine.merge(yours, "left", on=["stamp", "again"])["place"]
+    paired = {*partner.dropna()}
+    only = len(mine) - len(paired), len(yours) - len(paired)
+    found = Difference(topic.name, pd.DataFrame(), 0, only)
     waiting: dict[int, BagMessage] = {}  # of B, that come in another order than in A
-    later = enumerate(message for _, message in _messages(other, topic.name))
+    numbered = enumerate(message for _, message in _messages(other, topic.name))
+    later = (each for each in numbered if each[0] in paired)
     stamps, apart, furthest = [], [], 0.0
     for (stamp, a), place in zip(_messages(one, topic.name), partner, strict=True):
         if np.isnan(place):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, TrackingError
@@ -22,7 +23,7 @@ from us_sim.recording.lerobot_writer import (
     LeRobotWriter,
     require_lerobot,
 )
-from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
+from us_sim.recording.path import POSE_STAMPED, bodies_in, is_pose, pose_rows
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.resampling import Times, latest, linear, slerp
 from us_sim.recording.stamps import stamp_reader
@@ -315,33 +316,28 @@ class Episode:
             arrays = _times(times[1:]), np.array(kept, np.int64)
             self._images.append(Images(bag, name, *arrays, count, clock.notes()))
             return
-        is_pose = topic.type_name not in _NUMBERS
-        table: dict[int, dict[str, float]] = {}  # numbers of the same time go together
-        rejected, repeated, frames, clock = 0, 0, dict[str, None](), self._clock()
-        rows = self._poses(name, frames) if is_pose else self._vectors(topic)
-        for stamped, log_time, numbers in rows:
-            time = clock.time(stamped, log_time)
-            finite = {part: value for part, value in numbers.items() if np.isfinite(value)}
-            if is_pose and (
-                len(finite) < 7 or np.linalg.norm([finite[q] for q in POSE_PARTS[3:]]) < 1e-6
-            ):
-                finite = {}
-            rejected += not finite
-            known = table.setdefault(time, {}) if finite else {}
-            repeated += not known.keys().isdisjoint(finite)
-            known |= {part: value for part, value in finite.items() if part not in known}
+        is_body = topic.type_name not in _NUMBERS
+        frames, clock = dict[str, None](), self._clock()
+        rows = list(self._poses(name, frames) if is_body else self._vectors(topic))
+        index = _times([clock.time(stamp, log_time) for stamp, log_time, _ in rows])
+        table = pd.DataFrame([numbers for *_, numbers in rows], index=index, dtype=float)
+        there = np.isfinite(table.to_numpy())
+        if is_body and len(table):
+            there &= is_pose(table.to_numpy())[:, None]
         if len(frames) > 1:
             raise BagError(f"has poses in the frames {', '.join(frames)}, and a path has one")
+        table = table.where(there)
+        # Numbers of the same time go together, each as it came first.
+        repeated = (table.notna().groupby(level=0).cumsum() > 1) & table.notna()
+        table = table.groupby(level=0).first().dropna(how="all").dropna(axis=1, how="all")
         self._require_several(table)
-        parts = list(dict.fromkeys(part for row in table.values() for part in row))
-        times = sorted(table)
-        values = np.array([[table[t].get(part, np.nan) for part in parts] for t in times])
         notes = clock.notes()
-        if repeated:
-            notes.append(f"{repeated} have the time of one before and are left out")
-        if rejected:
-            notes.append(f"{rejected} are not finite and left out")
-        self._numbers.append(Numbers(name, _times(times), values, parts, is_pose, notes))
+        if count := int(repeated.any(axis=1).sum()):
+            notes.append(f"{count} have the time of one before and are left out")
+        if count := int((~there.any(axis=1)).sum()):
+            notes.append(f"{count} are not finite and left out")
+        parts, values = list(map(str, table.columns)), table.to_numpy()
+        self._numbers.append(Numbers(name, table.index.to_numpy(), values, parts, is_body, notes))
 
     def _clock(self) -> _Clock:
         return _Clock(self._wanted.by_log_time)
