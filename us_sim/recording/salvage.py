@@ -215,7 +215,7 @@ def unpacked_pieces(packed: BinaryIO) -> Iterator[bytes]:
 
 
 def _is_chunk(record: memoryview) -> bool:
-    """Whether a chunk begins so, whose two lengths agree; it may be cut."""
+    """Tell whether a chunk begins so, whose two lengths agree; it may be cut."""
     with contextlib.suppress(struct.error):
         opcode, length, *_, name = _CHUNK.unpack_from(record)
         begin = _CHUNK.size + name + _LENGTH.size
@@ -225,7 +225,7 @@ def _is_chunk(record: memoryview) -> bool:
 
 
 def _is_sound(content: memoryview, offset: int) -> bool:
-    """Whether a whole chunk or message index begins there."""
+    """Tell whether a whole chunk or message index begins there."""
     record = content[offset:]
     if _is_chunk(record):
         with contextlib.suppress(*DAMAGE):
@@ -240,7 +240,7 @@ def _is_sound(content: memoryview, offset: int) -> bool:
 
 
 def _after_damage(content: memoryview, offset: int) -> int:
-    """Where records go on after a damaged one; the end if nowhere."""
+    """Find the place at which records go on after a damaged one; the end if nowhere."""
     opcode, length = HEADER.unpack_from(content, offset)
     end, size = offset + HEADER.size + length, len(content)
     if end == size or (end + HEADER.size <= size and 0 < content[end] <= max(Opcode)):
