@@ -71,17 +71,6 @@ def speckle(*shape: int):
     return np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8)
 
 
-def test_a_topic_is_subscribed_to_only_while_watched(bench, watcher):
-    publisher = bench.peer.create_publisher(Image, "ultrasound/image", 10)
-    bench.spin_for(5)
-    assert publisher.get_subscription_count() == 0
-    feed = watcher.feeds["image"]
-    feed.watch(nothing)
-    bench.spin_until(lambda: publisher.get_subscription_count() == 1)
-    feed.unwatch(nothing)
-    bench.spin_until(lambda: publisher.get_subscription_count() == 0)
-
-
 def test_watching_on_and_off_at_once_ends_as_it_was_left(bench, watcher):
     publisher = bench.peer.create_publisher(Image, "ultrasound/image", 10)
     feed = watcher.feeds["image"]

@@ -7,7 +7,6 @@ import math
 import time
 from time import monotonic as now
 
-import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 
@@ -108,13 +107,6 @@ def test_only_the_first_who_looks_and_the_last_who_goes_are_told():
     board.force.unwatch()
     board.unwatch()
     assert told == [(True, False), (True, True), (True, False), (False, False)]
-
-
-@pytest.mark.parametrize("level", [Level.WARNING, Level.ERROR])
-def test_what_is_wrong_has_its_level(level):
-    board = StatusBoard()
-    board.tell(said(level=level), now=0.0)
-    assert board.node("tissue_deformer", now=1.0).level is level
 
 
 def test_nodes_and_the_force_are_heard_while_somebody_looks(bench):

@@ -106,24 +106,6 @@ def test_no_more_than_the_rate_and_the_wait_is_told() -> None:
     assert len(page.due(0.1)[0]) == 1
 
 
-def test_two_pages_of_different_speed_each_get_their_newest() -> None:
-    feed = Feed("image", rate=None)
-    fast, _ = stream_of(feed)
-    slow, _ = stream_of(feed)
-    for page in (fast, slow):
-        page.take('{"watch": ["image"]}')
-    counts = {fast: 0, slow: 0}
-    for i in range(30):
-        packed(feed, bytes([i]))
-        for page, patience in ((fast, 1), (slow, 5)):
-            if i % patience == 0:
-                page.take('{"next": "image"}')
-            packets, _ = page.due(float(i))
-            counts[page] += len(packets)
-            assert all(Packet.decoded(data).payload == bytes([i]) for data in packets)
-    assert counts == {fast: 30, slow: 6}
-
-
 def test_what_a_page_may_not_say_is_one_sentence() -> None:
     page, _ = stream_of(Feed("image"))
     for text in ("", "[1]", "{", "7", '{"a": 1}', '{"watch": 3}', '{"next": []}', "[" * 60000):

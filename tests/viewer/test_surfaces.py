@@ -214,17 +214,6 @@ def test_a_surface_at_rest_is_read_as_the_page_does():
     np.testing.assert_array_equal(indices, [*RESTING.ravel(), *edges.ravel()])
 
 
-def test_moved_points_come_back_to_half_a_micrometre():
-    surface = RestSurface(SQUARE, RESTING)
-    moved = SQUARE + np.array([0.0, 0.0012344, 0.0100006])
-    packet = surface.moved(moved, kind="skin", sequence=1, stamp=12)
-    steps = np.frombuffer(packet.payload, np.int16).reshape(4, 3)
-    back = surface.points + packet.header["resolution"] * steps
-    assert np.abs(back - moved).max() <= 0.51e-6
-    assert packet.header["stamp"] == "12"
-    assert packet.header["mesh"] == surface.told("skin_mesh", 1).header["mesh"]
-
-
 def test_another_surface_has_another_number():
     one, other = RestSurface(SQUARE, RESTING), RestSurface(SQUARE, RESTING[:1])
     assert one.number != other.number
