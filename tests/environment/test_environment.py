@@ -155,12 +155,6 @@ def test_noise_is_as_large_as_it_says(plain):
     assert np.array_equal(plain.state.pose.position, [0, 0, 0])
 
 
-def test_an_episode_ends_after_its_steps(plain):
-    plain.reset()
-    ends = [plain.step([0, 0, -1, 0, 0, 0])[2:4] for _ in range(100)]
-    assert ends == [(False, False)] * 99 + [(False, True)]
-
-
 def test_following_the_goal_is_no_error(scene):
     settings = {"tissue": {"solver": "fem"}, "episode": {"draws": PLAIN | {"height": [0, 0]}}}
     environment = ScanEnvironment("FollowPlane", scene=scene, settings=settings)

@@ -292,18 +292,6 @@ def test_an_unmoved_probe_on_settled_skin_costs_nothing():
     assert skin.deform(Pose([0, 0, 0.0051])) is not found
 
 
-def test_reset_brings_the_rest_shape_back_at_once():
-    sheet = plane_surface((0.1, 0.1), 0.01)
-    skin = SkinMembrane(sheet, Sphere(0.03))
-    path = [Pose([0, 0, 0.002 * k]) for k in range(5)]
-    first = [skin.deform(pose).vertices for pose in path]
-    skin.reset()
-    np.testing.assert_array_equal(skin.deform(None).vertices, sheet.vertices)
-    skin.reset()
-    for expected, pose in zip(first, path, strict=True):
-        np.testing.assert_array_equal(skin.deform(pose).vertices, expected)
-
-
 def test_forces_that_overflow_leave_the_latest_shape_and_say_so():
     skin = SkinMembrane(
         plane_surface((0.1, 0.1), 0.01), Sphere(0.03), MembraneSettings(time_step=1e-9)

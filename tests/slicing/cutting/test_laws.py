@@ -87,18 +87,6 @@ def test_an_affine_deformation_gives_the_affinely_resampled_image(method, seed):
     assert slicer.skipped == 0
 
 
-@every_method
-def test_tissue_at_rest_is_the_volume_itself(method):
-    rng = np.random.default_rng(3)
-    mesh, volume, plane = box((5, 4, 5)), around_the_box(), random_plane(rng)
-    slicer = create_slicer(method, volume, mesh.nodes, mesh.tetrahedra)
-    image = slicer.image(mesh.nodes, plane)
-    assert np.abs(image.astype(int) - sample_plane(volume, plane)).max() <= 1
-    np.testing.assert_array_equal(slicer.labels(mesh.nodes, plane), sample_labels(volume, plane))
-    found = slicer.rest_coordinates(mesh.nodes, plane)
-    np.testing.assert_allclose(found, plane.pixels(), rtol=0, atol=2e-5)
-
-
 # --- conservation: areas known from geometry ------------------------------------------------------
 
 
@@ -213,23 +201,6 @@ def test_threads_do_not_change_a_byte(method, kind):
             np.testing.assert_array_equal(slicer.image(nodes, plane), image)
             np.testing.assert_array_equal(slicer.labels(nodes, plane), labels)
             assert slicer.skipped == one.skipped
-
-
-@every_method
-@settings(max_examples=10, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_an_image_seen_from_the_other_side_is_mirrored(method, seed):
-    rest, tetrahedra, nodes, plane, volume = random_case("cloud", seed)
-    last = plane.origin + (plane.columns - 1) * plane.column_step
-    mirrored = SlicePlane(
-        last, -plane.column_step, plane.row_step, columns=plane.columns, rows=plane.rows
-    )
-    slicer = create_slicer(method, volume, rest, tetrahedra)
-    image, skipped = slicer.image(nodes, plane), slicer.skipped
-    other = slicer.image(nodes, mirrored)[:, ::-1]
-    assert slicer.skipped == skipped
-    if not skipped:
-        assert np.abs(other.astype(int) - image).max() <= 1
 
 
 # --- the surface belongs to the tissue ------------------------------------------------------------

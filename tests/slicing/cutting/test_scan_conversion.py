@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from slicing_cases import SIZE, box, plane_of_nodes
 
-from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting import cut_polygons, resampling, section, span_sampling
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
@@ -100,20 +99,6 @@ def test_a_fan_shows_what_the_full_image_shows_within_its_spans():
     places = slicer.rest_coordinates(nodes, fan)
     assert np.isnan(places[~shown]).all()
     np.testing.assert_array_equal(places[shown], slicer.rest_coordinates(nodes, full)[shown])
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_one_node_that_is_not_finite_is_found_wherever_it_is(bad):
-    mesh = box(COUNTS)
-    slicer = ScanConversion(volume_around_the_box(), mesh.nodes, mesh.tetrahedra)
-    plane = LinearProbe(0.03, 0.03, 8, 8).plane(Pose())
-    for node, axis in ((0, 0), (100, 1), (len(mesh.nodes) - 1, 2)):
-        nodes = mesh.nodes.copy()
-        nodes[node, axis] = bad
-        with pytest.raises(MeshError, match=f"node {node} is not finite"):
-            slicer.image(nodes, plane)
-    with pytest.raises(MeshError, match="so far away"):
-        slicer.image(mesh.nodes + np.array([0.0, 1e306, 0.0]), plane)
 
 
 def test_grey_values_keep_within_a_level_along_the_longest_row():

@@ -119,14 +119,6 @@ def test_the_pose_before_decides_where_the_image_cannot():
     assert flips == 0
 
 
-def test_a_jump_back_in_time_forgets_the_last_pose(scene, image):
-    source = CameraSource(WEBCAM, MARKER)
-    assert source.measure(image, 10 * FRAME) is not None
-    other = Pose([-0.1, 0.1, 0.5], FACING.orientation)
-    seen = source.measure(scene.render(other, ORDINARY), FRAME)
-    assert np.linalg.norm(seen.pose.position - other.position) < 1.5e-3
-
-
 @pytest.mark.slow
 def test_a_large_image_is_searched_at_its_full_resolution_where_need_be():
     camera = CameraModel(1920, 1080, [[1800, 0, 960], [0, 1800, 540], [0, 0, 1]])

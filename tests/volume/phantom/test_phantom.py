@@ -12,7 +12,6 @@ from us_sim.volume.phantom.upper_arm import (
     PointSpread,
     UpperArm,
     echo_envelope,
-    sheets,
 )
 from us_sim.volume.volume import Volume
 
@@ -95,16 +94,6 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_moves_and_redraws(ar
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(VolumeError, match=message):
         upper_arm(**arguments)
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2])
-def test_a_tilted_plane_is_one_sheet_of_the_given_thickness(angle):
-    step, thickness = 0.05e-3, 0.2e-3
-    x, z = np.meshgrid(np.arange(100) * step, np.arange(120) * step, indexing="ij")
-    across = (x - 2.5e-3) * np.sin(angle) + (z - 3e-3) * np.cos(angle)
-    profile, facing = sheets(700.0 * across, (step, step), thickness)
-    np.testing.assert_allclose(profile, np.exp(-0.5 * (across / thickness) ** 2), atol=1e-9)
-    np.testing.assert_allclose(facing, np.cos(angle) ** 2, atol=1e-9)
 
 
 VOXEL = 0.3e-3

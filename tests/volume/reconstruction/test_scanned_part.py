@@ -106,16 +106,6 @@ def test_the_poses_are_evenly_spread_along_the_way_of_the_middle_of_the_image(tm
     assert (len(turned), sum(turned)) == (33, 16)
 
 
-def test_a_wide_picture_is_no_linear_array_but_says_where_it_was_seen_from(tmp_path):
-    mask = np.ones((ROWS, COLUMNS), bool)  # 200 mm
-    mask[:10] = False
-    found = scanning_probe(swept(tmp_path, mask), ImagePart(), np.ones_like(mask))
-    assert found.probe is None
-    pose = found.poses[4].pose
-    np.testing.assert_allclose(pose.position, [-0.1, 0.008, 10 * SIDE[1]], atol=SIDE[0])
-    np.testing.assert_allclose(pose.rotation[:, 2], [0, 0, 1], atol=1e-6)
-
-
 def test_a_part_that_is_named_is_the_probes(tmp_path):
     mask = np.random.default_rng(0).random((ROWS, COLUMNS)) < 0.3  # proves nothing
     sweep = swept(tmp_path, mask)
