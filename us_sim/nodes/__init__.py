@@ -18,8 +18,6 @@ import threading
 import time
 from pathlib import Path
 
-from setproctitle import setproctitle
-
 from us_sim.errors import UsSimError
 
 # Before NumPy loads its BLAS: several node processes share few cores, and small dense solves are
@@ -105,6 +103,8 @@ def prepare_process() -> None:
     name = node_name(sys.orig_argv)
     if not name:
         return
+    from setproctitle import setproctitle
+
     setproctitle(name)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
