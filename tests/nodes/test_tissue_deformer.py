@@ -56,6 +56,18 @@ def test_the_mesh_is_latched_for_who_comes_late(bench, small_scene):
     np.testing.assert_array_equal(tetrahedra_from(tetrahedra[0]), mesh.tetrahedra)
 
 
+def test_after_a_frame_that_failed_the_tissue_begins_anew(bench, deformer, monkeypatch):
+    node, nodes, _, publisher = deformer
+    before = press(bench, publisher, nodes, 0.004, 1)
+    solver = node._tissue.solver
+    with monkeypatch.context() as broken:
+        broken.setattr(solver, "deform", lambda _: 1 / 0)
+        publisher.publish(pose_at(0.006, 2))
+        bench.spin_until(lambda: node.failures)
+    assert solver.is_settled
+    np.testing.assert_allclose(press(bench, publisher, nodes, 0.004, 3), before, atol=1e-5)
+
+
 def test_nodes_are_the_solvers_and_carry_the_poses_stamp(bench, deformer, small_scene):
     _, nodes, wrenches, publisher = deformer
     received = press(bench, publisher, nodes, 0.004, 3)

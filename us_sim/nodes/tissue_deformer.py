@@ -47,6 +47,7 @@ from us_sim.tissue.solvers.solver import TissueSolver
 from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
 
 OWN = "tissue_deformer"
+STRUCTURES = "tissue/structures"
 PREPARED_CHECK_S = 0.1  # how often it is checked whether what was set is ready
 _MATERIALS = "materials."
 
@@ -105,7 +106,7 @@ class StructureMarkers:
         self._node = node
         self._mesh = mesh
         self._settings = LiveSettings(node, {"markers": Group(StructureMarkersSettings())})
-        self._publisher = node.stream(MarkerArray, "tissue/structures")
+        self._publisher = node.stream(MarkerArray, STRUCTURES)
         self._structures: list[Structure] = []
         self._making: threading.Thread | None = None
         self._sent: int | None = None  # ns, the stamp of the last
@@ -136,7 +137,7 @@ class StructureMarkers:
             for made in self._structures
         ]
         self._publisher.publish(structure_markers(surfaces, stamp, "patient"))
-        self._node.health.published("tissue/structures")
+        self._node.health.published(STRUCTURES)
 
     def _make(self) -> None:
         began = time.monotonic()
@@ -152,7 +153,7 @@ class StructureMarkers:
             return
         except Exception as error:  # so that the thread does not end silently
             self.state = "could not be made"
-            self._node.failed("tissue/structures", error)
+            self._node.failed(STRUCTURES, error)
             return
         count = sum(len(made.surface.triangles) for made in self._structures)
         names = ", ".join(made.name for made in self._structures)
@@ -229,6 +230,12 @@ class TissueDeformer(SceneNode):
         self.health.measure = self._take_estimate
         self.health.state = f"ready with {self._tissue.solver.name}"
         self.get_logger().info(self.health.state)
+
+    def failed(self, where: str, error: Exception) -> None:
+        """Begin anew after a frame that failed: the tissue may have been left halfway."""
+        super().failed(where, error)
+        if where != STRUCTURES:  # which another thread makes
+            self._tissue.reset()
 
     def _make_tissue(self, method: TissueMethod) -> LiveTissue:
         assert self.scene.tissue is not None
