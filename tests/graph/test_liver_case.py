@@ -64,4 +64,4 @@ def test_its_vessels_deform_when_it_is_pressed(case, tmp_path):
     with Image.open(tmp_path / "press" / "contact_sheet.png") as sheet:
         pixels = np.asarray(sheet.convert("RGB")).astype(int)
     outlines = (pixels[..., 2] > pixels[..., 0] + 80) & (pixels[..., 2] > 150)
-    assert outlines[: len(pixels) * 2 // 3].sum() > 200  # of the veins, in the images
+    assert outlines[: len(pixels) * 2 // 3].sum() > 100  # of the veins, in the images
