@@ -5,7 +5,6 @@ own.
 """
 
 import os
-import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -152,28 +151,6 @@ def test_dragging_the_probe_down_closes_the_vein_and_letting_go_opens_it(person:
     person.page.get_by_role("button", name="Look under the skin").click()
 
 
-def test_keys_alone_move_the_probe_and_reach_everything(person: Person) -> None:
-    page, before = person.page, person.image()
-    page.locator("body").press("ArrowLeft")
-    for _ in range(12):
-        page.keyboard.press("ArrowLeft")
-    person.settle()
-    assert np.abs(person.image() - before).mean() > 5
-    page.keyboard.press("h")
-    person.settle()
-    reached = set()
-    for _ in range(60):
-        page.keyboard.press("Tab")
-        reached.add(
-            page.evaluate(
-                "(document.activeElement.getAttribute('aria-label') ??"
-                " document.activeElement.textContent).trim()"
-            )
-        )
-    for name in ("Panels", "B-mode", "Strain", "Freeze", "Save"):
-        assert any(name in each for each in reached), reached
-
-
 def test_another_method_is_chosen_and_a_material_changed(person: Person) -> None:
     page = person.page
     person.press(6.0)
@@ -194,34 +171,6 @@ def test_another_method_is_chosen_and_a_material_changed(person: Person) -> None
     field.press("Enter")
     until(lambda: np.abs(person.image() - linear).mean() > 1, "a stiff vein stays open")
     person.settle()
-
-
-def test_a_value_that_is_refused_goes_back_and_says_why(person: Person) -> None:
-    person.tab("Image")
-    control = person.control("slice_interpolator.depth")
-    field = control.locator("input").last
-    before = field.input_value()
-    field.fill("9000")
-    field.press("Enter")
-    until(lambda: re.search("400 mm|range|at most", control.inner_text()), "the reason is shown")
-    until(lambda: field.input_value() == before, "the field shows what the node has")
-    person.picture("refused")
-
-
-def test_skin_is_hidden_and_shown(person: Person) -> None:
-    def scene() -> bytes:
-        return bytes(person.page.locator("#scene").screenshot())
-
-    person.page.get_by_role("button", name="Panels").click()
-    person.go_home()
-    shown = scene()
-    person.page.get_by_role("button", name="Layers").click()
-    box = person.page.get_by_role("checkbox", name="Skin")
-    box.uncheck()
-    until(lambda: scene() != shown, "the scene is drawn without skin")
-    person.picture("without_skin")
-    box.check()
-    person.page.get_by_role("button", name="Layers").click()
 
 
 def test_what_is_recorded_is_replayed(person: Person, folder: Path) -> None:
@@ -265,22 +214,3 @@ def test_another_scene_is_loaded_while_the_page_stays(person: Person) -> None:
     drawn = page.evaluate("usSim.images()")
     until(lambda: page.evaluate("usSim.images()") > drawn + 3, "images of the new scene", START_S)
     person.picture("loaded")
-
-
-def test_it_fits_a_tablet_in_both_directions(person: Person) -> None:
-    page = person.page
-    for width, height in ((1024, 768), (768, 1024)):
-        page.set_viewport_size({"width": width, "height": height})
-        for name in (".us-image", "#scene canvas", "#hand", "#image-tools"):
-
-            def fits(name: str = name, width: int = width, height: int = height) -> bool:
-                page.locator(name).first.scroll_into_view_if_needed()
-                box = page.locator(name).first.bounding_box()
-                right, bottom = box["x"] + box["width"], box["y"] + box["height"]
-                return bool(
-                    box["x"] >= -1 and box["y"] >= 0 and right <= width + 1 and bottom <= height + 1
-                )
-
-            until(fits, f"{name} is within {width} x {height}")
-        person.picture(f"tablet_{width}")
-    page.set_viewport_size({"width": 1280, "height": 720})

@@ -31,14 +31,6 @@ def test_the_common_come_first_and_the_rest_by_groups():
     assert sections[-1].labels["qos.x"] == "qos · x"
 
 
-def test_a_node_without_common_ones_begins_with_those_of_no_group():
-    sections = arrange(known("marker_rate", "skin.damping"))
-    assert [(s.title, s.names) for s in sections] == [
-        ("", ("marker_rate",)),
-        ("Skin", ("skin.damping",)),
-    ]
-
-
 def test_only_the_settings_of_the_methods_in_use_are_shown():
     methods = ("fem", "msds", "fem_cg")
     parameters = {

@@ -375,38 +375,6 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     assert graph.bench.peer.count_subscribers("tissue/nodes") == 0
 
 
-def test_one_mesh_serves_all_and_is_heard_until_the_last_has_left(graph):
-    topics = ("tissue/rest", "tissue/tetrahedra")
-    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
-    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
-    graph.feeds["structures"].watch(unused)
-    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/nodes") == 1)
-    graph.feeds["tissue_mesh"].watch(unused)  # for which the mesh is there already
-    assert graph.newest("tissue_mesh").header["points"] == len(MESH.nodes)
-    assert [graph.bench.peer.count_subscribers(topic) for topic in topics] == [1, 1]
-    graph.feeds["structures"].unwatch(unused)
-    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/nodes") == 0)
-    assert [graph.bench.peer.count_subscribers(topic) for topic in topics] == [1, 1]
-    graph.feeds["tissue_mesh"].unwatch(unused)
-    graph.bench.spin_until(
-        lambda: not any(graph.bench.peer.count_subscribers(topic) for topic in topics)
-    )
-
-
-def test_structures_of_another_tissue_are_refused_and_not_tried_again(graph):
-    graph.latch(PointCloud2, "tissue/rest", cloud(MESH.nodes))
-    graph.latch(Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(MESH.tetrahedra))
-    graph.feeds["structures"].watch(unused)
-    markers = graph.bench.publisher(MarkerArray, "tissue/structures")
-    nodes = graph.bench.publisher(PointCloud2, "tissue/nodes")
-    far = ("bone", (0.9, 0.9, 0.8, 1.0), SMALL + np.array([0, 0, 0.5]), CLOSED)
-    nodes.publish(cloud(MESH.nodes, second=5))
-    markers.publish(structure_markers([far], Time(sec=5), "patient"))
-    graph.bench.spin_until(lambda: graph.node.health.problems("mesh") == 1)
-    graph.bench.spin_until(lambda: graph.bench.peer.count_subscribers("tissue/structures") == 0)
-    assert graph.feeds["structures"].newest() is None
-
-
 def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
     parts = transducer_mesh(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
     surfaces = [(part.name, (*part.colour, 1.0), part.vertices, part.triangles) for part in parts]

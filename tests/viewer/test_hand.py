@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import pytest
-from fake_hand import MATRIX, PIXEL, STANCE, FakeHand
+from fake_hand import MATRIX, PIXEL, FakeHand
 
 from us_sim.viewer.stream import Simulator
 
@@ -80,38 +80,6 @@ def test_a_held_key_moves_the_probe_by_the_time_that_it_was_held(
     viewer.until(lambda: viewer.total("slide") == pytest.approx([way, 0], rel=0.02))
 
 
-def test_most_of_the_press_slider_presses_and_it_goes_by_keys(page: Any, viewer: FakeHand) -> None:
-    press = page.locator(".us-quantity input[type=range]").first
-    slide = """(slider, part) => {
-        slider.value = +slider.min + part * (slider.max - slider.min);
-        slider.dispatchEvent(new Event("input"));
-    }"""
-    contact = float(press.evaluate("s => s.parentNode.style.getPropertyValue('--contact')"))
-    assert contact < 0.25
-    mark = press.evaluate(
-        "s => parseFloat(getComputedStyle(s.parentNode, '::before').marginLeft) / s.clientWidth"
-    )
-    assert mark == pytest.approx(contact, abs=0.05)
-    middle = (1 + contact) / 2
-    for part, metres in ((0, -0.05), (contact, 0), (middle, 0.0125), (1, 0.025)):
-        press.evaluate(slide, part)
-        viewer.until(lambda: viewer.asked)
-        there = pytest.approx(metres, abs=1e-4)
-        viewer.until(lambda there=there: viewer.asked[-1]["to"]["press"] == there)
-    viewer.say(goal={**STANCE, "press": -0.01})
-    page.wait_for_function("document.querySelector('.us-quantity input').ariaValueText[0] === '-'")
-    press.focus()
-    for key, metres in (("ArrowRight", -9.5e-3), ("ArrowLeft", -10e-3)):
-        page.keyboard.press(key)
-        there = pytest.approx(metres, abs=1e-4)
-        viewer.until(lambda there=there: viewer.asked[-1]["to"].get("press") == there)
-    viewer.asked.clear()
-    for key, sign in (("PageDown", 1), ("PageUp", -1), ("s", 1)):
-        page.keyboard.press(key)
-        viewer.until(lambda: viewer.asked)
-        assert viewer.asked.pop()["by"] == {"press": pytest.approx(sign * 3e-4)}
-
-
 def test_keys_are_not_taken_from_who_types(page: Any, viewer: FakeHand) -> None:
     number = page.locator(".us-quantity input[type=number]").first
     number.click()
@@ -149,30 +117,6 @@ def test_a_number_beyond_its_range_is_put_to_the_nearest_end_and_that_is_said(
     assert "us-wrong" not in line.get_attribute("class")
 
 
-def test_a_tab_and_a_button_leave_the_page_the_keys_that_they_do_not_use(
-    page: Any, viewer: FakeHand
-) -> None:
-    page.get_by_role("button", name="Panels").click()
-    tabs = page.get_by_role("tab")
-    tabs.first.click()
-    for place in (tabs.first, page.get_by_role("button", name="Gizmo")):
-        place.focus()
-        viewer.asked.clear()
-        page.keyboard.press("s")
-        viewer.until(lambda: viewer.total("press") == pytest.approx(3e-4))
-        page.keyboard.press("?")
-        page.wait_for_selector(".us-help[open]")
-        page.keyboard.press("Escape")
-        page.wait_for_selector(".us-help", state="hidden")
-    viewer.asked.clear()
-    tabs.first.focus()
-    page.keyboard.press("ArrowRight")  # the next tab's
-    page.get_by_role("button", name="Gizmo").focus()
-    page.keyboard.press("ArrowRight")  # a button has no use for it
-    viewer.until(lambda: viewer.asked)
-    assert viewer.total("slide") == pytest.approx([7.5e-4, 0])
-
-
 def test_the_space_bar_is_the_pages_after_a_click_and_a_buttons_after_tab(
     page: Any, viewer: FakeHand
 ) -> None:
@@ -199,21 +143,6 @@ def test_the_space_bar_is_the_pages_after_a_click_and_a_buttons_after_tab(
         page.keyboard.press("Space")
         page.wait_for_selector(f"button[aria-pressed={is_on}]:text('Gizmo')")
     assert going_on.is_visible()
-
-
-@pytest.mark.usefixtures("viewer")
-def test_a_key_is_the_pages_as_soon_as_the_help_is_closed(page: Any) -> None:
-    page.keyboard.press("?")
-    page.wait_for_selector(".us-help", state="visible")
-    on_help = """() => {
-        document.querySelector(".us-help").close();
-        const space = new KeyboardEvent("keydown", { key: " ", bubbles: true, cancelable: true });
-        const focused = document.activeElement;
-        focused.dispatchEvent(space);
-        return Boolean(focused.closest(".us-help"));
-    }"""
-    assert page.evaluate(on_help)  # which has the focus until the next picture is drawn
-    page.get_by_role("button", name="Go on").wait_for()
 
 
 def test_dragging_down_the_image_presses_as_many_millimetres(page: Any, viewer: FakeHand) -> None:
@@ -351,28 +280,6 @@ def test_the_delay_counts_from_the_key_to_the_painted_image(page: Any, viewer: F
     assert page.evaluate("usSim.latency()") == {"count": 0}
 
 
-def test_help_shows_the_keys_and_goes(page: Any, viewer: FakeHand) -> None:
-    page.keyboard.press("?")
-    page.wait_for_selector(".us-help[open]")
-    (views,) = [key for key, does in listed(page) if does == "views"]
-    page.keyboard.press("s")
-    page.keyboard.press("Escape")
-    page.wait_for_selector(".us-help", state="hidden")
-    assert not viewer.asked
-    titles = page.locator("[data-view]").evaluate_all("views => views.map((view) => view.title)")
-    keys = sorted(int(title.split("(key ")[1].rstrip(")")) for title in titles)
-    assert views == f"{keys[0]} to {keys[-1]}"
-    assert keys == list(range(keys[0], keys[-1] + 1))
-
-
-def listed(page: Any) -> list[list[str]]:
-    """The keys of the help, each with what it does."""
-    found: list[list[str]] = page.locator(".us-help dt").evaluate_all(
-        "keys => keys.map(key => [key.textContent, key.nextSibling.textContent])"
-    )
-    return found
-
-
 def test_what_is_replayed_is_ended_by_one_button_that_is_there_only_then(
     page: Any, viewer: FakeHand
 ) -> None:
@@ -389,34 +296,6 @@ def test_what_is_replayed_is_ended_by_one_button_that_is_there_only_then(
     button.wait_for(state="hidden")
     assert centre.is_enabled()
     assert page.locator(".us-said").inner_text() == "You hold the probe"
-
-
-def test_a_reason_is_not_shown_any_more_when_the_probe_is_the_persons(
-    page: Any, viewer: FakeHand
-) -> None:
-    told = page.locator("#hand [role=status]")
-    page.get_by_role("button", name="Lift").click()
-    page.wait_for_function("document.querySelector('.us-said').textContent === 'the hand cannot'")
-    viewer.say(leader="driver", obstacle="driver moves the probe")
-    page.wait_for_function("document.querySelector('.us-quantity input').disabled")
-    viewer.say()
-    page.wait_for_function("!document.querySelector('.us-quantity input').disabled")
-    assert told.inner_text().startswith("Nobody holds the probe")
-
-
-def test_it_says_when_another_page_moves_the_probe_and_that_it_did_so_last(
-    page: Any, viewer: FakeHand
-) -> None:
-    said = "text => document.querySelector('.us-said').textContent === text"
-    viewer.say(holder="another", is_moving=True)
-    page.wait_for_function(said, arg="Another page moves the probe")
-    viewer.say(holder="another")
-    page.wait_for_function(said, arg="Another page held the probe last")
-    page.keyboard.press("s")
-    viewer.until(lambda: viewer.asked)  # it may be moved here, too
-    for is_moving in (True, False):
-        viewer.say(holder=viewer.asked[-1]["source"], is_moving=is_moving)
-        page.wait_for_function(said, arg="You hold the probe")
 
 
 def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_took_it(
@@ -440,31 +319,3 @@ def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_t
     viewer.say(holder="")
     page.wait_for_function(said, arg="Nobody holds the probe")
     assert set(viewer.takes) == {source}
-
-
-def test_a_viewer_that_says_nothing_any_more_does_not_answer(page: Any, viewer: FakeHand) -> None:
-    said = "text => document.querySelector('.us-said').textContent.includes(text)"
-    viewer.say(every=0.2)
-    page.wait_for_function(said, arg="Nobody holds the probe")
-    page.wait_for_function(said, arg="The viewer does not answer")
-    assert not page.get_by_role("button", name="Centre").is_enabled()
-    assert "us-wrong" in page.locator(".us-said").get_attribute("class")
-    viewer.say(every=0.2)
-    page.wait_for_function(said, arg="Nobody holds the probe")
-
-
-@pytest.mark.parametrize("width", [768, 1024, 1280])
-def test_who_holds_the_probe_can_be_read_whole_beside_how_soon_it_is_seen(
-    page: Any, viewer: FakeHand, width: int
-) -> None:
-    page.set_viewport_size({"width": width, "height": 768})
-    page.get_by_role("button", name="Panels").click()
-    page.get_by_role("tab").first.wait_for()
-    sentence = "the replay of a.mcap moves the probe"
-    viewer.say(leader="path_player", obstacle=sentence, can_take=True)
-    told = page.locator(".us-said")
-    viewer.until(lambda: told.inner_text() == sentence)
-    viewer.until(lambda: told.evaluate("e => e.scrollWidth <= e.clientWidth"))
-    beside = page.locator(".us-pace").bounding_box()
-    box = told.bounding_box()
-    assert abs(beside["y"] + beside["height"] / 2 - box["y"] - box["height"] / 2) < 4

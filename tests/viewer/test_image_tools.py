@@ -1,7 +1,6 @@
 """Measuring, freezing and keeping the image in a real browser, against a geometry that is known."""
 
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -195,17 +194,6 @@ def test_circumferences_are_those_of_the_elliptic_integral(
         f"m.circumference({b}, {a})])"
     )
     assert found == pytest.approx([known, known], rel=1e-12)
-
-
-def test_a_text_stays_where_it_was_written(page: Any) -> None:
-    page.keyboard.press("t")
-    page.mouse.click(*at(page, 5, 12))
-    page.keyboard.type("vein, s")
-    page.keyboard.press("Enter")
-    assert values(page) == ["vein, s"]
-    handle = page.locator(".us-handle").bounding_box()
-    middle = (handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2)
-    assert middle == pytest.approx(at(page, 5, 12), abs=1.0)
 
 
 def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
@@ -486,27 +474,6 @@ def test_the_last_seconds_are_saved_as_they_are_seen(
         shown, picture = cv2.VideoCapture(str(file)).read()
         assert shown
         assert picture[200, 200].tolist() == pytest.approx([40] * 3, abs=4)
-
-
-@pytest.mark.usefixtures("images")
-def test_what_the_viewer_refuses_to_save_is_said(
-    browser: Any, served: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pydicom.dataset", None)
-    page = browser.new_page(viewport={"width": 1280, "height": 720})
-    page.goto(served[0].address)
-    save = page.get_by_role("button", name="Save", exact=True)
-    until(save.is_enabled, "there is an image")
-    page.evaluate(
-        "import('/us_sim/assets/events.js').then(m => m.events.on('problem', said => "
-        "document.body.dataset.said = said))"
-    )
-    page.locator(".us-kinds").select_option("dcm")
-    save.click()
-    said = page.locator("body[data-said]")
-    said.wait_for()
-    assert "us_sim[dicom]" in said.get_attribute("data-said")
-    page.close()
 
 
 def test_a_strip_is_frozen_with_the_image_and_saved_below_it(

@@ -109,20 +109,6 @@ UNREACHED = """() => [...document.querySelectorAll("header button, .us-main :is(
 """Names of controls that no scrolling brings in front."""
 
 
-def test_a_remark_on_the_image_is_above_it(opened: Open) -> None:
-    page = opened((1280, 720))
-    remark = "No spectrum: the flow is slower than the wall filter lets through"
-    page.evaluate(
-        "said => import('/us_sim/assets/image.js').then(m => { m.setRemarks([said]);"
-        " m.setLive(true); })",
-        remark,
-    )
-    badge = page.locator(".us-stale")
-    until(lambda: badge.inner_text() == remark, "it is said")
-    below = badge.bounding_box()["y"] + badge.bounding_box()["height"]
-    assert below <= page.locator(".us-image").bounding_box()["y"]
-
-
 @pytest.mark.parametrize(
     ("size", "touch"),
     [(PHONE, True), (TURNED, True), (TWICE, False), (FOUR_TIMES, False), ((2560, 1440), False)],
@@ -142,53 +128,6 @@ def test_no_part_is_buried_and_every_control_can_be_reached(
         assert page.evaluate(UNREACHED) == []
     page.locator("#us-panels").click()
     page.locator("#scene").wait_for()
-
-
-@pytest.mark.parametrize("size", [(2560, 1440), (1280, 720), PHONE])
-def test_sliders_are_as_long_as_the_window_allows(opened: Open, size: tuple[int, int]) -> None:
-    widths = (
-        opened(size)
-        .locator(".us-quantity input[type=range]")
-        .evaluate_all("sliders => sliders.map(slider => slider.clientWidth)")
-    )
-    assert min(widths) > min(160, 0.35 * size[0])
-
-
-@pytest.mark.parametrize("size", [PHONE, TURNED])
-def test_fingers_find_room_on_every_control(opened: Open, size: tuple[int, int]) -> None:
-    page = opened(size, touch=True)
-    page.get_by_role("button", name="Layers").tap()
-    page.get_by_role("button", name="Distance").focus()
-    page.keyboard.press("Enter")
-    page.locator(".us-handle").first.wait_for()
-    small = """() => [...document.querySelectorAll(
-            "button, input:not([type=checkbox]):not(.q-field *), .us-row label, .q-field--dense," +
-            " select, .us-handle, [role=tab], [role=switch], .q-slider__track-container, .q-item")]
-        .filter((control) => control.checkVisibility())
-        .map((control) => [control, control.getBoundingClientRect()])
-        .filter(([, { width, height }]) => Math.min(width, height) < 40)
-        .map(([control]) => control.ariaLabel || control.textContent)"""
-    assert page.evaluate(small) == []
-    page.locator("#us-panels").tap()
-    for tab in TABS:
-        chosen(page, tab)
-        assert page.evaluate(small) == []
-
-
-def test_a_tap_leaves_nothing_over_the_page(browser: Any, served: Any, hand: FakeHand) -> None:
-    with browser.new_context(has_touch=True) as context:  # a computer with a touch screen
-        page = context.new_page()
-        page.goto(served[0].address)
-        page.locator("#us-panels").tap()
-        chosen(page, "Tissue")
-        page.get_by_role("button", name="Strain").tap()
-        page.wait_for_timeout(1000)  # longer than a tooltip waits
-        for tab in page.get_by_role("tab").all():
-            box = tab.bounding_box()
-            at = f"{box['x'] + box['width'] / 2}, {box['y'] + box['height'] / 2}"
-            assert page.evaluate(f"!!document.elementFromPoint({at}).closest('[role=tab]')")
-        assert hand.asked == []
-        assert page.locator("[role=tooltip], .q-tooltip").count() == 0
 
 
 @pytest.mark.parametrize(
@@ -223,18 +162,6 @@ def test_axe_finds_no_violation(opened: Open, size: tuple[int, int], touch: bool
         " !/-(enter|leave)-/.test(each.className) && !each.getAnimations({ subtree: true }).length)"
     )
     check("dialog of a node")
-
-
-def test_escape_closes_the_layers(opened: Open) -> None:
-    page = opened((1280, 720))
-    layers = page.get_by_role("button", name="Layers")
-    layers.focus()
-    page.keyboard.press("Enter")
-    page.get_by_label("Skin", exact=True).focus()
-    page.keyboard.press("Escape")
-    page.locator(".us-layers").wait_for(state="hidden")
-    assert layers.get_attribute("aria-expanded") == "false"
-    assert layers.evaluate("button => button === document.activeElement")
 
 
 def fingers(page: Any) -> Callable[..., None]:

@@ -1,6 +1,5 @@
 """The bar above the image: what it sets, what it watches, and what it does when it is refused."""
 
-import time
 from typing import Any
 
 import cv2
@@ -10,7 +9,6 @@ from awaiting import until
 from fake_nodes import FakeNodes
 
 from us_sim.viewer.parameters import Kind, Parameter
-from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Feed, Packet, Simulator
 
 NODE = "slice_interpolator"
@@ -78,36 +76,6 @@ def test_a_mode_is_asked_for_shown_and_left(
 
 
 @pytest.mark.usefixtures("asked")
-def test_a_mode_that_is_chosen_while_the_image_is_frozen_is_announced_and_comes_with_the_next(
-    page: Any, simulator: Simulator
-) -> None:
-    plain = Feed("image")
-    pixels = np.full((32, 32), 90, np.uint8).tobytes()
-    header = {"stamp": "1", "rows": 32, "columns": 32, "encoding": "mono8"}
-    plain.offer(lambda sequence: Packet("image", sequence, header, pixels))
-    simulator.add(plain)
-    coloured(simulator, "annotated", (0, 0, 200))
-    page.goto(page.address)
-    image = PIXEL.format(".us-image")
-    page.get_by_role("button", name="Strain", exact=True).click()
-    page.wait_for_function(f"({image})()?.[1] === 0")
-    page.get_by_role("button", name="Freeze").click()
-    announced = page.get_by_text("The image is frozen: Go on shows B-mode")
-    page.wait_for_timeout(300)
-    assert not announced.is_visible()
-    page.get_by_role("button", name="B-mode").click()
-    announced.wait_for()
-    assert page.evaluate(f"({image})()")[1] == 0  # it is still the one that was frozen
-    page.get_by_role("button", name="Strain", exact=True).click()
-    announced.wait_for(state="hidden")
-    page.get_by_role("button", name="B-mode").click()
-    announced.wait_for()
-    page.get_by_role("button", name="Go on").click()
-    page.wait_for_function(f"({image})()?.[1] === 90")
-    announced.wait_for(state="hidden")
-
-
-@pytest.mark.usefixtures("asked")
 def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simulator) -> None:
     annotated = coloured(simulator, "annotated", (0, 0, 200))
     page.goto(page.address)
@@ -115,52 +83,6 @@ def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simul
     page.get_by_text("this scene has nothing for 'velocity'").wait_for()
     assert page.get_by_role("button", pressed=True).all_text_contents() == ["B-mode"]
     until(lambda: not annotated.is_watched, "what was refused is not watched")
-
-
-@pytest.mark.usefixtures("asked")
-def test_a_mode_that_was_changed_elsewhere_is_marked(page: Any, simulator: Simulator) -> None:
-    page.goto(page.address)
-    page.get_by_role("button", name="Outlines").click()
-    page.get_by_role("button", name="Outlines", pressed=True).wait_for()
-    simulator.nodes.tell(*known("strain"))
-    page.get_by_role("button", name="Strain", exact=True, pressed=True).wait_for()
-
-
-@pytest.mark.usefixtures("asked")
-def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
-    def see(**values: str) -> None:
-        simulator.status.tell(NodeStatus(NODE, Level.WELL, "imaging", values), time.monotonic())
-
-    def is_said(*words: str) -> None:
-        page.wait_for_function(
-            "words => { const said = document.querySelector('.us-stale');"
-            " const lines = said.hidden ? [] : said.textContent.split('\\n');"
-            " return lines.length === words.length"
-            " && words.every((word, i) => lines[i].includes(word)); }",
-            arg=list(words),
-        )
-
-    page.goto(page.address)
-    see(contact="none", no_colour="no_contact")
-    is_said("No contact")
-    see(contact="good", no_colour="across_flow")
-    is_said()
-    page.get_by_role("button", name="Outlines").click()
-    page.get_by_role("button", name="Outlines", pressed=True).wait_for()
-    simulator.nodes.tell(*known("velocity"))
-    is_said("No colour: the beams cross")
-    see(contact="poor", no_colour="no_contact", no_spectrum="no_vessel")
-    is_said("Poor contact")
-    page.get_by_role("button", name="Spectrum").click()
-    is_said("Poor contact", "No spectrum: no vessel")
-    see(contact="good", no_colour="", no_spectrum="")
-    is_said()
-    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"force": "24.20"})
-    simulator.status.tell(tissue, time.monotonic())
-    is_said("Too much force: 24 N")
-    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"unbalanced": "1"})
-    simulator.status.tell(tissue, time.monotonic())
-    is_said()
 
 
 @pytest.mark.parametrize(("name", "kind"), [("M-mode", "m_mode"), ("Spectrum", "spectrum")])
@@ -176,17 +98,6 @@ def test_a_strip_is_watched_while_it_is_shown(
     button.click()
     page.wait_for_function("!document.querySelector('.us-strip')")
     until(lambda: not feed.is_watched, "nobody watches the strip any more")
-
-
-def test_the_node_is_asked_for_nothing_once_the_page_has_gone(
-    browser: Any, served: Any, simulator: Simulator
-) -> None:
-    page = browser.new_page()
-    page.goto(served[0].address)
-    page.wait_for_function("document.querySelector('.us-modes')")
-    until(lambda: simulator.nodes.of(NODE).pages, "the page looks at the node")
-    page.close()
-    until(lambda: not simulator.nodes.of(NODE).pages, "nobody looks at any node any more")
 
 
 def test_flip_is_asked_for_and_followed_where_it_was_set_elsewhere(

@@ -1,9 +1,6 @@
 """The page in a real browser: the image is drawn as it was sent, to scale, and only on demand."""
 
-import dataclasses
-import json
 import socket
-import time
 import urllib.error
 import urllib.request
 from typing import Any
@@ -14,8 +11,6 @@ from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.viewer.server import listening
-from us_sim.viewer.session import SessionState
-from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Feed, Packet, Simulator
 
 PIXEL = 1e-4  # m
@@ -75,19 +70,6 @@ def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
     until(lambda: image.is_watched, "the page is back", 5.0)
 
 
-def test_the_header_says_why_few_images_come_at_rest(page: Any, simulator: Simulator) -> None:
-    image, _ = feeds_of(simulator)
-    hand = Feed("hand")
-    simulator.add(hand)
-    state = {"leader": "hand", "is_resting": True}
-    hand.offer(lambda sequence: Packet("hand", sequence, state, b""))
-    page.goto(page.address)
-    page.locator("#readout").get_by_text("0 images/s").wait_for()
-    assert "while nothing moves, a few a second" in page.locator("#readout").get_attribute("title")
-    offer(image, np.zeros((1, 1), np.uint8))
-    page.locator("#readout").get_by_text("at rest", exact=True).wait_for()
-
-
 def test_a_page_of_another_origin_gets_no_stream(browser: Any, served: Any) -> None:
     server, _ = served
     page = browser.new_page()
@@ -128,15 +110,6 @@ def test_a_path_that_is_not_there_leaves_nothing_in_the_log(
     assert not caplog.records
 
 
-def test_a_foreign_host_is_refused(served: Any) -> None:
-    server, _ = served
-    request = urllib.request.Request(server.address, headers={"Host": "evil.example"})
-    with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(request)
-    assert refused.value.code == 403
-    assert "open the address as it was printed" in refused.value.read().decode()
-
-
 def test_a_taken_port_is_said(served: Any) -> None:
     server, _ = served
     with pytest.raises(UsSimError, match=f"port {server.port} of 127.0.0.1 is taken"):
@@ -149,16 +122,6 @@ def test_a_taken_port_is_said(served: Any) -> None:
             listening("127.0.0.1", free.getsockname()[1])
 
 
-def test_what_the_page_says_wrongly_is_answered(page: Any, simulator: Simulator) -> None:
-    feeds_of(simulator)
-    page.goto(page.address)
-    answer = page.evaluate(
-        "() => new Promise(resolve => { const s = new WebSocket(`ws://${location.host}/us_sim/"
-        "stream`); s.onopen = () => s.send('{\"no\": 1}'); s.onmessage = e => resolve(e.data); })"
-    )
-    assert "does not know" in json.loads(answer)["problem"]
-
-
 def test_an_image_that_is_not_followed_by_another_is_marked(
     page: Any, simulator: Simulator
 ) -> None:
@@ -169,78 +132,3 @@ def test_an_image_that_is_not_followed_by_another_is_marked(
     page.get_by_text("No new image for 1 s").wait_for()
     offer(image, pixels)
     page.get_by_text("No new image").wait_for(state="hidden")
-
-
-def test_the_header_says_what_runs_and_what_is_done_with_it(
-    page: Any, simulator: Simulator
-) -> None:
-    loading = SessionState(is_there=True, scene="upper_arm", state="loading liver", fraction=0.25)
-    simulator.session.state = loading
-    page.goto(page.address)
-    page.get_by_text("loading liver, 25 %").wait_for()
-    done = SessionState(is_there=True, scene="liver", state="running", record="press.mcap")
-    simulator.session.state = done
-    page.get_by_text("recording press.mcap").wait_for()
-    simulator.session.state = dataclasses.replace(done, problem="the gain is lost")
-    lost = page.get_by_role("alert").filter(has_text="the gain is lost")
-    lost.wait_for()
-    assert lost.evaluate("each => getComputedStyle(each).color") == "rgb(229, 115, 92)"
-    assert page.evaluate("usSim.scene()") == "liver"
-
-
-@pytest.mark.parametrize("size", [(768, 1024), (1024, 768), (1280, 720)])
-def test_the_panels_can_be_closed_however_the_screen_was_turned(
-    page: Any, size: tuple[int, int]
-) -> None:
-    page.set_viewport_size({"width": 768, "height": 1024})
-    page.goto(page.address)
-    button = page.get_by_role("button", name="Panels")
-    tabs = page.get_by_role("tab")
-    button.click()
-    tabs.last.wait_for()
-    page.set_viewport_size({"width": size[0], "height": size[1]})
-
-    def is_whole(tab: Any) -> bool:
-        """Whether nothing lies over a tab, and nothing of it is cut off."""
-        box = tab.bounding_box()
-        x, y = box["x"] + box["width"] - 2, box["y"] + box["height"] / 2
-        on_top = f"document.elementFromPoint({x}, {y})?.closest('[role=tab]')?.textContent"
-        right = box["x"] + box["width"]
-        return right <= size[0] + 1 and page.evaluate(on_top) == tab.text_content()
-
-    for tab in tabs.all():
-        until(lambda tab=tab: is_whole(tab), "each tab can be seen and clicked")
-    button.click(timeout=10_000)
-    tabs.last.wait_for(state="hidden")
-
-
-def test_the_table_of_nodes_is_above_the_plots(page: Any, simulator: Simulator) -> None:
-    page.goto(page.address)
-    page.get_by_role("button", name="Panels").click()
-    page.get_by_role("tab", name="Status").click()
-    now = time.monotonic()
-    for number in range(9):
-        simulator.status.tell(NodeStatus(f"node_{number}", Level.WELL, "runs"), now)
-    page.get_by_text("node_8").wait_for()
-    table = page.locator(".us-status").bounding_box()
-    plot = page.locator(".us-plot").first.bounding_box()
-    assert table["height"] > 9 * 30
-    assert table["y"] + table["height"] <= plot["y"]
-
-
-def test_all_views_can_be_chosen_beside_the_panels_of_a_small_screen(page: Any) -> None:
-    page.set_viewport_size({"width": 1024, "height": 768})
-    page.goto(page.address)
-    page.get_by_role("button", name="Panels").click()
-    page.get_by_role("tab").last.wait_for()
-    scene = page.locator("#scene")
-
-    def are_inside() -> bool:
-        left = scene.bounding_box()["x"]
-        right = left + scene.bounding_box()["width"]
-        boxes = [button.bounding_box() for button in page.locator(".us-tools-views button").all()]
-        return len(boxes) == 7 and all(
-            left <= box["x"] and box["x"] + box["width"] <= right for box in boxes
-        )
-
-    until(are_inside, "every button of a view is within the scene")

@@ -95,31 +95,6 @@ def test_a_number_is_set_in_its_unit(page: Any, node: Node) -> None:
     assert field(page, "focus").get_attribute("placeholder") == "none"
 
 
-def test_what_cannot_be_is_said_beside_the_control(page: Any, node: Node) -> None:
-    opened(page, "Image")
-    shows(page, "depth", "40")
-    field(page, "depth").fill("900")
-    field(page, "depth").press("Enter")
-    reason = control(page, "depth").get_by_role("alert")
-    reason.wait_for()
-    assert reason.inner_text() == "900 mm is outside 5 to 400 mm"
-    shows(page, "depth", "40")
-    field(page, "depth").fill("much")
-    field(page, "depth").press("Enter")
-    until(lambda: reason.inner_text() == "'much' is not a number", "the page refuses it")
-    node.refusal = "40 mm is deeper than the focus"
-    field(page, "depth").fill("60")
-    field(page, "depth").press("Enter")
-    until(lambda: reason.inner_text() == node.refusal, "the node's reason is shown")
-    shows(page, "depth", "40")
-    node.refusal = ""
-    field(page, "depth").fill("60")
-    field(page, "depth").press("Enter")
-    until(lambda: reason.count() == 0, "the reason goes")
-    shows(page, "depth", "60")
-    until(lambda: node.values("depth") == [0.06, 0.06], "it was sent twice")
-
-
 def test_a_slider_sends_ten_times_a_second_at_most_and_its_last_for_certain(
     page: Any, node: Node
 ) -> None:
@@ -140,30 +115,6 @@ def test_a_slider_sends_ten_times_a_second_at_most_and_its_last_for_certain(
     shows(page, "gain", "60")
     assert len(node.sent) <= lasted / 0.1 + 3
     assert all(-60.0 <= raw <= 60.0 for raw in node.values("gain"))
-
-
-def test_a_change_made_elsewhere_moves_the_control(page: Any, node: Node) -> None:
-    opened(page, "Image")
-    shows(page, "gain", "0")
-    node.tell(node.parameters["gain"].with_raw(12.0))
-    shows(page, "gain", "12")
-    slider = control(page, "gain").get_by_role("slider")
-    assert slider.get_attribute("aria-valuenow") == "12"
-    node.tell(node.parameters["overlay"].with_raw("strain"))
-    until(lambda: "strain" in control(page, "overlay").inner_text(), "the choice is shown")
-    assert node.sent == []
-
-
-def test_a_parameter_that_is_added_has_a_control(page: Any, node: Node) -> None:
-    opened(page, "Image")
-    shows(page, "gain", "0")
-    page.get_by_role("button", name="More").wait_for(state="detached")
-    node.tell(made("sparkle", raw=2.0, unit="dB", limits=(0.0, 9.0)))
-    page.get_by_text("More", exact=True).click()
-    shows(page, "sparkle", "2")
-    field(page, "sparkle").fill("3")
-    field(page, "sparkle").press("Enter")
-    until(lambda: node.values("sparkle") == [3.0], "the new parameter is set")
 
 
 def test_every_kind_has_its_control_and_the_keyboard_will_do(page: Any, node: Node) -> None:
@@ -294,51 +245,3 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     assert board.is_watched  # the image says what its node says of it
     page.goto("about:blank")
     until(lambda: not board.is_watched, "nobody looks any more")
-
-
-def test_the_tissue_panel_says_what_is_prepared_and_how_far_methods_are_apart(
-    page: Any, simulator: Simulator, node: Node
-) -> None:
-    methods = ("fem", "msds")
-    meanings = {"fem": "for light presses", "msds": "springs, for comparison"}
-    tissue = "tissue_deformer"
-    parameters = [
-        Parameter(tissue, "solver", Kind.TEXT, "fem", choices=methods, meanings=meanings),
-        Parameter(tissue, "compare_with", Kind.TEXT, "", choices=methods, may_be_nothing=True),
-        Parameter(tissue, "fem.friction", Kind.NUMBER, 0.3, limits=(0.1, 1.0)),
-        Parameter(tissue, "msds.steps", Kind.WHOLE, 20, limits=(1, 100)),
-    ]
-    node.nodes.tell(*parameters)
-    opened(page, "Tissue")
-    panel = page.locator(".us-panels")
-
-    def says(text: str, **values: str) -> None:
-        def is_said() -> bool:
-            status = NodeStatus(tissue, Level.WELL, "fem", {"state": "fem"} | values)
-            simulator.status.tell(status, time.monotonic())
-            return text in panel.inner_text()
-
-        until(is_said, text)
-
-    choice = page.locator(f'[data-parameter="{tissue}.solver"]')
-    until(lambda: "for light presses" in choice.inner_text(), "what the method is good for")
-    choice.locator("input").click()
-    option = page.get_by_role("option", name="msds", exact=True)
-    option.wait_for()
-    words, box = option.get_by_text("springs").bounding_box(), option.bounding_box()
-    assert words["width"] > 0.8 * (box["width"] - 32)  # all of the menu but its margins
-    page.keyboard.press("Escape")
-    says("preparing msds: the tissue goes on", preparing="preparing msds")
-    page.locator(".us-headline", has_text="preparing msds").wait_for()
-    apart = {"compared_with": "msds", "difference_max_mm": "0.4123", "difference_rms_mm": "0.05"}
-    says("msds is 0.412 mm away at most, 0.05 mm root mean square", **apart)
-    assert panel.get_by_text("Settings of fem").is_visible()
-    assert not panel.get_by_text("Settings of msds").is_visible()
-    node.nodes.tell(parameters[0].with_raw("msds"), *parameters[1:])
-    panel.get_by_text("Settings of msds").wait_for()
-    panel.get_by_text("Settings of fem").wait_for(state="hidden")
-    sentence = "msds: its step is too long; it is set back"
-    simulator.status.tell(
-        NodeStatus(tissue, Level.WARNING, sentence, {"problem": "setting"}), time.monotonic()
-    )
-    until(lambda: sentence in panel.inner_text(), "what was set back is said")

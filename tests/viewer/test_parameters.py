@@ -26,7 +26,7 @@ from us_sim.nodes.settings import TissueDeformerSettings
 from us_sim.settings.quantity import Quantity, dial_unit, units_of
 from us_sim.settings.registry import SOLVERS
 from us_sim.slicing.settings import ColourSettings, Imaging
-from us_sim.viewer.parameters import Kind, Parameter, in_words
+from us_sim.viewer.parameters import Kind, Parameter
 from us_sim.viewer.remote_parameters import (
     ABSENT,
     SILENT,
@@ -145,12 +145,6 @@ def test_lists_are_numbers_in_the_unit_that_is_shown():
     made = Parameter("n", "x", Kind.NUMBERS, (0.001, 0.02), unit="mm", size=1e-3)
     assert made.value == (1.0, 20.0)
     assert made.raw_of(["3", 4]) == (0.003, 0.004)
-
-
-def test_a_name_says_its_group_and_its_words_as_in_the_field():
-    made = Parameter("n", "materials.fat.nyquist_velocity", Kind.NUMBER, 1.0)
-    assert (made.group, made.label) == ("materials.fat", "Nyquist velocity")
-    assert in_words("m_mode.lateral") == "M-mode · lateral"
 
 
 class Pages:
@@ -305,15 +299,6 @@ def test_a_node_that_goes_is_gone_and_one_that_restarts_is_read_anew(bench, page
     again = bench.add(Node("console", context=bench.context))
     again.declare_parameter("other", 2.5)
     bench.spin_until(lambda: set(shown.parameters) == {"other"})
-
-
-def test_a_restart_between_two_looks_is_noticed(bench, pages):
-    node, shown = console(bench), pages.look_at("console")
-    end(bench, node)
-    again = bench.add(Node("console", context=bench.context))
-    again.declare_parameter("gain", 12.0)
-    bench.spin_until(lambda: set(shown.parameters) == {"gain"})
-    assert shown.parameters["gain"].value == 12.0
 
 
 def test_a_foreign_node_s_plain_descriptors_will_do(bench, pages):

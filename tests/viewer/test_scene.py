@@ -1,6 +1,5 @@
 """The 3D scene in a real browser: what is seen where, and what the pointer meets."""
 
-import base64
 import io
 import time
 from collections.abc import Callable
@@ -188,10 +187,6 @@ def is_red(colour: np.ndarray) -> bool:
     return bool(colour[0] > colour[1] + 60 and colour[0] > colour[2] + 60)
 
 
-def is_skin(colour: np.ndarray) -> bool:
-    return bool(colour[0] > colour[2] + 15 and colour[0] < colour[1] + 70 and colour.min() > 60)
-
-
 def is_dark(colour: np.ndarray) -> bool:
     return bool(colour.max() < 40)
 
@@ -206,15 +201,6 @@ def test_structures_are_seen_where_they_are_in_their_colours(scene):
     scene.becomes(ARTERY, is_red)
 
 
-def test_skin_hides_them_unless_one_looks_under_it(scene):
-    scene.ask("scene.setOpacity('skin', 1)")
-    scene.becomes(VEIN, is_skin)
-    scene.page.click("[data-tool=under]")
-    scene.becomes(VEIN, is_blue)
-    scene.page.click("[data-tool=under]")
-    scene.becomes(VEIN, is_skin)
-
-
 def test_structures_go_with_the_tissue(scene):
     scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
     scene.becomes(VEIN, is_blue)
@@ -224,32 +210,6 @@ def test_structures_go_with_the_tissue(scene):
     scene.becomes([0.012, 0.0, 0.015], is_dark)
 
 
-def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_it(scene):
-    """The skin is at z = 0; of what is to do, the nearest to the probe at y = 40 mm is next."""
-    for name in ("image", "structures", "force"):
-        scene.ask(f"scene.setVisible('{name}', false)")
-    states = {-0.04: "done", -0.02: "missed", 0.0: "to do", 0.02: "to do"}
-    steps = [
-        {"what": "", "seen": "", "state": state, "target": [[-0.02, y, 0.013]]}
-        for y, state in states.items()
-    ]
-    score = scene.patient.feeds["score"]
-    score.offer(lambda n: Packet("score", n, {"scene": "", "steps": steps}, b""))
-
-    def stands(y: float, z: float = 0.0) -> list[float]:
-        return [-0.02, y, z]
-
-    scene.becomes(stands(-0.04), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)  # green
-    scene.becomes(stands(-0.02), lambda c: c[0] > c[2] + 80 and c[0] > c[1] + 80)  # red
-    scene.becomes(stands(0.0), lambda c: c.min() > 200)  # white
-    scene.becomes(stands(0.02), lambda c: c[0] > c[2] + 100 and c[1] > c[2] + 50)  # orange
-    scene.patient.dent(np.add(SKIN.vertices, [0.0, 0.0, 0.01]))
-    scene.ask("scene.view('front')")
-    scene.becomes(stands(-0.04, 0.0095), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)
-    scene.ask("scene.setVisible('targets', false)")
-    scene.becomes(stands(-0.04, 0.0095), lambda c: not (c[1] > c[0] + 60))
-
-
 def test_the_pointer_meets_the_skin_and_its_normal(scene):
     x, y = scene.place([-0.02, -0.03, 0.0])
     hit = scene.ask(f"return scene.pick({{ clientX: {x}, clientY: {y} }})")
@@ -257,53 +217,6 @@ def test_the_pointer_meets_the_skin_and_its_normal(scene):
     assert hit["point"] == pytest.approx([-0.02, -0.03, 0.0], abs=5e-4)
     assert hit["normal"] == pytest.approx([0, 0, -1], abs=1e-6)
     assert scene.ask("return scene.pick({ clientX: 4, clientY: 300 })") is None
-
-
-def test_a_drag_is_the_hands_if_it_takes_it_and_else_the_cameras(scene):
-    scene.ask(
-        """window.told = []; window.takes = true;
-        scene.onPointer((event, hit) => {
-          window.told.push([event.type, hit?.object ?? null]);
-          return window.takes;
-        });"""
-    )
-    x, y = scene.place([-0.02, -0.02, 0.0])
-    before = scene.ask("return scene.stage.camera.position.toArray()")
-
-    def drag() -> None:
-        scene.page.mouse.move(x, y)
-        scene.page.mouse.down()
-        scene.page.mouse.move(x + 40, y + 10, steps=3)
-        scene.page.mouse.up()
-
-    drag()
-    told = scene.ask("return window.told.splice(0)")
-    assert told[0] == ["pointerdown", "skin"]
-    assert ["pointermove", "skin"] in told
-    assert told[-1][0] == "pointerup"
-    assert scene.ask("return scene.stage.camera.position.toArray()") == before
-    scene.ask("window.takes = false")
-    drag()
-    assert scene.ask("return window.told") == [["pointerdown", "skin"]]
-    assert scene.ask("return scene.stage.camera.position.toArray()") != before
-
-
-def test_the_gizmo_says_how_far_along_its_axis_it_was_dragged(scene):
-    scene.ask("scene.view('front')")
-    scene.until("Math.abs(scene.stage.camera.position.x) < 1e-3")
-    scene.ask("window.told = []; scene.setGizmo((said) => window.told.push(said))")
-    # The probe stands at y = 40 mm, and its x arrow points to the right.
-    x, y = scene.place([0.020, 0.04, 0.0])
-    to_x, to_y = scene.place([0.030, 0.04, 0.0])
-    scene.page.mouse.move(x, y)
-    scene.page.mouse.down()
-    scene.page.mouse.move(to_x, to_y, steps=4)
-    scene.page.mouse.up()
-    told = scene.ask("return window.told")
-    assert [told[0]["phase"], told[-1]["phase"]] == ["start", "end"]
-    assert {said["mode"] for said in told} == {"translate"}
-    assert {said["axis"] for said in told} == {"x"}
-    assert told[-1]["amount"] == pytest.approx(0.010, abs=3e-4)
 
 
 def test_colours_of_the_tissue_have_a_bar_with_a_unit_and_strain_is_asked_for_only_then(scene):
@@ -342,47 +255,6 @@ def test_along_the_patient_it_is_the_right_way_up(scene):
     scene.patient.move(np.array([0.0, 0.03, 0.0]))
     scene.becomes([0.0, 0.03, 0.015], is_blue)
     scene.becomes([0.0, -0.03, 0.015], is_dark)
-
-
-def test_it_keeps_to_its_place_when_the_window_becomes_another(scene):
-    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
-    scene.becomes(VEIN, is_blue)
-    for width, height in ((900, 1000), (1400, 620)):
-        scene.page.set_viewport_size({"width": width, "height": height})
-        scene.until(
-            "Math.abs(scene.stage.canvas.height / scene.stage.pace.ratio"
-            " - scene.stage.place.clientHeight) < 2 &&"
-            " Math.abs(scene.stage.canvas.width / scene.stage.pace.ratio"
-            " - scene.stage.place.clientWidth) < 2"
-        )
-        scene.becomes(VEIN, is_blue)
-        scene.becomes(ARTERY, is_red)
-        scene.becomes([-0.03, 0.0, 0.015], is_dark)
-
-
-def test_where_the_processor_draws_the_page_has_the_picture_and_not_what_is_drawn_into(scene):
-    scene.ask("for (const name of ['skin', 'probe', 'force']) scene.setVisible(name, false)")
-    scene.becomes(VEIN, is_blue)
-    kinds = scene.ask(
-        "return [...document.querySelectorAll('canvas')]"
-        ".map((canvas) => canvas.getContext('2d') !== null);"
-    )
-    assert all(kinds)
-    assert pixel_of_file(scene, VEIN) == pytest.approx(scene.becomes(VEIN, is_blue), abs=12)
-
-
-def pixel_of_file(scene: SimpleNamespace, point: list[float]) -> np.ndarray:
-    """Red, green, blue of a point of the patient, in the PNG file that a browser would save."""
-    data, width = scene.ask(
-        "const { canvas } = scene.stage; return [canvas.toDataURL(), canvas.clientWidth];"
-    )
-    picture = Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))).convert("RGB")
-    left, top = scene.ask(
-        "const box = scene.stage.canvas.getBoundingClientRect(); return [box.x, box.y];"
-    )
-    x, y = scene.place(point)
-    factor = picture.width / width
-    return np.array(picture.getpixel((int(factor * (x - left)), int(factor * (y - top)))), float)
 
 
 HARDWARE = """const { getParameter } = WebGL2RenderingContext.prototype;

@@ -2,7 +2,6 @@
 
 import dataclasses
 from concurrent.futures import Future
-from datetime import datetime
 
 import cv2
 import numpy as np
@@ -140,51 +139,6 @@ def test_a_path_or_a_name_that_is_typed_is_replayed_and_stays(page, session, typ
     until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
 
 
-def test_a_recording_is_named_by_the_time_at_which_it_is_asked_for(page, session):
-    _, asked = session
-    opened(page, "Session")
-    file = page.get_by_label("file")
-    until(lambda: file.input_value().startswith("session_"), "a name is proposed", 30.0)
-    page.wait_for_timeout(2100)
-    pressed = f"session_{datetime.now():%Y%m%d_%H%M%S}.mcap"
-    page.get_by_role("button", name="Record", exact=True).click()
-    until(lambda: asked, "it is asked for", 30.0)
-    assert asked[0]["record"] >= pressed
-    until(lambda: file.input_value() == asked[0]["record"], "the field says so", 30.0)
-    file.fill("mine.mcap")
-    page.get_by_role("button", name="Record", exact=True).click()
-    until(lambda: asked[-1] == {"record": "mine.mcap"}, "a name of one's own stays", 30.0)
-
-
-def test_it_is_said_what_becomes_of_the_simulation_when_all_is_replayed_as_recorded(page, session):
-    board, asked = session
-    board.bags = {"hand.mcap": "/bags/hand.mcap"}
-    opened(page, "Session")
-    kind = page.get_by_role("button", name="All as recorded")
-    page.get_by_title("when you end it the nodes start again").wait_for()
-    page.get_by_label("recording or path").click()
-    page.get_by_role("option", name="hand.mcap").click()
-    kind.click()
-    page.get_by_role("button", name="Play or pause").click()
-    until(lambda: asked and asked[-1]["replay_as"] == "recording", "it is asked for", 30.0)
-    replay = {"replay": "/bags/hand.mcap", "replay_as": "recording", "replay_state": "playing"}
-    board.state = dataclasses.replace(RUNNING, **replay)
-    until(kind.is_disabled, "it cannot be changed now", 30.0)
-    page.get_by_title("cannot be changed: end the replay first").wait_for()
-
-
-def test_how_long_and_how_large_a_recording_is_and_what_room_is_left_is_said(page, session):
-    board, _ = session
-    state = dataclasses.replace(RUNNING, record="/a.mcap", record_seconds=61.0, record_bytes=61e6)
-    board.state = dataclasses.replace(state, record_room_bytes=36e9)
-    opened(page, "Session")
-    recorded = page.get_by_text("recording to /a.mcap: 1:01 min, 61 MB, room for 10 h")
-    recorded.wait_for()
-    assert "us-wrong" not in recorded.get_attribute("class")
-    board.state = dataclasses.replace(state, record_room_bytes=5e8)
-    page.locator(".us-wrong", has_text="room for 8 min").wait_for()
-
-
 @pytest.mark.parametrize(
     ("asked", "file"),
     [
@@ -212,10 +166,3 @@ def test_pages_of_others_name_what_is_listed_and_record_to_one_folder(asked, fil
         else:
             assert not sent
             assert next(iter(asked.values())) in told.result() or "/etc/passwd" in told.result()
-
-
-def test_where_us_sim_does_not_run_the_simulation_that_is_said(page, session):
-    board, _ = session
-    board.state = SessionState()
-    opened(page, "Session")
-    page.get_by_text("us-sim does not run this simulation").wait_for()

@@ -220,19 +220,6 @@ def test_another_surface_has_another_number():
     assert one.number == RestSurface(SQUARE.copy(), RESTING).number
 
 
-def test_around_a_mesh_are_its_outer_faces_with_each_edge_once():
-    planes = np.linspace(0.0, 0.03, 4)
-    mesh = box_mesh(planes, planes, planes)
-    packet = RestSurface.around(mesh).told("tissue_mesh", 1)
-    count = packet.header["triangles"]
-    assert (packet.header["points"], count) == (64, 6 * 9 * 2)
-    assert packet.header["edges"] == 3 * count // 2  # of a closed surface
-    indices = np.frombuffer(packet.payload, np.uint32, offset=12 * 64)
-    edges = {tuple(edge) for edge in indices[3 * count :].reshape(-1, 2)}
-    sides = indices[: 3 * count].reshape(-1, 3)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    assert edges == {tuple(sorted(side)) for side in sides}
-
-
 def test_another_number_of_points_is_refused():
     surface = RestSurface(SQUARE, RESTING)
     with pytest.raises(MeshError, match="3 points came, and the mesh has 4"):

@@ -386,20 +386,6 @@ def test_a_simulator_that_does_not_follow_is_said(bench, page, tracked, monkeypa
     bench.spin_until(lambda: page.state["warning"] == "")
 
 
-def test_a_page_that_comes_back_finds_the_probe_where_it_was(bench, page, tracked):
-    page.open()
-    page.await_leader("hand")
-    page(to={"press": 0.006, "fan": 0.2})
-    bench.spin_until(lambda: tracked and depth(tracked[-1]) == pytest.approx(0.006, abs=1e-5))
-    page.close()
-    bench.spin_until(lambda: bench.peer.count_publishers("tracker/pose") == 0)
-    page.open()
-    page.await_leader("hand")
-    count = len(tracked)
-    bench.spin_until(lambda: len(tracked) > count)
-    assert depth(tracked[-1]) == pytest.approx(0.006, abs=1e-5)
-
-
 def test_a_scene_that_calibrates_such_poses_is_said(bench, page, tmp_path):
     scene = tmp_path / "moved.yaml"
     calibration = "tracker: {calibration: {position: [0, 0, 5 mm]}}"
