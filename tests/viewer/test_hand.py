@@ -26,9 +26,6 @@ def box_of_image(page: Any) -> Any:
     ("key", "quantity", "sign"),
     [
         ("s", "press", 1),
-        ("w", "press", -1),
-        ("PageDown", "press", 1),
-        ("e", "rotation", 1),
         ("q", "rotation", -1),
         ("Shift+ArrowUp", "fan", 1),
         ("Shift+ArrowLeft", "rock", -1),
@@ -96,7 +93,6 @@ def test_keys_are_not_taken_from_who_types(page: Any, viewer: FakeHand) -> None:
     ("row", "typed", "there", "asked", "said"),
     [
         (1, "999", "60", {"fan": math.radians(60)}, "Fan: -60 to 60°"),
-        (0, "500", "25.0", {"press": 0.025}, "Press: -50.0 to 25.0 mm"),
     ],
 )
 def test_a_number_beyond_its_range_is_put_to_the_nearest_end_and_that_is_said(

@@ -156,10 +156,6 @@ def test_time_gain_has_a_slider_for_each_depth(page: Any, node: Node) -> None:
     opened(page, "Image")
     gains = control(page, "time_gain")
     until(lambda: gains.get_by_role("slider").count() == 8, "eight sliders")
-    assert [t.strip() for t in gains.locator(".us-depth").all_inner_texts()][::7] == [
-        "0 mm",
-        "40 mm",
-    ]
     gains.locator(".q-slider__track-container").nth(2).focus()
     for _ in range(4):
         page.keyboard.press("ArrowRight")
@@ -216,8 +212,6 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
     until(lambda: len(rows()) == 2, "two nodes are told")
     assert rows()[1].strip() == "tissue_deformer fem 59.9 7.0 · 120 300 3"
     assert "the probe is lost" in rows()[0]
-    wrong = page.locator(".us-level-error .us-problem td")
-    assert wrong.evaluate("e => getComputedStyle(e).color") == "rgb(229, 115, 92)"
     plot = page.get_by_role("img", name=re.compile("^contact force"))
 
     def is_drawn() -> bool:
@@ -225,16 +219,6 @@ def test_status_and_plots(page: Any, simulator: Simulator, node: Node) -> None:
         return "probe 4.25 N" in (plot.get_attribute("aria-label") or "")
 
     until(is_drawn, "the force is drawn")
-    texts = plot.locator("text").all_text_contents()
-    assert [t.strip() for t in texts if t.strip()] == [
-        "0",
-        "2.5",
-        "5",
-        "−60 s",
-        "−40 s",
-        "−20 s",
-        "now",
-    ]
     page.get_by_role("button", name="tissue_deformer").click()
     page.get_by_role("dialog").wait_for()
     until(lambda: "tissue_deformer" in node.nodes.watched, "the dialog shows its parameters")

@@ -65,10 +65,8 @@ class Node:
 @pytest.mark.parametrize(
     ("kind", "probe", "steering", "flip"),
     [
-        ("colour", LINEAR, 0.3, False),
         ("colour", CONVEX, 0.0, True),
         ("spectrum", LINEAR, 0.3, True),
-        ("spectrum", CONVEX, 0.0, False),
         ("m_mode", LINEAR, 0.0, True),
     ],
 )

@@ -59,7 +59,7 @@ class Patient:
             "probe_mesh",
             "probe",
         ]
-        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image", "score"]}
+        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image"]}
         simulator.add(*self.feeds.values())
         self._offer("skin_mesh", lambda n: self.skin.told("skin_mesh", n))
         self._offer("tissue_mesh", lambda n: self.tissue.told("tissue_mesh", n))
@@ -83,10 +83,6 @@ class Patient:
         self._offer(
             "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=stamp)
         )
-
-    def dent(self, vertices: np.ndarray) -> None:
-        """The skin elsewhere than at rest."""
-        self._offer("skin", lambda n: self.skin.moved(vertices, kind="skin", sequence=n, stamp=0))
 
     def strain(self, values: np.ndarray) -> None:
         """Of each node."""
