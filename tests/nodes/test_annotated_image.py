@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from bench import pose_at
 from builtin_interfaces.msg import Time as TimeMessage
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -215,16 +214,6 @@ def test_colours_that_cannot_be_made_are_said_and_the_image_is_shown(bench, show
     assert picture(pictures[0])[90, 100].tolist() == [90, 90, 90]
 
 
-def test_before_the_first_pose_a_black_picture_says_so(bench, show):
-    node = show()
-    assert node.annotated.state == "waiting"
-    pictures = subscribed(bench, node)
-    bench.spin_until(lambda: pictures)
-    assert frame(pictures[0]) == GREY
-    assert pictures[0].header.stamp == TimeMessage()
-    assert picture(pictures[0])[60, 80].tolist() == [0, 0, 0]
-
-
 def test_without_new_poses_the_last_image_is_frozen_marked_and_keeps_its_stamp(bench, show):
     node = show(stale_after=0.3, lost_after=0.8)
     pictures = subscribed(bench, node)
@@ -257,21 +246,6 @@ def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench,
         assert node.health.problems("pose age") == times
 
 
-@pytest.mark.slow
-def test_diagnostics_warn_for_as_long_as_poses_stay_away(bench, show):
-    node = show(stale_after=1.0, lost_after=60.0)
-    reports = bench.collect(DiagnosticArray, "diagnostics")
-    node.annotated.pose_came(node.stamp())
-    warned = DiagnosticStatus.WARN, "the probe's pose is stale: the image is frozen"
-    bench.spin_until(lambda: (reports and words(reports[-1])) == warned)
-    count = len(reports)
-    bench.spin_until(lambda: len(reports) == count + 2)
-    assert words(reports[-1]) == warned
-    node.annotated.pose_came(node.stamp())
-    bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
-    assert node.health.warning == ""
-
-
 def test_an_image_that_no_page_moves_is_no_fault_of_a_tracker(bench, show):
     node = show(stale_after=1.0, lost_after=60.0)
     viewer, tracker = (
@@ -287,10 +261,6 @@ def test_an_image_that_no_page_moves_is_no_fault_of_a_tracker(bench, show):
     node.annotated.pose_came(node.stamp())
     bench.spin_until(lambda: node.health.problems("pose age") == 1)
     viewer.destroy_publisher(driver)
-
-
-def words(report):
-    return report.status[0].level, report.status[0].message
 
 
 @pytest.mark.parametrize("age", [95_332_936.7, -3600.0])  # a path of years ago, a clock ahead

@@ -116,28 +116,6 @@ def test_velocities_are_those_of_the_domain_at_the_poses_stamp(bench, scene, arm
         assert np.frombuffer(last.data, np.uint8).any()
 
 
-def test_colours_and_gates_show_in_the_annotated_image_when_they_are_asked_for(bench, send):
-    node, pose = send(gain=-60.0)
-    pictures = bench.collect(Image, "ultrasound/image_annotated")
-    bench.spin_until(lambda: node._annotated.is_wanted)
-
-    def colourful(second):
-        before = len(pictures)
-        pose(second)
-        bench.spin_until(lambda: len(pictures) > before)
-        picture = np.frombuffer(pictures[-1].data, np.uint8).reshape(80, 96, 3).astype(int)
-        return np.ptp(picture, axis=2) > 60
-
-    plain = colourful(11)
-    assert node.set_parameters([Parameter("overlay", value="velocity")])[0].successful
-    coloured = colourful(11)
-    assert np.count_nonzero(coloured & ~plain) > 30
-    assert node.set_parameters([Parameter("overlay", value="none")])[0].successful
-    bench.collect(Image, "ultrasound/spectrum")
-    bench.spin_until(lambda: node._streams[-2].is_wanted)
-    assert np.count_nonzero(colourful(12) & ~plain) > 3
-
-
 def test_why_an_image_shows_no_flow_is_on_diagnostics_at_once(bench, scene, send):
     scene.write_text(yaml.safe_dump(yaml.safe_load(scene.read_text()) | {"skin": None}))
     node, pose = send(contact=True, overlay="velocity")
@@ -212,23 +190,11 @@ def test_a_strip_goes_on_when_the_line_or_the_gate_is_moved(bench, send, kind):
     assert columns(6) < before  # begun anew, as columns stand for other moments
 
 
-def test_nothing_is_computed_for_nobody(bench, send):
-    node, pose = send()
-    images = bench.collect(Image, "ultrasound/image")
-    bench.spin_until(lambda: node._streams[0].is_wanted)
-    blood = node._streams[-2]._blood
-    pose(3)
-    bench.spin_until(lambda: images)
-    assert blood._frame is None
-
-
 @pytest.mark.parametrize(
     ("parameter", "value", "reason"),
     [
-        ("colour.nyquist_velocity", 0.0, "value"),
         ("colour.nyquist_velocity", 0.012, "colour.wall_filter: 0.015 m/s is not below nyquist"),
         ("colour.depth", 0.09, "colour.depth: the middle of the box at 90 mm lies outside"),
-        ("spectrum.depth", 0.041, "spectrum.depth: the gate at 41 mm lies outside the image"),
         ("flow.artery.direction", [1.0, 0.0, 0.0], "flow.direction: [1.0, 0.0, 0.0] is across"),
         ("flow.artery.mean_velocity", 0.5, "is less than twice mean_velocity"),
     ],

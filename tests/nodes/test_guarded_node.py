@@ -96,17 +96,6 @@ def test_bad_input_is_refused_by_its_kind_and_is_no_failure(bench, broken):
     assert not broken.failures
 
 
-def test_a_problem_that_goes_on_is_said_ever_more_rarely(broken, said, monkeypatch):
-    def second(number):
-        monkeypatch.setattr(guarded_node.time, "monotonic", lambda: 1000.0 + number)
-        broken.health.problem("deep", str(number))
-
-    for number in range(700):
-        second(number)
-    assert broken.health.problems("deep") == 700
-    assert [text for _, text in said] == ["0", "5", "15", "35", "75", "155", "315", "615"]
-
-
 def test_what_is_said_is_one_line_however_a_message_is_quoted(broken):
     broken.refused("/pose", PoseError("in frame '\x1b[2J\n" + "a" * 10_000))
     broken.failed("/pose", ValueError("\x07\n" * 10_000))
@@ -172,11 +161,7 @@ def test_what_ends_a_node_still_does(broken):
     [
         (pose_at(0.0, -1), "stamp"),
         (Time(sec=2_147_483_647, nanosec=4_294_967_295), "stamp"),
-        (Time(sec=1, nanosec=1_000_000_000), "stamp"),
-        (Time(sec=2_147_483_647), "stamp"),
         (pose_at(0.0, 8, w=0.0), "pose"),
-        (pose_at(0.0, 8, w=1e308), "pose"),
-        (pose_at(0.0, 8, w=5e-324), "pose"),
         (pose_at(1e308, 8), "pose"),
     ],
 )

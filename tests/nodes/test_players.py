@@ -111,14 +111,6 @@ def test_in_lockstep_the_next_pose_waits_for_the_image(bench, path):
     bench.spin_until(player.finished.done)
 
 
-def test_a_path_begins_again_when_it_loops(bench, path):
-    poses = bench.collect(PoseStamped, "tracker/pose")
-    player = bench.make(PathPlayer, path=str(path), loop=True, rate=20.0)
-    bench.spin_until(lambda: len(poses) >= 25)
-    assert not player.finished.done()
-    assert poses[10].pose.position.z == poses[0].pose.position.z
-
-
 def test_nothing_is_played_before_what_is_awaited_is_there(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     bench.make(PathPlayer, path=str(path), await_topics=["ultrasound/image"])
@@ -148,11 +140,6 @@ def test_what_is_waited_for_is_said_and_is_what_the_recorder_records(bench, path
 @pytest.mark.parametrize("player", [PathPlayer, SessionPlayer])
 def test_an_installed_bag_is_played_by_its_name(bench, player):
     assert not bench.make(player, path="press_and_slide.mcap").finished.done()
-
-
-def test_a_path_that_cannot_be_read_is_one_sentence(bench, tmp_path):
-    with pytest.raises(BagError, match=r"nowhere\.mcap"):
-        bench.make(PathPlayer, path=str(tmp_path / "nowhere.mcap"))
 
 
 def test_poses_that_cannot_be_told_apart_are_refused_in_lockstep(bench, tmp_path):

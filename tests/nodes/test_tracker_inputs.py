@@ -19,7 +19,7 @@ from us_sim.errors import SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.tf import TFMessage
-from us_sim.recording.path import ProbePath, read_path, write_path
+from us_sim.recording.path import ProbePath, write_path
 from us_sim.tracking.camera.encodings import decompress_image
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import SHARP, RenderedView
@@ -75,14 +75,6 @@ def test_a_pose_in_patient_is_the_probes_own_where_the_device_has_another_frame(
     bench.spin_until(lambda: poses)
     np.testing.assert_allclose(place(poses[0]), [0, 0, 0.007], atol=1e-12)
     assert (poses[0].header.stamp.sec, poses[0].header.stamp.nanosec) == (7, 0)
-
-
-def test_a_pose_in_patient_is_calibrated_where_that_is_the_devices_frame(bench, tracker):
-    _, poses = tracker("{calibration: {position: [0, 0, 0.1]}}")
-    publisher = bench.publisher(PoseStamped, "tracker/pose")
-    publisher.publish(pose_at(-0.09, 7, frame="patient"))
-    bench.spin_until(lambda: poses)
-    np.testing.assert_allclose(place(poses[0]), [0, 0, 0.01], atol=1e-12)
 
 
 def test_a_driver_that_publishes_best_effort_is_heard(bench, tracker):
@@ -181,15 +173,6 @@ def test_a_frame_of_tf_is_not_missed_among_those_of_others(bench, tracker):
     for _ in range(30):
         moving.publish(transform("elsewhere", "other", 5.0, now))
     bench.spin_until(lambda: poses)
-
-
-@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
-def test_a_way_in_tf_that_never_moves_is_said(bench, tracker):
-    node, _ = tracker("{source: tf, frame: world, body: stylus}")
-    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    fixed = bench.peer.create_publisher(TFMessage, "tf_static", latched)
-    fixed.publish(transform("world", "stylus", 0.1, 1))
-    bench.spin_until(lambda: node.health.problems("frame") == 1)
 
 
 def test_a_pose_in_millimetres_is_not_believed(bench, tracker):
@@ -292,7 +275,6 @@ SECTION = "{source: camera, camera: {dictionary: 6X6_250, marker: 3, size: 40 mm
     ("encoding", "encode"),
     [
         ("mono8", lambda grey: grey),
-        ("bgr8", lambda grey: cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)),
         ("bayer_rggb16", lambda grey: grey.astype(np.uint16) << 8),
     ],
 )
@@ -454,12 +436,6 @@ def test_a_recording_of_plus_leads_from_the_probe_to_the_reference(
     poses = bench.collect(PoseStamped, "probe/pose")
     bench.spin_until(lambda: len(poses) == 2)
     np.testing.assert_allclose([p.pose.position.x for p in poses], [0.006, 0.008])
-
-
-def test_the_path_of_a_command_takes_a_recording_too(recording):
-    path = read_path(recording, "ProbeToReference")
-    assert (len(path), path.rejected, path.frame_id) == (2, 1, "Reference")
-    np.testing.assert_array_equal(np.diff(path.stamps), 40_000_000)
 
 
 def test_another_source_may_be_named_at_the_start(bench, tmp_path, small_scene):

@@ -1,7 +1,6 @@
 """Parts of a recording as files, read by programs that are not ours."""
 
 import csv
-import struct
 
 import cv2
 import numpy as np
@@ -58,16 +57,6 @@ def test_real_poses_are_what_rosbags_decodes(shared_data, tmp_path):
     assert [tuple(float(row[n]) for n in ("x_m", "y_m", "z_m")) for row in rows] == [
         each[:3] for each in numbers
     ]
-
-
-def test_poses_that_are_not_finite_are_in_the_csv_alone(tmp_path):
-    messages = [each for each in press(10) if each[0] == "/probe/pose"]
-    at = len(messages[3][1]) - 7 * 8
-    data = messages[3][1]
-    messages[3][1] = data[:at] + struct.pack("<d", np.nan) + data[at + 8 :]
-    assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--poses") == 0
-    assert len((tmp_path / "probe_pose.tum").read_text().splitlines()) == 9
-    assert len((tmp_path / "probe_pose.csv").read_text().splitlines()) == 11
 
 
 def test_wrenches_are_in_newtons(tmp_path):
@@ -143,8 +132,6 @@ def test_real_images_have_no_scale_that_nobody_recorded(shared_data, tmp_path):
     ("option", "said"),
     [
         ("--poses", "holds no poses"),
-        ("--wrench", "holds no wrench"),
-        ("--images", "holds no image"),
         ("--areas", "holds no scene attached"),
     ],
 )
@@ -160,16 +147,6 @@ def test_all_that_a_recording_lacks_is_named_and_nothing_written(tmp_path, capsy
     assert extracted(session, tmp_path / "out", "--poses", "--wrench", "--images") == 1
     assert "no wrench and no image; leave out --wrench and --images" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_images_that_are_no_pictures(tmp_path, capsys):
-    messages = [each for each in press(3) if each[0] == "/ultrasound/image"]
-    for message in messages:
-        message[1] = message[1].replace(b"mono8", b"bayer")
-    assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--images") == 1
-    told = capsys.readouterr()
-    assert "/ultrasound/image: 3 images skipped: the image's encoding is 'bayer'" in told.out
-    assert "no image that can be decoded" in told.err
 
 
 @pytest.mark.parametrize(
@@ -192,14 +169,6 @@ def test_what_is_odd_in_real_bags_is_told(
     extracted(shared_data / "cases" / case, tmp_path, options)
     assert said in capsys.readouterr().out
     assert sum(len(file.read_text().splitlines()) for file in tmp_path.glob("*.tum")) == lines
-
-
-def test_images_are_taken_in_every_encoding_of_a_camera(shared_data, tmp_path):
-    assert extracted(shared_data / "cases/bag-stamps-zero/zed_like.mcap", tmp_path, "--images") == 0
-    file, *others = sorted((tmp_path / "zed_zed_node_left_image_rect_color").iterdir())
-    assert len(others) == 59
-    with Image.open(file) as picture:
-        assert picture.mode == "RGB"
 
 
 def test_nothing_is_overwritten(scaled, tmp_path, capsys):

@@ -110,23 +110,11 @@ def test_joints_of_several_publishers_and_compressed_images_go_together(tmp_path
     assert "observation.state" not in frames[0]
 
 
-def test_poses_that_are_none_are_left_out_and_told(tmp_path):
-    messages = [("/p", pose(EPOCH + k * PERIOD, z=1e-3 * k), EPOCH + k) for k in range(6)]
-    messages[2] = ("/p", pose(EPOCH + 2 * PERIOD, z=np.nan), EPOCH + 2)
-    file = write(tmp_path / "lost.mcap", messages, {"/p": TYPES["/probe/pose"]})
-    moments, frames, _, told = frames_of(file, 60)
-    depth = np.array([frame["observation.state"][2] for frame in frames])
-    assert depth == pytest.approx(1e-3 * (moments - EPOCH) / PERIOD, abs=1e-9)
-    assert told[-1].endswith("1 are not finite and left out")
-
-
 @pytest.mark.parametrize(
     ("case", "by_log_time", "said"),
     [
         ("bag-time-back/stamps_back_by_20_s.mcap", False, "back by 30.0 s"),
-        ("bag-time-back/looped_sim_time.mcap", False, "back by 10.0 s"),
         ("bag-time-back/stamps_back_by_20_s.mcap", True, "1200 messages, 0.117 s apart at most"),
-        ("bag-time-back/log_time_back_too.mcap", True, "601 frames lie between messages more than"),
         ("bag-quaternions/quaternions.mcap", False, "360 messages.*120 are not finite"),
         ("bag-stamps-zero/zed_like.mcap", False, "60 messages have no stamp"),
         ("bag-every-type/test_bag_mcap", False, "image is left out: the image holds 30 bytes"),

@@ -107,9 +107,7 @@ def test_a_player_at_its_end_is_no_loss(session):
     [
         ({}, True),
         ({"exclude": ["/ultrasound/image"]}, False),
-        ({"exclude": ["/probe/pose"]}, True),
         ({"topics": ["/probe/pose"]}, False),
-        ({"topics": ["/ultrasound/image"]}, True),
         ({"paused": True}, False),
     ],
 )
@@ -128,7 +126,7 @@ def test_a_path_that_was_never_played_is_a_loss(session):
     assert "the end of days" in supervisor.outcome(1.0).sentence()
 
 
-@pytest.mark.parametrize("status", [0, 1, 3, -15, -9, INTERRUPTED])
+@pytest.mark.parametrize("status", [0, -9, INTERRUPTED])
 def test_any_other_end_is(session, status):
     supervisor, group, monitor = session
     supervisor.update()
@@ -250,9 +248,7 @@ def test_another_plan_ends_what_it_lacks_and_then_starts_what_is_new(session):
     [
         ("path_player", "rate", True),
         ("path_player", "path", False),
-        ("session_recorder", "parameters", True),
         ("session_recorder", "file", False),
-        ("tissue_deformer", "threads", False),
     ],
 )
 def test_what_takes_another_process(node, name, stays):
