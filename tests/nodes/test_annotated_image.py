@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from bench import pose_at
 from builtin_interfaces.msg import Time as TimeMessage
-from geometry_msgs.msg import PoseStamped
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 
 from us_sim.errors import MeshError, SettingsError
-from us_sim.nodes.scene_node import NO_PAGE, SceneNode, poses_ended
+from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.annotated_image import AnnotatedImage
 from us_sim.scene.building import probe_of
 from us_sim.slicing.cutting.resampling import Located
@@ -244,23 +242,6 @@ def test_diagnostics_say_once_that_poses_stay_away_and_that_they_are_back(bench,
         bench.spin_until(lambda: node.health.values["probe_pose"] == "live")
         bench.spin_until(lambda: node.health.values["probe_pose"] == "lost")
         assert node.health.problems("pose age") == times
-
-
-def test_an_image_that_no_page_moves_is_no_fault_of_a_tracker(bench, show):
-    node = show(stale_after=1.0, lost_after=60.0)
-    viewer, tracker = (
-        bench.add(Node(name, context=bench.context)) for name in ("viewer", "probe_tracker")
-    )
-    tracker.create_subscription(PoseStamped, "tracker/pose", print, 10)
-    bench.spin_until(lambda: poses_ended(node) == NO_PAGE)
-    node.annotated.pose_came(node.stamp())
-    bench.spin_until(lambda: node.health.warning.startswith("no page moves the probe"))
-    assert node.health.problems("pose age") == 0
-    driver = viewer.create_publisher(PoseStamped, "tracker/pose", 10)
-    bench.spin_until(lambda: not poses_ended(node))
-    node.annotated.pose_came(node.stamp())
-    bench.spin_until(lambda: node.health.problems("pose age") == 1)
-    viewer.destroy_publisher(driver)
 
 
 @pytest.mark.parametrize("age", [95_332_936.7, -3600.0])  # a path of years ago, a clock ahead

@@ -2,7 +2,6 @@
 
 import functools
 import math
-import socket
 import warnings
 from array import array
 from functools import partial
@@ -29,7 +28,6 @@ from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes import messages
 from us_sim.nodes.image_writer import ImageWriter
-from us_sim.nodes.openigtlink_bridge import OpenIGTLinkBridge
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.skin_deformer import SkinDeformer
 from us_sim.nodes.slice_interpolator import SliceInterpolator
@@ -41,7 +39,6 @@ from us_sim.scene.building import tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.tracking.camera.encodings import decode_image, decompress_image
 from us_sim.tracking.haptic import ContactModel
-from us_sim.tracking.openigtlink import HEADER, header_of, poses_in
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 
@@ -286,30 +283,6 @@ def test_no_mesh_and_no_pose_end_the_slicing(bench, small_scene, lockstep):
             send(node, topic, make(second))
 
     answers(bench, good, images)
-
-
-def test_no_message_ends_the_bridge(bench, small_scene, monkeypatch):
-    node = bench.make(OpenIGTLinkBridge, scene=str(small_scene), host="127.0.0.1", port=0)
-    sent = []
-    monkeypatch.setattr(node._server, "send", lambda name, data: sent.append((name, data)))
-    inputs = {
-        "ultrasound/image_to_probe": lambda _: messages.affine_message(np.eye(4)),
-        "probe/pose": pose,
-        "ultrasound/image": grey,
-    }
-    with socket.create_connection(("127.0.0.1", node.port)):
-        bench.spin_until(lambda: node._server.clients == 1)
-        attack(bench, node, inputs, 80)
-        count = len(sent)
-        for topic, make in inputs.items():
-            send(node, topic, make(100_001))
-        bench.spin_for(5)
-    names = {name for name, _ in sent[count:]}
-    assert names == {"ProbeToReference", "ImageToReference", "Image_Reference"}
-    for name, data in sent:
-        if name != "Image_Reference":
-            ((_, matrix),) = poses_in(header_of(data[: HEADER.size]), data[HEADER.size :])
-            assert np.isfinite(matrix).all()
 
 
 def test_a_folder_for_images_that_cannot_be_made_is_refused(bench, tmp_path):

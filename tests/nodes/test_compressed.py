@@ -11,7 +11,6 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 
-from us_sim.nodes.settings import CompressedSettings
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.streams.compressed import compressed
 from us_sim.recording.decoding import pixels_from
@@ -111,20 +110,3 @@ def test_it_is_made_only_for_subscribers_and_alone_is_enough(bench, imager) -> N
     assert told[f"published {IMAGE}/compressed"] == "1"
     assert f"published {IMAGE}_annotated" not in told
     assert f"published {IMAGE}_annotated/compressed" not in told
-
-
-def test_quality_and_level_are_those_of_the_encoders() -> None:
-    noise = np.random.default_rng(1).integers(0, 256, (64, 64), np.uint8)
-    image = Image(height=64, width=64, step=64, encoding="mono8", data=noise.tobytes())
-    for settings, suffix, options in (
-        (CompressedSettings(jpeg_quality=30), ".jpg", [cv2.IMWRITE_JPEG_QUALITY, 30]),
-        (CompressedSettings("png", png_level=9), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9]),
-    ):
-        data = bytes(compressed(image, settings).data)
-        assert data == cv2.imencode(suffix, noise, options)[1].tobytes()
-
-
-def test_colours_are_as_they_were() -> None:
-    noise = np.random.default_rng(2).integers(0, 256, (16, 24, 3), np.uint8)
-    image = Image(height=16, width=24, step=72, encoding="rgb8", data=noise.tobytes())
-    assert np.array_equal(decoded(compressed(image, CompressedSettings("png"))), noise)

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 from std_msgs.msg import Bool, Float64MultiArray
 
-from us_sim.errors import SceneError, TrackingError
+from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.haptic_renderer import HapticRenderer, PeriodicThread
 from us_sim.nodes.messages import (
@@ -218,16 +218,6 @@ def test_a_wrench_written_by_hand_is_the_message(frame):
     message = wrench_message(wrench[:3], wrench[3:], stamp, frame)
     assert deserialize_message(written, WrenchStamped) == message
     assert len(written) == len(serialize_message(message))  # some leave anything in the padding
-
-
-def test_a_scene_without_tissue_is_refused(bench, tmp_path):
-    file = tmp_path / "bare.yaml"
-    file.write_text(
-        "name: bare\nvolume: {phantom: upper_arm, voxel_size: 1 mm}\n"
-        "probe: {aperture: 40 mm, depth: 40 mm}\n"
-    )
-    with pytest.raises(SceneError, match="nothing can be felt"):
-        bench.make(HapticRenderer, scene=str(file))
 
 
 def run(thread, done):

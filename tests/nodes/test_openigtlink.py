@@ -61,26 +61,6 @@ tracker:
     assert said.count("lost") >= 2
 
 
-def test_a_time_that_no_stamp_can_say_is_refused_in_the_servers_name(bench, tmp_path, small_scene):
-    port = free_port()
-    tracker = f"""
-tracker:
-  source: openigtlink
-  openigtlink: {{host: 127.0.0.1, port: {port}, clock: server}}
-"""
-    node = bench.make(ProbeTracker, scene=scene_with(tmp_path, small_scene, tracker))
-    message = pyigtl.TransformMessage(MATRIX, device_name="P", timestamp=float(2**32 - 1))
-    with pyigtl_server(port) as server:
-        bench.spin_until(server.is_connected)
-
-        def is_refused():
-            server.send_message(message)
-            return node.health.problems("stamp") > 0
-
-        bench.spin_until(is_refused)
-    assert not node.failures
-
-
 @pytest.mark.parametrize("reference", ["volume", "patient"])
 def test_the_image_is_served_where_it_lies(bench, tmp_path, small_scene, reference):
     place = np.array([0.01, 0.0, 0.0])

@@ -168,20 +168,6 @@ def test_the_depth_of_the_image_may_change_and_its_range_is_said(bench, scene, t
     assert attempt(node, "focus", 0.0).successful
 
 
-def test_the_frequency_is_one_that_the_probe_has_while_artefacts_are_live(bench, scene, tmp_path):
-    node = made(bench, "slice_interpolator", scene, tmp_path)
-    assert attempt(node, "acoustics.frequency", 2e6).successful  # of no use yet
-    refused = attempt(node, "acoustics.artefacts", "live")
-    assert not refused.successful
-    assert "2 MHz is not one that this probe has, which are 4 to 16 MHz" in refused.reason
-    assert attempt(node, "acoustics.frequency", 0.0).successful  # the probe's middle
-    assert attempt(node, "acoustics.artefacts", "live").successful
-    assert attempt(node, "acoustics.frequency", 6e6).successful
-    refused = attempt(node, "acoustics.frequency", 20e6)
-    assert not refused.successful
-    assert "20 MHz is not one that this probe has" in refused.reason
-
-
 @pytest.fixture
 def pressed(bench, small_scene):
     """A node, and what presses it once and returns its force, NaN where it is not in balance."""
@@ -269,22 +255,6 @@ def test_what_cannot_be_made_is_set_back_and_said(bench, pressed):
     )
     assert press() * before > 0
     assert node.health.state == "msds"
-
-
-def test_what_is_set_back_may_be_what_two_settings_say_together(bench, pressed):
-    node, _ = pressed(solver="fem", compare_with="msds", lockstep=True)
-    parameters = [
-        Parameter("solver", value="msds"),
-        Parameter("compare_with", value="fem"),
-        Parameter("msds.stabilisation", value="substeps"),
-        Parameter("msds.maximum_substeps", value=1),
-        Parameter("msds.time_step", value=5.0),
-    ]
-    assert node.set_parameters_atomically(parameters).successful
-    assert node.health.problems("setting") == 1
-    assert node.get_parameter("solver").value == "fem"
-    assert node.get_parameter("compare_with").value == "msds"
-    bench.spin_for(3)
 
 
 @pytest.mark.parametrize(

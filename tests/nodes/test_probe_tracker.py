@@ -4,7 +4,7 @@ import math
 
 import pytest
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -12,7 +12,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.scene_node import NO_SENDER
-from us_sim.nodes.tf import TFMessage
 from us_sim.settings.registry import PROBES
 
 
@@ -38,9 +37,7 @@ def test_a_pose_is_forwarded_with_its_stamp_and_unit_quaternion(bench, tracker):
     ("bad", "kind"),
     [
         (pose_at(math.nan, 8), "pose"),
-        (pose_at(math.inf, 8), "pose"),
         (pose_at(0.0, 8, w=0.0), "pose"),
-        (pose_at(0.0, 8, w=math.nan), "pose"),
         (pose_at(0.0, 8, frame="moon"), "frame"),
         (pose_at(0.0, 7), "order"),
     ],
@@ -64,7 +61,7 @@ def test_a_quaternion_that_is_not_of_unit_length_is_taken_and_said(bench, tracke
     assert node.health.problems("quaternion") == 1
 
 
-@pytest.mark.parametrize("turns", [(0, 1), (0, 0, 1), (0, 1, 1)])
+@pytest.mark.parametrize("turns", [(0, 1), (0, 0, 1)])
 @pytest.mark.parametrize(("apart", "contested"), [(0.028, True), (0.001, False)])
 def test_two_that_fight_over_the_pose_are_said(bench, tracker, turns, apart, contested):
     node, poses, publisher = tracker
@@ -97,37 +94,6 @@ def test_an_unstamped_pose_gets_its_time_of_arrival(bench, tracker):
     now = node.get_clock().now().nanoseconds * 1e-9
     assert abs(now - poses[0].header.stamp.sec) < 60
     assert node.health.problems("stamp") == 1
-
-
-@pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
-def test_the_transform_is_sent_to_who_asks(bench, tracker):
-    _, _, publisher = tracker
-    transforms = bench.collect(TFMessage, "tf")
-    bench.spin_until(lambda: bench.peer.count_publishers("tf") > 0)
-    second = 10
-    while not transforms:
-        publisher.publish(pose_at(0.003, second))
-        second += 1
-        bench.spin_for(5)
-        assert second < 200
-    transform = transforms[0].transforms[0]
-    assert (transform.header.frame_id, transform.child_frame_id) == ("patient", "probe")
-    assert transform.transform.translation.z == 0.003
-
-
-def test_diagnostics_say_what_was_refused(bench, tracker):
-    node, _, publisher = tracker
-    reports = bench.collect(DiagnosticArray, "diagnostics")
-    publisher.publish(pose_at(math.nan, 8))
-    publisher.publish(pose_at(0.002, 9))
-    bench.spin_until(
-        lambda: any(
-            item.key == "rejected pose" and item.value == "1"
-            for report in reports
-            for item in report.status[0].values
-        )
-    )
-    assert reports[0].status[0].name == node.get_fully_qualified_name()
 
 
 def test_the_filter_and_its_settings_may_change_while_poses_come(bench, tracker):

@@ -8,8 +8,6 @@ import textwrap
 
 import pytest
 
-from us_sim.nodes import process
-from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.process import go_first, scheduling_of
 from us_sim.share import find_bag
 
@@ -82,33 +80,10 @@ def test_who_may_not_goes_on_as_before(monkeypatch):
     assert scheduling_of(os.getpid()) == "ordinary"
 
 
-@pytest.mark.parametrize(
-    ("parameters", "asked"),
-    [({}, True), ({"realtime": False}, False), ({"lockstep": True}, False)],
-)
-def test_a_node_asks_for_it_and_says_what_it_got(
-    bench, small_scene, monkeypatch, parameters, asked
-):
-    node = bench.make(ProbeTracker, scene=str(small_scene), **parameters)
-    times = []
-    monkeypatch.setattr(process, "go_first", lambda priority: times.append(priority) or "realtime")
-    monkeypatch.setattr(process, "spin", lambda _: None)
-    monkeypatch.setattr(process.rclpy, "init", lambda **_: None)
-    monkeypatch.setattr(process.rclpy, "try_shutdown", lambda: None)
-    monkeypatch.setattr(node, "destroy_node", lambda: None)
-    monkeypatch.setattr(process.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(process.gc, "freeze", lambda: None)
-    assert process.run_node(lambda: node) == 0
-    assert (times, node.health.scheduling) == (([2], "realtime") if asked else ([], ""))
-
-
 UNUSED = [
     ("us_sim.viewer.viewer, us_sim.viewer.page", {"numba", "scipy"}),
     ("us_sim.nodes.probe_tracker", {"numba", "scipy", "cv2"}),
-    ("us_sim.nodes.session_recorder", {"numba", "scipy", "cv2"}),
-    ("us_sim.nodes.path_player", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.session_player, us_sim.nodes.session_control", {"numba", "scipy", "cv2"}),
-    ("us_sim.run.live, us_sim.run.lockstep", {"numba", "scipy", "cv2"}),
     ("us_sim.nodes.tissue_deformer", {"scipy.ndimage", "scipy.spatial", "cv2"}),
     (
         "us_sim.nodes.slice_interpolator, us_sim.slicing.acoustics.beam_acoustics, "

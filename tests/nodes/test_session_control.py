@@ -124,19 +124,6 @@ def test_a_page_that_opens_later_has_the_picture_of_every_scene(bench):
     bench.spin_until(lambda: dict(session.thumbnails) == pictures)
 
 
-def test_a_change_is_reported_at_once_but_the_time_in_a_replay_is_not(bench):
-    control, _ = controlled(bench)
-    reports = bench.collect(DiagnosticArray, "diagnostics")
-    control.tell("running", {"record": "", "position": "1.0"})
-    sent = []
-    control.health.report = lambda: sent.append(dict(control.health.values))
-    control.tell("running", {"record": "", "position": "2.0"})
-    assert not sent
-    control.tell("running", {"record": "a.mcap", "position": "2.0"})
-    assert sent[-1]["record"] == "a.mcap"
-    bench.spin_until(lambda: reports)
-
-
 def report(name, **values):
     """A node's report."""
     pairs = [KeyValue(key=key.replace("_", " "), value=value) for key, value in values.items()]

@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -14,7 +13,6 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from us_sim.errors import BagError
 from us_sim.nodes.messages import image_message
 from us_sim.nodes.session_recorder import SessionRecorder
 from us_sim.nodes.slice_interpolator import SliceInterpolator
@@ -60,23 +58,6 @@ def test_topics_can_be_chosen_and_left_out(bench, tmp_path):
     bench.executor.remove_node(chosen)
     chosen.destroy_node()
     assert [topic.name for topic in read_bag(tmp_path / "a.mcap").topics] == ["/wanted"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "topic", ["tissue/structures", "ultrasound/image_annotated", "ultrasound/displacement"]
-)
-def test_what_is_made_on_demand_is_recorded_only_by_name(bench, tmp_path, topic):
-    shown = bench.peer.create_publisher(String, topic, 10)
-    other = bench.peer.create_publisher(String, "tissue/nodes", 10)
-    bench.make(SessionRecorder, file=str(tmp_path / "all.mcap"))
-    bench.spin_until(lambda: other.get_subscription_count() > 0)
-    bench.spin_for(30)
-    assert shown.get_subscription_count() == 0
-    named = tmp_path / "named" / "one.mcap"
-    named.parent.mkdir()
-    bench.make(SessionRecorder, file=str(named), topics=[f"/{topic}"])
-    bench.spin_until(lambda: shown.get_subscription_count() > 0)
 
 
 def test_what_is_made_on_demand_is_recorded_beside_all_others(bench, tmp_path):
@@ -132,34 +113,6 @@ def test_each_simulator_on_a_domain_is_recorded_alone(bench, tmp_path, small_sce
     }
     ordered = "/a/ultrasound/labels"
     assert heard == {ordered} | {f"{space}/ultrasound/image" for space in ("", "/a", "/b")}
-
-
-@pytest.mark.slow
-def test_a_recording_is_not_overwritten(bench, tmp_path):
-    file = tmp_path / "session.mcap"
-    file.write_bytes(b"precious")
-    with pytest.raises(BagError, match=r"session\.mcap"):
-        bench.make(SessionRecorder, file=str(file))
-    assert file.read_bytes() == b"precious"
-
-
-@pytest.mark.slow
-def test_diagnostics_say_that_a_recording_beside_another_gets_no_metadata(bench, tmp_path):
-    def notes():
-        said = [status for message in reports for status in message.status]
-        recorder = [status for status in said if status.name.endswith("session_recorder")]
-        return [{each.key: each.value for each in status.values}.get("note") for status in recorder]
-
-    reports = bench.collect(DiagnosticArray, "diagnostics")
-    first = bench.make(SessionRecorder, file=str(tmp_path / "first.mcap"))
-    bench.spin_until(notes)
-    assert set(notes()) == {None}
-    bench.executor.remove_node(first)
-    first.destroy_node()
-    reports.clear()
-    bench.make(SessionRecorder, file=str(tmp_path / "second.mcap"))
-    bench.spin_until(lambda: notes() and notes()[-1])
-    assert "metadata.yaml in this folder belongs to another recording" in notes()[-1]
 
 
 GIVEN_BACK = """

@@ -101,23 +101,6 @@ def test_the_estimate_is_made_of_two_images_and_only_for_its_subscribers(bench, 
     assert set(node.node.health._published) == {"ultrasound/strain_estimate"}
 
 
-def test_an_estimate_that_cannot_be_made_is_said_and_the_image_comes(bench, pressed):
-    node = pressed(**{"strain.window": 0.03, "strain.interval": 1})
-    images = bench.collect(Image, "ultrasound/image")
-    bench.collect(Image, "ultrasound/strain_estimate")
-    for topic in ("ultrasound/image", "ultrasound/strain_estimate"):
-        bench.spin_until(lambda topic=topic: bench.peer.count_publishers(topic) > 0)
-    bench.spin_until(lambda: all(s.is_wanted for s in (node.node._streams[0], estimates_of(node))))
-    node.press(1)
-    node.press(2)
-    bench.spin_until(lambda: len(images) == 2)
-    bench.spin_until(lambda: node.node.health.problems("strain estimate") == 1)
-
-
-def estimates_of(node):
-    return next(s for s in node.node._streams if s.topic == "ultrasound/strain_estimate")
-
-
 def test_a_gap_begins_anew(bench, pressed):
     node = pressed(**{"strain.since": "image", "strain.interval": 1})
     images = bench.collect(Image, "ultrasound/strain")
@@ -130,29 +113,6 @@ def test_a_gap_begins_anew(bench, pressed):
     node.press(4)
     bench.spin_until(lambda: len(images) == 2)
     assert [message.header.stamp.sec for message in images] == [2, 4]
-
-
-def test_the_colour_bar_follows_the_strain_unless_its_end_is_given(pressed):
-    node = pressed()
-    stream = next(s for s in node.node._streams if s.topic == "ultrasound/strain")
-    assert stream.overlay(node.frame(2)).scale.high == 0.05  # the press compresses by 4 %
-    node.node.set_parameters([Parameter("strain.colours", value=0.15)])
-    assert stream.overlay(node.frame(2)).scale.high == 0.15
-
-
-def test_strain_is_laid_over_the_annotated_image_with_what_the_press_is_like(bench, pressed):
-    node = pressed(overlay="strain", **{"strain.colours": 0.04})
-    pictures = bench.collect(Image, "ultrasound/image_annotated")
-    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/image_annotated") > 0)
-    node.press(2)
-    bench.spin_until(lambda: pictures)
-    message = pictures[-1]
-    picture = np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
-    grey = int(node.frame(2).pixels[40, 60])
-    np.testing.assert_allclose(picture[40, 60], [(c + grey) / 2 for c in (215, 48, 39)], atol=2)
-    assert node.node.health.values["strain_mean"] == "-4 %"
-    assert node.node.health.values["compression_quality"] == "1.00"
-    assert "published ultrasound/strain" not in node.node.health.values
 
 
 def test_a_window_that_the_image_does_not_hold_is_refused(pressed):

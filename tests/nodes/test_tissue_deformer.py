@@ -1,13 +1,11 @@
 """The tissue node: mesh latched, nodes and wrench with the pose's stamp, solver switched live."""
 
-import threading
 import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
@@ -22,10 +20,7 @@ from us_sim.nodes.tissue_deformer import TissueDeformer
 from us_sim.recording.decoding import tetrahedra_from, vectors_from
 from us_sim.scene.building import structures_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.tissue import live_tissue
 from us_sim.tissue.solvers.solver import create_solver
-
-ESTIMATE = "discretisation_error_percent"
 
 
 @pytest.fixture
@@ -126,69 +121,6 @@ def test_a_force_out_of_balance_is_counted_and_not_sent_until_it_balances(bench,
     assert node.health.warning == ""
 
 
-def test_while_no_pose_comes_diagnostics_say_what_is_being_made_and_then_what_is_in_use(
-    bench, small_scene, monkeypatch
-):
-    node = bench.make(TissueDeformer, scene=str(small_scene))
-    told, may_end, make = threading.Event(), threading.Event(), live_tissue.compiled_solver
-
-    def slow(solver, model, settings, progress):
-        progress(0.0, "compiling msds, kernel 7")
-        told.set()
-        assert may_end.wait(timeout=20)
-        return make(solver, model, settings, progress)
-
-    monkeypatch.setattr(live_tissue, "compiled_solver", slow)
-    assert node.set_parameters([Parameter("solver", value="msds")])[0].successful
-    assert told.wait(timeout=20)
-    bench.spin_until(lambda: node.health.preparing.endswith(" s, compiling msds, kernel 7"))
-    # Set back, it goes on as it is, and what was begun is never adopted.
-    assert node.set_parameters([Parameter("solver", value="fem")])[0].successful
-    assert node.health.state == "fem"
-    told.clear()
-    may_end.set()
-    assert node.set_parameters([Parameter("solver", value="msds")])[0].successful
-    bench.spin_until(lambda: node.health.state == "msds")
-
-
-def test_two_methods_run_side_by_side_and_diagnostics_say_how_far_they_are_apart(bench, deformer):
-    node, nodes, _, publisher = deformer
-    statuses = bench.collect(DiagnosticArray, "diagnostics")
-    assert node.set_parameters([Parameter("compare_with", value="fem_cg")])[0].successful
-    for second in range(1, 12):
-        press(bench, publisher, nodes, 0.004, second)
-    values = node.health.values
-    assert values["compared_with"] == "fem_cg"
-    assert 0 < float(values["difference_rms_mm"]) < float(values["difference_max_mm"]) < 4.0
-    statuses.clear()
-    bench.spin_until(
-        lambda: any(v.key == "difference_max_mm" for s in statuses for v in s.status[0].values)
-    )
-    refused = node.set_parameters([Parameter("compare_with", value="fem")])[0]
-    assert not refused.successful
-    assert "fem is in use already: compare with another" in refused.reason
-    assert node.set_parameters([Parameter("compare_with", value="")])[0].successful
-    press(bench, publisher, nodes, 0.004, 13)
-    assert "compared_with" not in node.health.values
-
-
-def test_diagnostics_say_the_estimated_error_where_the_method_knows_it(bench, deformer):
-    node, nodes, _, publisher = deformer
-    statuses = bench.collect(DiagnosticArray, "diagnostics")
-
-    def estimates():
-        return [v.value for s in statuses for v in s.status[0].values if v.key == ESTIMATE]
-
-    press(bench, publisher, nodes, 0.004, 1)
-    statuses.clear()
-    bench.spin_until(lambda: statuses)
-    assert estimates() == []  # by fem
-    assert node.set_parameters([Parameter("solver", value="fem_nonlinear")])[0].successful
-    press(bench, publisher, nodes, 0.004, 2)
-    bench.spin_until(estimates)
-    assert 0.1 < float(estimates()[-1]) < 60.0
-
-
 def test_nothing_is_solved_for_nobody(bench, small_scene):
     node = bench.make(TissueDeformer, scene=str(small_scene), lockstep=True)
     publisher = bench.publisher(PoseStamped, "probe/pose")
@@ -235,22 +167,6 @@ def test_structures_are_where_the_tissue_has_carried_them(bench, scene_with_stru
         vertices, _ = made.surface.deform(vectors_from(nodes[-1]))
         np.testing.assert_allclose(points, vertices[made.surface.triangles], atol=2e-8)
     assert np.abs(vertices - made.surface.vertices).max() > 1e-5  # something moved
-
-
-def test_structures_are_made_for_nobody_and_live_beside_the_deforming(bench, scene_with_structures):
-    node = bench.make(TissueDeformer, scene=str(scene_with_structures), structure_triangles=2000)
-    nodes = bench.collect(PointCloud2, "tissue/nodes")
-    publisher = bench.publisher(PoseStamped, "probe/pose")
-    bench.spin_until(lambda: bench.peer.count_publishers("tissue/nodes") > 0)
-    press(bench, publisher, nodes, 0.004, 1)
-    assert node.health.values["structures"] == "not made, nobody subscribes"
-    markers = bench.collect(MarkerArray, "tissue/structures")
-    bench.spin_until(lambda: bench.peer.count_publishers("tissue/structures") > 0)
-    second = 2
-    while not markers:
-        press(bench, publisher, nodes, 0.004, second)
-        second += 1
-    assert [marker.ns for marker in markers[0].markers] == ["vein", "bone"]
 
 
 def test_a_structure_that_cannot_be_made_is_said_and_the_tissue_goes_on(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from bench import pose_at
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy, PointCloud2
@@ -313,52 +312,6 @@ def test_a_compressed_image_larger_than_can_be_decoded_is_refused():
     png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0"))
     with pytest.raises(TrackingError, match="cannot be decoded"):
         decompress_image(CompressedImage(format="png", data=png + chunk(b"IEND", b"")), "GRAY")
-
-
-def test_what_a_camera_may_do_wrong_is_said_and_survived(bench, tracker, view):
-    node, poses = tracker(SECTION)
-    images = bench.publisher(Image, "camera/image_raw")
-    infos = bench.publisher(CameraInfo, "camera/camera_info")
-
-    def wrong(publisher, message, kind, count):
-        publisher.publish(message)
-        bench.spin_until(lambda: node.health.problems(kind) == count)
-
-    wrong(images, image(view, "mono8", 1), "camera", 1)  # nobody described the camera
-    wrong(infos, CameraInfo(width=640, height=480), "tracking", 1)  # not calibrated
-    infos.publish(camera_info())
-    bench.spin_for(5)
-    wrong(images, image(view, "jpeg2000", 2), "tracking", 2)
-    short = image(view, "mono8", 3)
-    short.data = short.data[:1000]
-    wrong(images, short, "tracking", 3)
-    wrong(images, image(view[::2, ::2].copy(), "mono8", 4), "tracking", 4)  # another size
-    wrong(images, image(np.zeros_like(view), "mono8", 5), "markers", 1)  # black
-    images.publish(image(view, "mono8", 6))
-    bench.spin_until(lambda: poses)
-    assert poses[0].header.stamp.sec == 6
-
-
-def test_status_says_tracked_coasting_lost_and_tracked_again(bench, tracker):
-    node, poses = tracker("{coast_for: 0.4 s, lost_after: 2 s}", lockstep=False)
-    status = bench.collect(DiagnosticStatus, "probe/status", latched=True)
-    publisher = bench.publisher(PoseStamped, "tracker/pose")
-    bench.spin_until(lambda: status)
-    now = node.get_clock().now().nanoseconds // 1_000_000_000
-    publisher.publish(pose_at(0.001, now))
-    bench.spin_until(lambda: status[-1].message == "lost")
-    publisher.publish(pose_at(0.002, now + 1))
-    bench.spin_until(lambda: status[-1].message == "tracked")
-    words = [s.message for s in status]
-    assert words[:5] == ["waiting", "tracked", "coasting", "lost", "tracked"]
-    assert [s.level for s in status[:4]] == [
-        DiagnosticStatus.STALE,
-        DiagnosticStatus.OK,
-        DiagnosticStatus.WARN,
-        DiagnosticStatus.ERROR,
-    ]
-    bench.spin_until(lambda: len(poses) >= 2)
-    assert len(poses) == 2  # nothing was sent again meanwhile
 
 
 STEP = 10_000_000  # ns

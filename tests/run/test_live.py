@@ -16,24 +16,6 @@ from us_sim.settings.viewer import ViewerSettings
 
 
 @pytest.mark.parametrize(
-    ("plan", "said"),
-    [
-        (Plan([], 40), "waiting for poses"),
-        (Plan([], loops=True), "begins again at its end; waiting for poses"),
-        (Plan([], 40, loops=True), "begins again every 40 poses; waiting for poses"),
-        (
-            Plan([], 40, player="camera_driver", loops=True),
-            "begins again every 40 images; waiting for poses",
-        ),
-    ],
-)
-def test_a_run_says_when_what_it_plays_begins_again(plan: Plan, said: str) -> None:
-    node: Any = SimpleNamespace(reports={}, count=lambda *_: 0)
-    monitor: Any = SimpleNamespace(node=node)
-    assert _status(plan, monitor) == said
-
-
-@pytest.mark.parametrize(
     ("host", "address"),
     [("127.0.0.1", "http://127.0.0.1:8123/"), ("::1", "http://[::1]:8123/"), ("0.0.0.0", "token")],
 )
@@ -42,13 +24,6 @@ def test_a_run_that_waits_says_where_its_page_is(host: str, address: str) -> Non
     node: Any = SimpleNamespace(reports={"viewer": {"port": "8123"}}, count=lambda *_: 0)
     monitor: Any = SimpleNamespace(node=node)
     assert address in _status(plan, monitor)
-
-
-def test_the_rate_of_the_last_second_is_not_said_once_the_path_is_at_its_end() -> None:
-    reports = {"slice_interpolator": {"rate_hz": "21.0", "latency_p99_ms": "9.5"}}
-    monitor: Any = SimpleNamespace(node=SimpleNamespace(reports=reports, count=lambda *_: 600))
-    assert "21.0" in _status(Plan([], 600), monitor)
-    assert "21.0" not in _status(Plan([], 600), monitor, at_end=True)
 
 
 @pytest.fixture

@@ -24,24 +24,6 @@ def test_nothing_lost_is_nothing_said(files):
     assert outcome(made=590, recorded=0).sentence() == ""  # nothing was recorded
 
 
-def test_what_became_of_a_node_is_said(files):
-    back = Loss("tissue_deformer", "was ended by SIGKILL", 12.34, back_after=2.46)
-    gone = Loss("session_recorder", "was stopped (SIGSTOP)", 20.0, given_up="is not started again")
-    assert outcome([back, gone], files, made=550, recorded=550).sentence() == (
-        "tissue_deformer was ended by SIGKILL at 12.3 s and was back after 2.5 s; "
-        "session_recorder was stopped (SIGSTOP) at 20.0 s and is not started again; "
-        "550 images were recorded of 600 poses; "
-        "the recording is in session.mcap, session_1.mcap"
-    )
-
-
-def test_many_are_counted():
-    losses = [Loss("a", "ended with status 3", float(k)) for k in range(1000)]
-    said = outcome(losses).sentence()
-    assert said.count("status 3") == 4
-    assert said.endswith("and 996 more times nodes ended or hung")
-
-
 def test_images_that_are_not_in_the_recording_are_said(files):
     lacking = outcome(files=files[:1], recorded=64, made=440, poses=None)
     assert lacking.sentence() == (

@@ -7,9 +7,8 @@ import pytest
 
 from us_sim.errors import BagError
 from us_sim.evaluation.hand.hand_motion import hand_motion, shipped_hand_path
-from us_sim.geometry.pose import Pose
 from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.run.contact_sheet import _moments, _place
+from us_sim.run.contact_sheet import _moments
 
 
 def session_on(path):
@@ -51,9 +50,3 @@ def test_a_path_that_never_touches_has_its_moments_too():
 def test_nothing_to_show():
     with pytest.raises(BagError, match="nothing to show"):
         _moments(SimpleNamespace(images=[], poses={}))
-
-
-def test_a_tilt_is_said_where_there_is_one():
-    assert _place(Pose([0.0, 0.0, 0.0123])) == "pressed 12.3 mm"
-    tilted = Pose([0.0, 0.0, -0.01], [np.sin(np.radians(10)), 0.0, 0.0, np.cos(np.radians(10))])
-    assert _place(tilted) == "in the air, 10.0 mm high, tilted 20°"

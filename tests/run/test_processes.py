@@ -98,21 +98,6 @@ def test_what_was_started_ends_with_a_killed_parent(after):
     wait_until(lambda: not any(map(runs, pids)))
 
 
-BEGIN = """
-import sys
-from us_sim.errors import UsSimError
-from us_sim.run.monitored import alone_on_domain
-print("here", flush=True)
-sys.stdin.readline()
-try:
-    with alone_on_domain():
-        print("runs", flush=True)
-        sys.stdin.readline()
-except UsSimError as error:
-    print(error, flush=True)
-"""
-
-
 @pytest.fixture(autouse=True)
 def _own_domain(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", f"test-{os.getpid()}")
@@ -126,27 +111,3 @@ def test_the_second_is_refused_until_the_first_has_ended():
             pass
     with alone_on_domain():
         pass
-
-
-@pytest.mark.slow
-def test_of_six_processes_at_once_one_goes_on_and_the_others_name_it():
-    command = [sys.executable, "-c", BEGIN]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    processes = [subprocess.Popen(command, **pipes) for _ in range(6)]
-    try:
-        assert all(process.stdout.readline() == "here\n" for process in processes)
-        for process in processes:
-            process.stdin.write("\n")
-            process.stdin.flush()
-        said = [process.stdout.readline() for process in processes]
-        (winner,) = [p for p, line in zip(processes, said, strict=True) if line == "runs\n"]
-        others = [line for line in said if line != "runs\n"]
-        assert all("runs already on ROS domain" in line for line in others)
-        winner.kill()  # the lock goes with its process, however that ends
-        winner.wait()
-        with alone_on_domain():
-            pass
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()

@@ -7,7 +7,7 @@ import pytest
 from session_files import EPOCH, press, write
 
 from us_sim.command.main import main
-from us_sim.nodes.sessions.attachments import checksum, parts_of, session_attachments
+from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.settings import SessionRecorderSettings
 from us_sim.recording.path import ProbePath, read_path, write_poses
 from us_sim.recording.repair import versions
@@ -131,13 +131,3 @@ def test_parameters_that_are_none(tmp_path, capsys, attached):
 def test_a_scene_beside_a_session(tmp_path, capsys, attached, scene):
     told = refused(tmp_path, capsys, attached, scene)
     assert "leave out the scene, --case, --path and --topic" in told
-
-
-def test_a_cases_files_have_checksums(tmp_path):
-    """A folder that a scene names is listed file by file."""
-    folder = tmp_path / "case"
-    (folder / "in").mkdir(parents=True)
-    for name in ("a", "in/b"):
-        (folder / name).write_text(name)
-    assert parts_of(folder) == [folder / "a", folder / "in" / "b"]
-    assert checksum(folder / "a") == hashlib.sha256(b"a").hexdigest()

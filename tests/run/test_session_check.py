@@ -2,8 +2,6 @@
 
 import re
 import struct
-import threading
-import time
 
 import pytest
 from mcap.reader import make_reader
@@ -15,7 +13,6 @@ from us_sim.recording.repair import repair
 from us_sim.recording.schemas import stamped
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import QosProfile
-from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.run.session_check import check, report, table
 
@@ -217,29 +214,6 @@ def test_what_is_wrong_with_a_file_is_told(tmp_path, change, told):
     assert kind == "index"
     assert re.search(told, text)
     assert not others
-
-
-def test_what_a_full_queue_lost_is_told_with_the_recorders_own_count(tmp_path):
-    messages = press()
-    bag = BagWriter(tmp_path / "s.mcap", sidecar=False)
-    recorder = WriteBehind(bag, 40_000)
-    for topic, kind in TYPES.items():
-        recorder.add_topic(topic, kind)
-    may_write = threading.Event()
-    recorder._queue.put(may_write.wait)
-    for topic, data, logged, sent, _ in messages:
-        recorder.put(topic, data, logged, sent)
-    may_write.set()
-    last = (*messages[-1][:2], messages[-1][2] + 1, messages[-1][3])
-    while not recorder.put(*last):
-        time.sleep(0.01)
-    recorder.close()
-    lost = recorder.losses.total()
-    assert lost > 100
-    found, told = findings(tmp_path / "s.mcap")
-    assert sum(each.missing or 0 for each in found.topics) <= lost == sum(found.bag.lost().values())
-    ((_, text),) = [each for each in told if f"in the numbers of {IMAGE}" in each[1]]
-    assert f"(the recorder itself counted {found.bag.lost()[IMAGE]})" in text
 
 
 def test_a_repaired_bag_still_proves_its_losses(tmp_path):

@@ -86,13 +86,6 @@ def test_what_cannot_be_is_refused(wrong):
         SupervisionSettings(**wrong)
 
 
-def test_a_recorder_goes_on_in_a_further_file():
-    recorder = NodeProcess("session_recorder", {"file": "a.mcap"}, {"compression": "zstd"})
-    again = going_on(recorder, {})
-    wanted = {"file": "a.mcap", "compression": "zstd", "if_exists": "further"}
-    assert again.all_parameters == going_on(again, {}).all_parameters == wanted
-
-
 def test_a_player_goes_on_where_its_path_would_be():
     player = NodeProcess("path_player", {"path": "a.mcap"})
     again = going_on(player, {"played": "120", "begun": "1700000000.250000000"})
