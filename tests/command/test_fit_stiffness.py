@@ -101,17 +101,6 @@ def test_what_is_no_press_is_one_sentence(small_scene, tmp_path, capsys, spoil, 
     assert not list(tmp_path.glob("*fitted*"))
 
 
-def test_a_scene_without_tissue_is_refused(tmp_path, capsys):
-    scene = tmp_path / "bare.yaml"
-    scene.write_text(
-        "name: bare\nvolume: {phantom: upper_arm, voxel_size: 2 mm}\n"
-        "probe: {aperture: 40 mm, depth: 40 mm}\n"
-    )
-    out = str(tmp_path / "fitted.yaml")
-    assert main(["fit-stiffness", str(scene), "none.mcap", "--out", out]) == 1
-    assert "tissue: is missing" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
     grid = np.diag([2e-3, 2e-3, 2e-3, 1.0])

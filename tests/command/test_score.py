@@ -53,25 +53,11 @@ def test_without_force_it_is_said_and_not_zero(tmp_path, capsys):
     assert not [n for n, _ in table(tmp_path) if "Force" in n or "Contact" in n or " N" in n]
 
 
-@pytest.mark.slow
-def test_an_exercise_is_told_step_by_step(tmp_path, capsys):
-    session = write(tmp_path / "s.mcap", press(120))
-    file = tmp_path / "e.yaml"
-    file.write_text(
-        "name: Press\ntask: {kind: keep_force, force: 6 N, tolerance: 2.1 N, duration: 1 s}\n"
-    )
-    assert main(["score", str(session), "--exercise", str(file), "--out", str(tmp_path)]) == 0
-    assert "passed: 1 of 1 done" in capsys.readouterr().out
-    assert "passed: 1 of 1 done" in (tmp_path / "score.md").read_text()
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--exercise", "compresion"], "compression"),
         (["--exercise", "compression"], "without a scene"),
-        (["--topic", "/ultrasound/image"], "/ultrasound/image"),
-        (["--wrench", "force"], "force"),
         (["--force-limit", "2 kg"], "--force-limit"),
     ],
 )

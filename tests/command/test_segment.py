@@ -102,16 +102,8 @@ def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, 
     [
         ([], "no labels yet: give --labels, --seeds, or --vessels dark"),
         (["--seeds", "SEEDS", "--vessels", "dark"], "two sources of labels"),
-        (
-            ["--seeds", "nowhere.yaml"],
-            "nowhere.yaml: there is no such file; installed are liver_sweep",
-        ),
         (["--seeds", "SEEDS", "--resample"], "--resample: is for --labels only"),
-        (["--labels", "SEEDS"], "cannot be read as an image"),
-        (["--labels", "SEEDS", "--names", "x"], "write LABEL=NAME"),
         (["--labels", "SEEDS", "--names", "3=Doe 1961"], "identity"),
-        (["--vessels", "bright"], "is not one of dark"),
-        (["--seeds", "SEEDS", "--smoothing", "3 kg"], "--smoothing: '3 kg' is not a length"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(
@@ -126,18 +118,6 @@ def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(
     assert contents(case.parent) == before
 
 
-def test_a_name_that_means_something_else_in_a_case_is_refused(case, tmp_path, capsys):
-    file = tmp_path / "labels.seg.nrrd"
-    labelled = block()
-    write_labels(file, Volume(labelled.intensities, labelled.index_to_patient, labelled.labels))
-    before = contents(case)
-    assert main(["segment", str(case), "--labels", str(file), "--names", "6=tissue"]) == 1
-    error = capsys.readouterr().err
-    assert "structures.tissue: means something else already" in error
-    assert "--names 6=NAME" in error
-    assert contents(case) == before
-
-
 def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, capsys):
     before = contents(case.parent)
 
@@ -150,9 +130,7 @@ def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, 
     assert contents(case.parent) == before
 
 
-@pytest.mark.parametrize(
-    ("name", "word"), [("", "no case.yaml"), ("a.mha", "no such case"), ("seeds.yaml", "import")]
-)
+@pytest.mark.parametrize(("name", "word"), [("", "no case.yaml"), ("seeds.yaml", "import")])
 def test_what_is_no_case_is_said(tmp_path, seeds, capsys, name, word):
     assert main(["segment", str(tmp_path / name), "--seeds", seeds]) == 1
     assert word in capsys.readouterr().err

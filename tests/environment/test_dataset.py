@@ -141,7 +141,6 @@ def test_a_full_disk_is_one_sentence_and_the_command_goes_on_later(scene, tmp_pa
     [
         (["--task", "FindVien"], "--task: 'FindVien' is not one of"),
         (["--episodes", "0"], "--episodes: 0 is outside 1 to"),
-        (["--workers", "many"], "--workers: 'many' is not a number"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(scene, tmp_path, capsys, options, said):
@@ -207,7 +206,6 @@ def nobody_listens():
     ("package", "out", "options", "said"),
     [
         ("ray", "set", ["--ray", nobody_listens()], "no cluster can be used there: [Errno 111]"),
-        ("ray", "set", ["--ray", "here"], "no cluster can be used there: Invalid address"),
         ("upath", "nowhere://set", [], "--out nowhere://set: cannot be used: Unsupported"),
         ("upath", "memory://set", ["--workers", "2"], "each process has its own"),
     ],

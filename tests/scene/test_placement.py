@@ -158,9 +158,7 @@ def placed(folder, path, volume, position, **more):
     return scene, path, Volume(volume.intensities, matrix)
 
 
-@pytest.mark.parametrize(
-    ("shift", "part"), [(0.0, 1.0), (20e-3, 0.5), (41e-3, 0.0), (-30e-3, 0.25)]
-)
+@pytest.mark.parametrize(("shift", "part"), [(0.0, 1.0), (20e-3, 0.5), (-30e-3, 0.25)])
 def test_the_part_inside_is_that_of_the_rectangle(shift, part):
     probe = LinearProbe(aperture=0.04, depth=0.04, columns=400, rows=400)
     grid = np.diag([1e3, 1e3, 1e3, 1.0])
@@ -187,7 +185,6 @@ def test_the_corners_that_no_beam_reaches_do_not_count():
     ("position", "more"),
     [
         ((0, 0, 0), {}),
-        ((0, 0, 0.02), {}),
         ((0, 0, 0.03), {}),  # a twentieth of the deepest image
         # The probe's own poses are not registered again.
         ((0, 0, 0), {"tracker": {"frame": "ndi", "registration": {"position": [0.3, 0, 0]}}}),
@@ -201,7 +198,6 @@ def test_a_scene_whose_images_meet_the_volume_is_taken(tmp_path, path, volume, p
     ("position", "more", "fact"),
     [
         ((0.2, 0, 0), {}, "beside"),
-        ((0, 0.1, 0), {}, "beside"),
         ((0, 0, 0.04), {}, "black"),  # 52 mm deep at most, and scanned from 60 mm on
         ((0, 0, 0), {"tracker": {"registration": {"position": [0.3, 0, 0]}}}, "beside"),
     ],
@@ -211,7 +207,7 @@ def test_a_volume_beside_the_path_is_refused(tmp_path, path, volume, position, m
         check_path_in_volume(*placed(tmp_path, path, volume, position, **more))
 
 
-@pytest.mark.parametrize("command", ["run", "dry-run", "render", "demo"])
+@pytest.mark.parametrize("command", ["run", "render"])
 @pytest.mark.usefixtures("volume")
 def test_the_commands_say_so_before_they_start(tmp_path, path, command, capsys):
     file = tmp_path / "body.yaml"

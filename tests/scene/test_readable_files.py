@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 import SimpleITK
-import yaml
 
-from us_sim.command.main import main
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.reading import check_files, load_scene, parse_scene
@@ -60,20 +58,6 @@ def document(tmp_path):
         },
         "path": str(shared_path("bags/press_and_slide.mcap")),
     }
-
-
-def test_what_could_be_read_is_said(document, tmp_path, capsys):
-    said = check_files(parse_scene(document))
-    assert [each.partition(" ")[0] for each in said] == [
-        *("volume.file", "tissue.mesh.file", "structures.vessel.file", "skin.file"),
-        *("tracker.registration", "tracker.calibration", "tracker.camera.body", "path"),
-    ]
-    assert "1 of 4 nodes" in said[1]
-    file = tmp_path / "scene.yaml"
-    document["volume"]["pose"] = {"position": ["-3 mm", "-2 mm", "15 mm"]}  # into the image
-    file.write_text(yaml.safe_dump(document), encoding="utf-8")
-    assert main(["run", str(file), "--dry-run"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"readable  {', '.join(said)}"
 
 
 @pytest.mark.parametrize(

@@ -64,37 +64,17 @@ def test_units_are_si_inside():
 @pytest.mark.parametrize(
     ("key", "value", "fact"),
     [
-        ("probe.aperture", 40, "my.yaml: probe.aperture: .*'40 mm'"),
-        ("probe.image", [512], r"my.yaml: probe.image: .*\b2\b"),
-        ("probe.image", [512, 1.5], r"my.yaml: probe.image\[1\]: 1.5"),
-        ("probe.image", [4097, 5], r"my.yaml: probe.image\[0\]: 4097 .* 1 to 4096"),
-        ("probe.image", 512.5, "my.yaml: probe.image: 512.5"),
-        ("probe.radius", "5 cm", "my.yaml: probe.radius: .*aperture"),
-        ("probe.geometry", "convex", "my.yaml: probe.aperture: "),
         ("probe.geometry", "sector", "my.yaml: probe.opening_angle: "),
         ("probe.collider", None, "my.yaml: probe.collider: "),
-        ("volume", None, "my.yaml: volume: "),
         ("volume", {}, "my.yaml: volume.file: .*--volume"),
         ("volume.file", "a.mha", "my.yaml: .*`file` and `phantom`"),
-        ("volume", {"file": "nowhere.mha"}, "my.yaml: volume.file: .*nowhere.mha"),
-        ("path", "nowhere.mcap", "my.yaml: path: .*nowhere.mcap"),
-        ("skin.file", "nowhere.obj", "my.yaml: skin.file: .*nowhere.obj"),
-        ("tissue.mesh.upper", [1, 1, -1], r"my.yaml: tissue.mesh.upper\[2\]: -1 m"),
-        ("tissue.mesh.upper", None, "my.yaml: tissue.mesh.upper: "),
         ("tissue.mesh.planes", {"x": [0, 0]}, "my.yaml: tissue.mesh.planes.x: .*rising"),
         ("tissue.mesh.planes", {"x": [-0.02, 0, 0.01]}, "planes.x: .*3 .* -0.02 to 0.02 m"),
         ("tissue.mesh.planes", {"w": [0, 1]}, "my.yaml: tissue.mesh.planes: .*`w`"),
         ("tissue.mesh.file", "liver.msh", "my.yaml: tissue.mesh: .*`file` and `lower`"),
-        ("tissue.mesh", {"file": "liver.msh"}, "my.yaml: tissue.mesh.file: .*liver.msh"),
         ("tissue.mesh.unit", "1 mm", "my.yaml: .*`unit`, `pose` and `margin`"),
-        ("structures", "vein", "my.yaml: structures: .*'vein'"),
-        ("structures", {"vein": {"colour": [1, 0, 2]}}, r"my.yaml: .*vein.colour\[2\]: 2 "),
-        ("structures", {"a": {"file": "a.stl"}}, "my.yaml: structures.a.file: .*a.stl"),
         ("structures", {"a": {"file": "a", "label": "b"}}, "structures.a: .*`file` and `label`"),
         ("structures", {"a": {"unit": "1 mm"}}, "my.yaml: structures.a: .*`unit` and `pose`"),
-        ("tissue.mesh", 3, "my.yaml: tissue.mesh: .*3"),
-        ("tissue.materials", {}, "my.yaml: tissue.materials: "),
-        ("tissue.materials.muscle.poisson_ratio", 0.5, "materials.muscle.poisson_ratio: 0.5"),
     ],
 )
 def test_each_mistake_is_one_sentence_with_file_and_key(key, value, fact):
@@ -150,9 +130,7 @@ def test_fans_have_square_pixels_unless_told():
 @pytest.mark.parametrize(
     ("given", "fact"),
     [
-        ({}, "aperture: "),
         ({"aperture": "1 cm", "radius": "1 cm"}, "aperture: 10 mm .* 20 mm"),
-        ({"aperture": "30 cm"}, "aperture: 0.3 m .* 0.003 to 0.2"),
         ({"aperture": "2 cm", "image": 4096}, "image: .*5793"),
     ],
 )
@@ -163,25 +141,10 @@ def test_a_probe_that_cannot_be_is_refused_when_the_scene_is_read(given, fact):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "fact"),
-    [
-        ("probe.collider.shape", "capsule", "length: .*capsule"),
-        ("probe.collider", {"shape": "convex", "radius": 0.05, "length": 0.05}, "width: .*radius"),
-        ("probe.collider.width", 0.01, "width: .*sphere"),
-    ],
-)
-def test_a_collider_needs_its_own_dimensions_and_no_others(key, value, fact):
-    with pytest.raises(SceneError, match=f"probe.collider.{fact}"):
-        parse_scene(changed(key, value))
-
-
-@pytest.mark.parametrize(
     ("content", "fact"),
     [
-        (b"name: test\nvolume: [1, 2\n", "line 3"),
         (b"\xff\xfe\x00", ""),
         (b"", "empty"),
-        (b"just text", "'just text'"),
     ],
 )
 def test_a_broken_file_is_named_with_its_line(tmp_path, content, fact):
@@ -205,13 +168,6 @@ def test_the_installed_scenes_are_valid(tmp_path):
         load_scene("liver_sweep")
     for file in shared_path("config/scenes").glob("*.yaml"):
         load_scene(file, volume=volume)
-
-
-def test_what_a_scene_does_not_name_is_not_needed():
-    needed = {part.node for part in parse_scene(changed("skin", None)).parts() if part.needed}
-    assert needed == {"probe_tracker", "tissue_deformer", "slice_interpolator"}
-    reasons = {part.node: part.reason for part in parse_scene(changed("tissue", None)).parts()}
-    assert "`tissue`" in reasons["tissue_deformer"]
 
 
 def test_the_liver_scene_is_the_middle_frame_of_the_sweep_that_made_its_volume(shared_data):
@@ -312,17 +268,13 @@ def test_null_takes_back_what_the_base_says(tmp_path):
 @pytest.mark.parametrize(
     ("base", "fact"),
     [
-        ("mine.yaml", "this scene itself"),
         ("other.yaml", "this scene itself"),
         ("nowhere", "nowhere"),
-        ("[1]", "must be"),
-        ("list.yaml", "list.yaml"),
         ("bad.yaml", "bad.yaml"),
     ],
 )
 def test_a_base_that_cannot_be_is_refused(tmp_path, base, fact):
     (tmp_path / "other.yaml").write_text("based_on: mine.yaml")
-    (tmp_path / "list.yaml").write_text("- 1")
     (tmp_path / "bad.yaml").write_text("{")
     with pytest.raises(SceneError, match=fact):
         based_on(base, "", tmp_path)
@@ -331,13 +283,9 @@ def test_a_base_that_cannot_be_is_refused(tmp_path, base, fact):
 @pytest.mark.parametrize(
     ("tracker", "fact"),
     [
-        ("{source: telepathy}", "source: 'telepathy' .*pose"),
-        ("{filter: {method: median}}", r"filter\.method: 'median' .*none"),
-        ("{gate: {maximum_speed: -1}}", r"gate\.maximum_speed: -1 m/s"),
         ("{registration: nowhere.yaml}", "registration: "),
         ("{registration: {orientation: [0, 0]}}", r"registration\.orientation: .*4"),
         ("{source: six_dof_mouse, six_dof_mouse: {axes: [0, 1]}}", r"six_dof_mouse\.axes: .*6"),
-        ("{source: camera, camera: {size: 4}}", r"camera\.size: 4 m .*'4 cm'"),
     ],
 )
 def test_a_tracker_that_cannot_be_is_one_sentence(tmp_path, tracker, fact):

@@ -34,7 +34,7 @@ def test_the_line_lies_in_the_middle_and_is_as_long_as_the_tube(tube):
     assert line.lengths[-1] == pytest.approx(0.06 * np.hypot(1, SLOPE), abs=0.003)
 
 
-@pytest.mark.parametrize("turn", [-30, 0, 14.036, 50])
+@pytest.mark.parametrize("turn", [-30, 14.036])
 def test_where_a_turned_plane_cuts_it_and_at_which_angle(tube, turn):
     line = CentreLine.of(*tube)
     half = np.deg2rad(turn) / 2

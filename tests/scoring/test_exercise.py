@@ -144,13 +144,9 @@ def test_every_installed_exercise_can_be_read_and_is_of_a_scene_with_its_vessels
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name: x", "task"),
         ("name: x\ntask: {kind: compresion}", "task.kind"),
-        ("name: x\ntask: {kind: compression, spacing: 2 kg}", "task.spacing"),
         ("name: x\ntask: {kind: keep_force, structure: vein}", "task.structure"),
-        ("name: x\ntask: {kind: view}", "task.pose"),
         ("[1, 2]", "mapping"),
-        ("a: b: c", "YAML"),
     ],
 )
 def test_a_file_that_is_no_exercise_is_refused_with_file_and_key(tmp_path, text, said):
@@ -160,12 +156,3 @@ def test_a_file_that_is_no_exercise_is_refused_with_file_and_key(tmp_path, text,
         read_exercise(file)
     assert str(file) in str(refused.value)
     assert said in str(refused.value)
-
-
-def test_a_structure_that_the_scene_lacks_and_an_unknown_exercise_are_refused():
-    with pytest.raises(ScoreError, match=r"compresion.*compression"):
-        read_exercise("compresion")
-    with pytest.raises(ScoreError, match=r"vien.*vein"):
-        steps("centre", scan(), structure="vien")
-    with pytest.raises(ScoreError, match="without a scene"):
-        steps("centre", replace(scan(), lines={}))

@@ -196,11 +196,9 @@ def test_a_line_that_moves_sideways_sweeps_a_rectangle():
 @pytest.mark.parametrize(
     ("times", "positions", "orientations"),
     [
-        ([0.0], [[0, 0, 0]], [[0, 0, 0, 1]]),
         ([0.0, 0.0], np.zeros((2, 3)), [[0, 0, 0, 1]] * 2),
         ([0.0, 1.0], np.zeros((3, 3)), [[0, 0, 0, 1]] * 2),
         ([0.0, 1.0], [[0, 0, 0], [0, np.nan, 0]], [[0, 0, 0, 1]] * 2),
-        ([0.0, 1.0], np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 0]]),
     ],
 )
 def test_what_is_no_motion_is_refused(times, positions, orientations):

@@ -11,9 +11,7 @@ import pytest
 from us_sim.errors import CalibrationError, SceneError, TrackingError
 from us_sim.scene.reading import read_document
 from us_sim.settings.text_files import LARGEST_YAML, MOST_NODES, YamlError, load_yaml, read_text
-from us_sim.tracking.calibration.landmarks import read_landmarks
 from us_sim.tracking.calibration.transform_file import read_transform
-from us_sim.tracking.camera.model import read_camera_info
 from us_sim.tracking.camera.rigid_body import read_rigid_body
 
 
@@ -29,9 +27,7 @@ def test_a_pipe_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("read", "error"),
     [
-        (read_landmarks, CalibrationError),
         (read_transform, CalibrationError),
-        (read_camera_info, TrackingError),
         (read_rigid_body, TrackingError),
         (lambda path: read_document(path, lambda _: path), SceneError),
     ],
@@ -64,16 +60,12 @@ def merge_bomb():
         (bomb(), f"line 6: .*{MOST_NODES}"),
         (merge_bomb(), f"line 6: .*{MOST_NODES}"),
         ("[" * 1000 + "]" * 1000, "line 1: .*64"),
-        ("- " * 100_000, "line 1: .*64"),
         ("a: &a [1, *a]", r"`\*a`"),
-        ("a: &a {b: [*a]}", r"`\*a`"),
         ("a: 'x" + "x" * LARGEST_YAML + "'", str(LARGEST_YAML)),
         ("- 1\n" * (MOST_NODES + 1), str(MOST_NODES)),
         ("1:" * 100_000 + "1", "200001"),
-        ("9" * 100_000, "100000"),
         ("a: 1\nb: 2\na: 3", "line 3: .*`a`.*line 1"),
         ("x: &x {a: 1}\ny: {<<: *x, <<: *x}", "line 2: .*`<<`"),
-        ("a: {b: [{c: 1, c: 2}]}", "line 1: .*`c`"),
         *((text, "YAML") for text in ("!!timestamp foo", "!!int ''", "? [a]\n: b")),
     ],
 )

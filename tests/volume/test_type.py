@@ -57,10 +57,7 @@ def test_arrays_are_read_only_views_and_the_callers_stay_writable():
     ("change", "message"),
     [
         ({"intensities": GREY.astype(np.int16)}, "not int16"),
-        ({"intensities": GREY[0]}, "three-dimensional"),
-        ({"intensities": GREY[:, :0]}, "a voxel or more along each axis"),
         ({"labels": GREY[:, :, :5]}, "must have the same shape"),
-        ({"index_to_patient": np.eye(3)}, "finite 4×4"),
         ({"index_to_patient": np.diag([1e-3, 0.0, 1e-3, 1.0])}, "singular"),
         ({"index_to_patient": np.diag([1e-3, 1e-3, 1e-3, 2.0])}, "last row"),
     ],

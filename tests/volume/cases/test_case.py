@@ -53,11 +53,7 @@ def changed(folder, text):
         ("name: ../../etc\n", "name: '../../etc'"),
         ("name: a\nstructures: {../../up: {label: 6}}\n", "no path"),
         ("name: a\nstructures: {vein: {label: 6}, vena: {label: 6}}\n", "`vein`"),
-        ("name: a\nstructures: {vein: {label: 0}}\n", "label: 0"),
         ("name: a\nstructures: {top: {label: 6}}\n", "something else"),
-        ("name: a\nfixed: [botom]\n", "mean 'bottom'?"),
-        ("name: [\n", "YAML"),
-        ("name: a\nstart: {position: [1 km, 0, 0]}\n", "start.position"),
         ("name: a\nvolume: ../../../etc/passwd\n", "volume:"),
     ],
 )
@@ -125,14 +121,11 @@ def test_a_name_is_looked_up_in_each_root_in_order_and_a_path_goes_first(roots, 
     ("name", "message"),
     [
         ("livr", r"livr.* arm, liver; .*mean 'liver'"),
-        ("../one/nothing", "there is no"),
         ("./one", r"one: .*case\.yaml"),
-        ("./file.nrrd", r"file\.nrrd:"),
         ("./bare", r"volume\.nrrd"),
     ],
 )
 def test_what_is_no_case_is_said(roots, name, message):
-    Path("file.nrrd").touch()
     shutil.copytree(roots[0] / "arm", "bare")
     Path("bare/volume.nrrd").unlink()
     with pytest.raises(CaseError, match=message):

@@ -73,7 +73,7 @@ def refused(path, word, **how):
     assert str(error.value).startswith(str(path))
 
 
-@pytest.mark.parametrize("suffix", [".seg.nrrd", ".nrrd", ".mha", ".nii.gz"])
+@pytest.mark.parametrize("suffix", [".seg.nrrd", ".nii.gz"])
 def test_what_is_written_is_read_again(tmp_path, suffix):
     labels = block((1, 4), (2, 5), (0, 3), value=5)
     labels[5:7, 1:3, 2:4] = 7
@@ -209,11 +209,8 @@ GRADIENT = np.arange(np.prod(SHAPE), dtype=np.int16).reshape(SHAPE)
     [
         ("a.nrrd", np.zeros(SHAPE, np.uint8), {}, "none of its voxels has a label"),
         ("a.mha", GRADIENT + 1, {}, "336 different values"),
-        ("a.mha", -GRADIENT, {}, "down to -335"),
-        ("a.mha", GRADIENT / np.float32(3), {}, "fractions"),
         ("a.nrrd", np.ones((*SHAPE, 2), np.uint8), {}, "2 numbers per voxel"),
         ("a.seg.nrrd", ONES, segments(("vein", 1, 4)), "layer 4 of 1"),
-        ("a.seg.nrrd", ONES, segments(("vein", "x", 0)), "Segment0"),
         ("a.seg.nrrd", ONES, {"Segmentation_MasterRepresentation": "Fractional"}, "Fractional"),
     ],
 )

@@ -71,7 +71,6 @@ def _flip_a_byte(entry: Path) -> None:
         _flip_a_byte,
         lambda entry: os.truncate(entry / "intensities.npy", 300),
         lambda entry: (entry / "volume.json").write_text('{"crc32": {}}'),
-        lambda entry: (entry / "labels.npy").unlink(),
     ],
 )
 def test_a_damaged_entry_is_made_again_with_a_word(cache, caplog, damage):

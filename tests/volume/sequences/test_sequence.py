@@ -20,7 +20,6 @@ from us_sim.volume.sequences.sweep import read_sweep, sweep_of
 from us_sim.volume.sequences.transforms import (
     in_metres,
     shortest_chain,
-    split_transform_name,
 )
 
 FRAMES, ROWS, COLUMNS = 3, 4, 5
@@ -110,8 +109,6 @@ MEMBERS = [gzip.compress(part) for part in (GREY.tobytes()[:37], GREY.tobytes()[
     [
         (metaimage, {}),
         (metaimage, {"data": PACKED, "CompressedData": "True", "Kinds": "domain domain list"}),
-        (nrrd, {}),
-        (nrrd, {"pack": gzip.compress}),
         (nrrd, {"pack": lambda _: b"".join(MEMBERS)}),
         (nrrd, {"kinds": "domain domain list", "sizes": "5 4 3"}),
     ],
@@ -173,10 +170,8 @@ UNUSABLE = "a transform that is singular or not finite"
     [
         ({"ImageToReferenceTransform": None}, "no ImageToReferenceTransform"),
         ({"ImageToReferenceTransform": "1 0 x " + "0 " * 13}, "a transform that is not 16 numbers"),
-        ({"ImageToReferenceTransform": MATRIX.format(x="nan")}, UNUSABLE),
         ({"ImageToReferenceTransform": "1 1 0 0 1 1 0 0 0 0 1 0 0 0 0 1"}, UNUSABLE),
         ({"ImageToReferenceTransformStatus": "BAD"}, "ImageToReferenceTransformStatus is not OK"),
-        ({"ImageStatus": "INVALID"}, "ImageStatus is not OK"),
         ({"Timestamp": "soon"}, "no Timestamp"),
     ],
 )
@@ -194,10 +189,8 @@ NO_IMAGE = {"ImageToReferenceTransform": None, "ProbeToTrackerTransform": MATRIX
 @pytest.mark.parametrize(
     ("write", "fields", "message"),
     [
-        (metaimage, {"DimSize": "5 4"}, "columns, rows"),
         (metaimage, {"DimSize": "5 4 4"}, "60 bytes .* 80"),
         (metaimage, {"DimSize": "5 2 2 3"}, "flat images"),
-        (metaimage, {"ElementNumberOfChannels": "2"}, "2 numbers"),
         (metaimage, {"UltrasoundImageOrientation": "AMF"}, "'AMF'"),
         (
             metaimage,
@@ -206,7 +199,6 @@ NO_IMAGE = {"ImageToReferenceTransform": None, "ProbeToTrackerTransform": MATRIX
         ),
         (metaimage, {"data": b"", "data_file": "a.raw"}, r"a\.raw, which is not there"),
         (nrrd, {"kinds": "list domain domain domain"}, "is a volume"),
-        (nrrd, {"sizes": "5 4 1 8"}, "60 bytes .* 160"),
     ],
 )
 def test_a_sequence_of_another_kind_is_refused(tmp_path, write, fields, message):
@@ -227,10 +219,7 @@ def test_damaged_compression_is_noticed_where_the_images_are_read(tmp_path, data
     ("name", "message"),
     [
         ("plus-spine-freehand/SpinePhantomFreehand.igs.mha", "ProbeToTracker, Ref"),
-        ("plus-tracker-recordings/ReferenceToRASCalibration.igs.mha", "without images"),
         ("plus-tracker-recordings/WaterTankBottomTranslationVideoBuffer.igs.mha", "no transforms"),
-        ("imfusion-liver-sweep/liver_sweep_compounded_1mm.mha", "tracked frames"),
-        ("plus-spine-freehand/VolumeReconstructorTestNNMEANvolumeRef.mha", "is a volume"),
         ("plus-spine-freehand", "no such file"),
     ],
 )
@@ -252,16 +241,6 @@ def test_the_real_liver_sweep_is_what_simpleitk_reads(shared_file):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 8e6  # of 61 MB
-
-
-def test_plus_rule_for_names():
-    for name, ends in {
-        "ToolTipToTorso": ("ToolTip", "Torso"),
-        "ImageTo3DWorld": ("Image", "3DWorld"),
-        "probeToTracker": ("Probe", "Tracker"),
-        **dict.fromkeys(("AToBToC", "Torso", "ToTracker", "ProbeTo")),
-    }.items():
-        assert split_transform_name(name) == ends, name
 
 
 def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says(shared_file):
@@ -300,7 +279,7 @@ def test_chains_are_as_long_as_the_shortest_path_of_scipy(edges):
         assert (len(chain.steps) if chain else np.inf) == length
 
 
-@pytest.mark.parametrize("name", ["NeedleToReference", "NeedleTipToNeedle", "ImageToReference"])
+@pytest.mark.parametrize("name", ["NeedleToReference", "ImageToReference"])
 def test_a_file_holds_what_slicer_shows(shared_data, name):
     folder = shared_data / "perktutor-truth/InPlane"
     text = (folder / "Scene_InPlane.mrml").read_text()
@@ -320,7 +299,7 @@ def transform_file(path, angle=0.3, shift=(10.0, 20.0, 30.0)):
     return path
 
 
-@pytest.mark.parametrize("ending", ["h5", "tfm", "txt"])
+@pytest.mark.parametrize("ending", ["h5", "tfm"])
 def test_a_scene_takes_a_transform_of_slicer_as_registration(tmp_path, ending):
     found = read_transform(transform_file(tmp_path / f"NdiToPatient.{ending}"))
     c, s = np.cos(0.3), np.sin(0.3)

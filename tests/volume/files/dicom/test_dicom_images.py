@@ -12,7 +12,6 @@ from pydicom.uid import (
     ExplicitVRLittleEndian,
     JPEG2000Lossless,
     JPEGBaseline8Bit,
-    RLELossless,
 )
 
 from us_sim.errors import VolumeError
@@ -107,15 +106,12 @@ MPEG = "1.2.840.10008.1.2.4.102"
     ("syntax", "values", "message"),
     [
         (ExplicitVRLittleEndian, {"Rows": 13}, "480 bytes .* 520"),
-        (ExplicitVRLittleEndian, {"NumberOfFrames": 3}, "480 bytes .* 360"),
         (
             ExplicitVRLittleEndian,
             {"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000},
             "GB of memory",
         ),
-        (ExplicitVRLittleEndian, {"Rows": None}, "describe"),
         (ExplicitVRLittleEndian, {"PhotometricInterpretation": "PALETTE COLOR"}, "table of col"),
-        (RLELossless, {"NumberOfFrames": 5}, "decoded"),
         (JPEG2000Lossless, {"Rows": 13}, "decoded"),
         (MPEG, {}, "MPEG-4"),
     ],
@@ -132,9 +128,7 @@ def test_headers_that_do_not_fit_their_images_are_refused(tmp_path, syntax, valu
     ("name", "at", "value"),
     [  # as pydicom's own tests have them
         ("JPEG-lossy", (420, 140), 244),
-        ("JPEG-lossy", (230, 120), 95),
         ("HTJ2K_08_RGB", (160, 295), (91, 37, 2)),
-        ("HTJ2K_08_RGB", (275, 635), (207, 193, 171)),
     ],
 )
 def test_jpeg_of_12_bits_and_htj2k_are_decoded(shared_file, name, at, value):
