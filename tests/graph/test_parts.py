@@ -10,7 +10,6 @@ import pytest
 import yaml
 from command import us_sim
 
-from us_sim.command.main import main
 from us_sim.recording.reader import read_bag
 
 AT_EXIT = """
@@ -80,21 +79,6 @@ def test_what_a_scene_leaves_out_is_not_started_imported_or_published(
         assert ("us_sim.slicing.b_mode" in modules) == (node == "slice_interpolator"), node
     assert "/ultrasound/image" in topics
     assert not any(topic.startswith(f"/{left_out}/") for topic in topics)
-
-
-def test_the_dry_run_says_what_is_left_out_and_why(played_scene, tmp_path, capsys):
-    document = yaml.safe_load(played_scene.read_text())
-    del document["skin"]
-    scene = tmp_path / "scene.yaml"
-    scene.write_text(yaml.safe_dump(document))
-    assert main(["run", str(scene), "--dry-run"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert any(
-        line.split()[:3] == ["left", "out", "skin_deformer"]
-        and line.endswith("the scene has no `skin`: no membrane is computed")
-        for line in lines
-    )
-    assert any(line.split()[:2] == ["runs", "tissue_deformer"] for line in lines)
 
 
 def test_all_nodes_of_a_scene_in_one_process_record_every_image(played_scene, tmp_path):

@@ -16,8 +16,6 @@ from awaiting import until
 from chromium import watched
 from served_view import START_S, served_view
 
-from us_sim.recording.reader import read_bag
-
 STEP = 4
 """Of the image's pixels each so many-th of each so many-th row is looked at."""
 PIXELS = """step => {
@@ -92,16 +90,6 @@ class Person:
         self.page.mouse.up()
         self.settle()
 
-    def tab(self, name: str) -> None:
-        """Open a panel."""
-        if not self.page.get_by_role("tab", name=name).is_visible():
-            self.page.get_by_role("button", name="Panels").click()
-        self.page.get_by_role("tab", name=name).click()
-
-    def control(self, parameter: str) -> Any:
-        """The control of a parameter."""
-        return self.page.locator(f"[data-parameter='{parameter}']")
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -149,68 +137,3 @@ def test_dragging_the_probe_down_closes_the_vein_and_letting_go_opens_it(person:
     person.go_home()
     assert person.vein() > 0.8 * before
     person.page.get_by_role("button", name="Look under the skin").click()
-
-
-def test_another_method_is_chosen_and_a_material_changed(person: Person) -> None:
-    page = person.page
-    person.press(6.0)
-    soft = person.image()
-    person.tab("Tissue")
-    person.control("tissue_deformer.solver").locator("select, .q-select").first.click()
-    option = page.get_by_role("option", name="fem", exact=True)
-    if option.count():
-        option.click()
-    else:
-        person.control("tissue_deformer.solver").locator("select").select_option("fem")
-    person.settle()
-    until(lambda: np.abs(person.image() - soft).mean() > 1, "linear tissue looks otherwise")
-    person.picture("tissue")
-    field = person.control("tissue_deformer.materials.vein.young_modulus").locator("input").last
-    linear = person.image()
-    field.fill("200")
-    field.press("Enter")
-    until(lambda: np.abs(person.image() - linear).mean() > 1, "a stiff vein stays open")
-    person.settle()
-
-
-def test_what_is_recorded_is_replayed(person: Person, folder: Path) -> None:
-    page = person.page
-    person.tab("Session")
-    page.get_by_label("file").fill("press.mcap")
-    page.get_by_role("button", name="Record", exact=True).click()
-    until(lambda: (folder / "press.mcap").exists(), "the recording has begun")
-    for depth in (6.0, 1.0):
-        person.press(depth)
-    page.get_by_role("button", name="Stop", exact=True).click()
-    until(
-        lambda: (folder / "metadata.yaml").exists(), "the recording is complete, with its metadata"
-    )
-    recorded = read_bag(folder / "press.mcap").topic("/tracker/pose").message_count
-    assert recorded > 5
-    page.get_by_label("recording or path").click()
-    page.get_by_label("recording or path").fill("press")
-    page.get_by_role("option", name="press.mcap").click()
-    still = person.image()
-    page.get_by_role("button", name="Play or pause").click()
-    until(lambda: np.abs(person.image() - still).mean() > 5, "the replay presses")
-    person.picture("replay")
-    page.get_by_role("button", name="End replay").click()
-    until(
-        lambda: "You hold" in page.locator("#hand").inner_text(), "the probe is the person's again"
-    )
-
-
-def test_another_scene_is_loaded_while_the_page_stays(person: Person) -> None:
-    page = person.page
-    person.tab("Cases")
-    load = page.get_by_role("button", name="Load upper_arm_path", exact=True)
-    if not load.is_visible():
-        page.get_by_text("With other trackers").click()
-    person.picture("cases")
-    load.click()
-    until(
-        lambda: page.evaluate("usSim.scene()") == "upper arm path", "the scene is loaded", START_S
-    )
-    drawn = page.evaluate("usSim.images()")
-    until(lambda: page.evaluate("usSim.images()") > drawn + 3, "images of the new scene", START_S)
-    person.picture("loaded")

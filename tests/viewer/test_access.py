@@ -150,37 +150,3 @@ def test_a_token_that_is_no_secret_or_no_part_of_an_address_is_refused(token: st
     pytest.importorskip("nicegui", reason="nicegui is not installed")
     with pytest.raises(UsSimError, match="16 letters, digits"):
         WebServer(Simulator(), "0.0.0.0", 0, token)
-
-
-def test_other_computers_are_given_a_number_beside_a_name(monkeypatch) -> None:
-    server = object.__new__(WebServer)
-    server.host, server.port, server.token = "0.0.0.0", 33, "secret"
-    monkeypatch.setattr("socket.gethostname", lambda: "vm")
-
-    class Network:
-        """Where this computer is 10.1.2.3, or nothing."""
-
-        is_there = True
-
-        def __init__(self, *_) -> None:
-            pass
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_) -> None:
-            pass
-
-        def connect(self, _) -> None:
-            if not self.is_there:
-                raise OSError("Network is unreachable")
-
-        def getsockname(self):
-            return "10.1.2.3", 5
-
-    monkeypatch.setattr("socket.socket", Network)
-    assert server.addresses == ("http://vm:33/?token=secret", "http://10.1.2.3:33/?token=secret")
-    Network.is_there = False
-    assert server.addresses == ("http://vm:33/?token=secret",)
-    server.host, server.token = "127.0.0.1", ""
-    assert server.addresses == ("http://127.0.0.1:33/",)

@@ -8,7 +8,6 @@ import pytest
 from awaiting import until
 from bench import Bench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from fake_hand import FakeHand
 from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
@@ -72,23 +71,6 @@ def test_task_steps_and_score_are_shown_begun_anew_and_saved(page, simulator):
     page.get_by_role("img", name="The probe's way over the skin").wait_for()
     page.get_by_role("tab", name="Image").click()
     until(lambda: not scorer.picture.is_watched, "another tab is chosen")
-
-
-def test_a_teacher_sees_the_learners_exercise_and_result_and_who_holds_the_probe(
-    page, profile, simulator
-):
-    hand, scorer = FakeHand(simulator), Scorer(simulator)
-    hand.say(holder="learner", is_moving=True)
-    page.goto(page.address)
-    teacher = profile.new_page()
-    teacher.goto(page.address)
-    scorer.say(STEPS)
-    teacher.get_by_text("Another page moves the probe").wait_for()
-    teacher.get_by_text("1 of 2 done", exact=True).wait_for()
-    page.get_by_role("button", name="Show the result").click()
-    teacher.get_by_role("img", name="The probe's way over the skin").wait_for()
-    teacher.close()
-    assert not hand.asked  # a page that only looks moves nothing
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import pytest
-from fake_hand import MATRIX, PIXEL, FakeHand
+from fake_hand import MATRIX, PIXEL, STANCE, FakeHand
 
 from us_sim.viewer.stream import Simulator
 
@@ -75,6 +75,33 @@ def test_a_held_key_moves_the_probe_by_the_time_that_it_was_held(
     down, up = page.evaluate("times")
     way = -7.5e-4 - 0.03 * ((up - down) / 1000 - 0.22)
     viewer.until(lambda: viewer.total("slide") == pytest.approx([way, 0], rel=0.02))
+
+
+def test_most_of_the_press_slider_presses_and_it_goes_by_keys(page: Any, viewer: FakeHand) -> None:
+    press = page.locator(".us-quantity input[type=range]").first
+    slide = """(slider, part) => {
+        slider.value = +slider.min + part * (slider.max - slider.min);
+        slider.dispatchEvent(new Event("input"));
+    }"""
+    contact = float(press.evaluate("s => s.parentNode.style.getPropertyValue('--contact')"))
+    middle = (1 + contact) / 2
+    for part, metres in ((0, -0.05), (contact, 0), (middle, 0.0125), (1, 0.025)):
+        press.evaluate(slide, part)
+        viewer.until(lambda: viewer.asked)
+        there = pytest.approx(metres, abs=1e-4)
+        viewer.until(lambda there=there: viewer.asked[-1]["to"]["press"] == there)
+    viewer.say(goal={**STANCE, "press": -0.01})
+    page.wait_for_function("document.querySelector('.us-quantity input').ariaValueText[0] === '-'")
+    press.focus()
+    for key, metres in (("ArrowRight", -9.5e-3), ("ArrowLeft", -10e-3)):
+        page.keyboard.press(key)
+        there = pytest.approx(metres, abs=1e-4)
+        viewer.until(lambda there=there: viewer.asked[-1]["to"].get("press") == there)
+    viewer.asked.clear()
+    for key, sign in (("PageDown", 1), ("PageUp", -1), ("s", 1)):
+        page.keyboard.press(key)
+        viewer.until(lambda: viewer.asked)
+        assert viewer.asked.pop()["by"] == {"press": pytest.approx(sign * 3e-4)}
 
 
 def test_keys_are_not_taken_from_who_types(page: Any, viewer: FakeHand) -> None:
@@ -315,3 +342,14 @@ def test_a_page_whose_connection_was_lost_holds_the_probe_again_unless_another_t
     viewer.say(holder="")
     page.wait_for_function(said, arg="Nobody holds the probe")
     assert set(viewer.takes) == {source}
+
+
+def test_a_viewer_that_says_nothing_any_more_does_not_answer(page: Any, viewer: FakeHand) -> None:
+    said = "text => document.querySelector('.us-said').textContent.includes(text)"
+    viewer.say(every=0.2)
+    page.wait_for_function(said, arg="Nobody holds the probe")
+    page.wait_for_function(said, arg="The viewer does not answer")
+    assert not page.get_by_role("button", name="Centre").is_enabled()
+    assert "us-wrong" in page.locator(".us-said").get_attribute("class")
+    viewer.say(every=0.2)
+    page.wait_for_function(said, arg="Nobody holds the probe")

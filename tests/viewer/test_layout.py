@@ -111,7 +111,7 @@ UNREACHED = """() => [...document.querySelectorAll("header button, .us-main :is(
 
 @pytest.mark.parametrize(
     ("size", "touch"),
-    [(PHONE, True), (FOUR_TIMES, False)],
+    [(PHONE, True), (FOUR_TIMES, False), ((2560, 1440), False)],
 )
 def test_no_part_is_buried_and_every_control_can_be_reached(
     opened: Open, size: tuple[int, int], touch: bool

@@ -1,5 +1,6 @@
 """The bar above the image: what it sets, what it watches, and what it does when it is refused."""
 
+import time
 from typing import Any
 
 import cv2
@@ -9,6 +10,7 @@ from awaiting import until
 from fake_nodes import FakeNodes
 
 from us_sim.viewer.parameters import Kind, Parameter
+from us_sim.viewer.status import Level, NodeStatus
 from us_sim.viewer.stream import Feed, Packet, Simulator
 
 NODE = "slice_interpolator"
@@ -83,6 +85,43 @@ def test_a_refused_mode_says_why_and_stays_as_it_was(page: Any, simulator: Simul
     page.get_by_text("this scene has nothing for 'velocity'").wait_for()
     assert page.get_by_role("button", pressed=True).all_text_contents() == ["B-mode"]
     until(lambda: not annotated.is_watched, "what was refused is not watched")
+
+
+@pytest.mark.usefixtures("asked")
+def test_why_an_image_shows_little_is_said_on_it(page: Any, simulator: Simulator) -> None:
+    def see(**values: str) -> None:
+        simulator.status.tell(NodeStatus(NODE, Level.WELL, "imaging", values), time.monotonic())
+
+    def is_said(*words: str) -> None:
+        page.wait_for_function(
+            "words => { const said = document.querySelector('.us-stale');"
+            " const lines = said.hidden ? [] : said.textContent.split('\\n');"
+            " return lines.length === words.length"
+            " && words.every((word, i) => lines[i].includes(word)); }",
+            arg=list(words),
+        )
+
+    page.goto(page.address)
+    see(contact="none", no_colour="no_contact")
+    is_said("No contact")
+    see(contact="good", no_colour="across_flow")
+    is_said()
+    page.get_by_role("button", name="Outlines").click()
+    page.get_by_role("button", name="Outlines", pressed=True).wait_for()
+    simulator.nodes.tell(*known("velocity"))
+    is_said("No colour: the beams cross")
+    see(contact="poor", no_colour="no_contact", no_spectrum="no_vessel")
+    is_said("Poor contact")
+    page.get_by_role("button", name="Spectrum").click()
+    is_said("Poor contact", "No spectrum: no vessel")
+    see(contact="good", no_colour="", no_spectrum="")
+    is_said()
+    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"force": "24.20"})
+    simulator.status.tell(tissue, time.monotonic())
+    is_said("Too much force: 24 N")
+    tissue = NodeStatus("tissue_deformer", Level.WELL, "fem", {"unbalanced": "1"})
+    simulator.status.tell(tissue, time.monotonic())
+    is_said()
 
 
 @pytest.mark.parametrize(("name", "kind"), [("M-mode", "m_mode"), ("Spectrum", "spectrum")])

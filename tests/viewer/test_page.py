@@ -49,18 +49,6 @@ def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> 
     assert box["width"] / box["height"] == pytest.approx(512 / 300, rel=1e-3)
 
 
-def test_the_stream_ends_when_the_page_closes(
-    browser: Any, served: Any, simulator: Simulator
-) -> None:
-    image, told = feeds_of(simulator)
-    page = browser.new_page()
-    page.goto(served[0].address)
-    until(lambda: told == [True], "the page watches the image")
-    page.close()
-    until(lambda: told == [True, False], "nobody watches any more")
-    assert not image.is_watched
-
-
 def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
     image, _ = feeds_of(simulator)
     page.goto(page.address)

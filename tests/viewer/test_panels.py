@@ -152,21 +152,6 @@ def test_every_kind_has_its_control_and_the_keyboard_will_do(page: Any, node: No
     assert control(page, "scene").locator("input").count() == 0
 
 
-def test_time_gain_has_a_slider_for_each_depth(page: Any, node: Node) -> None:
-    opened(page, "Image")
-    gains = control(page, "time_gain")
-    until(lambda: gains.get_by_role("slider").count() == 8, "eight sliders")
-    gains.locator(".q-slider__track-container").nth(2).focus()
-    for _ in range(4):
-        page.keyboard.press("ArrowRight")
-    until(
-        lambda: node.values("time_gain")[-1:] == [(0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0)],
-        "the third is 2 dB",
-    )
-    gains.get_by_role("button", name="level").click()
-    until(lambda: node.values("time_gain")[-1] == (0.0,) * 8, "all are level")
-
-
 def test_nothing_is_watched_that_cannot_be_seen(page: Any, node: Node) -> None:
     page.goto(page.address)
     page.get_by_role("button", name="Panels").wait_for()

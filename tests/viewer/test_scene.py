@@ -59,7 +59,7 @@ class Patient:
             "probe_mesh",
             "probe",
         ]
-        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image"]}
+        self.feeds = {kind: Feed(kind) for kind in [*kinds, "image", "score"]}
         simulator.add(*self.feeds.values())
         self._offer("skin_mesh", lambda n: self.skin.told("skin_mesh", n))
         self._offer("tissue_mesh", lambda n: self.tissue.told("tissue_mesh", n))
@@ -83,6 +83,10 @@ class Patient:
         self._offer(
             "tissue", lambda n: self.tissue.moved(moved, kind="tissue", sequence=n, stamp=stamp)
         )
+
+    def dent(self, vertices: np.ndarray) -> None:
+        """The skin elsewhere than at rest."""
+        self._offer("skin", lambda n: self.skin.moved(vertices, kind="skin", sequence=n, stamp=0))
 
     def strain(self, values: np.ndarray) -> None:
         """Of each node."""
@@ -206,6 +210,32 @@ def test_structures_go_with_the_tissue(scene):
     scene.becomes([0.012, 0.0, 0.015], is_dark)
 
 
+def test_targets_stand_on_the_skin_in_the_colours_of_their_states_and_move_with_it(scene):
+    """The skin is at z = 0; of what is to do, the nearest to the probe at y = 40 mm is next."""
+    for name in ("image", "structures", "force"):
+        scene.ask(f"scene.setVisible('{name}', false)")
+    states = {-0.04: "done", -0.02: "missed", 0.0: "to do", 0.02: "to do"}
+    steps = [
+        {"what": "", "seen": "", "state": state, "target": [[-0.02, y, 0.013]]}
+        for y, state in states.items()
+    ]
+    score = scene.patient.feeds["score"]
+    score.offer(lambda n: Packet("score", n, {"scene": "", "steps": steps}, b""))
+
+    def stands(y: float, z: float = 0.0) -> list[float]:
+        return [-0.02, y, z]
+
+    scene.becomes(stands(-0.04), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)  # green
+    scene.becomes(stands(-0.02), lambda c: c[0] > c[2] + 80 and c[0] > c[1] + 80)  # red
+    scene.becomes(stands(0.0), lambda c: c.min() > 200)  # white
+    scene.becomes(stands(0.02), lambda c: c[0] > c[2] + 100 and c[1] > c[2] + 50)  # orange
+    scene.patient.dent(np.add(SKIN.vertices, [0.0, 0.0, 0.01]))
+    scene.ask("scene.view('front')")
+    scene.becomes(stands(-0.04, 0.0095), lambda c: c[1] > c[0] + 60 and c[1] > c[2] + 40)
+    scene.ask("scene.setVisible('targets', false)")
+    scene.becomes(stands(-0.04, 0.0095), lambda c: not (c[1] > c[0] + 60))
+
+
 def test_the_pointer_meets_the_skin_and_its_normal(scene):
     x, y = scene.place([-0.02, -0.03, 0.0])
     hit = scene.ask(f"return scene.pick({{ clientX: {x}, clientY: {y} }})")
@@ -272,13 +302,6 @@ def test_with_a_graphics_card_it_looks_the_same_and_is_drawn_into_the_page(page,
     drawn = [seen.becomes(VEIN, is_blue), seen.becomes(ARTERY, is_red)]
     page.close()  # no other test has that card
     np.testing.assert_allclose(read, drawn, atol=12)
-
-
-def test_keys_choose_views_and_the_force_is_told(scene):
-    scene.page.locator(".us-scene-canvas").focus()
-    scene.page.keyboard.press("2")
-    scene.until("scene.stage.camera.position.x > 0.2 && scene.stage.camera.position.y < 0.1")
-    scene.until("document.querySelector('.us-force').innerText === '2.5 N'")
 
 
 def test_nothing_is_drawn_while_nothing_changes(scene):

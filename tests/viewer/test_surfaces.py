@@ -72,21 +72,6 @@ def test_vertices_that_are_drawn_while_moving_come_first():
         np.testing.assert_allclose(at_rest[fine], sheet.vertices[sheet.triangles], atol=1e-8)
 
 
-def test_what_is_told_is_read_as_the_page_does():
-    carried = CarriedSurfaces(MESH, [grid(0.004)], triangles=60)
-    packet = carried.told("structures", 1, mesh=77)
-    count = packet.header["vertices"]
-    (part,) = packet.header["parts"]
-    nodes = np.frombuffer(packet.payload, np.uint32, 4 * count).reshape(-1, 4)
-    weights = np.frombuffer(packet.payload, np.float32, 4 * count, 16 * count).reshape(-1, 4)
-    indices = np.frombuffer(packet.payload, np.uint32, offset=32 * count)
-    assert len(indices) == 3 * (part["fine"] + part["coarse"])
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
-    vertices = np.einsum("va,vax->vx", weights, MESH.nodes[nodes])
-    np.testing.assert_allclose(vertices[:, 2], 0.004, atol=1e-8)
-    assert (part["name"], packet.header["mesh"]) == ("vein", 77)
-
-
 def test_what_is_not_in_the_tissue_is_refused():
     with pytest.raises(MeshError, match=r"vein is 30\.0 mm outside the tissue"):
         CarriedSurfaces(MESH, [grid(0.004), grid(0.060)])
@@ -152,10 +137,6 @@ def test_half_the_triangles_hold_nearly_the_same_volume(count):
     fewer = at_most(VERTICES, TRIANGLES, count)
     assert 0.5 * count < len(fewer) <= count
     assert volume(VERTICES, fewer) == pytest.approx(volume(VERTICES, TRIANGLES), rel=0.12)
-
-
-def test_what_has_few_enough_stays_as_it_is():
-    assert at_most(VERTICES, TRIANGLES, len(TRIANGLES)) is TRIANGLES
 
 
 STRAINED_PLANES = uniform_planes(-0.02, 0.02, 4)

@@ -3,13 +3,11 @@
 import time
 from typing import Any
 
-import numpy as np
 import pytest
 from awaiting import until
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.viewer.measure import (
-    Case,
     Point,
     Taker,
     cases,
@@ -67,10 +65,3 @@ def test_what_is_asked_is_compared_with_the_run_without_a_viewer() -> None:
     assert seen["images a second in a browser, hand"] == ("26", True)
     assert seen["browser: ms from the mouse to the image, 99th percentile"] == ("130 ms", False)
     assert seen["from `us-sim view` to the first image in a page"] == ("not measured", None)
-
-
-def test_the_longer_of_two_runs_of_one_case_tells_its_memory() -> None:
-    short, long = Case(browsers=1, seconds=8.0), Case(browsers=1, seconds=600.0)
-    seen = targets([Point(short, shown=30.0), Point(long, shown=27.0)])
-    assert next(t for t in seen if t.what == "images a second in a browser, path").seen == "27"
-    assert np.isnan(Point(long).growth("viewer"))

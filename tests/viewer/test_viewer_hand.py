@@ -386,16 +386,6 @@ def test_a_simulator_that_does_not_follow_is_said(bench, page, tracked, monkeypa
     bench.spin_until(lambda: page.state["warning"] == "")
 
 
-def test_a_scene_that_calibrates_such_poses_is_said(bench, page, tmp_path):
-    scene = tmp_path / "moved.yaml"
-    calibration = "tracker: {calibration: {position: [0, 0, 5 mm]}}"
-    scene.write_text(f"based_on: upper_arm\nname: moved\n{calibration}\n")
-    bench.make(ProbeTracker, scene=str(scene))
-    page.open()
-    page.await_leader("hand")
-    bench.spin_until(lambda: "5 mm from where it is held" in page.state["warning"])
-
-
 @pytest.mark.parametrize(
     ("wish", "said"),
     [
