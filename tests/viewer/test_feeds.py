@@ -83,23 +83,6 @@ def test_watching_on_and_off_at_once_ends_as_it_was_left(bench, watcher):
     assert publisher.get_subscription_count() == 1
 
 
-def test_pixels_and_stamp_come_as_they_were_published(bench, watcher):
-    feed, pixels = watcher.feeds["image"], speckle(40, 30)
-    feed.watch(nothing)
-    publisher = bench.publisher(Image, "ultrasound/image")
-    publisher.publish(image_message(pixels, Time(sec=7, nanosec=9), "probe"))
-    bench.spin_until(lambda: feed.sequence == 1)
-    packet = feed.newest()
-    assert packet.header == {
-        "stamp": "7000000009",
-        "rows": 40,
-        "columns": 30,
-        "encoding": "mono8",
-        "known": 7000000009,
-    }
-    np.testing.assert_array_equal(np.frombuffer(packet.payload, np.uint8).reshape(40, 30), pixels)
-
-
 @pytest.mark.parametrize(
     ("kind", "topic"),
     [

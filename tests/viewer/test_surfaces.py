@@ -199,9 +199,3 @@ def test_another_surface_has_another_number():
     one, other = RestSurface(SQUARE, RESTING), RestSurface(SQUARE, RESTING[:1])
     assert one.number != other.number
     assert one.number == RestSurface(SQUARE.copy(), RESTING).number
-
-
-def test_another_number_of_points_is_refused():
-    surface = RestSurface(SQUARE, RESTING)
-    with pytest.raises(MeshError, match="3 points came, and the mesh has 4"):
-        surface.moved(SQUARE[:3], kind="skin", sequence=1, stamp=0)
