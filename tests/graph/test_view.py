@@ -1,4 +1,4 @@
-"""`us-sim view` used by a person in a real browser: the arm is pressed, and everything is tried.
+"""`us-sim view` used by a person in a real browser: the arm is pressed, and let go.
 
 Each step leaves a picture of the page in the folder that US_SIM_SCREENSHOTS names, or in the test's
 own.

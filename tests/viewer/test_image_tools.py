@@ -143,6 +143,10 @@ def test_the_area_of_an_ellipse_and_its_circumference(page: Any) -> None:
     area, circumference = (float(part) for part in values(page)[0].split() if part[0].isdigit())
     assert area == pytest.approx(math.pi * 9 * 4, abs=0.1 * math.pi * (9 + 4) / 2)
     assert circumference == pytest.approx(42.3656, abs=0.5)  # SciPy: 4 a E(1 - b²/a²)
+    page.keyboard.press("x")
+    assert values(page) == []
+    page.keyboard.press("x")
+    assert len(values(page)) == 1  # and back
     page.get_by_role("button", name="Remove ").click()
     assert values(page) == []
     page.keyboard.press("Control+z")
