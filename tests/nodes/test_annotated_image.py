@@ -154,18 +154,6 @@ def test_nothing_is_drawn_and_no_label_is_cut_for_nobody(bench, show):
     assert not Asked.called
 
 
-def test_a_frame_without_a_picture_leaves_the_one_before(bench, show):
-    node = show(lockstep=True)
-    pictures = subscribed(bench, node)
-    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
-    with pytest.raises(MeshError, match="no slice"):
-        node.annotated.show(Asked(), node.stamp())
-    assert Asked.called == ["pixels"]
-    Asked.called.clear()
-    node.annotated.show(Shown(GREY_IMAGE), node.stamp())
-    bench.spin_until(lambda: len(pictures) == 2)
-
-
 def test_colours_are_laid_over_the_image_and_others_are_refused(bench, show):
     node = show(lockstep=True, streams=[Reds()])
     pictures = subscribed(bench, node)
@@ -177,21 +165,6 @@ def test_colours_are_laid_over_the_image_and_others_are_refused(bench, show):
     assert picture(pictures[0])[90, 100].tolist() == [172, 45, 45]
     assert picture(pictures[0])[90, 20].tolist() == [90, 90, 90]
     assert picture(pictures[1])[90, 100].tolist() == [90, 90, 90]
-
-
-def test_flipped_and_beside_the_plain_image_while_it_runs(bench, show):
-    node = show(lockstep=True, streams=[Reds()], overlay="strain")
-    pictures = subscribed(bench, node)
-    plain = np.tile(np.arange(160, dtype=np.uint8), (120, 1))
-    for name in ("flip", "beside"):
-        assert node.set_parameters([Parameter(name, value=True)])[0].successful
-        node.annotated.show(Shown(plain), node.stamp())
-    bench.spin_until(lambda: len(pictures) == 2)
-    flipped, both = map(picture, pictures)
-    assert flipped[60, 159 - 60].tolist() == [60, 60, 60]
-    assert flipped[90, 159 - 100, 0] > 150  # red
-    np.testing.assert_array_equal(both[:, 160:], flipped)
-    np.testing.assert_array_equal(both[:, :160, 1], plain[:, ::-1])
 
 
 def test_colours_that_the_scene_cannot_provide_are_refused(show):

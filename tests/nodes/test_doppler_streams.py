@@ -1,13 +1,11 @@
 """Blood on topics: made for those who subscribe, under the pose's stamp, as the parameters say."""
 
 import math
-import time
 
 import numpy as np
 import pytest
 import yaml
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -114,35 +112,6 @@ def test_velocities_are_those_of_the_domain_at_the_poses_stamp(bench, scene, arm
         last = collected[name][-1]
         assert (last.encoding, last.header.stamp.sec) == ("rgb8", 8)
         assert np.frombuffer(last.data, np.uint8).any()
-
-
-def test_why_an_image_shows_no_flow_is_on_diagnostics_at_once(bench, scene, send):
-    scene.write_text(yaml.safe_dump(yaml.safe_load(scene.read_text()) | {"skin": None}))
-    node, pose = send(contact=True, overlay="velocity")
-    told = bench.collect(DiagnosticArray, "diagnostics")
-    bench.collect(Image, "ultrasound/image_annotated")
-    bench.collect(Image, "ultrasound/spectrum")
-    bench.spin_until(lambda: node._annotated.is_wanted and node._streams[-2].is_wanted)
-
-    def says(second, **wanted):
-        told.clear()
-        began = time.monotonic()
-        pose(second, -0.01 if wanted["contact"] == "none" else 0.002)
-        bench.spin_until(
-            lambda: any(
-                wanted.items() <= {v.key: v.value for v in each.status[0].values}.items()
-                for each in told
-            )
-        )
-        return time.monotonic() - began
-
-    no_contact, no_vessel = "no_contact", "no_vessel"
-    waits = says(3, contact="none", no_colour=no_contact, no_spectrum=no_contact)
-    waits += says(4, contact="good", no_colour="", no_spectrum=no_vessel)
-    beside = [Parameter("colour.lateral", value=0.5), Parameter("colour.width", value=0.05)]
-    assert all(result.successful for result in node.set_parameters(beside))
-    waits += says(5, contact="good", no_colour=no_vessel, no_spectrum=no_vessel)
-    assert waits < 2.0  # else it comes once a second
 
 
 @pytest.mark.parametrize(("kind", "steering"), [("colour", 0.2), ("spectrum", 0.2)])

@@ -407,17 +407,3 @@ def test_in_lockstep_the_clock_goes_with_the_poses(bench, path):
     assert depths(poses) == [7, 8, 9]
     times = {Time.from_msg(tick.clock).nanoseconds - EPOCH for tick in ticks}
     assert times == {7 * STEP, 8 * STEP, 9 * STEP}
-
-
-@pytest.mark.parametrize("topic", ["/tracker/pose", "/tf:probe"])
-def test_poses_and_transforms_of_a_bag_are_played(bench, shared_data, topic):
-    """The bag, made by the real ROS 2, has the motion that its SOURCE.txt describes on both."""
-    bag = shared_data / "ros2-jazzy" / "bags" / "probe_path_mcap"
-    poses = bench.collect(PoseStamped, "tracker/pose")
-    player = bench.make(PathPlayer, path=str(bag), topic=topic, rate=50.0)
-    bench.spin_until(player.finished.done)
-    bench.spin_until(lambda: len(poses) == player.pose_count)
-    down = [pose.pose.position.z for pose in poses]
-    np.testing.assert_allclose(np.diff(down[:100]), 0.01 / 60, atol=1e-9)
-    assert down[-1] == pytest.approx(0.02)
-    assert poses[-1].pose.position.x == pytest.approx(0.04)

@@ -11,8 +11,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
-from us_sim.errors import ProbeError
-from us_sim.nodes import slice_interpolator
 from us_sim.nodes.messages import cloud_message, tetrahedra_message
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.slice_interpolator import SliceInterpolator
@@ -20,7 +18,7 @@ from us_sim.nodes.streams.stream import MModeStream
 from us_sim.recording.decoding import affine_from, pixels_from, pose_from
 from us_sim.scene.building import probe_of, skin_surface_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
-from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
+from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
 
 BARE = """
@@ -207,14 +205,6 @@ def test_a_setting_that_cannot_be_is_refused_and_nothing_changes(bench, rigid, n
     np.testing.assert_array_equal(image_at(bench, images, poses, 2), image)
 
 
-def test_a_setting_given_at_the_start_is_refused_before_the_volume_is_made(
-    bench, small_scene, monkeypatch
-):
-    monkeypatch.setattr(slice_interpolator, "volume_of", None)
-    with pytest.raises(ProbeError, match=r"^slice_interpolator\.grey_map: 'purple'"):
-        bench.make(SliceInterpolator, scene=str(small_scene), grey_map="purple")
-
-
 def test_pixels_are_placed_in_millimetres_also_after_a_change_of_depth(bench, rigid):
     node, images, poses = rigid
     places = bench.collect(Float64MultiArray, "ultrasound/image_to_probe", latched=True)
@@ -230,28 +220,3 @@ def test_pixels_are_placed_in_millimetres_also_after_a_change_of_depth(bench, ri
     plane = shallow.plane(pose_from(pose_at(0.002, 5)))
     expected = sample_plane(volume_of(scene), plane)
     np.testing.assert_array_equal(image_at(bench, images, poses, 5), expected)
-
-
-def test_labels_are_sent_to_those_who_ask_for_nothing_else(bench, small_scene):
-    node = bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)
-    labels = bench.collect(Image, "ultrasound/labels")
-    scene = load_scene(small_scene)
-    mesh = tissue_model_of(scene, volume_of(scene)).mesh
-    for message_type, topic, message in (
-        (PointCloud2, "tissue/rest", cloud(mesh.nodes, pose_at(0.0, 1))),
-        (Int32MultiArray, "tissue/tetrahedra", tetrahedra_message(mesh.tetrahedra)),
-    ):
-        bench.peer.create_publisher(message_type, topic, KEPT).publish(message)
-    poses = bench.publisher(PoseStamped, "probe/pose")
-    nodes = bench.publisher(PointCloud2, "tissue/nodes")
-    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/labels") > 0)
-    poses.publish(pose_at(0.003, 1))
-    nodes.publish(cloud(mesh.nodes, pose_at(0.003, 1)))
-    bench.spin_until(lambda: labels)
-    assert (labels[0].encoding, labels[0].header.frame_id) == ("mono8", "probe")
-    assert labels[0].header.stamp.sec == 1
-    plane = probe_of(scene).plane(pose_from(pose_at(0.003, 1)))
-    expected = sample_labels(volume_of(scene), plane)
-    assert len(np.unique(expected)) > 2
-    np.testing.assert_array_equal(pixels_from(labels[0]), expected)
-    assert "published ultrasound/image" not in node.health.values

@@ -101,20 +101,6 @@ def test_the_estimate_is_made_of_two_images_and_only_for_its_subscribers(bench, 
     assert set(node.node.health._published) == {"ultrasound/strain_estimate"}
 
 
-def test_a_gap_begins_anew(bench, pressed):
-    node = pressed(**{"strain.since": "image", "strain.interval": 1})
-    images = bench.collect(Image, "ultrasound/strain")
-    bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/strain") > 0)
-    node.press(1)
-    node.press(2)
-    bench.spin_until(lambda: len(images) == 1)
-    node.node._number += 1  # one that nobody wanted
-    node.press(3)
-    node.press(4)
-    bench.spin_until(lambda: len(images) == 2)
-    assert [message.header.stamp.sec for message in images] == [2, 4]
-
-
 def test_a_window_that_the_image_does_not_hold_is_refused(pressed):
     result = pressed().node.set_parameters([Parameter("strain.window", value=0.021)])[0]
     assert not result.successful
