@@ -43,7 +43,6 @@ class Shown:
 
     @property
     def volume(self):
-        """A volume of one layer, whose voxels are the pixels."""
         layer = self.labels[..., None]
         return Volume(layer, np.eye(4), layer, {})
 
@@ -67,8 +66,6 @@ class Asked:
 
 
 class Reds:
-    """Red over the right half, half opaque."""
-
     topic = "ultrasound/strain"
     is_wanted = False
 
@@ -93,7 +90,6 @@ class Show(SceneNode):
         self.annotated = AnnotatedImage(self, probe_of(self.scene), LABELS, streams)
 
     def stamp(self, age=0.0):
-        """Of a pose that is so many seconds old."""
         now = self.get_clock().now().nanoseconds - round(1e9 * age)
         return TimeMessage(sec=now // 10**9, nanosec=now % 10**9)
 
@@ -165,6 +161,21 @@ def test_colours_are_laid_over_the_image_and_others_are_refused(bench, show):
     assert picture(pictures[0])[90, 100].tolist() == [172, 45, 45]
     assert picture(pictures[0])[90, 20].tolist() == [90, 90, 90]
     assert picture(pictures[1])[90, 100].tolist() == [90, 90, 90]
+
+
+def test_flipped_and_beside_the_plain_image_while_it_runs(bench, show):
+    node = show(lockstep=True, streams=[Reds()], overlay="strain")
+    pictures = subscribed(bench, node)
+    plain = np.tile(np.arange(160, dtype=np.uint8), (120, 1))
+    for name in ("flip", "beside"):
+        assert node.set_parameters([Parameter(name, value=True)])[0].successful
+        node.annotated.show(Shown(plain), node.stamp())
+    bench.spin_until(lambda: len(pictures) == 2)
+    flipped, both = map(picture, pictures)
+    assert flipped[60, 159 - 60].tolist() == [60, 60, 60]
+    assert flipped[90, 159 - 100, 0] > 150  # red
+    np.testing.assert_array_equal(both[:, 160:], flipped)
+    np.testing.assert_array_equal(both[:, :160, 1], plain[:, ::-1])
 
 
 def test_colours_that_the_scene_cannot_provide_are_refused(show):

@@ -102,7 +102,6 @@ GOOD = [
 
 
 def numbers_of(value):
-    """All numbers of what a conversion has made."""
     if isinstance(value, np.ndarray):
         return value.astype(np.float64).ravel()
     parts = [part for part in vars(value).values() if isinstance(part, np.ndarray | Pose)]
@@ -160,7 +159,6 @@ def attack(bench, node, inputs, count):
 
 
 def is_finite(message):
-    """Whether all numbers of a message are, those of its parts and of its points too."""
     if isinstance(message, PointCloud2):
         return bool(np.isfinite(np.frombuffer(message.data, "<f4")).all())
     for name, kind in type(message).get_fields_and_field_types().items():

@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image
 
+from us_sim.nodes.settings import CompressedSettings
 from us_sim.nodes.slice_interpolator import SliceInterpolator
 from us_sim.nodes.streams.compressed import compressed
 from us_sim.recording.decoding import pixels_from
@@ -35,7 +36,6 @@ def imager(bench, tmp_path):
 
 
 def heard(bench, node, *topics):
-    """Wait until the node knows a subscriber of each."""
     by_name = {publisher.topic_name: publisher for publisher in node.publishers}
     publishers = [by_name[f"/{topic}"] for topic in topics]
     bench.spin_until(lambda: all(each.get_subscription_count() for each in publishers))
@@ -77,7 +77,6 @@ def test_a_png_is_the_image_itself_and_a_jpeg_is_near(bench, imager) -> None:
 
 
 def test_live_an_image_does_not_wait_for_its_companion(bench, imager, monkeypatch) -> None:
-    """Encoding is held up: the images come meanwhile, and then the newest is encoded."""
     from us_sim.nodes.streams import compressed as module
 
     may_encode = threading.Event()
@@ -110,3 +109,14 @@ def test_it_is_made_only_for_subscribers_and_alone_is_enough(bench, imager) -> N
     assert told[f"published {IMAGE}/compressed"] == "1"
     assert f"published {IMAGE}_annotated" not in told
     assert f"published {IMAGE}_annotated/compressed" not in told
+
+
+def test_quality_and_level_are_those_of_the_encoders() -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (64, 64), np.uint8)
+    image = Image(height=64, width=64, step=64, encoding="mono8", data=noise.tobytes())
+    for settings, suffix, options in (
+        (CompressedSettings(jpeg_quality=30), ".jpg", [cv2.IMWRITE_JPEG_QUALITY, 30]),
+        (CompressedSettings("png", png_level=9), ".png", [cv2.IMWRITE_PNG_COMPRESSION, 9]),
+    ):
+        data = bytes(compressed(image, settings).data)
+        assert data == cv2.imencode(suffix, noise, options)[1].tobytes()

@@ -62,8 +62,6 @@ def tilted(second, depth=0.0):
 
 @pytest.fixture
 def send(bench, scene, arm):
-    """Makes the node, and a function that sends it a pose with the tissue at rest."""
-
     def make(**parameters):
         node = bench.make(SliceInterpolator, scene=str(scene), lockstep=True, **parameters)
         bench.peer.create_publisher(PointCloud2, "tissue/rest", KEPT).publish(

@@ -43,7 +43,6 @@ def broken(bench):
 
 @pytest.fixture
 def said(broken, monkeypatch):
-    """The node's log: level and sentence."""
     lines = []
     log = broken.get_logger()
     for level in ("error", "warning", "debug"):

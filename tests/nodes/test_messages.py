@@ -20,14 +20,11 @@ from us_sim.nodes.messages import (
     affine_message,
     cloud_message,
     colour_image_message,
-    image_message,
     mesh_message,
     pose_message,
     pose_text,
     stamp_message,
     structure_markers,
-    surface_marker,
-    tetrahedra_message,
     transducer_markers,
 )
 from us_sim.recording.decoding import (
@@ -48,14 +45,6 @@ STAMP = Time(sec=3, nanosec=4)
 quick = settings(max_examples=25, deadline=None)
 floats = st.floats(-1e3, 1e3, width=32)
 points = arrays(np.float64, st.tuples(st.integers(1, 20), st.just(3)), elements=floats)
-
-
-@quick
-@given(points)
-def test_clouds_keep_float32_coordinates(vectors):
-    message = cloud_message(dict(zip("xyz", vectors.T, strict=True)), STAMP, "patient")
-    assert message.row_step == 12 * len(vectors) == len(message.data)
-    np.testing.assert_array_equal(vectors_from(message), vectors)
 
 
 @quick
@@ -89,20 +78,6 @@ def test_clouds_of_any_layout_are_read(vectors, order, size, padding):
     np.testing.assert_array_equal(vectors_from(message), vectors)
 
 
-@quick
-@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9))))
-def test_images_round_trip(pixels):
-    np.testing.assert_array_equal(pixels_from(image_message(pixels, STAMP, "probe")), pixels)
-
-
-@quick
-@given(
-    arrays(np.int32, st.tuples(st.integers(0, 9), st.just(4)), elements=st.integers(0, 2**31 - 1))
-)
-def test_tetrahedra_round_trip(tetrahedra):
-    np.testing.assert_array_equal(tetrahedra_from(tetrahedra_message(tetrahedra)), tetrahedra)
-
-
 def test_poses_round_trip():
     pose = Pose([0.1, -0.2, 0.3], [0.5, -0.5, 0.5, 0.5])
     message = pose_message(pose, STAMP, "patient")
@@ -115,22 +90,6 @@ def test_a_pose_farther_away_than_any_place_is_refused():
         pose_from(pose_message(Pose(-9e6 * axis), STAMP, "patient"))
         with pytest.raises(PoseError, match="metres"):
             pose_from(pose_message(Pose(-2e7 * axis), STAMP, "patient"))
-
-
-@pytest.mark.parametrize("frame", ["p", "patient"])
-@pytest.mark.parametrize("count", [0, 7])
-def test_a_marker_has_each_corner_of_each_triangle(frame, count):
-    rng = np.random.default_rng(5)
-    vertices, triangles = rng.normal(size=(9, 3)), rng.integers(0, 9, (count, 3))
-    serialized = surface_marker(vertices, triangles, STAMP, frame, 0.25)
-    marker = deserialize_message(serialized, Marker)
-    received = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3)
-    np.testing.assert_array_equal(received, vertices[triangles.ravel()])
-    assert marker.header.frame_id == frame
-    assert (marker.ns, marker.colors, marker.text) == ("skin", [], "")
-    assert marker.pose.orientation.w == 1.0
-    assert marker.color.a == 0.25
-    assert len(serialize_message(marker)) == len(serialized)
 
 
 def test_a_mesh_has_vertices_and_triangles():

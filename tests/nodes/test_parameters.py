@@ -46,7 +46,6 @@ def scene(tmp_path_factory, small_scene):
 
 
 def given_to(node: str, scene: Any, folder: Any) -> dict[str, object]:
-    """The parameters without which a node cannot be."""
     own: dict[str, dict[str, object]] = {
         "path_player": {"path": str(BAG)},
         "session_player": {"path": str(BAG)},
@@ -60,7 +59,6 @@ def given_to(node: str, scene: Any, folder: Any) -> dict[str, object]:
 
 
 def made(bench, node: str, scene: Any, folder: Any) -> Any:
-    """A node by its name."""
     module = importlib.import_module(module_of(node))
     name = next(n for n in vars(module) if n.lower() == node.replace("_", ""))
     node_class = getattr(module, name)

@@ -32,12 +32,10 @@ STEP = 20_000_000
 
 @pytest.fixture
 def path(tmp_path):
-    """Ten poses, 20 ms apart."""
     return written(tmp_path / "path.mcap", STEP)
 
 
 def written(file, step):
-    """A path of ten poses, so many ns apart."""
     stamps = EPOCH + step * np.arange(10)
     positions = np.zeros((10, 3))
     positions[:, 2] = np.arange(10) * 1e-3
@@ -206,7 +204,6 @@ def test_a_recording_of_which_nothing_can_be_played_is_refused(bench, tmp_path, 
 
 @pytest.fixture
 def damaged(tmp_path):
-    """A recording of 100 messages in some chunks, the second of which is damaged."""
     file = tmp_path / "damaged.mcap"
     with BagWriter(file, chunk_size=500) as bag:
         bag.add_topic("/said", "std_msgs/msg/String")
@@ -317,7 +314,6 @@ def test_a_recording_is_paused_gone_along_and_ends_when_it_may(bench, tmp_path):
 
 
 def ask(bench, player, name):
-    """Give one of a player's commands; why it was refused."""
     client = bench.peer.create_client(Trigger, f"/{player.get_name()}/{name}")
     bench.spin_until(client.service_is_ready)
     answer = client.call_async(Trigger.Request())
@@ -333,7 +329,6 @@ def depths(poses):
 
 @pytest.fixture
 def said_bag(tmp_path):
-    """Ten texts, their numbers, 20 ms apart."""
     file = tmp_path / "said" / "said.mcap"
     with BagWriter(file) as bag:
         bag.add_topic("/said", "std_msgs/msg/String")
@@ -344,7 +339,6 @@ def said_bag(tmp_path):
 
 @pytest.fixture(params=[PathPlayer, SessionPlayer])
 def numbers(request, bench, path, said_bag):
-    """A player that a test makes, and the numbers that it has sent."""
     if request.param is PathPlayer:
         poses = bench.collect(PoseStamped, "tracker/pose")
         return lambda **given: bench.make(PathPlayer, path=str(path), **given), lambda: depths(

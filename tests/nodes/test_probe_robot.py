@@ -22,7 +22,6 @@ def twist(frame="probe", **linear):
 
 @pytest.fixture
 def commands(bench):
-    """The node, publishers of what it takes, and its poses."""
     node = bench.make(ProbeRobot, rate=200.0, lift=0.005, damping=50.0, timeout=5.0)
     twists = bench.publisher(TwistStamped, "robot/twist")
     forces = bench.publisher(WrenchStamped, "robot/force")

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.session_recorder import SessionRecorder
-from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
+from us_sim.nodes.sessions.recorded_topic import RecordedTopic
 from us_sim.recording.path import ProbePath, write_path
 from us_sim.recording.reader import read_bag
 from us_sim.recording.repair import extract
@@ -34,7 +34,6 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def call(bench, name):
-    """Give one of the recorder's commands; why it was refused."""
     client = bench.peer.create_client(Trigger, f"/session_recorder/{name}")
     bench.spin_until(client.service_is_ready)
     answer = client.call_async(Trigger.Request())
@@ -60,7 +59,6 @@ def texts(file, topic="/note"):
 
 
 def say(bench, recorder, publisher, *words):
-    """Publish, and wait until the recorder has it."""
     before = recorder.health.received
     for word in words:
         publisher.publish(String(data=word))
@@ -157,7 +155,6 @@ def test_a_session_can_be_made_again_from_its_file(bench, tmp_path):
 
 
 def bag_of(folder, frame, x=0.0, topic="/tracker/pose"):
-    """A bag, in a folder, of two poses at x in a frame."""
     stamps = 1_700_000_000_000_000_000 + np.arange(2) * 10**8
     places = np.tile([x, 0.0, 0.0], (2, 1)), np.tile([0.0, 0, 0, 1], (2, 1))
     write_path(folder, ProbePath(topic, frame, stamps, *places))
@@ -216,7 +213,6 @@ def test_of_a_large_attachment_there_is_the_checksum(bench, tmp_path):
 
 @pytest.fixture
 def may_write(monkeypatch):
-    """An event before which nothing is written."""
     allowed = threading.Event()
     write = BagWriter.write
     monkeypatch.setattr(
@@ -332,17 +328,6 @@ def test_gaps_in_a_publishers_numbers_are_losses(bench):
     for number in (30, 1, 31):
         topic._receive(b"", {"source_timestamp": 0, "publication_sequence_number": number})
     assert len(lost) == 2
-
-
-@pytest.mark.parametrize("name", ["a/b/c/msg/X", "X", "", "os/msg/path", "std_msgs/srv/String"])
-def test_names_that_are_no_types(name):
-    with pytest.raises(BagError, match="is no message type"):
-        message_type(name)
-
-
-def test_types_that_are_not_here():
-    with pytest.raises(BagError, match="my_msgs/msg/Unheard is unknown: install"):
-        message_type("my_msgs/msg/Unheard")
 
 
 @pytest.mark.slow

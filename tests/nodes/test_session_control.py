@@ -125,7 +125,6 @@ def test_a_page_that_opens_later_has_the_picture_of_every_scene(bench):
 
 
 def report(name, **values):
-    """A node's report."""
     pairs = [KeyValue(key=key.replace("_", " "), value=value) for key, value in values.items()]
     return DiagnosticArray(status=[DiagnosticStatus(name=name, message="running", values=pairs)])
 

@@ -51,7 +51,6 @@ class Graph:
         self.bench.spin_until(lambda: self.tracker._steady.now().nanoseconds > until)
 
     def reports(self, seconds: float) -> dict[str, list[dict[str, object]]]:
-        """The reports of each node in so many real seconds."""
         self._reports.clear()
         self.spin_for(seconds)
         told: dict[str, list[dict[str, object]]] = {name: [] for name in NODES}
@@ -66,7 +65,6 @@ class Graph:
 
 
 def path_of(folder):
-    """A bag with a press that comes and goes, a pose every 20 ms."""
     positions = np.column_stack([np.zeros((POSES, 2)), DEPTHS])
     orientations = np.tile([0.0, 0, 0, 1], (POSES, 1))
     bag = folder / "path" / "path.mcap"

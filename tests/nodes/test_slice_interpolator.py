@@ -12,9 +12,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray, Int32MultiArray
 
 from us_sim.nodes.messages import cloud_message, tetrahedra_message
-from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.slice_interpolator import SliceInterpolator
-from us_sim.nodes.streams.stream import MModeStream
 from us_sim.recording.decoding import affine_from, pixels_from, pose_from
 from us_sim.scene.building import probe_of, skin_surface_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene
@@ -49,20 +47,6 @@ def slicer(bench, small_scene):
     nodes = bench.publisher(PointCloud2, "tissue/nodes")
     bench.spin_until(lambda: bench.peer.count_publishers("ultrasound/image") > 0)
     return node, mesh, images, poses, nodes
-
-
-def test_the_images_topic_is_there_once_all_is_prepared(bench, small_scene, monkeypatch):
-    """The player of poses waits for it, so that none is lost while a volume is being loaded."""
-    made = []
-    stream = SceneNode.stream
-    monkeypatch.setattr(
-        SceneNode,
-        "stream",
-        lambda node, kind, topic, *qos: made.append(topic) or stream(node, kind, topic, *qos),
-    )
-    monkeypatch.setattr(MModeStream, "prepare", lambda *_: made.append("prepared"))
-    bench.make(SliceInterpolator, scene=str(small_scene), lockstep=True)
-    assert made.index("ultrasound/image") > made.index("prepared")
 
 
 def test_the_face_meets_the_skin_where_the_scene_has_one(bench, small_scene):
@@ -154,7 +138,6 @@ def test_without_tissue_the_volume_is_cut_as_it_is(bench, tmp_path):
 
 @pytest.fixture
 def rigid(bench, tmp_path):
-    """A slicing node without tissue, its images, and what publishes poses to it."""
     file = tmp_path / "bare.yaml"
     file.write_text(BARE)
     node = bench.make(SliceInterpolator, scene=str(file), lockstep=True)

@@ -169,6 +169,22 @@ def test_structures_are_where_the_tissue_has_carried_them(bench, scene_with_stru
     assert np.abs(vertices - made.surface.vertices).max() > 1e-5  # something moved
 
 
+def test_structures_are_made_for_nobody_and_live_beside_the_deforming(bench, scene_with_structures):
+    node = bench.make(TissueDeformer, scene=str(scene_with_structures), structure_triangles=2000)
+    nodes = bench.collect(PointCloud2, "tissue/nodes")
+    publisher = bench.publisher(PoseStamped, "probe/pose")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/nodes") > 0)
+    press(bench, publisher, nodes, 0.004, 1)
+    assert node.health.values["structures"] == "not made, nobody subscribes"
+    markers = bench.collect(MarkerArray, "tissue/structures")
+    bench.spin_until(lambda: bench.peer.count_publishers("tissue/structures") > 0)
+    second = 2
+    while not markers:
+        press(bench, publisher, nodes, 0.004, second)
+        second += 1
+    assert [marker.ns for marker in markers[0].markers] == ["vein", "bone"]
+
+
 def test_a_structure_that_cannot_be_made_is_said_and_the_tissue_goes_on(
     bench, tmp_path, small_scene
 ):

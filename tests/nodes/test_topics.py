@@ -40,8 +40,6 @@ TRACKER_KEYS = {
 
 @pytest.fixture
 def scenes(tmp_path, small_scene):
-    """The small scene with a vein and its flow, for each source of poses."""
-
     def scene(source):
         file = tmp_path / f"{source}.yaml"
         keys = TRACKER_KEYS.get(source)
@@ -76,7 +74,6 @@ def endpoints_of(node):
 
 
 def told(nodes):
-    """The same of the table, for those nodes."""
     return {
         (topic.name, topic.type_name, topic.latched, direction, node)
         for topic in TOPICS
@@ -143,8 +140,6 @@ def test_what_records_and_plays_every_topic_reports_too(bench, tmp_path):
 
 @pytest.fixture
 def all_nodes(scenes, tmp_path):
-    """A function that makes one of each node that needs no device, in a bench."""
-
     def make(bench):
         scene = scenes("pose")
         bag = tmp_path / "bag.mcap"
@@ -179,7 +174,6 @@ def test_every_topic_has_overrides_of_its_quality_of_service(bench, all_nodes):
 
 
 def test_every_topic_can_be_remapped_and_is_in_the_namespace(all_nodes):
-    """Nothing of a simulator in a namespace is outside but what ROS itself has there."""
     moved = [f"{topic.name}:=moved/{topic.name}" for topic in TOPICS]
     rules = [word for rule in ("__ns:=/left", *moved) for word in ("-r", rule)]
     bench = Bench(["--ros-args", *rules])

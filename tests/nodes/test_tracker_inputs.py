@@ -111,7 +111,6 @@ def transform(parent, child, z, second):
 
 @pytest.mark.skipif(TFMessage is None, reason="tf2_msgs is not installed")
 def test_tf_leads_from_the_device_to_the_patient_and_to_the_probe(bench, tracker):
-    """A tool of the device is where the probe is, by the transforms alone."""
     turned = "{position: [0.1, 0.2, 0.3], orientation: [0, 0, 1, 0]}"
     node, poses = tracker(f"{{source: pose, frame: camera, registration: {turned}}}")
     static = bench.collect(TFMessage, "tf_static", latched=True)
@@ -267,7 +266,6 @@ STEP = 10_000_000  # ns
 
 @pytest.fixture
 def bag(tmp_path):
-    """Twenty poses, 10 ms apart, going down."""
     stamps = 1_600_000_000_000_000_000 + STEP * np.arange(20)
     positions = np.zeros((20, 3))
     positions[:, 2] = 1e-3 * np.arange(20)

@@ -28,7 +28,6 @@ def test_a_run_that_waits_says_where_its_page_is(host: str, address: str) -> Non
 
 @pytest.fixture
 def taken():
-    """A port that is listened at."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         yield other.getsockname()[1]
 

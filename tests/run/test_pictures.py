@@ -18,7 +18,6 @@ def session_on(path):
 
 
 def told(path):
-    """Seconds since the begin, by title."""
     return {title: (stamp - path.stamps[0]) * 1e-9 for title, stamp in _moments(session_on(path))}
 
 

@@ -21,7 +21,6 @@ from us_sim.volume.volume import Volume
 
 @pytest.fixture
 def scene(tmp_path):
-    """A scene with a volume that is too large to be attached."""
     voxels = np.random.default_rng(1).integers(0, 255, (180, 180, 180), dtype=np.uint8)
     write_volume(tmp_path / "large.nrrd", Volume(voxels, np.diag([5e-4, 5e-4, 5e-4, 1.0])))
     file = tmp_path / "plain.yaml"
@@ -44,7 +43,6 @@ def prepared(tmp_path, attached, **options):
 
 
 def refused(tmp_path, capsys, attached, *options):
-    """The sentence of `us-sim render --session`."""
     session = write(tmp_path / "session.mcap", press(30), attached)
     out = tmp_path / "out"
     assert main(["render", "--session", str(session), "--out", str(out), *map(str, options)]) == 1

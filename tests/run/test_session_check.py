@@ -81,7 +81,6 @@ def test_a_big_endian_stamp_is_read(tmp_path):
 
 
 def remove(topic, part):
-    """A change: messages of a topic are missing."""
     return lambda messages: [messages.remove(each) for each in of(messages, topic)[part]]
 
 

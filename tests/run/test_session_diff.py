@@ -15,7 +15,6 @@ IMAGE, NODES, POSE, WRENCH = "/ultrasound/image", "/tissue/nodes", "/probe/pose"
 
 
 def changed(tmp_path, change):
-    """Session A, and B with one change; their difference by topic and quantity."""
     messages = press(60)
     one = write(tmp_path / "a.mcap", messages)
     change(messages)

@@ -20,7 +20,6 @@ SECOND = 10**9
 
 
 def write(file, messages, types):
-    """A bag of (topic, bytes, log time)."""
     with BagWriter(file) as writer:
         for topic, type_name in types.items():
             writer.add_topic(topic, type_name)

@@ -58,7 +58,6 @@ class Control:
 
 @pytest.fixture
 def running(small_scene):
-    """A simulation of the small scene that is ready, its supervisor and its control."""
     request = Request(load_scene(small_scene), by_hand=True)
     supervisor, control = Supervisor(plan_of(request)), Control()
     made = lambda _, settings: control.show(settings) or control  # noqa: E731

@@ -7,7 +7,7 @@ import pytest
 
 from us_sim.errors import UsSimError
 from us_sim.nodes import INTERRUPTED
-from us_sim.run.plan import NodeProcess, Plan, Request, goes_on, plan_of
+from us_sim.run.plan import NodeProcess, Plan, Request, plan_of
 from us_sim.run.supervision import Supervisor
 from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.reading import load_scene
@@ -79,7 +79,6 @@ class Monitor:
 
 @pytest.fixture
 def session(tmp_path):
-    """A supervisor of three nodes, its group and its monitor."""
     group = Group()
     monitor = Monitor(group)
     processes = [
@@ -241,21 +240,6 @@ def test_another_plan_ends_what_it_lacks_and_then_starts_what_is_new(session):
     assert not supervisor.losses
     # How many images were made while something was recorded is not known then.
     assert supervisor.outcome(1.0).sentence() == ""
-
-
-@pytest.mark.parametrize(
-    ("node", "name", "stays"),
-    [
-        ("path_player", "rate", True),
-        ("path_player", "path", False),
-        ("session_recorder", "file", False),
-    ],
-)
-def test_what_takes_another_process(node, name, stays):
-    before, after = NodeProcess(node, {name: "1"}), NodeProcess(node, {name: "2"})
-    assert goes_on(before, after) is stays
-    assert goes_on(before, before)
-    assert not goes_on(before, None)
 
 
 @pytest.mark.parametrize(
