@@ -181,7 +181,7 @@ def test_what_a_full_disk_did_not_take_is_written_when_there_is_room(tmp_path, c
         assert reader.message_count == written
 
 
-@pytest.mark.parametrize("room", (3000, 3300, 3500))
+@pytest.mark.parametrize("room", [3000, 3300, 3500])
 def test_what_a_disk_that_stays_full_did_not_take_is_counted(tmp_path, room):
     bag = BagWriter(tmp_path / "session.mcap", chunk_size=300)
     disk_under(bag, room)
