@@ -77,3 +77,8 @@ def test_a_part_is_printed_by_its_name(capsys):
 def test_a_part_that_is_not_there_is_said(name, meant, capsys):
     assert main(["reference", name]) == 1
     assert f"did you mean '{meant}'?" in capsys.readouterr().err
+
+
+def test_the_page_is_written_to_a_file(tmp_path):
+    assert main(["reference", "--out", str(tmp_path / "page.md")]) == 0
+    assert (tmp_path / "page.md").read_text(encoding="utf-8") == reference_page()

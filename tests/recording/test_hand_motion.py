@@ -74,19 +74,6 @@ def test_it_stays_in_its_room(motion, room):
     np.testing.assert_allclose(np.linalg.norm(path.orientations, axis=1), 1, atol=1e-12)
 
 
-@pytest.mark.slow
-@settings(max_examples=10, deadline=None)
-@given(motions)
-def test_a_seed_gives_one_motion_and_another_another(motion):
-    path, again = hand_motion(*motion), hand_motion(*motion)
-    np.testing.assert_array_equal(path.positions, again.positions)
-    np.testing.assert_array_equal(path.orientations, again.orientations)
-    kind, haste, seed, duration = motion
-    other = hand_motion(kind, haste, seed + 1, duration)
-    assert not np.array_equal(path.positions, other.positions) or not KINDS[kind].moves
-    assert not np.array_equal(path.orientations, other.orientations) or not KINDS[kind].turns
-
-
 def test_the_approach_comes_from_above_and_does_not_count():
     path = hand_motion("fanning", "brisk", 2, 1.0, approach=0.5)
     assert len(path) == 90

@@ -2,12 +2,10 @@
 
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from us_sim.errors import BagError
 from us_sim.recording.metadata import BagMetadata, FileEntry, read_metadata
-from us_sim.recording.topic import INFINITE, QosProfile, qos_from_yaml, qos_to_yaml
+from us_sim.recording.topic import QosProfile, qos_from_yaml, qos_to_yaml
 
 
 @pytest.mark.parametrize("bag", ["mcap", "zstd"])
@@ -36,26 +34,6 @@ def test_every_older_version_is_read(shared_data):
             (topic["topic_metadata"]["name"], topic["message_count"])
             for topic in information["topics_with_message_count"]
         ]
-
-
-profiles = st.builds(
-    QosProfile,
-    history=st.sampled_from(["keep_last", "keep_all", "unknown", "system_default"]),
-    depth=st.integers(0, 2**31),
-    reliability=st.sampled_from(["reliable", "best_effort", "best_available"]),
-    durability=st.sampled_from(["volatile", "transient_local"]),
-    deadline=st.integers(0, INFINITE),
-    lifespan=st.integers(0, INFINITE),
-    liveliness=st.sampled_from(["automatic", "manual_by_topic"]),
-    liveliness_lease_duration=st.integers(0, INFINITE),
-    avoid_ros_namespace_conventions=st.booleans(),
-)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(profiles, max_size=3))
-def test_yaml_round_trip(profiles):
-    assert qos_from_yaml(qos_to_yaml(profiles)) == tuple(profiles)
 
 
 def test_numbers_of_older_bags_are_the_policies_of_rmw():

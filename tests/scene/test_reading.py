@@ -64,17 +64,30 @@ def test_units_are_si_inside():
 @pytest.mark.parametrize(
     ("key", "value", "fact"),
     [
+        ("probe.aperture", 40, "my.yaml: probe.aperture: .*'40 mm'"),
+        ("probe.image", [512, 1.5], r"my.yaml: probe.image\[1\]: 1.5"),
+        ("probe.image", [4097, 5], r"my.yaml: probe.image\[0\]: 4097 .* 1 to 4096"),
+        ("probe.geometry", "convex", "my.yaml: probe.aperture: "),
         ("probe.geometry", "sector", "my.yaml: probe.opening_angle: "),
         ("probe.collider", None, "my.yaml: probe.collider: "),
+        ("volume", None, "my.yaml: volume: "),
         ("volume", {}, "my.yaml: volume.file: .*--volume"),
         ("volume.file", "a.mha", "my.yaml: .*`file` and `phantom`"),
+        ("volume", {"file": "nowhere.mha"}, "my.yaml: volume.file: .*nowhere.mha"),
+        ("path", "nowhere.mcap", "my.yaml: path: .*nowhere.mcap"),
+        ("skin.file", "nowhere.obj", "my.yaml: skin.file: .*nowhere.obj"),
+        ("tissue.mesh.upper", [1, 1, -1], r"my.yaml: tissue.mesh.upper\[2\]: -1 m"),
         ("tissue.mesh.planes", {"x": [0, 0]}, "my.yaml: tissue.mesh.planes.x: .*rising"),
         ("tissue.mesh.planes", {"x": [-0.02, 0, 0.01]}, "planes.x: .*3 .* -0.02 to 0.02 m"),
         ("tissue.mesh.planes", {"w": [0, 1]}, "my.yaml: tissue.mesh.planes: .*`w`"),
         ("tissue.mesh.file", "liver.msh", "my.yaml: tissue.mesh: .*`file` and `lower`"),
+        ("tissue.mesh", {"file": "liver.msh"}, "my.yaml: tissue.mesh.file: .*liver.msh"),
         ("tissue.mesh.unit", "1 mm", "my.yaml: .*`unit`, `pose` and `margin`"),
+        ("structures", {"vein": {"colour": [1, 0, 2]}}, r"my.yaml: .*vein.colour\[2\]: 2 "),
         ("structures", {"a": {"file": "a", "label": "b"}}, "structures.a: .*`file` and `label`"),
         ("structures", {"a": {"unit": "1 mm"}}, "my.yaml: structures.a: .*`unit` and `pose`"),
+        ("tissue.materials", {}, "my.yaml: tissue.materials: "),
+        ("tissue.materials.muscle.poisson_ratio", 0.5, "materials.muscle.poisson_ratio: 0.5"),
     ],
 )
 def test_each_mistake_is_one_sentence_with_file_and_key(key, value, fact):
@@ -130,6 +143,7 @@ def test_fans_have_square_pixels_unless_told():
 @pytest.mark.parametrize(
     ("given", "fact"),
     [
+        ({}, "aperture: "),
         ({"aperture": "1 cm", "radius": "1 cm"}, "aperture: 10 mm .* 20 mm"),
         ({"aperture": "2 cm", "image": 4096}, "image: .*5793"),
     ],
@@ -138,6 +152,19 @@ def test_a_probe_that_cannot_be_is_refused_when_the_scene_is_read(given, fact):
     sector = {"geometry": "sector", "opening_angle": "90 deg", "depth": "16 cm"}
     with pytest.raises(SceneError, match=f"my.yaml: probe.{fact}"):
         scene_with_probe(**sector, **given)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "fact"),
+    [
+        ("probe.collider.shape", "capsule", "length: .*capsule"),
+        ("probe.collider", {"shape": "convex", "radius": 0.05, "length": 0.05}, "width: .*radius"),
+        ("probe.collider.width", 0.01, "width: .*sphere"),
+    ],
+)
+def test_a_collider_needs_its_own_dimensions_and_no_others(key, value, fact):
+    with pytest.raises(SceneError, match=f"probe.collider.{fact}"):
+        parse_scene(changed(key, value))
 
 
 @pytest.mark.parametrize(
@@ -283,6 +310,8 @@ def test_a_base_that_cannot_be_is_refused(tmp_path, base, fact):
 @pytest.mark.parametrize(
     ("tracker", "fact"),
     [
+        ("{source: telepathy}", "source: 'telepathy' .*pose"),
+        ("{filter: {method: median}}", r"filter\.method: 'median' .*none"),
         ("{registration: nowhere.yaml}", "registration: "),
         ("{registration: {orientation: [0, 0]}}", r"registration\.orientation: .*4"),
         ("{source: six_dof_mouse, six_dof_mouse: {axes: [0, 1]}}", r"six_dof_mouse\.axes: .*6"),

@@ -4,32 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from us_sim.errors import VolumeError
 from us_sim.volume.volume import Volume
 
 GREY = np.zeros((4, 5, 6), dtype=np.uint8)
 MILLIMETRES = np.diag([1e-3, 1e-3, 1e-3, 1.0])
-STEPS = st.floats(1e-5, 1e-2)
-OFFSETS = st.floats(-1.0, 1.0)
-
-
-@given(
-    steps=st.tuples(STEPS, STEPS, STEPS),
-    offset=st.tuples(OFFSETS, OFFSETS, OFFSETS),
-    angles=st.tuples(OFFSETS, OFFSETS, OFFSETS),
-)
-@settings(max_examples=30, deadline=None)
-def test_patient_to_index_undoes_index_to_patient(steps, offset, angles):
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix() * steps
-    matrix[:3, 3] = offset
-    volume = Volume(GREY, matrix)
-    index = np.array([1.0, 2.5, -3.0, 1.0])
-    np.testing.assert_allclose(volume.patient_to_index @ (matrix @ index), index, atol=1e-6)
 
 
 def test_extent_encloses_the_voxels_faces():
