@@ -40,19 +40,6 @@ def test_a_press_of_8_newtons_for_two_seconds(tmp_path, capsys):
     assert "Area" not in "".join(name for name, _ in table(tmp_path))
 
 
-def test_without_force_it_is_said_and_not_zero(tmp_path, capsys):
-    messages = [each for each in press(60) if each[0] != "/probe/wrench"]
-    session = tmp_path / "s.mcap"
-    with BagWriter(session, sidecar=False) as bag:
-        bag.add_topic("/probe/pose", TYPES["/probe/pose"])
-        for topic, data, logged, sent, number in messages:
-            if topic == "/probe/pose":
-                bag.write(topic, data, logged, sent, number)
-    assert main(["score", str(session), "--out", str(tmp_path)]) == 0
-    assert "left out: force" in capsys.readouterr().out
-    assert not [n for n, _ in table(tmp_path) if "Force" in n or "Contact" in n or " N" in n]
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -128,9 +128,3 @@ def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, 
     assert main(["segment", str(case), "--seeds", seeds]) == 1
     assert "No space left" in capsys.readouterr().err
     assert contents(case.parent) == before
-
-
-@pytest.mark.parametrize(("name", "word"), [("", "no case.yaml"), ("seeds.yaml", "import")])
-def test_what_is_no_case_is_said(tmp_path, seeds, capsys, name, word):
-    assert main(["segment", str(tmp_path / name), "--seeds", seeds]) == 1
-    assert word in capsys.readouterr().err

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import us_sim.environment
 from us_sim.environment.environment import ScanEnvironment
@@ -80,6 +81,29 @@ def test_a_seed_decides_every_byte_here_and_in_another_process(scene):
     code = REPEATED.format(here=here, scene=scene, settings=settings)
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (first, other.stdout.strip()) == (again, again), other.stderr
+
+
+@pytest.mark.slow
+def test_other_processes_step_as_this_one_does_though_numba_and_threads_are_there(scene):
+    def make():
+        import us_sim.environment  # noqa: F401 - as in a process of its own
+
+        return gymnasium.make("us_sim/FindVein-v0", scene=scene, settings={"skin": None})
+
+    def run(vector):
+        vector.reset(seed=[1, 2])
+        actions = np.tile(np.float32([0, 0, 1, 0, 0, 0]), (2, 1))
+        seen = [vector.step(actions) for _ in range(8)][-1]
+        vector.close()
+        return seen
+
+    here = SyncVectorEnv([make, make])
+    assert here.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    beside = AsyncVectorEnv([make, make], context="forkserver")
+    (one, rewards, *_), (other, same, *_) = run(here), run(beside)
+    assert all(np.array_equal(one[name], other[name]) for name in one)
+    assert np.array_equal(rewards, same)
+    assert one["wrench"][0, 2] < 0.0
 
 
 def test_an_action_is_a_velocity_in_the_probes_frame(plain):

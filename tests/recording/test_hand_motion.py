@@ -84,23 +84,6 @@ def test_the_approach_comes_from_above_and_does_not_count():
     np.testing.assert_allclose(path.orientations[30:], alone.orientations, atol=1e-12)
 
 
-def test_the_shipped_path_begins_and_ends_at_rest_above_the_skin():
-    path = shipped_hand_path()
-    assert len(path) == 600
-    for end in (0, -1):
-        assert path.positions[end] == pytest.approx([0, 0, -0.010], abs=1e-12)
-        assert path.orientations[end] == pytest.approx([0, 0, 0, 1], abs=1e-12)
-    moved, turned = speeds(path)
-    assert max(moved[0], moved[-1]) < 1e-3
-    busy = slice(round(60 * 1.7), round(60 * 8.2))
-    assert 1e3 * np.median(moved[busy]) == pytest.approx(60, rel=0.1)
-    assert np.degrees(np.median(turned[busy])) == pytest.approx(90, rel=0.1)
-    # Nowhere does it leap: an acceleration is at most a fifth of gravity's.
-    assert np.abs(np.diff(path.positions, 2, axis=0)).max() * 60**2 < 2.0
-    assert np.abs(path.positions[:, 0]).max() <= 0.018
-    assert path.positions[:, 2].max() > 0.012
-
-
 @pytest.mark.parametrize(
     ("name", "make"),
     [
@@ -118,32 +101,6 @@ def test_the_bags_in_the_repository_are_these_paths(name, make):
     tolerance = 1e-9 if name == "hand" else 1e-15
     np.testing.assert_allclose(kept.positions, made.positions, rtol=0, atol=tolerance)
     np.testing.assert_allclose(kept.orientations, made.orientations, rtol=0, atol=tolerance)
-
-
-def at(seconds):
-    """Number of the pose at a time, at 60 Hz."""
-    return round(seconds * 60)
-
-
-def test_phases():
-    path = press_and_slide()
-    x, y, z = path.positions.T
-    assert len(path) == 600
-    assert path.frame_id == "patient"
-    np.testing.assert_array_equal(x, 0)
-    for seconds, height in [(0, -0.01), (1, -0.01), (1.5, 0), (3.5, 0.012), (5, 0.012), (6, 0.012)]:
-        assert z[at(seconds)] == pytest.approx(height, abs=1e-12)
-    for seconds, height in [(7.5, 0.012), (8.7, 0), (9.2, -0.01), (9.9, -0.01)]:
-        assert z[at(seconds)] == pytest.approx(height, abs=1e-12)
-    # Halfway in time a minimum-jerk motion is halfway in space.
-    assert z[at(2.5)] == pytest.approx(0.006, abs=1e-12)
-    assert y[at(6.25)] == y.max() == pytest.approx(0.008, abs=1e-12)
-    assert np.all(y[: at(5)] == 0)
-    assert np.all(y[at(7.5) :] == 0)
-    tilt = 2 * np.degrees(np.arctan2(path.orientations[:, 0], path.orientations[:, 3]))
-    assert (tilt.min(), tilt.max()) == pytest.approx((-4, 4), abs=0.01)
-    assert tilt[at(6.25)] == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(path.orientations, axis=1), 1, atol=1e-15)
 
 
 def test_it_moves_as_smoothly_as_a_hand():

@@ -333,18 +333,6 @@ def test_files_that_are_no_path(tmp_path, name, content, words):
         read_path(tmp_path / name)
 
 
-def test_other_encodings_are_no_path(shared_data, tmp_path):
-    record(tmp_path / "path.mcap", {"/tracker/pose": [of_type(POSE_STAMPED, 0)]})
-    (one,) = read_bag(tmp_path / "path.mcap").messages()
-    with BagWriter(tmp_path / "xcdr2.mcap", sidecar=False) as bag:
-        bag.add_topic(one.topic, POSE_STAMPED)
-        bag.write(one.topic, b"\0\7" + one.data[2:], one.log_time)
-    wrong = shared_data / "mcap-rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test"
-    for file in (wrong, tmp_path / "xcdr2.mcap"):
-        with pytest.raises(BagError, match=POSE_STAMPED):
-            read_path(file)
-
-
 def test_arrays_that_do_not_go_together_are_refused():
     with pytest.raises(BagError, match="2 stamps"):
         ProbePath("/p", "patient", np.arange(2), np.zeros((3, 3)), np.zeros((2, 4)))

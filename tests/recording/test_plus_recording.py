@@ -66,14 +66,9 @@ def test_a_body_is_led_to_a_reference_by_way_of_the_tracker(tmp_path):
     [
         ({"ProbeToTrackerTransformStatus": "INVALID"}, "ProbeToTrackerTransformStatus is not OK"),
         (
-            {"ProbeToTrackerTransform": MOVED.replace("30", "nan")},
-            "a transform that is singular or not finite",
-        ),
-        (
             {"ProbeToTrackerTransform": "0.2 0 0 0 0 0.2 0 0 0 0 0.2 0 0 0 0 1"},
             "a transform that is not rigid",
         ),
-        ({"ProbeToTrackerTransform": "1 2 3"}, "a transform that is not 16 numbers"),
         ({"ProbeToTrackerTransform": IDENTITY}, "an identity among poses that are none"),
     ],
 )

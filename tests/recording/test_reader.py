@@ -10,13 +10,12 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from session_files import EPOCH, HI, STRING
 
 from us_sim.errors import BagError
-from us_sim.recording.reader import describe, read_bag
+from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
 
@@ -280,24 +279,6 @@ def test_blocks_of_zeros_after_a_power_cut(tmp_path, sessions):
     assert read == list(read_bag(sessions["none"]).messages())[: len(read)]
 
 
-@pytest.mark.parametrize("summary", [True, False])
-def test_files_without_chunks_by_another_writer(tmp_path, summary):
-    file = tmp_path / "other.mcap"
-    with file.open("wb") as stream:
-        writer = Writer(stream, use_chunking=False, use_statistics=summary, repeat_channels=summary)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(STRING, "ros2msg", b"string data\n")
-        channel = writer.register_channel("/note", "cdr", schema)
-        for k in (2, 0, 1):
-            writer.add_message(channel, EPOCH + k, HI, EPOCH)
-        writer.finish()
-    bag = read_bag(file)
-    assert not bag.note
-    assert [m.log_time - EPOCH for m in bag.messages()] == [0, 1, 2]
-    assert bag.topic("note").qos == ()
-    assert bag.deserialize(next(bag.messages())).data == "hi"
-
-
 def test_a_compressed_file_leaves_nothing_behind(tmp_path, monkeypatch):
     write_session(tmp_path / "bag.mcap")
     packed = tmp_path / "bag.mcap.zstd"
@@ -376,13 +357,3 @@ def test_a_database_that_is_no_bag(tmp_path):
         database.execute("CREATE TABLE things(id)")
     with pytest.raises(BagError, match="rosbag2 database"):
         read_bag(tmp_path / "other.db3")
-
-
-def test_a_rate_is_that_between_a_topics_own_messages(tmp_path):
-    with BagWriter(tmp_path / "late.mcap", sidecar=False) as bag:
-        for topic in ("/a", "/late"):
-            bag.add_topic(topic, STRING)
-        for k in range(100):
-            bag.write("/a" if k < 50 else "/late", HI, EPOCH + k * 10**8)
-    lines = [line.split() for line in describe(read_bag(tmp_path / "late.mcap")).splitlines()]
-    assert f"/late {STRING} 50 10.0 -".split() in lines

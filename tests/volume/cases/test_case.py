@@ -49,7 +49,6 @@ def changed(folder, text):
     ("text", "sentence"),
     [
         ("", "is empty"),
-        ("name: a\nregoin: arm\n", "mean `region`?"),
         ("name: ../../etc\n", "name: '../../etc'"),
         ("name: a\nstructures: {../../up: {label: 6}}\n", "no path"),
         ("name: a\nstructures: {vein: {label: 6}, vena: {label: 6}}\n", "`vein`"),

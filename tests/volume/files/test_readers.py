@@ -173,7 +173,6 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
         ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular"),
         ({"Offset": "0 0 1e9"}, None, "1e\\+06 m"),
         ({"DimSize": "1024 1024 1024"}, None, "536870912"),
-        ({"NDims": "2", "DimSize": "4 30"}, None, "2-dimensional"),
     ],
 )
 def test_a_metaimage_that_is_no_volume_is_refused(tmp_path, fields, data, message):

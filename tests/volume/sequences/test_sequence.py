@@ -190,7 +190,6 @@ NO_IMAGE = {"ImageToReferenceTransform": None, "ProbeToTrackerTransform": MATRIX
     ("write", "fields", "message"),
     [
         (metaimage, {"DimSize": "5 4 4"}, "60 bytes .* 80"),
-        (metaimage, {"DimSize": "5 2 2 3"}, "flat images"),
         (metaimage, {"UltrasoundImageOrientation": "AMF"}, "'AMF'"),
         (
             metaimage,
