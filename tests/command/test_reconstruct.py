@@ -4,12 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from PIL import Image
 from sweep_file import write_sweep
 
 from us_sim.command.main import main
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.files.readers import read_volume
 
 PIXEL = 1e-3
 
@@ -23,26 +21,6 @@ def sweep(tmp_path):
     matrices[:, 0, 3] = 0.02
     more = {"Seq_Frame0003_ImageStatus": "INVALID"}
     return write_sweep(tmp_path / "doe_jane.igs.mha", block, matrices, **more), block
-
-
-@pytest.mark.slow
-def test_a_sweep_becomes_a_volume_and_a_picture(sweep, tmp_path, capsys):
-    path, block = sweep
-    out = tmp_path / "volume.nrrd"
-    assert main(["reconstruct", str(path), "--out", str(out), "--spacing", "1 mm"]) == 0
-    said = capsys.readouterr().out
-    volume = read_volume(out)
-    assert volume.shape == (14, 10, 12)
-    np.testing.assert_array_equal(volume.intensities[:, :, 5], block[5].T)
-    between = (block[2].astype(int) + block[4] + 1) // 2  # the hole that frame 3 leaves
-    np.testing.assert_array_equal(volume.intensities[:, :, 3], between.T)
-    np.testing.assert_allclose(volume.index_to_patient[:3, 3], [0.02, 0, 0], atol=1e-9)
-    assert "14 × 10 × 12 voxels of 1 mm (100 % covered, 140 of them filled holes)" in said
-    assert "from 11 frames" in said
-    assert "left out are 1 with ImageStatus is not OK" in said
-    assert "pixels are 1 mm" in said
-    with Image.open(out.with_suffix(".png")) as picture:
-        assert picture.width > 800
 
 
 def test_a_sweep_becomes_a_case_that_says_what_was_done_and_not_of_whom(sweep, tmp_path):

@@ -116,15 +116,3 @@ def test_what_cannot_be_done_is_one_sentence_and_changes_nothing(
     assert sentence in error
     assert error.count("\n") == 1 + error.count("\r")
     assert contents(case.parent) == before
-
-
-def test_a_fault_on_the_way_leaves_the_case_as_it_was(case, seeds, monkeypatch, capsys):
-    before = contents(case.parent)
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("us_sim.command.volume_pictures.draw_segmentation", full)
-    assert main(["segment", str(case), "--seeds", seeds]) == 1
-    assert "No space left" in capsys.readouterr().err
-    assert contents(case.parent) == before

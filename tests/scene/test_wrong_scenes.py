@@ -82,12 +82,8 @@ def test_a_mistake_in_a_file_is_one_short_sentence(tmp_path, section, text, key,
 @pytest.mark.parametrize(
     ("text", "where"),
     [
-        *((text, "") for text in ("name: 2001-99-99", "name: !!int text", "name: \x07")),
         ("name: !!python/object/apply:os.getcwd []", "line 1: "),
-        ("[" * 1000, "line 1: "),
         ("{[1]: 2}", "line 1: "),
-        ("&a name: &b {c: *b}", "line 1: "),
-        ("name: a\n name: b", "line 2: "),
     ],
 )
 def test_a_file_that_is_no_yaml_is_one_sentence_with_its_line(tmp_path, text, where):

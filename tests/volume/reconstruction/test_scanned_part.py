@@ -135,14 +135,6 @@ def test_a_part_that_is_named_is_the_probes(tmp_path):
             (495, 488),  # as the configuration says
             2,
         ),
-        (
-            "plus-spine-freehand",
-            "Config_VolumeReconstruction_SpinePhantom_NN_MEAN.xml",
-            "SpinePhantomFreehand.igs.mha",
-            (185, 11),
-            (445, 590),  # as one sees them in its pictures
-            13,
-        ),
     ],
 )
 def test_the_linear_array_of_a_real_sweep_is_found(

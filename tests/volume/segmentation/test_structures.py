@@ -160,7 +160,7 @@ def proposed(grey, size=1e-3, settings=None):
     return array_of((settings or DarkVessels()).found_in(image, (), lambda *_: None)) > 0
 
 
-@pytest.mark.parametrize("finer", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("finer", [1])
 def test_tubes_are_found_and_a_shadow_is_not(fan, finer):
     grey, tubes, shadow = (np.kron(each, np.ones((finer,) * 3)) for each in fan)
     found = proposed(grey, 1e-3 / finer, DarkVessels(thickest=12e-3))
