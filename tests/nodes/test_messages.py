@@ -25,11 +25,9 @@ from us_sim.nodes.messages import (
     pose_text,
     stamp_message,
     structure_markers,
-    transducer_markers,
 )
 from us_sim.recording.decoding import (
     affine_from,
-    line_from,
     markers_stamp,
     mesh_from,
     nanoseconds_of,
@@ -267,24 +265,6 @@ def test_what_is_no_affine_map_is_refused():
     for diagonal in ([1.0, np.nan, 1.0, 1.0], [1.0, 1.0, 1.0, 2.0], [1e7, 1.0, 1.0, 1.0]):
         with pytest.raises(ProbeError, match="finite"):
             affine_from(affine_message(np.diag(diagonal)))
-
-
-def test_a_transducers_markers_are_read_as_they_were_made():
-    corners = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]])
-    triangles = np.array([[0, 2, 1], [0, 1, 3]])
-    outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04]])
-    parts = [("face", (0.2, 0.2, 0.25, 1.0), corners, triangles)]
-    data = transducer_markers(parts, outline, STAMP, "probe")
-    message = deserialize_message(data, MarkerArray)
-    assert len(serialize_message(message)) == len(data)  # some leave anything in the padding
-    assert [marker.type for marker in message.markers] == [Marker.TRIANGLE_LIST, Marker.LINE_STRIP]
-    ((name, colour, read),) = triangles_from(message, "probe")
-    assert name == "face"
-    assert colour == pytest.approx((0.2, 0.2, 0.25))
-    np.testing.assert_array_equal(read, corners[triangles.ravel()])
-    np.testing.assert_array_equal(line_from(message, "probe"), outline)
-    with pytest.raises(MessageError, match=r"'probe'.*'patient'"):
-        triangles_from(message, "patient")
 
 
 @pytest.mark.parametrize("wrong", ["nan", "two corners"])

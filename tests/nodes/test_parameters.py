@@ -255,6 +255,22 @@ def test_what_cannot_be_made_is_set_back_and_said(bench, pressed):
     assert node.health.state == "msds"
 
 
+def test_what_is_set_back_may_be_what_two_settings_say_together(bench, pressed):
+    node, _ = pressed(solver="fem", compare_with="msds", lockstep=True)
+    parameters = [
+        Parameter("solver", value="msds"),
+        Parameter("compare_with", value="fem"),
+        Parameter("msds.stabilisation", value="substeps"),
+        Parameter("msds.maximum_substeps", value=1),
+        Parameter("msds.time_step", value=5.0),
+    ]
+    assert node.set_parameters_atomically(parameters).successful
+    assert node.health.problems("setting") == 1
+    assert node.get_parameter("solver").value == "fem"
+    assert node.get_parameter("compare_with").value == "msds"
+    bench.spin_for(3)
+
+
 @pytest.mark.parametrize(
     ("node", "given", "checked"),
     [

@@ -8,6 +8,8 @@ import textwrap
 
 import pytest
 
+from us_sim.nodes import process
+from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.process import go_first, scheduling_of
 from us_sim.share import find_bag
 
@@ -78,6 +80,26 @@ def test_who_may_not_goes_on_as_before(monkeypatch):
     assert scheduling_of(2**22 + 1) == "ordinary"  # there is no such process
     monkeypatch.delattr(os, "sched_getscheduler", raising=False)
     assert scheduling_of(os.getpid()) == "ordinary"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "asked"),
+    [({}, True), ({"realtime": False}, False), ({"lockstep": True}, False)],
+)
+def test_a_node_asks_for_it_and_says_what_it_got(
+    bench, small_scene, monkeypatch, parameters, asked
+):
+    node = bench.make(ProbeTracker, scene=str(small_scene), **parameters)
+    times = []
+    monkeypatch.setattr(process, "go_first", lambda priority: times.append(priority) or "realtime")
+    monkeypatch.setattr(process, "spin", lambda _: None)
+    monkeypatch.setattr(process.rclpy, "init", lambda **_: None)
+    monkeypatch.setattr(process.rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(node, "destroy_node", lambda: None)
+    monkeypatch.setattr(process.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(process.gc, "freeze", lambda: None)
+    assert process.run_node(lambda: node) == 0
+    assert (times, node.health.scheduling) == (([2], "realtime") if asked else ([], ""))
 
 
 UNUSED = [

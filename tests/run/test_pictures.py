@@ -2,11 +2,9 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from us_sim.errors import BagError
-from us_sim.evaluation.hand.hand_motion import hand_motion, shipped_hand_path
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.run.contact_sheet import _moments
 
@@ -29,16 +27,6 @@ def test_the_scripted_press():
     assert moments["full press"] == pytest.approx(3.2, abs=0.3)
     assert moments["slid aside"] == pytest.approx(6.25, abs=0.02)
     assert moments["after"] == pytest.approx(9.983, abs=0.001)
-
-
-@pytest.mark.parametrize("path", [shipped_hand_path(), hand_motion("free", "brisk", 2, 4.0)])
-def test_a_hand(path):
-    moments = told(path)
-    assert list(moments.values()) == sorted(moments.values())
-    depth = np.array([pose.position[2] for pose in path.poses])
-    deepest = depth[round(60 * moments["full press"])]
-    assert deepest == pytest.approx(depth.max(), abs=1e-4)
-    assert depth[round(60 * moments["slid aside"])] >= deepest / 2
 
 
 def test_a_path_that_never_touches_has_its_moments_too():
