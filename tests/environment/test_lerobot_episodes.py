@@ -1,4 +1,4 @@
-"""Episodes for LeRobot against the environment that they are of."""
+"""Episodes for LeRobot against the environment that they are of, and against lerobot itself."""
 
 import json
 import sys
@@ -165,3 +165,26 @@ def test_a_missing_lerobot_and_a_rate_that_is_none_are_told_before_work(
     assert frames_a_second(1 / 30) == 30
     with pytest.raises(EpisodeError, match=r"makes 33\.3333 steps a second.*set it to"):
         frames_a_second(0.03)
+
+
+def test_lerobot_itself_loads_the_same_for_any_number_of_workers(scene, made, tmp_path, capsys):
+    pytest.importorskip("lerobot", reason="lerobot is not installed: it brings torch")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    command = ["dataset", scene, "--episodes", "2", "--task", "FindVein", "--format", "lerobot"]
+    assert main([*command, "--out", str(made)]) == 0
+    assert main([*command, "--out", str(tmp_path / "two"), "--workers", "2"]) == 0
+    one, two = (LeRobotDataset("a/b", root=out / "lerobot") for out in (made, tmp_path / "two"))
+    assert (one.num_episodes, one.num_frames, one.fps) == (2, 2 * STEPS, 30)
+    _, frames, _ = episode(made)
+    for k, frame in enumerate(frames, STEPS):
+        item, other = one[k], two[k]
+        image = (255 * item["observation.images.ultrasound"].numpy()).round()
+        assert (image == frame["observation.images.ultrasound"]).all()  # PNG loses nothing
+        for name in ("observation.state", "action", "truth.labels", "next.reward"):
+            assert np.array_equal(item[name].numpy().reshape(frame[name].shape), frame[name])
+        assert all(str(item[name]) == str(other[name]) for name in item)
+    assert item["task"] == "Bring the vein to the image's middle, in contact and not pressed flat."
+    (made / "lerobot" / "meta" / "info.json").write_text('{"total_episodes": 1}')
+    assert main([*command, "--out", str(made)]) == 1
+    assert "has 1 episodes of 2: remove the folder" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from us_sim.errors import SceneError, UsSimError
 from us_sim.evaluation.slice.recorded import LIVER_SWEEP
 from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
-from us_sim.scene.reading import find_scene, load_scene, parse_scene
+from us_sim.scene.reading import load_scene, parse_scene
 from us_sim.scene.scene import ImagingSettings
 from us_sim.share import shared_path
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, SectorProbe
@@ -169,11 +169,6 @@ def test_a_broken_file_is_named_with_its_line(tmp_path, content, fact):
     file.write_bytes(content)
     with pytest.raises(SceneError, match=f"broken.yaml.*{fact}"):
         load_scene(file)
-
-
-def test_an_unknown_scene_lists_the_installed_ones():
-    with pytest.raises(SceneError, match="liver_sweep, upper_arm"):
-        find_scene("nowhere")
 
 
 def test_the_installed_scenes_are_valid(tmp_path):

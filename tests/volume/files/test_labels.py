@@ -209,6 +209,7 @@ GRADIENT = np.arange(np.prod(SHAPE), dtype=np.int16).reshape(SHAPE)
     [
         ("a.nrrd", np.zeros(SHAPE, np.uint8), {}, "none of its voxels has a label"),
         ("a.mha", GRADIENT + 1, {}, "336 different values"),
+        ("a.mha", GRADIENT / np.float32(3), {}, "fractions"),
         ("a.nrrd", np.ones((*SHAPE, 2), np.uint8), {}, "2 numbers per voxel"),
         ("a.seg.nrrd", ONES, segments(("vein", 1, 4)), "layer 4 of 1"),
         ("a.seg.nrrd", ONES, {"Segmentation_MasterRepresentation": "Fractional"}, "Fractional"),

@@ -172,6 +172,7 @@ def test_volumes_and_sequences_are_told_apart_by_their_axes_or_frames(
         ({"ElementSpacing": "0 1 1"}, None, "spacing 0 × 1 × 1 mm"),
         ({"TransformMatrix": "1 0 0 1 0 0 0 0 1"}, None, "singular"),
         ({"Offset": "0 0 1e9"}, None, "1e\\+06 m"),
+        ({"DistanceUnits": "furlong"}, None, "furlong"),
         ({"DimSize": "1024 1024 1024"}, None, "536870912"),
     ],
 )
