@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from PIL import Image
 from wrench_files import write_wrenches
 
 from us_sim.command.main import main
@@ -24,8 +22,6 @@ from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.volume import Volume
 
-OTHERS = ("skin", "fat", "bone", "artery", "vein", "nerve")
-
 
 def felt_in(source, name, modulus, path) -> np.ndarray:
     """The wrenches (K, 6) of a press of a scene, one of whose structures has another modulus."""
@@ -39,13 +35,6 @@ def felt_in(source, name, modulus, path) -> np.ndarray:
     return wrenches + np.random.default_rng(3).normal(scale=0.005, size=wrenches.shape)
 
 
-@pytest.fixture(scope="module")
-def press(small_scene) -> tuple[ProbePath, np.ndarray]:
-    """The small arm, pressed by few poses; its muscle is 20 kPa, and not 12 as the scene says."""
-    path = replace(press_and_slide(rate=4.0, duration=10.0), topic="/probe/pose")
-    return path, felt_in(small_scene, "muscle", 20e3, path)
-
-
 def session(folder: Path, path: ProbePath, wrenches: WrenchRecord | None) -> str:
     folder.mkdir()
     with BagWriter(folder / "session.mcap") as writer:
@@ -57,25 +46,6 @@ def session(folder: Path, path: ProbePath, wrenches: WrenchRecord | None) -> str
 
 def record_of(path, wrenches, frame="probe") -> WrenchRecord:
     return WrenchRecord("/probe/wrench", frame, path.stamps, wrenches)
-
-
-@pytest.mark.slow
-def test_a_press_gives_a_scene_with_its_moduli_and_a_picture(press, small_scene, tmp_path, capsys):
-    path, wrenches = press
-    recording = session(tmp_path / "bag", path, record_of(path, wrenches))
-    out = tmp_path / "fitted.yaml"
-    words = ["fit-stiffness", str(small_scene), recording, "--out", str(out), "--poses", "14"]
-    assert main([*words, "--keep", *OTHERS]) == 0
-    assert "left over (RMS)" in capsys.readouterr().out
-    made = yaml.safe_load(out.read_text())
-    assert list(made["tissue"]["materials"]) == ["muscle"]
-    scene = load_scene(out)
-    assert scene.tissue.materials["muscle"].young_modulus == pytest.approx(20e3, rel=0.05)
-    assert scene.tissue.materials["fat"].young_modulus == 5e3
-    with Image.open(out.with_suffix(".png")) as picture:
-        assert picture.width > 800
-    assert main([*words, "--keep", *OTHERS]) == 1
-    assert "exists already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
