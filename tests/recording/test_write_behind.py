@@ -1,5 +1,6 @@
 """A bag written from a thread of its own: nobody waits, and nothing is lost unsaid."""
 
+import resource
 import threading
 import time
 
@@ -63,6 +64,35 @@ def test_numbers_show_where_messages_are_missing(tmp_path, slow_disk):
         numbers = [m.sequence for _, _, m in make_reader(file).iter_messages()]
     lost = bag.losses.total()
     assert numbers == [1, 2, 3, 4 + lost]
+
+
+def test_a_full_disk_is_written_to_again_when_there_is_room(tmp_path, monkeypatch):
+    monkeypatch.setattr("us_sim.recording.write_behind._RETRY", 0.05)
+    file = tmp_path / "session.mcap"
+    bag = WriteBehind(BagWriter(file, chunk_size=1000), max_cache_size=20_000)
+    bag.add_topic("/a", STRING)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        for k in range(100):
+            while not bag.problem and not bag.put("/a", bytes(1000), EPOCH + k):
+                time.sleep(0.01)
+        wait_until(lambda: "File too large" in bag.problem)
+        assert "File too large" in bag.untold.popleft()
+        assert 30 < read_bag(file).message_count < 60  # as far as it goes
+        taken = [bag.put("/a", bytes(1000), EPOCH + 200 + k) for k in range(100)]
+        assert 0 < sum(taken) < 100
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    wait_until(lambda: not bag.problem)
+    bag.put("/a", bytes(1000), EPOCH + 1000)
+    bag.close()
+    whole = read_bag(tmp_path)
+    assert not whole.note
+    times = [message.log_time - EPOCH for message in whole.messages()]
+    assert times[-1] == 1000
+    assert whole.lost() == bag.losses
+    assert set(range(200)) & set(times) >= set(range(40))
 
 
 def test_a_failure_of_any_kind_is_counted_and_ends_nothing(tmp_path):
