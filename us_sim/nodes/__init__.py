@@ -8,6 +8,7 @@ it runs.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import itertools
 import os
@@ -103,9 +104,10 @@ def prepare_process() -> None:
     name = node_name(sys.orig_argv)
     if not name:
         return
-    from setproctitle import setproctitle
+    with contextlib.suppress(ImportError):  # a node works without a name in `ps`
+        from setproctitle import setproctitle
 
-    setproctitle(name)
+        setproctitle(name)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:
