@@ -20,7 +20,7 @@ IMAGES = "/ultrasound/image"
 ENDED = {
     "slice_interpolator": (signal.SIGKILL, "was ended by SIGKILL"),
     "tissue_deformer": (signal.SIGTERM, "ended with status 0"),
-    "session_recorder": (signal.SIGSTOP, "has not reported for 3 s"),
+    "session_recorder": (signal.SIGSTOP, "has not reported for 10 s"),
 }
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
@@ -58,7 +58,7 @@ def test_nodes_that_end_are_back_and_the_rest_goes_on(played_scene, tmp_path):
         "--restarts",
         "1",
         "--silence",
-        "3",
+        "10",
         "--param",
         "path_player.loop=true",
     ]
