@@ -18,6 +18,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from us_sim.errors import UsSimError, memory_limit
 from us_sim.nodes import INTERRUPTED, ros_refusal
@@ -95,6 +96,9 @@ _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 _told_to_end = threading.Event()
 """An exception of a handler is lost where it meets a destructor or a compiler's callback."""
 
+_is_spun = threading.Event()
+"""From then on a signal waits for the callback's end: no message or solver is left halfway."""
+
 
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     """Spin the node until it is done or told to stop; the exit status.
@@ -106,7 +110,9 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     for number in _ENDINGS:
         signal.signal(number, _interrupt_once)
     try:
-        rclpy.init(args=args)
+        # rclpy's own handlers shut the context down from a thread, before ours has run: that could
+        # then break off the very end of a node, and leave a recording without its index.
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:  # what rcl raises for bad arguments differs between its versions
@@ -119,6 +125,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         executor = create_executor(node)  # which starts threads for timers
         if priority := getattr(node, "realtime_priority", 0):
             node.health.scheduling = go_first(priority)
+        _is_spun.set()
         spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -151,7 +158,7 @@ def create_executor(node: Node) -> Executor:
 
 
 def spin(node: Node, executor: Executor) -> None:
-    """Run the node's callbacks until its future ``finished``, if it has one, or rclpy is shut down.
+    """Run the node's callbacks until its future ``finished``, if any, is done, or it shall end.
 
     Callbacks of a `GuardedNode` raise nothing, but rclpy does, for instance for a request of a
     service that it cannot decode: that is counted and said as a failure of the node, too.
@@ -165,7 +172,7 @@ def spin(node: Node, executor: Executor) -> None:
     try:
         while node.context.ok() and (finished is None or not finished.done()):
             if _told_to_end.is_set():
-                raise KeyboardInterrupt
+                return
             try:
                 executor.spin_once(timeout_sec=TURN_S)
                 worked = time.monotonic()
@@ -191,6 +198,8 @@ def _interrupt_once(*_: object) -> None:
     for number in _ENDINGS:
         signal.signal(number, lambda *_: None)
     _told_to_end.set()
+    if _is_spun.is_set():
+        return
     sys.unraisablehook = lambda _: None  # a compiler's callback has nobody to pass this on to
     raise KeyboardInterrupt
 

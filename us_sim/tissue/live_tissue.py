@@ -1,8 +1,8 @@
 """One tissue whose method, settings and materials change while frames go on.
 
 Numba's compiler holds the interpreter's lock for most of its time. With Python's usual turns of
-5 ms a frame in another thread waits a turn each time that it lets the lock go (99 % of frames of
-1.3 ms within 91 ms); with turns of 0.1 ms it hardly does (within 18 ms).
+5 ms a frame in another thread waits a turn each time that it lets the lock go; with turns of 0.1 ms
+it hardly does.
 
 >>> from us_sim.tissue.elasticity.material import Material
 >>> model = TissueModel.block(material=Material(10e3, 0.3, 1000.0))

@@ -29,8 +29,7 @@ class Tuning:
     """The same of a small tissue."""
     most_factors: int = 2
     """Factors of the stiffness that may be made for one pose, except in a small tissue: one, and
-    another where points have come to touch since. In a tissue of 6,929 nodes one takes 0.6 s, as
-    long as six frames."""
+    another where points have come to touch since."""
     small_tissue: int = 500
     """Free nodes up to which factoring the stiffness takes no longer than a frame."""
     forcing_term: float = 0.2
