@@ -231,6 +231,17 @@ def test_spinning_ends_where_nothing_works_any_more(bench, broken, monkeypatch):
     assert broken.failures["what came in"] > 1
 
 
+def test_timers_that_are_overdue_at_the_start_keep_their_periods(bench, broken):
+    bench.executor.remove_node(broken)
+    timers = [broken.create_timer(0.05, lambda: None) for _ in range(3)]
+    time.sleep(0.06)
+    executor = process.create_executor(broken)
+    for _ in range(10):
+        executor.spin_once(timeout_sec=0.0)
+    assert max(timer.time_until_next_call() for timer in timers) <= 0.05e9
+    executor.remove_node(broken)
+
+
 def test_every_node_and_every_subscription_is_guarded():
     package = Path(guarded_node.__file__).parents[1]
     texts = {file: file.read_text("utf-8") for file in package.rglob("*.py")}

@@ -122,10 +122,10 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         node = create()
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
         inspect.getframeinfo(sys._getframe())  # as rclpy does with each log; the first takes 40 ms
-        executor = create_executor(node)  # which starts threads for timers
+        _is_spun.set()
+        executor = create_executor(node)
         if priority := getattr(node, "realtime_priority", 0):
             node.health.scheduling = go_first(priority)
-        _is_spun.set()
         spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -151,9 +151,15 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
 
 
 def create_executor(node: Node) -> Executor:
-    """Return the executor that the node asks for, with the node."""
+    """Return the executor that the node asks for, with the node and the threads of its timers."""
     executor: Executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
+    # EventsExecutor calls a timer that is overdue when it is added once for each timer that follows
+    # it, and each call sets the next one a period later: a slow start made a node silent for 5 s.
+    for timer in node.timers:
+        if not timer.is_canceled():
+            timer.reset()
     executor.add_node(node)
+    executor.spin_once(timeout_sec=0.0)
     return executor
 
 
