@@ -151,7 +151,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
 
 
 def create_executor(node: Node) -> Executor:
-    """Return the executor that the node asks for, with the node and the threads of its timers."""
+    """Return the executor that the node asks for, with the node."""
     executor: Executor = getattr(node, "executor_class", EventsExecutor)(context=node.context)
     # EventsExecutor calls a timer that is overdue when it is added once for each timer that follows
     # it, and each call sets the next one a period later: a slow start made a node silent for 5 s.
@@ -159,7 +159,6 @@ def create_executor(node: Node) -> Executor:
         if not timer.is_canceled():
             timer.reset()
     executor.add_node(node)
-    executor.spin_once(timeout_sec=0.0)
     return executor
 
 
