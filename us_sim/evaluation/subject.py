@@ -1,0 +1,250 @@
+"""A subject of `us-sim evaluate`: pieces of work that yield rows, and a report of the table.
+
+A subject is a folder with a module that makes one `Subject`, and a page ``report.md``. Its
+``pieces`` are the work, by the name of the CSV file that their rows go to; each `Piece` says which
+case it measures, and has a function that returns rows (dicts) when it is called. The engine shows
+the progress, calls one piece after another, adds the case to each row, notes what a piece that
+fails raised, and writes the CSV: the columns stand as they first come up, and a key that the
+subject names as ``hidden`` is for the report alone, such as an array, an image or a whole object.
+
+The subject's ``report`` gets a pandas DataFrame for each CSV file, in order, failed pieces left
+out, and returns the `Report`: at most five lines for a reader to take home, `Target`s where the
+subject has some, and by name what stands at the places ``$name`` of the page. A place holds text, a
+list of lines (a bulleted list), a DataFrame (a table), or a figure of `us_sim.evaluation.figures`
+(written as ``SUBJECT_name.png``). A section of the page (from ``##`` to the next) of whose places
+none has anything is left out.
+
+The page comes out as: title, what to take home, how and on what machine it was measured, targets,
+then ``report.md``, then what failed. The command is ``us-sim evaluate SUBJECT [--quick]``; the
+registry's target is the `Subject`, which is called with the folder, ``quick``, and the subject's
+settings if it has some; these go to ``pieces``, too. It prints the lines to take home and returns 1
+where something failed.
+
+>>> from us_sim.evaluation.subject import Target, markdown_of
+>>> Target.at_most("an image", 2.0, 1.5, "ms").cells
+('an image', 'at most 2 ms', '1.5 ms', 'yes')
+>>> print(markdown_of(pd.DataFrame([{"method": "fem", "ms": 0.123456}, {"method": "msds"}])))
+| method | ms    |
+| ------ | ----- |
+| fem    | 0.123 |
+| msds   |       |
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+from typing import Any, TypeAlias
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from us_sim.errors import UsSimError
+from us_sim.evaluation.report import machine, markdown_table
+from us_sim.progress import Progress
+
+Place: TypeAlias = "str | Sequence[str] | pd.DataFrame | Figure"
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One piece of a subject's work."""
+
+    case: Mapping[str, Any]  # the columns that say what is measured, in every one of its rows
+    measure: Callable[[], Iterable[Mapping[str, Any]]]
+
+    def __str__(self) -> str:
+        return ", ".join(str(value) for value in list(self.case.values())[:4])
+
+
+@dataclass(frozen=True)
+class Target:
+    """One line of a report's table of targets."""
+
+    what: str
+    asked: str
+    seen: str = "not measured"
+    met: bool | None = None  # None where it was not measured
+
+    @classmethod
+    def at_most(
+        cls, what: str, limit: float, seen: float, unit: str = "", *, form: str = ".3g"
+    ) -> Target:
+        """A limit from above; ``seen`` is NaN where it was not measured."""
+        return cls._limit(what, f"at most {limit:g}", seen, seen <= limit, unit, form)
+
+    @classmethod
+    def at_least(
+        cls, what: str, limit: float, seen: float, unit: str = "", *, form: str = ".3g"
+    ) -> Target:
+        """A limit from below; likewise."""
+        return cls._limit(what, f"at least {limit:g}", seen, seen >= limit, unit, form)
+
+    @classmethod
+    def _limit(cls, what: str, asked: str, seen: float, met: bool, unit: str, form: str) -> Target:
+        unit = unit and f" {unit}"
+        if not np.isfinite(seen):
+            return cls(what, asked + unit)
+        return cls(what, asked + unit, f"{seen:{form}}{unit}", bool(met))
+
+    @property
+    def cells(self) -> tuple[str, str, str, str]:
+        """Cells in the table."""
+        return self.what, self.asked, self.seen, {True: "yes", False: "no", None: ""}[self.met]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a subject says of its table."""
+
+    take_home: Sequence[str]  # at most five lines
+    places: Mapping[str, Place]
+    targets: Sequence[Target] = ()
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One subject, called to measure it and write its report."""
+
+    name: str
+    title: str
+    pieces: Callable[..., Mapping[str, Sequence[Piece]]]  # of quick, and the settings if any
+    report: Callable[..., Report]  # of a DataFrame a CSV file
+    hidden: Sequence[str] = ()  # keys of rows that are no columns of the CSV
+    libraries: Sequence[str] = ("numpy", "scipy", "numba")  # whose versions matter
+    digits: int = 4  # significant, of numbers in the CSV
+
+    def __call__(self, out: Path, quick: bool, *settings: Any) -> int:
+        """Measure everything and write CSV files, pictures and the page into a folder.
+
+        Args:
+            out: the folder, made if it is not there.
+            quick: whether it is the short run.
+            settings: of the subject, if it has some.
+
+        Returns:
+            1 if a piece failed, else 0.
+
+        Raises:
+            UsSimError: the folder cannot be written, or holds a report. That is said before
+                anything is measured, so that nothing that took hours is lost.
+        """
+        page = out / f"{self.name}.md"
+        _check_folder(out, page)
+        begun = time.perf_counter()
+        tables: dict[str, pd.DataFrame] = {}
+        failures: list[str] = []
+        for name, pieces in self.pieces(quick, *settings).items():
+            rows, failed = _measure(name, pieces)
+            tables[name] = pd.DataFrame(rows)
+            failures += [f"{piece}: {words}" for piece, words in failed]
+            rows += [{**piece.case, "failure": words} for piece, words in failed]
+            self._write_csv(out / f"{name}.csv", pd.DataFrame(rows))
+        if any(table.empty for table in tables.values()):
+            report = Report(["Nothing was measured."], {})
+        else:
+            report = self.report(*tables.values())
+        seconds = time.perf_counter() - begun
+        command = f"us-sim evaluate {self.name}{' --quick' if quick else ''}"
+        files = " and ".join(f"[{name}.csv]({name}.csv)" for name in tables)
+        targets = pd.DataFrame(
+            [target.cells for target in report.targets], columns=["", "asked", "seen", "met"]
+        )
+        parts = (
+            f"# {self.title}",
+            _text_of(report.take_home),
+            f"`{command}`, {seconds:.0f} s, on {machine(*self.libraries)}. "
+            f"Every row is in {files}.",
+            _text_of(targets),
+            self._fill_page(out, report.places),
+            "## Failed" if failures else "",
+            _text_of(failures),
+        )
+        page.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+        print("\n".join([*report.take_home, f"Report: {page}"]))
+        for failure in failures[:10]:
+            print(f"failed: {failure}")
+        return 1 if failures else 0
+
+    def _write_csv(self, file: Path, table: pd.DataFrame) -> None:
+        shown = table.drop(columns=[name for name in self.hidden if name in table])
+        # Counts that some rows lack are counts all the same.
+        cells = shown.convert_dtypes().map(lambda value: _cell(value, f".{self.digits}g"))
+        cells.to_csv(file, index=False, lineterminator="\n")
+
+    def _fill_page(self, out: Path, places: Mapping[str, Place]) -> str:
+        """Text of the subject's ``report.md`` with its places filled, and its figures written."""
+        filled = {}
+        for name, place in places.items():
+            if isinstance(place, Figure):
+                picture = out / f"{self.name}_{name}.png"
+                place.savefig(picture, dpi=110)
+                filled[name] = f"![{place.get_label()}]({picture.name})"
+            else:
+                filled[name] = _text_of(place)
+        text = Path(__file__).with_name(self.name).joinpath("report.md").read_text(encoding="utf-8")
+        sections = []
+        for section in re.split(r"\n(?=## )", text):
+            asked = Template(section).get_identifiers()
+            if not asked or any(filled.get(name) for name in asked):
+                sections.append(Template(section).safe_substitute(filled).strip())
+        return re.sub(r"\n{3,}", "\n\n", "\n\n".join(sections))
+
+
+def markdown_of(table: pd.DataFrame, form: str = ".3g") -> str:
+    """Write a table in Markdown, its floats in a format; what is not known is empty."""
+    rows = [[_cell(value, form) for value in row] for row in table.astype(object).to_numpy()]
+    return markdown_table([str(name) for name in table.columns], rows) if rows else ""
+
+
+def _cell(value: Any, form: str) -> str:
+    if isinstance(value, bool | np.bool_):
+        return str(value).lower()
+    if value is None or value is pd.NA or value != value:  # NaN is no number that equals itself
+        return ""
+    return f"{value:{form}}" if isinstance(value, float | np.floating) else str(value)
+
+
+def _text_of(place: str | Sequence[str] | pd.DataFrame) -> str:
+    if isinstance(place, pd.DataFrame):
+        return markdown_of(place)
+    if isinstance(place, str):
+        return place
+    return "\n".join(f"- {line}" for line in place)
+
+
+def _check_folder(out: Path, page: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise UsSimError(
+            f"--out {out}: cannot be written ({error.strerror or error}); name another folder"
+        ) from error
+    if page.exists():
+        raise UsSimError(f"{page} exists already; choose another folder with --out")
+
+
+def _measure(
+    name: str, pieces: Sequence[Piece]
+) -> tuple[list[dict[str, Any]], list[tuple[Piece, str]]]:
+    """Rows of all pieces, and the pieces that failed with the words of their errors."""
+    rows, failed = [], []
+    with Progress(name, len(pieces), "pieces") as progress:
+        for done, piece in enumerate(pieces):
+            progress.update(done, str(piece))
+            try:
+                for row in piece.measure():
+                    rows.append({**piece.case, **row})
+            # Whatever breaks in one piece must not take the others' results along.
+            except Exception as error:
+                failed.append((piece, f"{type(error).__name__}: {error}".replace("\n", " ")))
+        progress.update(len(pieces))
+    return rows, failed
