@@ -247,7 +247,7 @@ def key_beside(panel: Axes, handles: list | None = None) -> None:  # type: ignor
 
 
 def machine(*libraries: str) -> str:
-    """Processor, cores, system, and the versions of Python and of those libraries it has."""
+    """Name processor, cores, system, and the versions of Python and of the libraries it has."""
     processor = platform.processor() or platform.machine()
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
@@ -258,7 +258,7 @@ def machine(*libraries: str) -> str:
         pass
     parts = [processor, f"{cpu_count()} cores", platform.system()]
     parts.append(f"Python {platform.python_version()}")
-    for name in libraries:
+    for name in dict.fromkeys(["numpy", "scipy", "numba", *libraries]):
         try:
             parts.append(f"{name} {version(name)}")
         except PackageNotFoundError:

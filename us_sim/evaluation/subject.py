@@ -117,7 +117,7 @@ class Subject:
     pieces: Callable[..., Mapping[str, Sequence[Piece]]]  # of quick, and the settings if any
     report: Callable[..., Report]  # of a DataFrame a CSV file
     hidden: Sequence[str] = ()  # keys of rows that are no columns of the CSV
-    libraries: Sequence[str] = ("numpy", "scipy", "numba")  # whose versions matter
+    libraries: Sequence[str] = ()  # whose versions matter, besides those of every subject
     digits: int = 4  # significant, of numbers in the CSV
 
     def __call__(self, out: Path, quick: bool, *settings: Any) -> int:

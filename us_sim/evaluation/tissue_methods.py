@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from us_sim.evaluation.figures import Look
 from us_sim.evaluation.independent_forces import (
     averaged_hooke_forces,
     hooke_forces,
@@ -116,3 +117,6 @@ _ALL = (
 )
 TISSUE_METHODS = {method.name: method for method in _ALL}
 """By name, in the reports' order; colours are told apart in every common colour blindness."""
+
+LOOKS = {method.name: Look(method.colour, method.mark) for method in _ALL}
+"""Of each method's line in a figure."""

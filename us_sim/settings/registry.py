@@ -128,7 +128,7 @@ _EVALUATION = "us_sim.evaluation"
 EVALUATIONS = Choice(
     "evaluation",
     key="subject",
-    tissue=Option(f"{_EVALUATION}.tissue.report:evaluate_tissue", _NOTHING),
+    tissue=Option(f"{_EVALUATION}.tissue.report:TISSUE", _NOTHING),
     stability=Option(f"{_EVALUATION}.stability.report:evaluate_stability", _NOTHING),
     slice=Option(
         f"{_EVALUATION}.slice.report:evaluate_slice",

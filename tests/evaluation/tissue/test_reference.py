@@ -8,12 +8,11 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 from us_sim.errors import SolverError
 from us_sim.evaluation.block import graded_planes
 from us_sim.evaluation.tissue.cases import SCENES
-from us_sim.evaluation.tissue.finite_elements import LinearEquations, NeoHookeanHexahedra
+from us_sim.evaluation.tissue.finite_elements import NeoHookeanHexahedra
 from us_sim.evaluation.tissue.reference import solve_contact
 from us_sim.geometry.collider import Capsule, Sphere
 from us_sim.geometry.collider_distance import signed_distance
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.elasticity.linear_tetrahedra import stiffness
 from us_sim.tissue.elasticity.material import Material
 
 SOFT = Material(10e3, 0.45, 1000.0)
@@ -107,18 +106,3 @@ def test_nearly_incompressible_tissue_is_found_at_once_where_it_is_found_in_step
     at_once = solve_contact(planes, scene.material, scene.collider, [scene.path[-1]])
     in_steps = solve_contact(planes, scene.material, scene.collider, scene.path)
     assert at_once.force[2] == pytest.approx(in_steps.force[2], rel=1e-4)
-
-
-def test_linear_equations_are_hookes_where_nothing_is_averaged():
-    scene = SCENES["press_12mm"]
-    model = scene.model((5, 4, 4))
-    shear = 10e3 / 2.9
-    equations = LinearEquations(model)
-    field = np.sin(30 * model.mesh.nodes[:, [2, 0, 1]])
-    # What is averaged lowers the energy: it is that of Hooke's law or less.
-    whole = field.ravel() @ (stiffness(model.mesh, model.materials) @ field.ravel())
-    assert 0.3 * whole < (field * equations.forces(field)).sum() < whole
-    # A uniform strain has no difference between averages and tetrahedra.
-    strained = model.mesh.nodes * [0.01, 0.02, -0.005]
-    theirs = (stiffness(model.mesh, model.materials) @ strained.ravel()).reshape(-1, 3)
-    np.testing.assert_allclose(equations.forces(strained), theirs, atol=1e-9 * shear)

@@ -1,15 +1,10 @@
 """Finite elements of scikit-fem as a second opinion on `us_sim.tissue`, with no kernel in common.
 
->>> from us_sim.evaluation.tissue.cases import SCENES
 >>> planes = [0.0, 0.05, 0.1]
 >>> block = NeoHookeanHexahedra((planes, planes, planes), Material(10e3, 0.45, 1000.0))
 >>> turned = block.nodes @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T - block.nodes
 >>> block.nodes.shape, bool(abs(block.forces(turned)).max() < 1e-12)
 ((125, 3), True)
->>> model = SCENES["press_12mm"].model((5, 3, 3))
->>> turned = np.cross([0.0, 0.0, 1.0], model.mesh.nodes)
->>> bool(abs(LinearEquations(model).forces(turned)).max() < 1e-12)  # a small turn strains nothing
-True
 >>> matrix = bsr_array(np.diag(np.arange(1.0, 7.0)), blocksize=(3, 3))
 >>> TwoLevel(matrix, csr_array(np.eye(6, 3)))(np.ones(6), 1e-12).round(3).tolist()
 [1.0, 0.5, 0.333, 0.25, 0.2, 0.167]
@@ -21,29 +16,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import bsr_array, csr_array, dia_array
-from scipy.sparse.linalg import LinearOperator, splu
+from scipy.sparse import bsr_array, csr_array
+from scipy.sparse.linalg import splu
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.block import conjugate_gradients
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import volumetric_split
-from us_sim.tissue.model import TissueModel
 
 try:
-    from skfem import (
-        Basis,
-        BilinearForm,
-        ElementHex1,
-        ElementHex2,
-        ElementTetP1,
-        ElementVector,
-        FacetBasis,
-        LinearForm,
-        MeshHex,
-        MeshTet,
-    )
-    from skfem.helpers import ddot, div, sym_grad
+    from skfem import Basis, ElementHex1, ElementHex2, FacetBasis, MeshHex
 except ImportError as error:
     raise UsSimError(
         "the reference solution needs scikit-fem, which is not installed: run "
@@ -356,86 +336,3 @@ def _cofactor(matrix: Array) -> Array:
     """The derivative of the determinant of (..., 3, 3) matrices."""
     rows = [np.cross(matrix[..., (i + 1) % 3, :], matrix[..., (i + 2) % 3, :]) for i in range(3)]
     return np.stack(rows, axis=-2)
-
-
-@BilinearForm
-def _elasticity(u, v, w):  # type: ignore[no-untyped-def]
-    return 2 * w["shear"] * ddot(sym_grad(u), sym_grad(v)) + w["rest"] * div(u) * div(v)
-
-
-@BilinearForm
-def _divergence(u, v, _):  # type: ignore[no-untyped-def]
-    return div(u) * v
-
-
-@LinearForm
-def _volume(v, _):  # type: ignore[no-untyped-def]
-    return v
-
-
-class LinearEquations:
-    """Hooke's law on linear tetrahedra, with the part of the bulk stiffness that acts at nodes.
-
-    The model is of one material throughout.
-    """
-
-    def __init__(self, model: TissueModel) -> None:
-        self._model = model
-        mesh = MeshTet(*map(np.ascontiguousarray, (model.mesh.nodes.T, model.mesh.tetrahedra.T)))
-        split = volumetric_split(model.materials)
-        shear, element = float(split.shear[0]), float(split.element[0])
-        vectors = Basis(mesh, ElementVector(ElementTetP1()), intorder=2)
-        scalars = vectors.with_element(ElementTetP1())
-        self._matrix = _elasticity.assemble(vectors, shear=shear, rest=element - shear).tocsr()
-        volume = _volume.assemble(scalars)  # m3, of a quarter of each tetrahedron around a node
-        each = dia_array((1 / volume[None], [0]), shape=2 * volume.shape)
-        self._average = (each @ _divergence.assemble(vectors, scalars)).tocsr()
-        self._spread = self._average.T.tocsr()
-        self._nodal = float(split.nodal[0]) * volume  # (N,) Pa m3
-
-    def forces(self, displacement: Array) -> Array:
-        """(N, 3) N, that hold the tissue at a displacement (N, 3) m."""
-        return self._product(displacement.ravel()).reshape(-1, 3)
-
-    def solve(
-        self, touched: NDArray[np.int32], normals: Array, depths: Array
-    ) -> tuple[Array, Array]:
-        """Equilibrium with known displacements of the touched nodes along their normals.
-
-        Args:
-            touched: (K,) nodes.
-            normals: (K, 3), unit.
-            depths: (K,) m.
-
-        Returns:
-            (N, 3) m, displacement, and (K,) N, contact forces along the normals.
-
-        Raises:
-            SolverError: SciPy's conjugate gradients did not converge.
-        """
-        free = np.repeat(~self._model.fixed, 3).astype(float)
-
-        def project(vector: Array) -> Array:
-            kept = (vector * free).reshape(-1, 3)
-            along = np.einsum("ij,ij->i", kept[touched], normals)
-            kept[touched] -= along[:, None] * normals
-            return kept.ravel()
-
-        prescribed = np.zeros(self._model.mesh.nodes.shape)
-        prescribed[touched] = depths[:, None] * normals
-        right = project(-self._product(prescribed.ravel()))
-        diagonal = self._matrix.diagonal() + self._spread.power(2) @ self._nodal
-        shape = self._matrix.shape
-        found = conjugate_gradients(
-            LinearOperator(shape, lambda v: project(self._product(project(v)))),
-            right,
-            1e-11,
-            LinearOperator(shape, lambda v: project(project(v) / diagonal)),
-            10_000,
-        )
-        displacement = prescribed + found.reshape(-1, 3)
-        pushes = np.einsum("ij,ij->i", self.forces(displacement)[touched], normals)
-        return displacement, pushes
-
-    def _product(self, vector: Array) -> Array:
-        return self._matrix @ vector + self._spread @ (self._nodal * (self._average @ vector))

@@ -18,7 +18,7 @@ y = 0 and its side; the probe must be as symmetric. Solutions are kept in the us
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,7 +81,6 @@ def solve_contact(
     collider: Collider,
     poses: Sequence[Pose],
     start: Solution | None = None,
-    progress: Callable[[float, str], None] | None = None,
 ) -> Solution:
     """Approach the last pose through the others.
 
@@ -91,7 +90,6 @@ def solve_contact(
         collider: the probe's shape.
         poses: with y = 0 and turned about y only.
         start: another mesh's solution of the first pose, or of one near it.
-        progress: called with the fraction of poses that are done, and a word.
 
     Raises:
         SolverError: a pose is not symmetric, or no equilibrium was found.
@@ -103,17 +101,15 @@ def solve_contact(
                 "x and z, and turn it about y only"
             )
     block = NeoHookeanHexahedra(planes, material)
-    search = _Search(block, collider, progress)
+    search = _Search(block, collider)
     modulus = material.young_modulus
     penalties = np.array(_HARDER) * modulus
     search.penalty = _SOFT * modulus
     if start is not None:
         search.displacement = start.at(block.nodes) * search.free
         search.push, penalties = start.pressure_near(block.surface_points), penalties[3:]
-    for number, pose in enumerate(poses[:-1]):
-        search.done = number / len(poses)
+    for pose in poses[:-1]:
         search.equilibrate(pose, _APPROACHING)
-    search.done = (len(poses) - 1) / len(poses)
     for penalty in penalties:
         search.penalty = penalty
         search.equilibrate(poses[-1], _APPROACHING)
@@ -134,14 +130,9 @@ def solve_contact(
 class _Search:
     """Newton's method on one block; keeps the displacement and the contact multipliers."""
 
-    def __init__(
-        self,
-        block: NeoHookeanHexahedra,
-        collider: Collider,
-        progress: Callable[[float, str], None] | None,
-    ) -> None:
-        self.block, self.collider, self._progress = block, collider, progress
-        self.done, self.penalty = 0.0, 0.0
+    def __init__(self, block: NeoHookeanHexahedra, collider: Collider) -> None:
+        self.block, self.collider = block, collider
+        self.penalty = 0.0
         self.displacement = np.zeros_like(block.nodes)
         self.push = np.zeros(len(block.surface_points))  # Pa, multipliers
         self.free = _movable(block, block.nodes)
@@ -165,8 +156,6 @@ class _Search:
         for _ in range(_NEWTON_STEPS):
             unbalanced, load = self._unbalanced(pose)
             residual = float(np.linalg.norm(unbalanced))
-            if self._progress is not None:
-                self._progress(self.done, f"imbalance {residual / (load or 1.0):.1e}")
             if residual <= tolerance * load or residual < 1e-12:
                 return
             step = self._step(pose, unbalanced)
@@ -257,8 +246,6 @@ def _movable(block: NeoHookeanHexahedra, points: Array) -> NDArray[np.bool_]:
     return free
 
 
-_STRIDE = 0.005  # m, the least distance between the poses through which the last is approached
-
 _ARRAYS, _NUMBERS = ("displacement", "pressure", "force"), ("volume", "penetration")
 """Arrays of a solution that are kept."""
 
@@ -279,30 +266,21 @@ class Reference:
         return self.solution.displacement.size
 
 
-def kept_reference(
-    scene: Scene, sizes: Sequence[float], progress: Callable[[float, str], None] | None = None
-) -> Reference:
-    """The reference of a scene, computed first if it is not kept.
+def kept_reference(scene: Scene, sizes: Sequence[float]) -> Reference:
+    """Return the reference of a scene, computed first if it is not kept.
 
     Args:
         scene: pressed as its path's end says.
         sizes: m, of the elements under the probe, at least two: each mesh starts from the one
             before, the last is the reference, and the one before it shows how far it has converged.
-        progress: called with the fraction that is done, and a word.
 
     Raises:
         SolverError: no equilibrium was found.
     """
-    fine: Solution | None = None
-    for number, size in enumerate(sizes):
-
-        def tell(done: float, text: str, number: int = number) -> None:
-            if progress is not None:
-                progress((number + done) / len(sizes), text)
-
-        coarse, fine = fine, _kept(scene, size, fine, tell)
-    assert coarse is not None
-    assert fine is not None
+    solutions: list[Solution] = []
+    for size in sizes:
+        solutions.append(_kept(scene, size, solutions[-1] if solutions else None))
+    coarse, fine = solutions[-2:]
     points = fine.block.corners
     here, there = fine.at(points), coarse.at(points)
     difference = float(np.linalg.norm(there - here) / np.linalg.norm(here))
@@ -310,9 +288,7 @@ def kept_reference(
     return Reference(fine, sizes[-1], sizes[-2], difference, forces)
 
 
-def _kept(
-    scene: Scene, size: float, start: Solution | None, progress: Callable[[float, str], None]
-) -> Solution:
+def _kept(scene: Scene, size: float, start: Solution | None) -> Solution:
     planes = scene.reference_planes(size)
 
     def pack(solution: Solution) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -324,21 +300,11 @@ def _kept(
         return Solution(block, **arrays, **{name: numbers[name] for name in _NUMBERS})
 
     def make() -> Solution:
-        poses = [scene.path[-1]] if start is not None else _approach(scene)
-        return solve_contact(planes, scene.material, scene.collider, poses, start, progress)
+        poses = scene.path if start is None else scene.path[-1:]
+        return solve_contact(planes, scene.material, scene.collider, poses, start)
 
     form = Form("reference.json", pack, unpack)
     return kept(f"reference-{_hash(scene, planes)}", form, make)
-
-
-def _approach(scene: Scene) -> list[Pose]:
-    """The path's poses without those that are near the one before; the last is there."""
-    poses = [scene.path[0]]
-    for pose in scene.path[1:-1]:
-        turn = 1.0 - abs(float(pose.orientation @ poses[-1].orientation))
-        if np.linalg.norm(pose.position - poses[-1].position) > 0.999 * _STRIDE or turn > 0.0009:
-            poses.append(pose)
-    return [*poses, scene.path[-1]]
 
 
 def _hash(scene: Scene, planes: tuple[Array, ...]) -> str:
@@ -346,7 +312,7 @@ def _hash(scene: Scene, planes: tuple[Array, ...]) -> str:
     digest = hashlib.sha256()
     for file in (str(finite_elements.__file__), __file__):
         digest.update(Path(file).read_bytes())
-    for array in (*planes, *(p.matrix for p in _approach(scene)), scene.collider.offset_box):
+    for array in (*planes, *(pose.matrix for pose in scene.path), scene.collider.offset_box):
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr(scene.material).encode())
     return digest.hexdigest()[:16]

@@ -1,311 +1,169 @@
-"""`us-sim evaluate tissue`: tissue.csv, its pictures, and tissue.md."""
+"""`us-sim evaluate tissue`: errors against run time, on every mesh."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter
+import pandas as pd
+from matplotlib.figure import Figure
 
 from us_sim.evaluation.block import MESHES
-from us_sim.evaluation.report import (
-    ReportFolder,
-    exponent,
-    failures,
-    filled,
-    key_beside,
-    markdown_table,
-    number,
-    panel_grid,
-    picture,
-    plain,
-)
-from us_sim.evaluation.timing import steps
-from us_sim.evaluation.tissue.cases import LOCKING, SCENES, Scene
-from us_sim.evaluation.tissue.measure import Bench, Point, plan
-from us_sim.evaluation.tissue.reference import Reference, kept_reference
-from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.progress import Progress
+from us_sim.evaluation.figures import Look, draw_error_over_parameter, draw_error_over_time
+from us_sim.evaluation.report import exponent
+from us_sim.evaluation.subject import Report, Subject
+from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES
+from us_sim.evaluation.tissue.measure import plan_pieces
+from us_sim.evaluation.tissue_methods import LOOKS, TISSUE_METHODS
 
-_PAPERS_FINEST = int(np.prod(MESHES[-1]))
-_FRAME = 1000.0 / 30.0  # ms, at the paper's 30 frames a second
-_AT_FRAME_RATE: Any = {"color": "0.75", "lw": 1, "ls": ":", "zorder": 0}
-_SIZES, _QUICK_SIZES = (0.01, 0.0065, 0.005), (0.01, 0.0065)  # m, of the reference's elements
-_DEFAULTS = ("scene", "method", "nodes", "ms", "p99 ms", "L2 %", "max mm", "force %", "volume %")
+_NODES = int(np.prod(MESHES[-1]))  # of the paper's finest mesh, on which results are shown
+_AT_FRAME_RATE = {"30 frames a second": 1000.0 / 30.0}  # ms
+_STYLES = ("-", "--", "-.", ":")
+_LABELS = {
+    "ms_median": "ms a frame (median)",
+    "rel_l2_error": "relative L2 error of the nodes",
+    "value": "",
+}
 
 
-def evaluate_tissue(out: Path, quick: bool) -> int:
-    """Write tissue.csv, the plots and tissue.md, as `us_sim.evaluation` says.
-
-    A quick run has fewer scenes, meshes and settings, and a coarser reference.
-
-    Raises:
-        UsSimError: the folder cannot be used, or no reference can be computed.
-    """
-    folder = ReportFolder("tissue", out, quick)
-    trials = plan(quick)
-    references = _references({trial.scene.name: trial.scene for trial in trials}.values(), quick)
-    bench = Bench(references)
-    points = [p for trial in steps("errors and times", trials, "points") for p in bench.run(trial)]
-    folder.write_rows("tissue", points)
-    return _report(folder, points, references)
-
-
-def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """Points than which no other is both faster and more accurate, fastest first."""
-    front: list[Point] = []
-    finite = [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)]
-    for point in sorted(finite, key=lambda p: (p.ms_median, p.rel_l2_error)):
-        if not front or point.rel_l2_error < front[-1].rel_l2_error:
-            front.append(point)
-    return front
-
-
-def _references(scenes: Iterable[Scene], quick: bool) -> dict[str, Reference]:
-    scenes, found = list(scenes), {}
-    with Progress("nonlinear reference", len(scenes), "scenes") as progress:
-        for done, scene in enumerate(scenes):
-
-            def tell(fraction: float, text: str, done: int = done, name: str = scene.name) -> None:
-                progress.update(done + fraction, f"{name}: {text}")
-
-            tell(0.0, "")
-            coarse = quick or scene.name in LOCKING[1:]
-            found[scene.name] = kept_reference(scene, _QUICK_SIZES if coarse else _SIZES, tell)
-        progress.update(len(scenes))
-    return found
-
-
-def _report(folder: ReportFolder, points: Sequence[Point], references: dict[str, Reference]) -> int:
-    """Pictures and tissue.md.
-
-    Results on one mesh are those on the paper's finest, or else on the finest there is; those of
-    one scene are of the one that is pressed on the most meshes.
-    """
-    sizes = {p.nodes for p in points}
-    nodes = _PAPERS_FINEST if _PAPERS_FINEST in sizes else max(sizes)
-    meshes = {name: len({p.nodes for p in points if p.scene == name}) for name in references}
-    scene = max(meshes, key=lambda name: meshes[name])
-    nonlinear, own = [p for p in points if not p.own], [p for p in points if p.own]
-    by_size = [p for p in _defaults(points) if p.scene == scene]
-    scenes = [name for name in references if name not in LOCKING[1:]]
-
-    def by_scene(some: Sequence[Point]) -> dict[str, list[Point]]:
-        return {name: [p for p in some if (p.scene, p.nodes) == (name, nodes)] for name in scenes}
-
-    by_mesh = {
-        f"{count:,} nodes": [p for p in nonlinear if (p.scene, p.nodes) == (scene, count)]
-        for count in sorted({p.nodes for p in points if p.scene == scene})
+def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
+    """Say what the methods cost and how far they are off."""
+    points = points.assign(
+        line=[_line(p.method, p.setting) for p in points.itertuples()],
+        default=points["setting"] == "default",
+    )
+    nonlinear, own = points[~points["own"]], points[points["own"]]
+    shown = nonlinear[(nonlinear["nodes"] == _NODES) & ~nonlinear["scene"].isin(LOCKING[1:])]
+    main = nonlinear[nonlinear["scene"] == MAIN_SCENE]
+    defaults = nonlinear[nonlinear["default"]]
+    fronts = {scene: _pareto_front(some) for scene, some in shown.groupby("scene", sort=False)}
+    places = {
+        "references": references,
+        "nodes": f"{_NODES:,}",
+        "error": _draw_errors(shown, "scene", "to large deformation on fine elements"),
+        "defaults": _in_percent(defaults),
+        "fronts": [f"**{scene}**: {_words(front)}." for scene, front in fronts.items()],
+        "meshes": _draw_errors(main, "nodes", f"by nodes of the mesh, {SCENES[MAIN_SCENE].words}"),
+        "own_error": _draw_errors(
+            own[own["nodes"] == _NODES], "scene", "to each method's own converged equations"
+        ),
+        "own": _in_percent(own[(own["nodes"] == _NODES) & (own["scene"] == MAIN_SCENE)]),
+        "locking": _tabulate_locking(defaults),
+        "estimates": _tabulate_estimates(defaults),
+        "size": _draw_sizes(main[main["default"]]),
+        "sizes": _tabulate_sizes(main[main["default"]]),
     }
-    against = "Error against run time"
-    fine = "large deformation on fine quadratic elements"
-    for name, title, panels in (
-        ("error", f"{against}, to {fine} ({nodes:,} nodes)", by_scene(nonlinear)),
-        (
-            "own_error",
-            f"{against}, to each method's own converged equations ({nodes:,} nodes)",
-            by_scene(own),
-        ),
-        ("meshes", f"{against}, by mesh, {SCENES[scene].words}", by_mesh),
-    ):
-        _plot_errors({k: v for k, v in panels.items() if v}, title, folder.picture(name))
-    _plot_sizes(by_size, f"Cost against size, {SCENES[scene].words}", folder.picture("size"))
-    defaults = [(*_default_cells(p), _number(p.smallest_volume_ratio)) for p in _defaults(points)]
-    return folder.finish(
-        markdown_table(_DEFAULTS, [_default_cells(p) for p in _defaults(points)]),
-        failures(points),
-        ("numpy", "scipy", "numba", "scikit-fem"),
-        references=_reference_table(references),
-        defaults=markdown_table((*_DEFAULTS, "smallest volume ratio"), defaults),
-        nodes=f"{nodes:,}",
-        fronts="\n\n".join(
-            _front(name, [p for p in nonlinear if (p.scene, p.nodes) == (name, nodes)])
-            for name in scenes
-        ),
-        own=_own_table([p for p in own if (p.scene, p.nodes) == (scene, nodes)]),
-        locking=_locking(points),
-        estimates=_estimates(points),
-        sizes=_size_table(by_size),
-    )
+    return Report(list(_take_home(main, fronts)), places)
 
 
-def _plot_errors(panels: dict[str, list[Point]], title: str, file: Path) -> None:
-    """A panel each: relative error against ms a frame, both logarithmic.
-
-    Full marks are defaults; a line joins a method's settings that solve the same equations.
-    """
-    columns, rows = min(3, len(panels)), -(-len(panels) // 3)
-    labels = ("ms a frame (median)", "relative L2 error of the nodes")
-    with picture(file, 4.6 * columns + 0.4, 4.0 * rows + 0.7, title) as figure:
-        keys: dict[str, Any] = {}
-        for axes, points in zip(panel_grid(figure, panels, *labels), panels.values(), strict=True):
-            _draw_errors(axes, [p for p in points if np.isfinite(p.ms_median * p.rel_l2_error)])
-            handles, names = axes.get_legend_handles_labels()
-            keys |= dict(zip(names, handles, strict=True))
-        keys["filled: its defaults"] = Line2D([], [], color="0.3", marker="o", ms=7, ls="")
-        keys["30 frames a second"] = Line2D([], [], **_AT_FRAME_RATE)
-        look: Any = {"loc": "outside right upper", "fontsize": 8, "frameon": False}
-        figure.legend(keys.values(), keys, handlelength=4.5, **look)  # a dash and a dot are seen
-
-
-def _draw_errors(axes: Axes, points: Sequence[Point]) -> None:
-    for name, method in TISSUE_METHODS.items():
-        families: dict[str, list[Point]] = {}
-        for point in sorted(points, key=lambda p: p.ms_median):
-            if point.method == name:
-                families.setdefault(method.family(point.setting), []).append(point)
-        for line, (family, chain) in zip(
-            ("-", "--", "-.", ":"), sorted(families.items()), strict=False
-        ):
-            x, y = [p.ms_median for p in chain], [p.rel_l2_error for p in chain]
-            look: Any = {"color": method.colour, "label": f"{name}, {family}" if family else name}
-            axes.plot(x, y, line + method.mark, mfc="white", ms=5, lw=1.2, **look)
-            for p in (p for p in chain if p.default):
-                axes.plot(p.ms_median, p.rel_l2_error, method.mark, color=method.colour, ms=7)
-    axes.set(xscale="log", yscale="log")
-    axes.axvline(_FRAME, **_AT_FRAME_RATE)
-    plain(axes)
-    axes.yaxis.set_major_formatter(FuncFormatter(_percent))
-    axes.margins(0.12)
-
-
-def _percent(value: float, _: int) -> str:
-    if value >= 1e-5:
-        return f"{100 * value:g} %"
-    return f"$10^{{{np.log10(100 * value):.0f}}}$ %"
-
-
-def _plot_sizes(points: Sequence[Point], title: str, file: Path) -> None:
-    """Time a frame, and memory, against the number of nodes; with the fitted exponents."""
-    with picture(file, 11.0, 4.8, title) as figure:
-        time_panel, memory_panel = figure.subplots(1, 2)
-        _draw_sizes(time_panel, points, lambda p: p.ms_median, "ms a frame (median)")
-        _draw_sizes(memory_panel, points, lambda p: p.memory / 1e6, "MB held")
-        time_panel.axhline(_FRAME, **_AT_FRAME_RATE)
-
-
-def _draw_sizes(
-    axes: Axes, points: Sequence[Point], value: Callable[[Point], float], label: str
-) -> None:
-    for name, method in TISSUE_METHODS.items():
-        mine = sorted((p for p in points if p.method == name), key=lambda p: p.nodes)
-        costs: dict[float, float] = {
-            p.nodes: value(p) for p in mine if np.isfinite(value(p)) and value(p) > 0
-        }
-        if costs:
-            power = exponent(costs)
-            words = name + (f"  ~ n$^{{{power:.2f}}}$" if np.isfinite(power) else "")
-            look: Any = {"color": method.colour, "label": words, "ms": 6, "lw": 1.4}
-            axes.plot(list(costs), list(costs.values()), method.mark + "-", **look)
-    axes.set(xscale="log", yscale="log", xlabel="nodes", ylabel=label)
-    plain(axes)
-    sizes = sorted({p.nodes for p in points})
-    axes.set_xticks(sizes, [f"{n:,}" for n in sizes])
-    axes.tick_params(labelsize=7.5)
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    key_beside(axes)
-
-
-def _defaults(points: Sequence[Point]) -> list[Point]:
-    return [p for p in points if p.default and not p.own]
-
-
-def _default_cells(p: Point) -> tuple[str, ...]:
-    """The cells of the columns `_DEFAULTS`."""
-    errors = (100 * p.rel_l2_error, p.max_error_mm, 100 * p.force_error, 100 * p.volume_error)
-    return (p.scene, p.method, f"{p.nodes:,}", *map(_number, (p.ms_median, p.ms_p99, *errors)))
-
-
-def _number(value: float) -> str:
-    return number(value, unknown="failed")
-
-
-def _locking(points: Sequence[Point]) -> str:
-    """Growth of the reaction as tissue becomes incompressible; nothing without those scenes."""
-    found = [p for p in _defaults(points) if not p.failure and p.nodes == _PAPERS_FINEST]
-    ratios = [name for name in LOCKING if any(p.scene == name for p in found)]
-    if len(ratios) < 2:
-        return ""
-    errors = {(p.scene, p.method): f"{100 * p.force_error:.2g} %" for p in found}
-    methods = dict.fromkeys(p.method for p in found)
-    table = markdown_table(
-        ["method", *(f"ν = {SCENES[name].poisson_ratio}" for name in ratios)],
-        [[method, *(errors.get((name, method), "") for name in ratios)] for method in methods],
-    )
-    return filled("tissue", "locking", nodes=f"{_PAPERS_FINEST:,}", table=table)
-
-
-def _estimates(points: Sequence[Point]) -> str:
-    """Errors that methods estimate by themselves beside the true ones; nothing without any."""
-    found = [p for p in _defaults(points) if np.isfinite(p.estimated_error * p.rel_l2_error)]
-    if not found:
-        return ""
-    ratios = [p.estimated_error / p.rel_l2_error for p in found]
-    rows = [
-        (
-            *(p.scene, p.method, f"{p.nodes:,}"),
-            *map(_number, (100 * p.rel_l2_error, 100 * p.estimated_error, ratio)),
+def _take_home(main: pd.DataFrame, fronts: dict[str, pd.DataFrame]) -> Iterator[str]:
+    for p in main[main["default"] & (main["nodes"] == _NODES)].itertuples():
+        yield (
+            f"`{p.method}` is {100 * p.rel_l2_error:.2g} % from large deformation "
+            f"({SCENES[MAIN_SCENE].words}, {_NODES:,} nodes), in {p.ms_median:.3g} ms a frame."
         )
-        for p, ratio in zip(found, ratios, strict=True)
-    ]
-    return filled(
-        "tissue",
-        "estimates",
-        right=str(sum(0.5 <= ratio <= 2.0 for ratio in ratios)),
-        cases=str(len(found)),
-        table=markdown_table(("scene", "method", "nodes", "L2 %", "estimated %", "ratio"), rows),
-    )
+    ahead = [f"`{name}`" for name in dict.fromkeys(pd.concat(fronts.values())["method"])]
+    yield f"Of {', '.join(ahead)} no other method was both faster and more accurate, in any scene."
 
 
-def _reference_table(references: dict[str, Reference]) -> str:
-    head = ("scene", "elements", "unknowns", "force N", "L2 change", "force change")
-    rows = [
-        (
-            name,
-            f"{r.coarser * 1e3:g} → {r.size * 1e3:g} mm",
-            f"{r.unknowns:,}",
-            f"{-r.solution.force[2]:.3f}",
-            f"{100 * r.difference:.2f} %",
-            f"{100 * r.force_difference:.2f} %",
-            f"{r.solution.penetration * 1e3:.3f}",
-        )
-        for name, r in references.items()
-    ]
-    return markdown_table((*head, "penetration mm"), rows)
+def _line(method: str, setting: str) -> str:
+    family = TISSUE_METHODS[method].family(setting)
+    return f"{method}, {family}" if family else method
 
 
-def _own_table(points: Sequence[Point]) -> str:
-    rows = []
-    for p in points:
-        numbers = (p.ms_median, 100 * p.rel_l2_error, p.max_error_mm, 100 * p.force_error)
-        rows.append((p.method, p.setting, f"{p.threads}", *map(_number, numbers), p.reference))
-    head = ("method", "setting", "threads", "ms", "L2 %", "max mm", "force %", "reference")
-    return markdown_table(head, rows)
+def _pareto_front(points: pd.DataFrame) -> pd.DataFrame:
+    """Points than which no other is both faster and more accurate, fastest first."""
+    ordered = points.sort_values(["ms_median", "rel_l2_error"])
+    best = ordered["rel_l2_error"].cummin().shift(fill_value=np.inf)
+    return ordered[ordered["rel_l2_error"] < best]
 
 
-def _size_table(sizes: Sequence[Point]) -> str:
-    counts = sorted({p.nodes for p in sizes})
-    rows = []
-    for method in dict.fromkeys(p.method for p in sizes):
-        mine = {p.nodes: p for p in sizes if p.method == method}
-        for cost, value in (
-            ("ms a frame", lambda p: p.ms_median),
-            ("MB held", lambda p: p.memory / 1e6),
-            ("s to set up", lambda p: p.setup),
-        ):
-            costs: dict[float, float] = {n: value(p) for n, p in mine.items()}
-            numbers = [_number(costs[n]) if n in costs else "" for n in counts]
-            rows.append((method, cost, *numbers, _number(exponent(costs))))
-    return markdown_table(("method", "cost", *(f"{n:,} nodes" for n in counts), "exponent"), rows)
-
-
-def _front(scene: str, points: Sequence[Point]) -> str:
-    steps = [
+def _words(front: pd.DataFrame) -> str:
+    return "; ".join(
         f"`{p.method}` ({p.setting}) leaves {100 * p.rel_l2_error:.2g} % in {p.ms_median:.3g} ms"
-        for p in pareto_front(points)
-    ]
-    return f"- **{scene}** ({SCENES[scene].words}): {'; '.join(steps) or 'nothing was measured'}."
+        for p in front.itertuples()
+    )
+
+
+def _draw_errors(points: pd.DataFrame, panels: str, words: str) -> Figure:
+    """Full marks are defaults; a line joins a method's settings that solve the same equations."""
+    looks = {}
+    for name, lines in points.groupby("method")["line"]:
+        for line, style in zip(sorted(set(lines)), _STYLES, strict=False):
+            looks[line] = Look(LOOKS[name].colour, LOOKS[name].mark, style)
+    return draw_error_over_time(
+        *(points, "ms_median", "rel_l2_error", f"Error against run time, {words}"),
+        panels=panels,
+        lines="line",
+        looks=looks,
+        labels=_LABELS,
+        filled="default",
+        limits=_AT_FRAME_RATE,
+    )
+
+
+def _draw_sizes(points: pd.DataFrame) -> Figure:
+    costs = points.rename(columns={"ms_median": "ms a frame (median)", "setup": "s to set up"})
+    costs = costs.melt(["method", "nodes"], ["ms a frame (median)", "s to set up"], "cost")
+    return draw_error_over_parameter(
+        *(costs, "nodes", "value", f"Cost against size, {SCENES[MAIN_SCENE].words}"),
+        panels="cost",
+        lines="method",
+        looks=LOOKS,
+        labels=_LABELS,
+        log="xy",
+        share_y=False,
+    )
+
+
+def _in_percent(points: pd.DataFrame) -> pd.DataFrame:
+    """The rows' main columns, by the names that a reader reads."""
+    table = points[["scene", "method", "setting", "nodes"]].copy()
+    table["ms"], table["p99 ms"] = points["ms_median"], points["ms_p99"]
+    table["L2 %"], table["max mm"] = 100 * points["rel_l2_error"], points["max_error_mm"]
+    table["force %"] = 100 * points["force_error"]
+    table["volume %"] = 100 * points["volume_error"]
+    table["smallest volume ratio"] = points["smallest_volume_ratio"]
+    if points["own"].any():
+        table["reference"] = points["reference"]
+    return table if (table["setting"] != "default").any() else table.drop(columns="setting")
+
+
+def _tabulate_locking(defaults: pd.DataFrame) -> pd.DataFrame | str:
+    """Error of the reaction as tissue becomes incompressible; nothing without those scenes."""
+    found = defaults[defaults["scene"].isin(LOCKING) & (defaults["nodes"] == _NODES)]
+    if found["scene"].nunique() < 2:
+        return ""
+    ratios = [f"ν = {SCENES[name].poisson_ratio}" for name in found["scene"]]
+    table = found.assign(ratio=ratios, error=100 * found["force_error"])
+    return table.pivot_table("error", "method", "ratio", sort=False).reset_index()
+
+
+def _tabulate_estimates(defaults: pd.DataFrame) -> pd.DataFrame | str:
+    """Errors that methods estimate by themselves beside the true ones."""
+    found = defaults[defaults["estimated_error"].notna()]
+    if found.empty:
+        return ""
+    table = found[["scene", "method", "nodes"]].copy()
+    table["L2 %"] = 100 * found["rel_l2_error"]
+    table["estimated %"] = 100 * found["estimated_error"].astype(float)
+    table["ratio"] = table["estimated %"] / table["L2 %"]
+    return table
+
+
+def _tabulate_sizes(points: pd.DataFrame) -> pd.DataFrame:
+    """Costs by the number of nodes, and k in cost ~ nodes^k."""
+    costs = points.melt(["method", "nodes"], ["ms_median", "setup"], "cost")
+    table = costs.pivot_table("value", ["method", "cost"], "nodes", sort=False)
+    table["exponent"] = [exponent(row.to_dict()) for _, row in table.iterrows()]
+    return table.reset_index()
+
+
+TISSUE = Subject(
+    "tissue",
+    "Tissue: error against run time",
+    plan_pieces,
+    report_tissue,
+    hidden=("own", "setup", "smallest_volume_ratio"),
+    libraries=("scikit-fem",),
+)
