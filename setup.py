@@ -8,7 +8,6 @@ from setuptools import find_packages, setup
 
 NODES = [
     "nodes.camera_driver",
-    "nodes.composed",
     "nodes.haptic_renderer",
     "nodes.image_writer",
     "nodes.openigtlink_bridge",

@@ -74,25 +74,6 @@ def test_more_than_one_ctrl_c_does_not_break_off_the_end(tmp_path):
     assert (tmp_path / "metadata.yaml").is_file()
 
 
-INTERRUPTED_AS_IT_SPINS = """
-import os, signal, sys
-from us_sim.nodes import composed, process
-spin = process.spin
-def interrupt(node, executor):
-    os.kill(os.getpid(), signal.SIGINT)
-    spin(node, executor)
-process.spin = interrupt
-sys.exit(composed.main())
-"""
-
-
-def test_composed_nodes_have_done_their_work_when_they_are_told_to_end(small_scene):
-    command = [sys.executable, "-c", INTERRUPTED_AS_IT_SPINS, "--ros-args"]
-    command += ["-p", "nodes:=[probe_tracker]", "-p", f"probe_tracker:scene:={small_scene}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 def message_count(recording: Path, topic: str) -> int:
     """Messages of a topic in the recording so far; -1 while it has no header yet."""
     try:

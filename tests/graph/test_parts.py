@@ -79,24 +79,3 @@ def test_what_a_scene_leaves_out_is_not_started_imported_or_published(
         assert ("us_sim.slicing.b_mode" in modules) == (node == "slice_interpolator"), node
     assert "/ultrasound/image" in topics
     assert not any(topic.startswith(f"/{left_out}/") for topic in topics)
-
-
-def test_all_nodes_of_a_scene_in_one_process_record_every_image(played_scene, tmp_path):
-    recording = tmp_path / "session.mcap"
-    path = yaml.safe_load(played_scene.read_text())["path"]
-    given = ("--path", path, "--record", recording, "--composed")
-    result = us_sim("run", played_scene, *given)
-    assert result.returncode == 0, result.stderr
-    bag = read_bag(recording)
-    reports = [bag.deserialize(each) for each in bag.messages(["/diagnostics"])]
-    pids = {
-        status.name.strip("/"): value.value
-        for report in reports
-        for status in report.status
-        for value in status.values
-        if value.key == "pid"
-    }
-    together = {"composed", "probe_tracker", "tissue_deformer", "skin_deformer"}
-    assert len({pids[node] for node in (*together, "slice_interpolator")}) == 1
-    assert len({pids[node] for node in ("composed", "session_recorder", "path_player")}) == 3
-    assert bag.topic("/ultrasound/image").message_count > 10

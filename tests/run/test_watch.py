@@ -63,15 +63,6 @@ def test_another_process_of_the_node_starts_anew(machine):
     assert machine.watch.hung({NODE: PID + 1}, {(NODE, PID): 1}) == {}
 
 
-def test_a_process_hangs_when_a_node_in_it_is_silent(machine):
-    told = {}
-    for report in range(2, 40):
-        machine.now += 0.5
-        heard = {("composed", PID): report, (NODE, PID): 1}
-        told |= machine.watch.hung({"composed": PID}, heard, {"composed": [NODE]})
-    assert told == {"composed": f"was ended, since {NODE} in it has not reported for 10 s"}
-
-
 @pytest.mark.parametrize("limit", [0, 3])
 def test_each_node_is_started_again_so_often(limit):
     restarts = Restarts(SupervisionSettings(restarts=limit))

@@ -78,10 +78,6 @@ class RunSettings(Settings):
 
     record: Path | None = setting(description="record the session to this MCAP", default=None)
     duration: float | None = setting(Quantity("time", 1e-3, 1e7), "end after so long", default=None)
-    composed: bool = setting(
-        description="have the scene's nodes in one process: less memory, more latency",
-        default=False,
-    )
 
     def check(self) -> None:
         """Refuse a recording that cannot be made, before anything is started."""
@@ -114,7 +110,6 @@ def _run(args: argparse.Namespace) -> int:
         path=args.path,
         topic=args.topic,
         duration=asked.duration,
-        composed=asked.composed,
         view=viewed(args),
     )
     scene = request.scene
@@ -196,7 +191,7 @@ def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
 
 def view_options(parser: argparse.ArgumentParser) -> None:
     add_viewer_options(parser)
-    add_setting_options(parser, RunSettings, ("record", "composed"))
+    add_setting_options(parser, RunSettings, ("record",))
     add_path_option(
         parser, "play this bag's probe path, and hold the probe at its end until it is taken"
     )
@@ -223,11 +218,11 @@ def _view(args: argparse.Namespace) -> int:
     from us_sim.run.live import run, view_running
 
     if args.attach:
-        given = ("scene", "case", "volume", "path", "tracker", "composed", "record")
+        given = ("scene", "case", "volume", "path", "tracker", "record")
         if any(getattr(args, name, None) for name in given):
             raise UsSimError(
                 "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
-                "--record, --composed and --tracker, or leave out --attach"
+                "--record and --tracker, or leave out --attach"
             )
         return view_running(viewer(args), parameters, **following)
     if args.loop and args.path is None:
@@ -235,12 +230,11 @@ def _view(args: argparse.Namespace) -> int:
     from us_sim.run.plan import Request
     from us_sim.scene.reading import load_scene
 
-    asked = read_settings(args, RunSettings, ("record", "composed"))
+    asked = read_settings(args, RunSettings, ("record",))
     request = Request(
         load_scene(scene_name(args, "upper_arm"), volume=args.volume),
         parameters,
         record=asked.record,
-        composed=asked.composed,
         path=args.path,
         topic=args.topic,
         view=viewer(args),

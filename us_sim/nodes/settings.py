@@ -331,24 +331,6 @@ class SceneNodeSettings(Settings):
     )
 
 
-COMPOSABLE = (
-    *("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"),
-    *("haptic_renderer", "openigtlink_bridge"),
-)
-"""Nodes that a scene may need, which can be in one process."""
-
-
-@dataclass(frozen=True)
-class ComposedSettings(Settings):
-    """Of ``composed``."""
-
-    nodes: tuple[str, ...] = setting(
-        description="names of the nodes in this process, whose parameters are given as "
-        "`-p NODE:NAME:=VALUE`",
-        default=(),
-    )
-
-
 @dataclass(frozen=True)
 class ProbeTrackerSettings(Settings):
     """Of ``probe_tracker``."""
@@ -509,7 +491,6 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "haptic_renderer": (SceneNodeSettings,),
     "scorer": (SceneNodeSettings, ScorerSettings, ScoreSettings),
     "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),
-    "composed": (ComposedSettings,),
     "path_player": (PathPlayerSettings, AwaitedSettings),
     "session_player": (SessionPlayerSettings,),
     "session_recorder": (SessionRecorderSettings,),

@@ -172,7 +172,7 @@ session/bags: diagnostic_msgs/DiagnosticArray [latched] [on_demand]
     installed ones
 diagnostics: diagnostic_msgs/DiagnosticArray
     probe_tracker, tissue_deformer, skin_deformer, slice_interpolator, haptic_renderer,
-    scorer, openigtlink_bridge, composed, path_player, session_player, session_recorder,
+    scorer, openigtlink_bridge, path_player, session_player, session_recorder,
     camera_driver, space_mouse_driver, probe_robot, session_monitor,
     session_control, viewer -> session_monitor, viewer | once a second: state, rate, latency, what
     was dropped or refused; of `session_monitor` which nodes ended or hung

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -43,11 +44,11 @@ def node_in_process(name: str, parameters: Mapping[str, object], context: Any) -
     from rclpy.parameter import Parameter
 
     require_texts(parameters)
-    from us_sim.nodes.composed import node_class
-
+    kind = "".join(word.capitalize() for word in name.split("_"))
+    node_class: Any = getattr(importlib.import_module(f"us_sim.nodes.{name}"), kind)
     overrides = [Parameter(key, value=value) for key, value in parameters.items()]
     try:
-        return node_class(name)(context=context, parameter_overrides=overrides)
+        return node_class(context=context, parameter_overrides=overrides)
     except ParameterException as error:
         raise UsSimError(" ".join(str(error).split())) from error
 

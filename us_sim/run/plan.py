@@ -56,7 +56,6 @@ class NodeProcess:
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     given: dict[str, object] = field(default_factory=dict)  # by a person; take precedence
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
-    parts: tuple[NodeProcess, ...] = ()  # other nodes in the same process
 
     def __post_init__(self) -> None:
         require_texts(self.all_parameters)
@@ -70,16 +69,7 @@ class NodeProcess:
         arguments = ["--ros-args", "--enclave", enclave_of(self.node), *ros_arguments()]
         for name, value in self.all_parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
-        return arguments + self.arguments_of_parts()
-
-    def arguments_of_parts(self) -> list[str]:
-        """Those that set the parameters of other nodes in the process."""
-        return [
-            word
-            for part in self.parts
-            for name, value in part.all_parameters.items()
-            for word in ("-p", f"{part.node}:{name}:={json.dumps(value)}")
-        ]
+        return arguments
 
     @property
     def all_parameters(self) -> dict[str, object]:
@@ -118,7 +108,6 @@ class Request:
     view: ViewerSettings | None = None  # address of the page that shows it; None is no page
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
-    composed: bool = False  # the scene's nodes are in one process
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
 
     def with_scene(self, scene: Scene) -> Request:
@@ -148,7 +137,7 @@ class Plan:
 
     @property
     def nodes(self) -> list[str]:
-        return [each.node for process in self.processes for each in (process, *process.parts)]
+        return [process.node for process in self.processes]
 
     def with_free_port(self) -> Plan:
         """The same plan, checked before anything is made for it.
@@ -208,11 +197,7 @@ def plan_of(request: Request) -> Plan:
         processes.append(NodeProcess(RECORDER, settings, recorder))
     driver = taken("camera_driver") if request.video is not None else {}
     is_played = request.by_hand or request.path is not None
-    nodes = simulation_nodes(scene, parameters, played=is_played)
-    if request.composed:
-        names = [part.node for part in nodes]
-        nodes = [NodeProcess("composed", {"nodes": names}, parts=tuple(nodes))]
-    processes += nodes
+    processes += simulation_nodes(scene, parameters, played=is_played)
     for process in processes:
         if process.node == RECORDER:
             process.parameters["parameters"] = parameters_file(processes)
@@ -293,11 +278,7 @@ def scene_settings(scene: Scene) -> dict[str, object]:
 
 def parameters_file(processes: Sequence[NodeProcess]) -> str:
     """The parameters of nodes as ROS reads them with ``--params-file``."""
-    document = {
-        each.node: {"ros__parameters": each.all_parameters}
-        for process in processes
-        for each in (process.parts or (process,))
-    }
+    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
     text: str = yaml.safe_dump(document, sort_keys=False)
     return text
 

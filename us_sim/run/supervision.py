@@ -113,10 +113,7 @@ class Supervisor:
         for node, status in ended.items():
             self._on_ended(node, status)
         running = {n: pid for n, pid in self._group.pids.items() if self._group.is_running(n)}
-        parts = {
-            node: [part.node for part in process.parts] for node, process in self._processes.items()
-        }
-        for node, how in self._watch.hung(running, self._monitor.node.heard, parts).items():
+        for node, how in self._watch.hung(running, self._monitor.node.heard).items():
             said = self._monitor.node.messages.get(node) or self._group.last_words(node)
             self._group.end([node])
             self._on_lost(node, how, said)

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -59,31 +58,26 @@ class Watch:
         self,
         pids: Mapping[str, int],
         reports: Mapping[tuple[str, int], int],
-        parts: Mapping[str, Collection[str]] = MappingProxyType({}),
     ) -> dict[str, str]:
         """Return the nodes that hang, and how that shows, for a person; each is told once.
 
         Args:
             pids: the processes that run, by node.
             reports: how many have come, by node and process.
-            parts: other nodes in the process of a node; it hangs when one of them does.
         """
         now = self._clock()
         self._time += min(now - self._looked, STEP_S)
         self._looked = now
         hung: dict[str, str] = {}
         for node, pid in pids.items():
-            for part in (node, *parts.get(node, ())):
-                count = reports.get((part, pid), 0)
-                before, since = self._heard.get((part, pid), (-1, 0.0))
-                silent = self._time - since
-                limit = self._silence if count else max(self._silence, START_S)
-                if count == before and silent < limit:
-                    continue
-                self._heard[part, pid] = count, self._time
-                if count == before:
-                    told = f"has not reported for {silent:.0f} s"
-                    hung[node] = told if part == node else f"was ended, since {part} in it {told}"
+            count = reports.get((node, pid), 0)
+            before, since = self._heard.get((node, pid), (-1, 0.0))
+            silent = self._time - since
+            if count == before and silent < (self._silence if count else START_S):
+                continue
+            self._heard[node, pid] = count, self._time
+            if count == before:
+                hung[node] = f"has not reported for {silent:.0f} s"
         return hung
 
 
