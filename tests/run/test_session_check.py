@@ -14,7 +14,7 @@ from us_sim.recording.schemas import stamped
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
-from us_sim.run.session_check import check, report, table
+from us_sim.run.session_check import check, report
 
 IMAGE = "/ultrasound/image"
 
@@ -32,7 +32,7 @@ def test_a_whole_session_passes_with_its_numbers(tmp_path, capsys):
     file = write(tmp_path / "s.mcap", press())
     found, told = findings(file)
     assert told == []
-    (head, *rows), by_name = table(found), {}
+    (head, *rows), by_name = found.rows, {}
     for row in rows:
         by_name[row[0]] = dict(zip(head, row, strict=True))
     expected = ("120", "60.0", "0.02", "4.00", "4.00", "4.00", "0", "0")
@@ -45,7 +45,7 @@ def test_a_whole_session_passes_with_its_numbers(tmp_path, capsys):
 def test_bags_of_the_real_rosbag2_pass(shared_data, name):
     found, told = findings(shared_data / f"ros2-jazzy/bags/probe_path_{name}")
     assert told == []
-    rates = {row[0]: row[2] for row in table(found)}
+    rates = {row[0]: row[2] for row in found.rows}
     assert abs(float(rates["/tracker/pose"]) - 60) < 0.2
 
 
@@ -123,21 +123,21 @@ def shorten(messages):
 @pytest.mark.parametrize(
     ("change", "kinds", "told"),
     [
-        (remove("/probe/wrench", slice(30, 37)), "loss", "7 messages .* first after 0.485 s"),
-        (remove(IMAGE, slice(60, None)), "gap", "longest of 0.997 s at 0.986 s, .*interpolator"),
-        (remove(IMAGE, slice(None)), "gap", "no message, while 120 poses came"),
+        (remove("/probe/wrench", slice(30, 37)), "loss", "7 messages.* first after 0.485 s"),
+        (remove(IMAGE, slice(60, None)), "gap", "longest of 0.997 s at 0.986 s, while poses"),
+        (remove(IMAGE, slice(None)), "gap", "1 gap, .* while poses came"),
         (list.clear, "index", "holds no message"),
         (pause, "gap", "/probe/pose has 1 gap, the longest of 0.817 s at 0.983 s"),
         (
             lambda m: restamp(of(m, "/tissue/nodes")[50], EPOCH + 50 * PERIOD + 1),
             "stamp",
-            "1 message of /tissue/nodes",
+            "/tissue/nodes has 1 message .* no pose",
         ),
-        (shorten, "order stamp stamp stamp", "/probe/pose has 1 message too short"),
-        (exchange(4), "order", f"the numbers of {IMAGE} go back 1 time, first at 0.686 s"),
-        (exchange(1), "order latency", f"the stamps of {IMAGE} go back 1 time"),
+        (shorten, "order stamp stamp stamp", "/probe/pose has 1 message that came too short"),
+        (exchange(4), "order", f"{IMAGE} has 1 message .* numbers, first at 0.686 s"),
+        (exchange(1), "order latency", f"{IMAGE} has 1 message that went back in their stamps"),
         (later(0.05, 3, topic=IMAGE), "latency", "came up to 49.7 ms before being sent"),
-        (later(0.7, 2, 3, topic=IMAGE), "latency", "120 messages .* more than 0.5 s old"),
+        (later(0.7, 2, 3, topic=IMAGE), "latency", "120 messages .* 0.5 s old"),
     ],
 )
 def test_what_is_wrong_with_messages_is_told(tmp_path, change, kinds, told):
@@ -163,8 +163,8 @@ def number_anew(messages):
 @pytest.mark.parametrize(
     ("change", "said", "latency", "missing"),
     [
-        (later(86_400, 2, 3), "1.00 days older than the recording", "-", 0),
-        (later(86_400, 3), "sending of 480 messages, as under simulated time", "-", 0),
+        (later(86_400, 2, 3), "no latency is told", "-", 0),
+        (later(86_400, 3), "no latency is told", "-", 0),
         (number_together, "", "1.00", None),
         (number_anew, "", "1.00", 0),
     ],
@@ -175,7 +175,7 @@ def test_what_is_only_unusual_is_whole(tmp_path, change, said, latency, missing)
     found = check(read_bag(write(tmp_path / "s.mcap", messages)))
     assert found.is_whole
     assert said in report(found)
-    assert table(found)[1][2:5] == ("60.0", "0.02", latency)
+    assert found.rows[1][2:5] == ("60.0", "0.02", latency)
     assert {each.missing for each in found.topics} == {missing}
 
 
@@ -263,4 +263,4 @@ def test_latched_messages_have_no_age_and_no_rate(tmp_path):
         for topic, data, *times, number in press()[::40]:
             bag.write(topic, data, *(time + 10**10 for time in times), number)
     found = check(read_bag(tmp_path / "s.mcap"))
-    assert {row[4] for row in table(found)[1:]} == {"-"}
+    assert {row[4] for row in found.rows[1:]} == {"-"}

@@ -17,7 +17,7 @@ def found(path):
     ("case", "words"),
     [
         ("bag-packed-messages/soccer_goal_12.mcap", "packed with zstd"),
-        ("bag-time-back/stamps_back_by_20_s.mcap", "go back 1 time"),
+        ("bag-time-back/stamps_back_by_20_s.mcap", "went back in their stamps"),
     ],
 )
 def test_a_wrong_time_or_packing_is_one_finding(shared_file, case, words):
@@ -27,7 +27,7 @@ def test_a_wrong_time_or_packing_is_one_finding(shared_file, case, words):
 
 def test_log_times_that_go_back_are_said_with_their_place(shared_file):
     said = found(shared_file("cases/bag-time-back/log_time_back_too.mcap"))
-    assert any("go back by 29.983 s, from 29.983 s on" in text for text in said)
+    assert any("clock was set back" in text for text in said)
 
 
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def test_a_bag_of_every_type_is_read_to_the_end(shared_file):
         read_bag(shared_file("cases/bag-every-type/test_bag_mcap/metadata.yaml").parent)
     )
     assert len(checked.topics) == 94
-    assert all(len(each.logged) == each.topic.message_count == 2 for each in checked.topics)
+    assert all(len(each.messages) == each.topic.message_count == 2 for each in checked.topics)
     assert not any("too short" in finding.text for finding in checked.findings)
 
 
@@ -44,7 +44,9 @@ def test_all_stamps_zero_is_said_of_each_topic(shared_file):
     """The images, and the poses of a PoseArray; those of the others rise."""
     said = found(shared_file("cases/bag-stamps-zero/zed_like.mcap"))
     assert len(said) == 2
-    assert any("all stamps of /zed/zed_node/left/image_rect_color" in text for text in said)
+    assert any(
+        "/zed/zed_node/left/image_rect_color has stamps that are all 0" in text for text in said
+    )
 
 
 def test_packed_messages_are_read_unpacked(shared_file):

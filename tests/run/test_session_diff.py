@@ -91,8 +91,8 @@ def test_images_differ_by_grey_levels_and_the_worst_are_shown(tmp_path, capsys):
     mean, worst = rows[IMAGE, "grey levels, mean"], rows[IMAGE, "grey levels, worst"]
     assert float(mean["worst"]) == pytest.approx(200 / 48, rel=1e-3)
     assert (worst["worst"], worst["same"]) == ("200", "58")
-    one, other = found.images
-    assert int(other[0, 0]) - int(one[0, 0]) == 200
+    one, other = next(each for each in found.topics if each.topic == IMAGE).worst
+    assert int(other.data[0]) - int(one.data[0]) == 200
     files = [str(tmp_path / name) for name in ("a.mcap", "b.mcap")]
     assert main(["bag", "diff", *files, "--out", str(tmp_path / "out")]) == 1
     assert IMAGE in capsys.readouterr().out

@@ -1,50 +1,50 @@
-"""Whether a recording is whole: its index, order, gaps, latency, losses, and the pairing of stamps.
+"""Whether a recording can be trusted: its index, order, gaps, latency, losses, and unpaired stamps.
 
 Nothing is decoded but the stamps, so that the time goes into reading the file.
 """
 
 from __future__ import annotations
 
-import struct
 import time
-from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from us_sim.errors import printable
 from us_sim.nodes.settings import PoseAgeSettings
-from us_sim.nodes.topics import TOPICS, Topic
+from us_sim.nodes.topics import TOPICS
 from us_sim.recording.reader import Bag
-from us_sim.recording.stamps import Stamp, stamp_reader
+from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import BagTopic, Fault
+from us_sim.run.session_tables import SECOND, Progress, read_times
 from us_sim.settings.spelling import aligned, counted
 
 POSES = "probe/pose"
-DERIVED = {
-    topic.name: topic
+DERIVED = [
+    topic.name
     for topic in TOPICS
     if {*topic.publishers} <= {"tissue_deformer", "skin_deformer", "slice_interpolator"}
     and topic.publishers
     and not (topic.latched or topic.on_demand)
-}
+]
 """Topics whose messages carry the stamp of the pose that they follow from."""
 
-STALE = round(1e9 * PoseAgeSettings().stale_after)
-"""ns without a message after which there is a gap: an image is called stale then."""
+STALE = PoseAgeSettings().stale_after
+"""s without a message after which there is a gap: an image is called stale then."""
+TITLES = ("topic", "count", "Hz", "gap s", "age ms: median", "p99", "worst", "lost", "unpaired")
+"""Of the printed columns; the age is from the stamp of a message to its publication."""
 _PERIODS = 5  # of a topic, that a gap has at least
 _REGULAR = 20  # messages of a topic, from which on its rate is known
-_APART = 1_000_000  # ns, by which two clocks may differ unnoticed
-_OTHER_TIME = 60 * 10**9  # ns of age, beyond which a stamp is of another recording
+_APART = 1e-3  # s, by which two clocks may differ unnoticed
+_OTHER_TIME = 60.0  # s, by which times differ that are not of the same clock or recording
 _SHARED = ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray")
 """Types of topics that many publish at once, each later than it stamps, and heard in any order."""
-_SHARED_DELAY = 10**10  # ns, by which their stamps may go back: a busy machine delays one for long
+_SHARED_DELAY = 10 * SECOND  # ns, by which their stamps may go back: a busy machine delays one
 _SEVERAL = 0.01  # of the numbers of a topic, that go back where several publishers count
-
-Times = NDArray[np.int64]
+_CLOCKS = "let the machines' clocks follow one of them (chrony, or NTP)"
 
 
 class Finding(NamedTuple):
@@ -57,49 +57,157 @@ class Finding(NamedTuple):
 
 @dataclass
 class TopicCheck:
-    """One topic's messages, in the order of their log times."""
+    """One topic's messages, and what is found on them."""
 
     topic: BagTopic
-    read_stamp: Stamp | None
-    logged: array[int] = field(default_factory=lambda: array("Q"))  # ns
-    sent: array[int] = field(default_factory=lambda: array("Q"))  # ns
-    stamps: array[int] = field(default_factory=lambda: array("q"))  # ns; 0 where there is none
-    numbers: array[int] = field(default_factory=lambda: array("Q"))
-    too_short: int = 0  # messages, for their type
-    by_another_clock: int = 0  # messages whose log time is of another clock than their sending
+    messages: pd.DataFrame  # as of `read_times`
+    has_stamps: bool
+    start: int  # ns, of the recording
+    findings: list[Finding] = field(default_factory=list)
+    interval: float | None = None  # s from message to message as is usual, where there is such
+    longest_gap: float | None = None  # s
+    ages: pd.Series | None = None  # s from stamp to sending, where that is a latency
     missing: int | None = None  # messages, by their numbers; None without numbers
-    longest_gap: float = 0.0  # s
     unpaired: int | None = None  # messages; None where no pose is followed
 
-    @property
-    def derived(self) -> Topic | None:
-        """The topic of the graph, if its messages follow from poses."""
-        found = (each for name, each in DERIVED.items() if self.topic.name.endswith(f"/{name}"))
-        return next(found, None) if self.read_stamp else None
+    def tell(self, kind: str, text: str) -> None:
+        """Add a finding on the topic."""
+        self.findings.append(Finding(kind, f"{self.topic.name} {text}"))
+
+    def tell_rows(self, kind: str, rows: pd.Series, text: str, remedy: str) -> None:
+        """Add a finding on the messages for which ``rows`` holds, if there are any."""
+        if rows.any():
+            logged = self.messages["logged"][rows.idxmax()]
+            first = f"first at {(logged - self.start) / SECOND:.3f} s"
+            count = counted(int(rows.sum()), "message")
+            self.tell(kind, f"has {count} that {text}, {first}: {remedy}")
+
+    def check_order(self) -> None:
+        """Find stamps that go back, or are all 0, and messages that are too short for one."""
+        is_short = self.messages["is_short"] > 0
+        text = f"came too short for {self.topic.type_name}"
+        self.tell_rows("order", is_short, text, "find out what publishes them")
+        stamps = self.messages["stamp"].where(lambda stamp: stamp != 0).ffill()
+        if not self.has_stamps or self.topic.is_latched or stamps.empty:
+            return
+        if stamps.isna().all():
+            self.tell("order", "has stamps that are all 0: let its publisher stamp what it sends")
+        may_go_back = _SHARED_DELAY if self.topic.type_name in _SHARED else 0
+        remedy = "let one node publish it, with one clock"
+        back = stamps.diff() < -may_go_back
+        self.tell_rows("order", back, "went back in their stamps", remedy)
+
+    def check_numbers(self, said: int, *, one_counter: bool) -> None:
+        """Find missing messages, and numbers that go back.
+
+        Args:
+            said: messages that the recorder says it lost.
+            one_counter: whether the numbers are those of all topics together.
+        """
+        numbers = self.messages["number"]
+        steps = numbers.diff()
+        restarts = (steps < 0) & (numbers <= 1) & (numbers.iloc[:1].min() <= 1)
+        back = (steps <= 0) & ~restarts
+        if numbers.any() and not one_counter and back.sum() <= max(_SEVERAL * len(numbers), 1):
+            parts = numbers.groupby(restarts.cumsum())
+            self.missing = int((parts.max() - parts.min() + 1 - parts.nunique()).sum())
+            if self.topic.type_name not in _SHARED:
+                why = "they were exchanged or doubled, or the recorder's clock was set back"
+                self.tell_rows("order", back, "went back in their numbers", why)
+        if lost := self.missing or said:
+            where = f", {said} of them by the recorder's own count" if said else ""
+            jumps = self.messages["logged"].shift()[steps > 1]
+            if self.missing and len(jumps):
+                where += f", the first after {(jumps.iloc[0] - self.start) / SECOND:.3f} s"
+            self.tell(
+                "loss",
+                f"lacks {counted(lost, 'message')}{where}: give session_recorder a larger "
+                f"max_cache_size, and its publisher a depth for a second",
+            )
+
+    def check_gaps(self, poses: TopicCheck | None, *, is_cut: bool) -> None:
+        """Find times without messages: of a regular topic, or while poses came.
+
+        Args:
+            poses: that the messages follow from, if they follow from any.
+            is_cut: whether the recording ends before its time.
+        """
+        times = (self.messages["logged"].to_numpy() - self.start) / SECOND
+        steps = np.diff(times)
+        if len(times) >= _REGULAR and not self.topic.is_latched:
+            usual, long = np.percentile(steps, [50, 90]).tolist()
+            self.interval = usual if 0 < long <= 2 * usual else None
+        if poses is not None and len(poses.messages):
+            # What follows from poses is missed where poses came, and at the end, too.
+            came = (poses.messages["logged"].to_numpy() - self.start) / SECOND
+            begins = times if len(times) else came[:1]
+            ends = np.append(begins[1:], begins[-1] if is_cut else max(came[-1], begins[-1]))
+            steps = ends - begins
+            between = np.searchsorted(came, ends) - np.searchsorted(came, begins, "right")
+            is_gap = (steps > STALE) & (between > 1)
+            why = "while poses came: see its node's diagnostics and log, whether it ended"
+        elif self.interval:
+            begins, is_gap = times, steps > max(STALE, _PERIODS * self.interval)
+            rate = f"where {1 / self.interval:.1f} Hz are usual"
+            why = f"{rate}: see whether its publisher or the recording stood still"
+        else:
+            return
+        self.longest_gap = float(steps.max())
+        if is_gap.any():
+            worst = int(np.argmax(np.where(is_gap, steps, 0.0)))
+            count = counted(int(is_gap.sum()), "gap")
+            longest = f"the longest of {steps[worst]:.3f} s at {begins[worst]:.3f} s"
+            self.tell("gap", f"has {count}, {longest}, {why}")
+
+    def check_latency(self) -> None:
+        """Find messages that came before they were sent, or long after their stamp."""
+        stamp, sent, logged = (self.messages[name] for name in ("stamp", "sent", "logged"))
+        ages = ((sent - stamp) / SECOND).where(stamp != 0)
+        delays = (logged - sent) / SECOND
+        if max(abs(ages.median()), abs(delays.median())) > _OTHER_TIME:
+            text = (
+                f"{self.topic.name} was stamped, sent and recorded by clocks over a minute apart, "
+                f"as in lockstep, under simulated time or when played: no latency is told"
+            )
+            self.findings.append(Finding("latency", text, matters=False))
+            return
+        most = f"came up to {-1e3 * delays.min():.1f} ms before being sent"
+        self.tell_rows("latency", delays < -_APART, most, _CLOCKS)
+        if not self.has_stamps or self.topic.is_latched or not stamp.any():
+            return
+        self.ages = ages.dropna()
+        most = f"bear stamps up to {-1e3 * ages.min():.1f} ms after their sending"
+        self.tell_rows("latency", ages < -_APART, most, _CLOCKS)
+        if self.topic.name.endswith(tuple(f"/{name}" for name in DERIVED)):
+            text = f"followed from poses more than {STALE:.1f} s old"
+            remedy = "give its node more processor time, or a coarser scene"
+            self.tell_rows("latency", ages > STALE, text, remedy)
+
+    def check_pairs(self, poses: TopicCheck, *, is_cut: bool) -> None:
+        """Find messages without their pose.
+
+        Nobody knows those before the first recorded one, and after the last where the bag was cut.
+        """
+        stamps, known = self.messages["stamp"], poses.messages["stamp"]
+        unknown = (stamps < known.min()) & (stamps > known.min() - SECOND)
+        alone = ~stamps.isin(known) & ~unknown & ~(is_cut & (stamps > known.max()))
+        self.unpaired = int(alone.sum())
+        text = f"have no pose of their stamp on {poses.topic.name}"
+        remedy = "see whether poses were lost, or its node stamps by itself"
+        self.tell_rows("stamp", alone, text, remedy)
 
     @property
-    def ages(self) -> NDArray[np.float64]:
-        """(K,) ms from the stamps to the sending, of messages with a stamp."""
-        stamps, sent = _times(self.stamps), _times(self.sent)
-        return np.asarray((sent - stamps)[stamps != 0] / 1e6)
-
-    @property
-    def is_of_another_time(self) -> bool:
-        """Whether the stamps are from long before the sending, or after it."""
-        ages = self.ages
-        return bool(len(ages)) and abs(float(np.median(ages))) > _OTHER_TIME / 1e6
-
-    @property
-    def tells_latency(self) -> bool:
-        return not (self.topic.is_latched or self.is_of_another_time or self.by_another_clock)
-
-    @property
-    def interval(self) -> float | None:
-        """ns from message to message as is usual; None where there is no such."""
-        if len(self.sent) < _REGULAR or self.topic.is_latched:
-            return None
-        usual, long = np.percentile(np.diff(np.sort(_times(self.sent))), [50, 90])
-        return float(usual) if 0 < long <= 2 * usual else None
+    def row(self) -> tuple[str, ...]:
+        """The numbers below `TITLES`; ``-`` where something cannot be told."""
+        ages = [None] * 3 if self.ages is None else np.percentile(1e3 * self.ages, [50, 99, 100])
+        told = [self.longest_gap or None, *ages]
+        return (
+            self.topic.name,
+            str(len(self.messages)),
+            f"{1 / self.interval:.1f}" if self.interval else "-",
+            *("-" if number is None else f"{number:.2f}" for number in told),
+            *("-" if count is None else str(count) for count in (self.missing, self.unpaired)),
+        )
 
 
 @dataclass(frozen=True)
@@ -109,7 +217,6 @@ class BagCheck:
     bag: Bag
     topics: list[TopicCheck]  # by name
     findings: list[Finding]
-    bytes: int  # of messages
     seconds: float  # that reading took
 
     @property
@@ -117,8 +224,13 @@ class BagCheck:
         """Whether nothing was found that matters."""
         return not any(finding.matters for finding in self.findings)
 
+    @property
+    def rows(self) -> list[tuple[str, ...]]:
+        """Titles, and the numbers of each topic."""
+        return [TITLES, *(each.row for each in self.topics)]
 
-def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) -> BagCheck:
+
+def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     """Read all of a bag and judge it.
 
     Args:
@@ -126,74 +238,36 @@ def check(bag: Bag, progress: Callable[[float, str], None] = lambda *_: None) ->
         progress: takes the fraction done, and what is being read.
     """
     began = time.monotonic()
-    topics = {topic.name: TopicCheck(topic, stamp_reader(bag, topic)) for topic in bag.topics}
     faults: list[Fault] = []
-    read, total, size = 0, max(bag.message_count, 1), 0
-    for message in bag.all_messages(faults):
-        into = topics[message.topic]
-        is_apart = abs(message.log_time - message.publish_time) > _OTHER_TIME
-        into.by_another_clock += is_apart
-        into.logged.append(message.log_time)
-        into.sent.append(message.log_time if is_apart else message.publish_time)
-        into.numbers.append(message.sequence)
-        into.stamps.append(_stamp(into, message.data))
-        size += len(message.data)
-        read += 1
-        if read % 500 == 0:
-            progress(min(read / total, 0.999), message.topic)
-    progress(1.0, "")
-    held = sorted(topics.values(), key=lambda each: each.topic.name)
-    findings = [*_index(bag, faults, read)]
-    if apart := sum(each.by_another_clock for each in held):
-        findings.append(
-            Finding(
-                "latency",
-                f"{bag.path} was recorded by another clock than that of the sending of "
-                f"{counted(apart, 'message')}, as under simulated time: no latency is told of them",
-                matters=False,
-            )
+    tables = read_times(bag, None, faults, progress)
+    start, is_cut, lost = bag.start or 0, bool(bag.opening_faults), bag.lost()
+    topics = {
+        topic.name: TopicCheck(
+            topic, tables[topic.name], stamp_reader(bag, topic) is not None, start
         )
-    one_counter = _count_together(held)
-    for each in held:
-        origin = bag.start or 0
-        findings += _order(each, origin)
-        findings += _losses(each, bag.lost()[each.topic.name], origin, one_counter)
-        name = each.derived.name if each.derived else ""
-        poses = topics.get(f"{each.topic.name.removesuffix(name)}{POSES}") if name else None
-        findings += _gaps(each, poses, origin, is_cut=bool(bag.opening_faults))
-        findings += _latency(each, origin)
-        if poses is not None and poses.read_stamp and len(poses.stamps):
-            findings += _pairing(each, poses, origin, is_cut=bool(bag.opening_faults))
+        for topic in sorted(bag.topics, key=lambda topic: topic.name)
+    }
+    heard = [each.messages["number"] for each in topics.values() if len(each.messages)]
+    one_counter = len(heard) > 1 and pd.concat(heard).is_unique
+    findings = [*_check_index(bag, faults)]
+    for name, each in topics.items():
+        derived = next((topic for topic in DERIVED if name.endswith(f"/{topic}")), None)
+        poses = topics.get(f"{name.removesuffix(derived)}{POSES}") if derived else None
+        each.check_order()
+        each.check_numbers(lost[name], one_counter=one_counter)
+        each.check_gaps(poses, is_cut=is_cut)
+        each.check_latency()
+        if poses is not None and len(poses.messages):
+            each.check_pairs(poses, is_cut=is_cut)
+        findings += each.findings
     damaged = sum(fault.messages for fault in faults)
-    if damaged > 0 and sum(each.missing or 0 for each in held) <= damaged:
+    if damaged > 0 and sum(each.missing or 0 for each in topics.values()) <= damaged:
         # The damaged parts held what is missing, and the poses of these stamps.
         findings = [finding for finding in findings if finding.kind not in ("loss", "stamp")]
-    return BagCheck(bag, held, findings, size, time.monotonic() - began)
+    return BagCheck(bag, [*topics.values()], findings, time.monotonic() - began)
 
 
-def _stamp(topic: TopicCheck, data: bytes) -> int:
-    if topic.read_stamp is None:
-        return 0
-    try:
-        return topic.read_stamp(data) or 0
-    except (struct.error, IndexError):
-        topic.too_short += 1
-        return 0
-
-
-def _times(values: array[int]) -> Times:
-    return (
-        np.minimum(np.array(values, np.uint64), 2**63 - 1).astype(np.int64)
-        if (values.typecode == "Q")
-        else np.array(values, np.int64)
-    )
-
-
-def _at(moment: int, origin: int) -> str:
-    return f"{(moment - origin) * 1e-9:.3f} s"
-
-
-def _index(bag: Bag, faults: list[Fault], read: int) -> Iterator[Finding]:
+def _check_index(bag: Bag, faults: list[Fault]) -> Iterator[Finding]:
     remedy = f"`us-sim bag repair {bag.path}` writes all that can be read as a new bag"
     for fault in faults:
         yield Finding("index", f"{fault.text}: {remedy}")
@@ -205,245 +279,17 @@ def _index(bag: Bag, faults: list[Fault], read: int) -> Iterator[Finding]:
             f"{bag.path} holds {bag.message_count} messages where its metadata.yaml says "
             f"{bag.metadata.message_count}: make it anew with `ros2 bag reindex`",
         )
-    elif bag.metadata is not None and bag.metadata.message_count == bag.message_count > 0:
-        start, end = bag.start or 0, bag.end or 0
-        said = bag.metadata.start, bag.metadata.start + bag.metadata.duration
-        if max(abs(said[0] - start), abs(said[1] - end)) > _APART:
-            yield Finding(
-                "index",
-                f"{bag.path} has messages from {start} to {end} ns, where its metadata.yaml says "
-                f"{said[0]} to {said[1]}: make it anew with `ros2 bag reindex`",
-            )
-    if not read:
+    if not bag.message_count:
         yield Finding("index", f"{bag.path} holds no message: record again")
-
-
-def _order(each: TopicCheck, origin: int) -> Iterator[Finding]:
-    name, logged = each.topic.name, each.logged
-    if each.too_short:
-        yield Finding(
-            "order",
-            f"{name} has {counted(each.too_short, 'message')} too short for a "
-            f"{each.topic.type_name}: find out what publishes them",
-        )
-    stamped = np.flatnonzero(_times(each.stamps))
-    may_go_back = _SHARED_DELAY if each.topic.type_name in _SHARED else 0
-    back = stamped[1:][np.diff(_times(each.stamps)[stamped]) < -may_go_back]
-    if each.read_stamp and len(each.stamps) and not len(stamped) and not each.topic.is_latched:
-        yield Finding(
-            "order",
-            f"all stamps of {name} are 0: let its publisher stamp what it sends",
-        )
-    if len(back) and not each.topic.is_latched:
-        yield Finding(
-            "order",
-            f"the stamps of {name} go back {counted(len(back), 'time')}, first at "
-            f"{_at(logged[back[0]], origin)}: let one node publish it, with one clock",
-        )
-
-
-def _count_together(topics: list[TopicCheck]) -> bool:
-    """Whether one counter numbers the messages of all topics, as some writers do."""
-    numbers = [np.array(each.numbers) for each in topics if len(each.numbers)]
-    together = np.concatenate(numbers) if numbers else np.zeros(0)
-    return len(numbers) > 1 and len(np.unique(together)) == len(together)
-
-
-def _losses(each: TopicCheck, said: int, origin: int, one_counter: bool) -> Iterator[Finding]:
-    name, numbers = each.topic.name, np.array(each.numbers, np.int64)
-    steps = np.diff(numbers)
-    restarts = np.append(False, (steps < 0) & (numbers[1:] <= 1)) if len(numbers) else steps > 0
-    back = np.flatnonzero((steps <= 0) & ~restarts[1:])
-    first = ""
-    if numbers.any() and not one_counter and len(back) <= max(_SEVERAL * len(numbers), 1):
-        parts = np.split(numbers, np.flatnonzero(restarts))
-        parts = [np.unique(part) for part in parts if len(part)]
-        each.missing = sum(int(part[-1] - part[0]) + 1 - len(part) for part in parts)
-        edges = [0, *np.flatnonzero(restarts).tolist(), len(numbers)]
-        for begin, at, end in zip(edges, edges[1:], edges[2:], strict=False):
-            # Who begins anew counts from 1 again; this one went on where the later times end.
-            if 0 < numbers[begin] - numbers[at:end].max() <= 1 + _SEVERAL * len(numbers):
-                seconds = (each.logged[end - 1] - each.logged[begin]) * 1e-9
-                yield Finding(
-                    "order",
-                    f"the times at which {name} was recorded go back by {seconds:.3f} s, from "
-                    f"{_at(each.logged[end - 1], origin)} on: the recorder's clock was set "
-                    f"meanwhile, so that what came first is last; let it be set before",
-                )
-        if len(back) and each.topic.type_name not in _SHARED:
-            yield Finding(
-                "order",
-                f"the numbers of {name} go back {counted(len(back), 'time')}, first at "
-                f"{_at(each.logged[back[0] + 1], origin)}: the messages were exchanged or doubled "
-                f"after they were recorded; take the recording as it was made",
-            )
-        jumps = np.flatnonzero(steps > 1)
-        if len(jumps):
-            first = f", the first after {_at(each.logged[jumps[0]], origin)}"
-    remedy = "give session_recorder a larger max_cache_size, and its publisher a depth for a second"
-    if each.missing:
-        also = f" (the recorder itself counted {said})" if said else ""
-        yield Finding(
-            "loss",
-            f"{counted(each.missing, 'message is', 'messages are')} missing in the numbers of "
-            f"{name}{first}{also}: {remedy}",
-        )
-    elif said:
-        lost = f"{counted(said, 'message')} of {name} {'was' if said == 1 else 'were'} lost"
-        yield Finding("loss", f"{lost}, as the recorder says: {remedy}")
-
-
-def _gaps(
-    each: TopicCheck, poses: TopicCheck | None, origin: int, *, is_cut: bool
-) -> Iterator[Finding]:
-    sent, interval = np.sort(_times(each.sent)), each.interval
-    name = each.topic.name
-    if poses is not None and len(poses.sent) > 1 and not len(sent):
-        yield Finding(
-            "gap",
-            f"{name} has no message, while {len(poses.sent)} poses came: see in the diagnostics "
-            f"and the log of {each.derived.publishers[0] if each.derived else 'its node'} why",
-        )
-        return
-    if poses is not None and len(poses.sent) and len(sent):
-        # What follows from poses is missed where poses came, and at the end, too.
-        came = np.sort(_times(poses.sent))
-        end = sent[-1] if is_cut else max(came[-1], sent[-1])
-        begins, ends = sent, np.append(sent[1:], end)
-        between = np.searchsorted(came, ends) - np.searchsorted(came, begins, "right")
-        lengths = ends - begins
-        gaps = np.flatnonzero((lengths > STALE) & (between > 1))
-    elif interval is not None:
-        begins, lengths = sent[:-1], np.diff(sent)
-        gaps = np.flatnonzero(lengths > max(STALE, _PERIODS * interval))
-    else:
-        return
-    each.longest_gap = float(lengths.max()) * 1e-9
-    if not len(gaps):
-        return
-    worst = gaps[np.argmax(lengths[gaps])]
-    where = f"the longest of {lengths[worst] * 1e-9:.3f} s at {_at(int(begins[worst]), origin)}"
-    many = counted(len(gaps), "gap")
-    if each.derived is not None and poses is not None:
-        node = each.derived.publishers[0]
-        yield Finding(
-            "gap",
-            f"{name} has {many}, {where}, while poses came: see in the diagnostics and the log of "
-            f"{node} whether it was too slow or had ended",
-        )
-    elif interval is not None:
-        yield Finding(
-            "gap",
-            f"{name} has {many}, {where}, where {1e9 / interval:.1f} Hz are usual: see whether its "
-            f"publisher or the recording stood still then",
-        )
-
-
-def _latency(each: TopicCheck, origin: int) -> Iterator[Finding]:
-    name = each.topic.name
-    sent, logged, stamps = _times(each.sent), _times(each.logged), _times(each.stamps)
-    clocks = "let the machines' clocks follow one of them (chrony, or NTP)"
-    early = np.flatnonzero(logged < sent - _APART)
-    if len(early):
-        ahead = (sent - logged).max() * 1e-6
-        yield Finding(
-            "latency",
-            f"{counted(len(early), 'message')} of {name} came up to {ahead:.1f} ms before being "
-            f"sent, first at {_at(int(logged[early[0]]), origin)}: {clocks}",
-        )
-    if each.topic.is_latched or each.by_another_clock or not stamps.any():
-        return
-    if each.is_of_another_time:
-        days = float(np.median(each.ages)) / 86_400_000
-        yield Finding(
-            "latency",
-            f"the stamps of {name} are {abs(days):.2f} days {'older' if days > 0 else 'younger'} "
-            f"than the recording, as in lockstep or when played as they were: they tell no latency",
-            matters=False,
-        )
-        return
-    ahead_of = np.flatnonzero((stamps > sent + _APART) & (stamps != 0))
-    if len(ahead_of):
-        most = (stamps - sent).max() * 1e-6
-        yield Finding(
-            "latency",
-            f"the stamps of {counted(len(ahead_of), 'message')} of {name} are up to {most:.1f} ms "
-            f"after their sending, first at {_at(int(logged[ahead_of[0]]), origin)}: {clocks}",
-        )
-    old = np.flatnonzero((sent - stamps > STALE) & (stamps != 0))
-    if each.derived is not None and len(old):
-        yield Finding(
-            "latency",
-            f"{counted(len(old), 'message')} of {name} followed from poses more than "
-            f"{STALE * 1e-9:.1f} s old, first at {_at(int(logged[old[0]]), origin)}: give "
-            f"{each.derived.publishers[0]} more processor time, or a coarser scene",
-        )
-
-
-def _pairing(
-    each: TopicCheck, poses: TopicCheck, origin: int, *, is_cut: bool
-) -> Iterator[Finding]:
-    """Find messages without their pose.
-
-    Of those before the first recorded one, and after the last where the bag was cut, nobody knows.
-    """
-    stamps, known = _times(each.stamps), _times(poses.stamps)
-    unknown = (stamps < known.min()) & (stamps > known.min() - 10**9)
-    if is_cut:
-        unknown |= stamps > known.max()
-    alone = np.flatnonzero(~np.isin(stamps, known) & ~unknown)
-    each.unpaired = len(alone)
-    if len(alone):
-        yield Finding(
-            "stamp",
-            f"{poses.topic.name} has no pose of the stamp of "
-            f"{counted(len(alone), 'message')} of {each.topic.name}, first at "
-            f"{_at(each.logged[alone[0]], origin)}: see whether poses were lost, or "
-            f"{each.derived.publishers[0] if each.derived else 'its node'} stamps by itself",
-        )
-
-
-_TITLES = ("topic", "count", "Hz", "gap s", "age ms: median", "p99", "worst", "lost", "unpaired")
-
-
-def table(found: BagCheck) -> list[tuple[str, ...]]:
-    """Titles and a row for each topic; ``-`` where something cannot be told.
-
-    The age is from the stamp of a message to its publication.
-    """
-    rows: list[tuple[str, ...]] = [_TITLES]
-    for each in found.topics:
-        ages = each.ages if each.tells_latency else np.zeros(0)
-        told = [f"{age:.2f}" for age in np.percentile(ages, [50, 99, 100])] if len(ages) else "---"
-        interval = each.interval
-        rows.append(
-            (
-                each.topic.name,
-                str(len(each.logged)),
-                f"{1e9 / interval:.1f}" if interval else "-",
-                f"{each.longest_gap:.2f}" if each.longest_gap else "-",
-                *told,
-                "-" if each.missing is None else str(each.missing),
-                "-" if each.unpaired is None else str(each.unpaired),
-            )
-        )
-    return rows
 
 
 def report(found: BagCheck) -> str:
     """The table, and a line for each finding, for a person."""
-    rate = found.bytes / 1e6 / max(found.seconds, 1e-3)
-    lines = [
-        f"{found.bag.path}: {sum(len(each.logged) for each in found.topics)} messages, "
-        f"{found.bytes / 1e6:.1f} MB, read in {found.seconds:.2f} s ({rate:.0f} MB/s)",
-        "",
-        *aligned(table(found)),
-        "",
-    ]
-    lines += [
-        f"{finding.kind if finding.matters else 'note'}: {finding.text}"
-        for finding in found.findings
-    ]
-    if found.is_whole:
-        lines.append("nothing is wrong with it")
+    count = sum(len(each.messages) for each in found.topics)
+    size = sum(int(each.messages["size"].sum()) for each in found.topics) / 1e6
+    speed = f"{found.seconds:.2f} s ({size / max(found.seconds, 1e-3):.0f} MB/s)"
+    head = f"{found.bag.path}: {count} messages, {size:.1f} MB, read in {speed}"
+    told = [f"{each.kind if each.matters else 'note'}: {each.text}" for each in found.findings]
+    whole = ["nothing is wrong with it"] if found.is_whole else []
+    lines = [head, "", *aligned(found.rows), "", *told, *whole]
     return "\n".join(printable(line) for line in lines)

@@ -1,0 +1,127 @@
+"""Topics of a recording as pandas tables: a row for each message, in the order of recording.
+
+Columns ``stamp`` (of the header; 0 where there is none), ``logged`` and ``sent`` are ns since the
+epoch.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from us_sim.errors import BagError
+from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
+from us_sim.recording.path import pose_rows
+from us_sim.recording.reader import Bag
+from us_sim.recording.stamps import stamp_reader
+from us_sim.recording.topic import Fault
+from us_sim.recording.wrench import WRENCH_STAMPED
+
+SECOND = 1_000_000_000  # ns
+_LARGEST = 2**63 - 1
+_COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
+Progress = Callable[[float, str], None]
+
+
+def read_times(
+    bag: Bag,
+    topics: Collection[str] | None = None,
+    faults: list[Fault] | None = None,
+    progress: Progress = lambda *_: None,
+) -> dict[str, pd.DataFrame]:
+    """Read when messages were stamped, sent and logged, their numbers and sizes, by topic.
+
+    ``is_short`` is 1 for a message that ends before its stamp. Nothing else is decoded.
+
+    Args:
+        bag: the recording.
+        topics: names of topics; None for all.
+        faults: takes what is wrong with the bag, all of which is read then.
+        progress: takes the fraction done, and the topic.
+
+    Raises:
+        BagError: the bag is damaged, and ``faults`` is None; or it has no such topic.
+    """
+    chosen = bag.topics if topics is None else [bag.topic(name) for name in topics]
+    readers = {topic.name: stamp_reader(bag, topic) for topic in chosen}
+    values = {name: array("q") for name in readers}
+    total = max(sum(topic.message_count for topic in chosen), 1)
+    messages = bag.messages(topics) if faults is None else bag.all_messages(faults)
+    for done, message in enumerate(messages):
+        if done % 500 == 0:
+            progress(min(done / total, 0.999), message.topic)
+        read, stamp, is_short = readers[message.topic], 0, 0
+        try:
+            stamp = read(message.data) or 0 if read is not None else 0
+        except (struct.error, IndexError):
+            is_short = 1
+        logged, sent = (min(t, _LARGEST) for t in (message.log_time, message.publish_time))
+        values[message.topic].extend(
+            (stamp, logged, sent, message.sequence, len(message.data), is_short)
+        )
+    progress(1.0, "")
+    return {
+        name: pd.DataFrame(np.array(held, np.int64).reshape(-1, len(_COLUMNS)), columns=_COLUMNS)
+        for name, held in values.items()
+    }
+
+
+def _components(*vectors: Any) -> Iterator[float]:
+    return (float(each) for vector in vectors for each in (vector.x, vector.y, vector.z))
+
+
+_VALUES: Mapping[str, Callable[[Any], Iterator[tuple[str, float]]]] = {
+    WRENCH_STAMPED: lambda m: zip(
+        WRENCH_PARTS, _components(m.wrench.force, m.wrench.torque), strict=True
+    ),
+    "geometry_msgs/msg/TwistStamped": lambda m: zip(
+        ("x", "y", "z", "rx", "ry", "rz"), _components(m.twist.linear, m.twist.angular), strict=True
+    ),
+    "sensor_msgs/msg/JointState": lambda m: zip(
+        map(str, m.name), map(float, m.position), strict=False
+    ),
+}
+VALUES = tuple(_VALUES)
+"""Types whose numbers `read_values` reads, besides those of poses."""
+
+
+def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Read poses, wrenches, twists or joint positions.
+
+    Args:
+        bag: the recording.
+        name: a topic, or a body as in `recording.path`, such as ``/tf:probe``.
+
+    Returns:
+        ``stamp``, ``logged`` and ``frame`` of each message, and its numbers in columns of their
+        names: ``x`` and ``qw`` of a pose, ``fz`` of a wrench, or those of joints; NaN where a
+        message lacks one.
+
+    Raises:
+        BagError: there is no such topic or body, it has no numbers, or a message is unlike ROS 2's.
+    """
+    topic = bag.topic(name.partition(":")[0])
+    times: list[tuple[int, int, str]] = []
+    numbers: list[dict[str, float]] = []
+    if topic.type_name not in _VALUES:
+        for row in pose_rows(bag, name):
+            times.append((row.stamp, row.log_time, row.frame_id))
+            numbers.append(dict(zip(POSE_PARTS, row.pose, strict=True)))
+    else:
+        for raw in bag.messages([topic.name]):
+            message = bag.deserialize(raw)
+            try:
+                stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+                times.append((stamp, raw.log_time, message.header.frame_id))
+                numbers.append(dict(_VALUES[topic.type_name](message)))
+            except (AttributeError, TypeError, ValueError) as error:
+                raise BagError(
+                    f"{bag.path}, {topic.name}: no {topic.type_name} of ROS 2: {error}"
+                ) from None
+    found = pd.DataFrame(times, columns=["stamp", "logged", "frame"])
+    return found, pd.DataFrame(numbers, index=found.index, dtype=float)
