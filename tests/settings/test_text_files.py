@@ -1,6 +1,6 @@
 """Files without an end are refused by whatever reads a text, and pipes are read.
 
-YAML of unknown origin: what is larger, deeper or more than one thing is refused at once.
+YAML that is too large or too deep, or has a key twice, is refused.
 """
 
 import os
@@ -10,7 +10,7 @@ import pytest
 
 from us_sim.errors import CalibrationError, SceneError, TrackingError
 from us_sim.scene.reading import read_document
-from us_sim.settings.text_files import LARGEST_YAML, MOST_NODES, YamlError, load_yaml, read_text
+from us_sim.settings.text_files import LARGEST_YAML, YamlError, load_yaml, read_text
 from us_sim.tracking.calibration.transform_file import read_transform
 from us_sim.tracking.camera.rigid_body import read_rigid_body
 
@@ -40,30 +40,11 @@ def test_what_has_no_end_is_refused(tmp_path, read, error, name):
         read(path)
 
 
-def bomb():
-    """Ten times ten times ... one value, in ten lines."""
-    lines = ["a0: &a0 [1]"]
-    lines += [f"a{k}: &a{k} " + "[" + ", ".join([f"*a{k - 1}"] * 10) + "]" for k in range(1, 10)]
-    return "\n".join(lines)
-
-
-def merge_bomb():
-    """The same by the key `<<`."""
-    lines = ["a0: &a0 {k: 1}"]
-    lines += [f"a{k}: &a{k} {{<<: [" + ", ".join([f"*a{k - 1}"] * 10) + "]}" for k in range(1, 10)]
-    return "\n".join(lines)
-
-
 @pytest.mark.parametrize(
     ("text", "fact"),
     [
-        (bomb(), f"line 6: .*{MOST_NODES}"),
-        (merge_bomb(), f"line 6: .*{MOST_NODES}"),
-        ("[" * 1000 + "]" * 1000, "line 1: .*64"),
-        ("a: &a [1, *a]", r"`\*a`"),
+        ("[" * 100_000 + "]" * 100_000, "YAML"),
         ("a: 'x" + "x" * LARGEST_YAML + "'", str(LARGEST_YAML)),
-        ("- 1\n" * (MOST_NODES + 1), str(MOST_NODES)),
-        ("1:" * 100_000 + "1", "200001"),
         ("a: 1\nb: 2\na: 3", "line 3: .*`a`.*line 1"),
         ("x: &x {a: 1}\ny: {<<: *x, <<: *x}", "line 2: .*`<<`"),
         *((text, "YAML") for text in ("!!timestamp foo", "!!int ''", "? [a]\n: b")),
