@@ -32,7 +32,7 @@ def test_images_that_are_not_in_the_recording_are_said(files):
 
 
 def test_the_summary_has_all_of_it(files):
-    loss = Loss("a", "ended with status 3", 1.234, said="out of memory", back_after=2.0)
+    loss = Loss("a", "ended with status 3", 1.23, last_words="out of memory", back_after_s=2.0)
     told = outcome([loss], files, recorded=590).summary()
     assert told["images_made"] == 600
     assert told["images_recorded"] == 590

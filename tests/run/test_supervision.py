@@ -73,9 +73,6 @@ class Monitor:
                 self.node.heard[node, pid] = self.node.heard.get((node, pid), 0) + 1
                 self.node.reports.setdefault(node, {})["pid"] = str(pid)
 
-    def waiting(self, pids):
-        return [node for node, pid in pids.items() if (node, pid) not in self.node.heard]
-
 
 @pytest.fixture
 def session(tmp_path):
@@ -132,10 +129,10 @@ def test_any_other_end_is(session, status):
     group.ended = {"slice_interpolator": status}
     supervisor.update()
     (loss,) = supervisor.losses
-    assert (loss.node, loss.said) == ("slice_interpolator", "slice_interpolator was here")
+    assert (loss.node, loss.last_words) == ("slice_interpolator", "slice_interpolator was here")
     assert [process.node for process in group.started[3:]] == ["slice_interpolator"]
     supervisor.update()
-    assert loss.back_after is not None
+    assert loss.back_after_s is not None
     assert not supervisor.finished
     assert monitor.told[-1] == [str(loss)]
 

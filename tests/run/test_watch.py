@@ -1,11 +1,11 @@
-"""Supervision: silence told apart from a pause of the watch itself; how often it restarts."""
+"""Silence of a node told apart from a pause of the watch itself."""
 
 import pytest
 
 from us_sim.errors import SettingsError
 from us_sim.run.plan import NodeProcess
 from us_sim.run.supervision import going_on
-from us_sim.run.watch import START_S, Restarts, SupervisionSettings, Watch
+from us_sim.run.watch import START_S, SupervisionSettings, Watch
 
 NODE, PID = "tissue_deformer", 7
 
@@ -61,14 +61,6 @@ def test_the_first_report_may_take_long_since_a_node_may_compile(machine):
 def test_another_process_of_the_node_starts_anew(machine):
     machine.pass_time(9.0)
     assert machine.watch.hung({NODE: PID + 1}, {(NODE, PID): 1}) == {}
-
-
-@pytest.mark.parametrize("limit", [0, 3])
-def test_each_node_is_started_again_so_often(limit):
-    restarts = Restarts(SupervisionSettings(restarts=limit))
-    assert [restarts.refused("a") for _ in range(limit)] == [""] * limit
-    assert f"after {limit} restarts" in restarts.refused("a")
-    assert bool(restarts.refused("b")) is (limit == 0)
 
 
 @pytest.mark.parametrize("wrong", [{"restarts": -1}, {"silence": "1 s"}])

@@ -121,6 +121,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
     try:
         node = create()
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
+        gc.enable()
         inspect.getframeinfo(sys._getframe())  # as rclpy does with each log; the first takes 40 ms
         _is_spun.set()
         executor = create_executor(node)

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from us_sim.errors import BagError, UsSimError
-from us_sim.recording.metadata import read_metadata
+from us_sim.errors import UsSimError
 from us_sim.run.processes import LIFELINE, child_environment
 from us_sim.scene.building import volume_of
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes, thumbnail_file
@@ -97,9 +95,8 @@ def _telling(text: str) -> Callable[[float, str], None]:
 
     def show(fraction: float, _: str) -> None:
         nonlocal told
-        now = time.monotonic()
-        if now - told > 0.1:
-            told = now
+        if time.monotonic() - told > 0.1:
+            told = time.monotonic()
             _tell(fraction=fraction, text=text)
 
     return show
@@ -112,29 +109,28 @@ def list_scenes(*names: str) -> None:
         scenes.setdefault(scene.origin, scene)
     _tell(scenes=[dataclasses.asdict(scene) for scene in scenes.values()])
     for scene in scenes.values():
-        if not scene.problem:
-            with contextlib.suppress(UsSimError, OSError, MemoryError):  # a list will do without
-                file = thumbnail_file(load_scene(scene.origin))
-                _tell(thumbnail=scene.origin, file=str(file))
+        with contextlib.suppress(UsSimError, OSError, MemoryError):  # a list will do without
+            _tell(thumbnail=scene.origin, file=str(thumbnail_file(load_scene(scene.origin))))
 
 
 def bags_in_reach(recordings: str | None = None) -> dict[str, str]:
     """Return bags of the working folder and installed ones: files by names, the newest first.
 
-    Files in a bag's folder that do not belong to that bag are bags of their own.
+    A bag of several files is one with its folder; each of these files is a bag of its own, too.
 
     Args:
         recordings: folder to which pages record, wherever that is.
     """
     here = Path.cwd()
-    found = [(_bags_in(here), here), (_bags_in(here / "bags"), here)]
+    places = [(here, here), (here / "bags", here)]
     if recordings:
-        folder = full_path(recordings)
-        found.insert(1, (_bags_at(folder), folder.parent))
-    found += [(_bags_in(root / "bags"), root / "bags") for root in shared_roots()]
+        places.insert(1, (full_path(recordings), full_path(recordings).parent))
+    places += [(root / "bags", root / "bags") for root in shared_roots()]
     bags: dict[str, str] = {}
-    for files, base in found:
-        for file in sorted(files, key=_changed_at, reverse=True)[:_MOST_BAGS]:
+    for folder, base in places:
+        found = [each for each in folder.glob("*") if each.suffix in (".mcap", ".db3", ".zstd")]
+        found += [each.parent for each in folder.glob("*/metadata.yaml")]
+        for file in sorted(found, key=_changed_at, reverse=True)[:_MOST_BAGS]:
             if str(file) not in bags.values():
                 bags.setdefault(file.relative_to(base).as_posix(), str(file))
     return bags
@@ -145,34 +141,6 @@ def _changed_at(file: Path) -> float:
         return file.stat().st_mtime
     except OSError:  # taken away meanwhile
         return 0.0
-
-
-def _files_in(folder: Path) -> Iterator[Path]:
-    return (file for file in folder.glob("*") if file.name.endswith((".mcap", ".db3", ".zstd")))
-
-
-def _bags_in(folder: Path) -> Iterator[Path]:
-    yield from _files_in(folder)
-    for metadata in folder.glob("*/metadata.yaml"):
-        yield from _bags_at(metadata.parent)
-
-
-def _bags_at(folder: Path) -> Iterator[Path]:
-    """Yield a bag's folder, and the files in it that its metadata does not name."""
-    metadata = folder / "metadata.yaml"
-    named = _named_in(metadata, _changed_at(metadata))
-    if named:
-        yield folder
-    yield from (file for file in _files_in(folder) if file.name not in named)
-
-
-@functools.lru_cache(_MOST_BAGS)
-def _named_in(metadata: Path, _changed: float) -> frozenset[str]:
-    """Return the names of a bag's files; none where its metadata cannot be read."""
-    try:
-        return frozenset(PurePosixPath(file.path).name for file in read_metadata(metadata).files)
-    except (BagError, OSError):
-        return frozenset()
 
 
 if __name__ == "__main__":

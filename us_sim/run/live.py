@@ -25,7 +25,7 @@ from us_sim.run.processes import ProcessGroup, prepare_ros
 from us_sim.run.ros_arguments import ros_arguments
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import Supervisor, say
-from us_sim.run.watch import SupervisionSettings, Watch
+from us_sim.run.watch import SupervisionSettings
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
@@ -142,8 +142,10 @@ def _shown(plan: Plan) -> tuple[float | None, str]:
 
 def _status(plan: Plan, monitor: Monitored, *, at_end: bool = False) -> str:
     page = _page(plan, monitor)
-    if IMAGER not in plan.nodes and page:  # what it shows runs elsewhere
-        return page
+    if IMAGER not in plan.nodes and (page or plan.poses is not None):  # what images runs elsewhere
+        state = monitor.node.reports.get(plan.player, {}).get("state", "")
+        waits = f"waiting for the simulation on ROS domain {domain()}"
+        return page or (waits if state == "waiting" else state)
     again = ""
     if plan.loops:
         when = "at its end" if plan.poses is None else f"every {plan.poses} {_shown(plan)[1]}"
@@ -279,10 +281,7 @@ def demo(
     source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
     if source == "path":
         path_of(scene, file, topic)  # before anything is made for what cannot be played
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    out.mkdir(parents=True, exist_ok=True)
     video = _prepared_video(scene, file, topic) if source == "camera" else None
     played = file if video is None else None
     request = Request(scene, parameters, recording, played, topic, video=video, view=view)
@@ -339,6 +338,7 @@ def play(
         UsSimError: it cannot be played.
     """
     from us_sim.recording.path import read_path
+    from us_sim.recording.reader import read_bag
 
     prepare_ros(network=network)
     settings: dict[str, object] = {
@@ -346,31 +346,12 @@ def play(
         **{name: value for name, value in vars(player).items() if value is not None},
     }
     if everything:
-        process = NodeProcess("session_player", settings)
+        process, poses = NodeProcess("session_player", settings), read_bag(bag).message_count
     else:
-        read_path(bag, topic or None, option="--topic")  # or say why it cannot be
+        poses = len(read_path(bag, topic or None, option="--topic"))
         process = NodeProcess("path_player", settings | {"topic": topic, "lockstep": lockstep})
-    group, watch = ProcessGroup(), Watch(SupervisionSettings().silence)
-    try:
-        with (
-            contextlib.closing(Monitored([process.node])) as monitor,
-            Progress("playing", 100, "%") as bar,
-        ):
-            group.start([process])
-            while group.is_running(process.node):
-                monitor.spin()
-                for how in watch.hung(group.pids, monitor.node.heard).values():
-                    raise UsSimError(f"{process.node} {how}, and what it plays is not at its end")
-                report = monitor.node.reports.get(process.node, {})
-                done, length = (float(report.get(name, 0)) for name in ("position", "duration"))
-                state = report.get("state", "starting")
-                if state == "waiting":
-                    state = f"waiting for the simulation on ROS domain {domain()}"
-                bar.update(100 * done / length if length else 0, state)
-            group.check()
-            bar.update(100)
-    finally:
-        group.stop()
+    plan = Plan([process], poses, player=process.node, loops=player.loop)
+    _require_nothing_lost(follow(plan, None, SupervisionSettings()))
     return 0
 
 

@@ -6,7 +6,7 @@ import re
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -25,31 +25,18 @@ class Loss:
 
     node: str
     what: str  # it did: "was ended by SIGKILL"
-    at: float  # s since the nodes were started
-    said: str = ""  # last, by the node
-    back_after: float | None = None  # s, until it reported again
+    at_s: float  # since the nodes were started
+    last_words: str = ""  # of the node
+    back_after_s: float | None = None  # until it reported again
     given_up: str = ""  # why it was not started again
     time: str = field(default_factory=lambda: datetime.now().astimezone().isoformat())
 
     def __str__(self) -> str:
         """For a person."""
-        if self.back_after is not None:
-            then = f" and was back after {self.back_after:.1f} s"
-        else:
-            then = f" and {self.given_up}" if self.given_up else ""
-        return f"{self.node} {self.what} at {self.at:.1f} s{then}"
-
-    def summary(self) -> dict[str, Any]:
-        """As one JSON-like mapping."""
-        return {
-            "node": self.node,
-            "what": self.what,
-            "time": self.time,
-            "at_s": round(self.at, 2),
-            "last_words": self.said,
-            "back_after_s": None if self.back_after is None else round(self.back_after, 2),
-            "given_up": self.given_up,
-        }
+        then = f" and {self.given_up}" if self.given_up else ""
+        if self.back_after_s is not None:
+            then = f" and was back after {self.back_after_s:.1f} s"
+        return f"{self.node} {self.what} at {self.at_s:.1f} s{then}"
 
 
 @dataclass(frozen=True)
@@ -70,10 +57,10 @@ class Outcome:
         if not (self.losses or self.awaited or lacks_images):
             return ""
         told = [str(loss) for loss in self.losses[:TOLD]]
-        if self.awaited:
-            told.append(f"nothing was played: it waited for {self.awaited}")
         if len(self.losses) > TOLD:
             told.append(f"and {len(self.losses) - TOLD} more times nodes ended or hung")
+        if self.awaited:
+            told.append(f"nothing was played: it waited for {self.awaited}")
         if lacks_images:
             told.append(f"{self.recorded} images were recorded of {self.made} that were made")
         elif self.files and self.losses:
@@ -86,7 +73,7 @@ class Outcome:
     def summary(self) -> dict[str, Any]:
         """As one JSON-like mapping."""
         return {
-            "nodes": [loss.summary() for loss in self.losses],
+            "nodes": [asdict(loss) for loss in self.losses],
             "images_made": self.made,
             "images_recorded": self.recorded,
             "files": [file.name for file in self.files],

@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,10 +123,6 @@ class Monitored:
                 f"{taken[0]} runs already on ROS domain {domain()}: "
                 f"end that simulation, or set ROS_DOMAIN_ID to another number for this one"
             )
-
-    def waiting(self, pids: Mapping[str, int]) -> list[str]:
-        """Return the nodes whose processes have not reported yet."""
-        return [node for node, pid in pids.items() if (node, pid) not in self.node.heard]
 
     def close(self) -> None:
         """Leave the domain."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
@@ -17,7 +18,8 @@ from us_sim.run.monitored import Monitored
 from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
 from us_sim.run.processes import ProcessGroup, ending
 from us_sim.run.ros_arguments import namespace
-from us_sim.run.watch import START_S, Restarts, SupervisionSettings, Watch
+from us_sim.run.watch import START_S, SupervisionSettings, Watch
+from us_sim.settings.spelling import counted
 
 
 class Supervisor:
@@ -70,7 +72,7 @@ class Supervisor:
             self._away.pop(node, None)
             self._were_ready.discard(node)
         self.plan, self.finished = plan, False
-        self._restarts = Restarts(self._settings)
+        self._restarts: Counter[str] = Counter()
         self._changed = time.monotonic()
         self._changes += 1
         self._monitor.node.follow(plan.nodes)
@@ -85,8 +87,12 @@ class Supervisor:
     @property
     def waiting(self) -> list[str]:
         """Nodes that have not reported yet, or not yet again."""
-        pids = {node: pid for node, pid in self._group.pids.items() if node in self._processes}
-        return self._monitor.waiting(pids)
+        heard = self._monitor.node.heard
+        return [
+            node
+            for node, pid in self._group.pids.items()
+            if node in self._processes and (node, pid) not in heard
+        ]
 
     def failed(self) -> str:
         """Return why the plan cannot run, where a node is given up before all were ready."""
@@ -155,9 +161,13 @@ class Supervisor:
 
     def _on_lost(self, node: str, what: str, said: str) -> None:
         """Note a node's end, and start it again with the values that it was first started with."""
-        loss = self._note(node, what, said, self._restarts.refused(node), "it is started again")
+        limit, given_up = self._settings.restarts, ""
+        if self._restarts[node] >= limit:
+            given_up = f"is not started again after {counted(limit, 'restart')}"
+        loss = self._note(node, what, said, given_up, "it is started again")
         self._publish()
-        if loss.given_up:
+        self._restarts[node] += 1
+        if given_up:
             self._away.pop(node, None)
             self.finished |= node == self.plan.player
             return
@@ -171,17 +181,17 @@ class Supervisor:
         self._were_ready |= self._processes.keys() - set(waiting)
         for node in [node for node in self._away if node not in waiting]:
             loss = self._away.pop(node)
-            loss.back_after = time.monotonic() - self._began - loss.at
+            loss.back_after_s = round(time.monotonic() - self._began - loss.at_s, 2)
             self._publish()
-            say(f"{node} is back after {loss.back_after:.1f} s")
+            say(f"{node} is back after {loss.back_after_s:.1f} s")
 
     def _note(
         self, node: str, what: str, said: str = "", given_up: str = "", then: str = ""
     ) -> Loss:
-        loss = Loss(node, what, time.monotonic() - self._began, said, given_up=given_up)
+        loss = Loss(node, what, round(time.monotonic() - self._began, 2), said, given_up=given_up)
         self.losses.append(loss)
         last = f", and last said: {said}" if said else ""
-        say(f"{node} {what} after {loss.at:.1f} s{last}; {given_up or then}".removesuffix("; "))
+        say(f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or then}".removesuffix("; "))
         return loss
 
     def _publish(self) -> None:

@@ -1,4 +1,4 @@
-"""Supervision of node processes: which are silent, and how often one is started again.
+"""Supervision of node processes: when one hangs, and how often it is started again.
 
 >>> from us_sim.run.watch import Watch
 >>> times = iter(range(100))
@@ -11,13 +11,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import counted
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,7 @@ class Watch:
         self._heard: dict[tuple[str, int], tuple[int, float]] = {}  # reports, time of the last
 
     def hung(
-        self,
-        pids: Mapping[str, int],
-        reports: Mapping[tuple[str, int], int],
+        self, pids: Mapping[str, int], reports: Mapping[tuple[str, int], int]
     ) -> dict[str, str]:
         """Return the nodes that hang, and how that shows, for a person; each is told once.
 
@@ -69,32 +65,13 @@ class Watch:
         self._time += min(now - self._looked, STEP_S)
         self._looked = now
         hung: dict[str, str] = {}
-        for node, pid in pids.items():
-            count = reports.get((node, pid), 0)
-            before, since = self._heard.get((node, pid), (-1, 0.0))
+        for process in pids.items():
+            count = reports.get(process, 0)
+            before, since = self._heard.get(process, (-1, 0.0))
             silent = self._time - since
             if count == before and silent < (self._silence if count else START_S):
                 continue
-            self._heard[node, pid] = count, self._time
+            self._heard[process] = count, self._time
             if count == before:
-                hung[node] = f"has not reported for {silent:.0f} s"
+                hung[process[0]] = f"has not reported for {silent:.0f} s"
         return hung
-
-
-class Restarts:
-    """Counts the restarts of each node.
-
-    Args:
-        settings: how many there may be.
-    """
-
-    def __init__(self, settings: SupervisionSettings) -> None:
-        self._limit = settings.restarts
-        self._counts: Counter[str] = Counter()
-
-    def refused(self, node: str) -> str:
-        """Return why the node is not started again; nothing, and counted, where it is."""
-        if self._counts[node] >= self._limit:
-            return f"is not started again after {counted(self._limit, 'restart')}"
-        self._counts[node] += 1
-        return ""
