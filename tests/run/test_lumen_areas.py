@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from us_sim.geometry.pose import Pose
@@ -33,14 +34,14 @@ def cone():
 def measured(monkeypatch, poses, nodes):
     """The areas of a session in which the tissue was at ``nodes``, one array a pose."""
     stamps = range(len(poses))
-    sent = {"/ultrasound/image": [(stamp, stamp, stamp) for stamp in stamps]}
+    times = {"/ultrasound/image": pd.DataFrame({"stamp": stamps})}
     session = Session(
         SimpleNamespace(),
         dict(zip(stamps, poses, strict=True)),
         dict(zip(stamps, nodes, strict=True)),
         BLOCK.nodes,
         BLOCK.tetrahedra,
-        sent,
+        times,
         {},
     )
     scanner = BMode(cone(), PROBE)

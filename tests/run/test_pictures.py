@@ -6,17 +6,19 @@ import pytest
 
 from us_sim.errors import BagError
 from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.run.contact_sheet import _moments
+from us_sim.run.contact_sheet import pick_moments
 
 
 def session_on(path):
     """As a recording of it would be, with an image for every pose."""
     stamps = [int(stamp) for stamp in path.stamps]
-    return SimpleNamespace(images=stamps, poses=dict(zip(stamps, path.poses, strict=True)))
+    poses = dict(zip(stamps, path.poses, strict=True))
+    return SimpleNamespace(stamps=lambda _: stamps, poses=poses)
 
 
 def told(path):
-    return {title: (stamp - path.stamps[0]) * 1e-9 for title, stamp in _moments(session_on(path))}
+    moments = pick_moments(session_on(path))
+    return {title: (stamp - path.stamps[0]) * 1e-9 for title, stamp in moments.items()}
 
 
 def test_the_scripted_press():
@@ -36,4 +38,4 @@ def test_a_path_that_never_touches_has_its_moments_too():
 
 def test_nothing_to_show():
     with pytest.raises(BagError, match="nothing to show"):
-        _moments(SimpleNamespace(images=[], poses={}))
+        pick_moments(SimpleNamespace(stamps=lambda _: [], poses={}))

@@ -2,7 +2,6 @@
 
 import csv
 
-import cv2
 import numpy as np
 import pytest
 from session_files import EPOCH, PERIOD, cloud, image, pose, press, wrench, write
@@ -37,7 +36,6 @@ def test_a_session_and_its_copy_are_equal(tmp_path, capsys):
     files = [str(write(tmp_path / name, messages)) for name in ("a.mcap", "b.mcap")]
     assert main(["bag", "diff", *files, "--out", str(tmp_path / "out")]) == 0
     assert "all 240 pairs are equal" in capsys.readouterr().out
-    assert (tmp_path / "out" / "diff.png").stat().st_size > 1000
 
 
 def test_poses_differ_by_millimetres_and_degrees(tmp_path):
@@ -78,7 +76,7 @@ def test_wrenches_differ_by_newtons(tmp_path):
     assert rows[WRENCH, "torque (N mm)"]["worst"] == "0"
 
 
-def test_images_differ_by_grey_levels_and_the_worst_are_shown(tmp_path, capsys):
+def test_images_differ_by_grey_levels(tmp_path, capsys):
     ramp = np.add.outer(np.arange(8), np.arange(6)).astype(np.uint8)
 
     def brighten(messages):
@@ -91,14 +89,11 @@ def test_images_differ_by_grey_levels_and_the_worst_are_shown(tmp_path, capsys):
     mean, worst = rows[IMAGE, "grey levels, mean"], rows[IMAGE, "grey levels, worst"]
     assert float(mean["worst"]) == pytest.approx(200 / 48, rel=1e-3)
     assert (worst["worst"], worst["same"]) == ("200", "58")
-    one, other = next(each for each in found.topics if each.topic == IMAGE).worst
-    assert int(other.data[0]) - int(one.data[0]) == 200
     files = [str(tmp_path / name) for name in ("a.mcap", "b.mcap")]
     assert main(["bag", "diff", *files, "--out", str(tmp_path / "out")]) == 1
     assert IMAGE in capsys.readouterr().out
     with (tmp_path / "out" / "diff.csv").open(encoding="utf-8") as stream:
         assert [tuple(row) for row in csv.reader(stream)] == [HEAD, *found.rows]
-    assert cv2.imread(str(tmp_path / "out" / "diff.png")).shape[1] > 1000
     assert main(["bag", "diff", *files, "--out", str(tmp_path / "out")]) == 2
     assert "exists already" in capsys.readouterr().err
 

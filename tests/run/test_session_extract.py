@@ -85,37 +85,6 @@ def test_images_are_what_was_recorded_with_their_scale(scaled, tmp_path):
     assert (rows[1]["image"], rows[1]["stamp_s"]) == ("000001.png", "1700000000.016666667")
 
 
-def test_a_video_lasts_as_long_as_it_was(scaled, tmp_path):
-    assert extracted(scaled, tmp_path / "out", "--video") == 0
-    file = tmp_path / "out" / "ultrasound_image.mp4"
-    video = cv2.VideoCapture(str(file))
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(60.0, rel=1e-3)
-    levels = []
-    while True:
-        is_there, frame = video.read()
-        if not is_there:
-            break
-        assert frame.shape == (48, 64, 3)
-        levels.append(float(frame.mean()))
-    # 20 images of one period, 19 of two, and the last.
-    shown = [6 * k for k in range(40) for _ in range(2 if 20 <= k < 39 else 1)]
-    assert levels == pytest.approx(shown, abs=4)
-    with file.with_suffix(".csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert {(row["column_spacing_mm"], row["row_spacing_mm"]) for row in rows} == {("0.4", "0.25")}
-
-
-def test_a_pause_is_a_second_in_the_video(tmp_path):
-    messages = []
-    for k in range(30):
-        stamp = EPOCH + k * PERIOD + (3600 * 10**9 if k > 10 else 0)
-        data = bytes(image(stamp, np.full((8, 8), k)))
-        messages.append(["/ultrasound/image", data, stamp, stamp, k])
-    assert extracted(write(tmp_path / "s.mcap", messages), tmp_path, "--video") == 0
-    video = cv2.VideoCapture(str(tmp_path / "ultrasound_image.mp4"))
-    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 29 + 60
-
-
 def test_real_images_have_no_scale_that_nobody_recorded(shared_data, tmp_path):
     folder = shared_data / "ros2-jazzy/bags/probe_path_mcap"
     assert extracted(folder, tmp_path, "--images") == 0
@@ -173,10 +142,9 @@ def test_what_is_odd_in_real_bags_is_told(
 
 def test_nothing_is_overwritten(scaled, tmp_path, capsys):
     out = tmp_path / "out"
-    assert extracted(scaled, out, "--images", "--video") == 0
-    for option in ("--images", "--video"):
-        assert extracted(scaled, out, option) == 1
-        assert "exists already: choose another folder with --out" in capsys.readouterr().err
+    assert extracted(scaled, out, "--images") == 0
+    assert extracted(scaled, out, "--images") == 1
+    assert "exists already: choose another folder with --out" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
     assert extracted(scaled, tmp_path / "file", "--images") == 1
     assert "cannot be written" in capsys.readouterr().err

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 from us_sim.errors import UsSimError
@@ -13,7 +12,6 @@ _EXTRACTED = {
     "poses": "poses of each topic as CSV, and in TUM's format",
     "wrench": "forces and torques of each topic as CSV",
     "images": "images of each topic as PNG, with their scale",
-    "video": "images of each topic as MP4, with their scale in its comment",
     "areas": "areas of vessels in the image plane as CSV",
 }
 
@@ -33,7 +31,7 @@ def bag_options(bag: argparse.ArgumentParser) -> None:
     )
     diff.add_argument("one", type=Path, metavar="A")
     diff.add_argument("other", type=Path, metavar="B")
-    diff.add_argument("--out", type=Path, help="folder for the numbers as CSV, and a picture")
+    diff.add_argument("--out", type=Path, help="folder for the numbers as CSV")
     diff.set_defaults(command=_diff)
     extract = bag_commands.add_parser(
         "extract",
@@ -106,8 +104,8 @@ def _diff(args: argparse.Namespace) -> int:
     try:
         found = diff(read_bag(args.one), read_bag(args.other), late_progress("bag diff"))
         print(table(found))
-        for file in write(found, args.out) if args.out is not None else ():
-            print(file)
+        if args.out is not None:
+            print(write(found, args.out))
     except UsSimError as error:
         end_late_bars()
         print(f"us-sim: {error}", file=sys.stderr)
@@ -125,25 +123,12 @@ def _extract(args: argparse.Namespace) -> int:
         return 0
     from us_sim.progress import late_progress
     from us_sim.recording.reader import read_bag
-    from us_sim.run import session_extract as parts
+    from us_sim.run.session_extract import write_parts
 
-    bag, out = read_bag(args.file), args.out
-    parts.require_parts(bag, asked)
     show = late_progress(f"bag extract {args.file.name}")
-    if args.poses:
-        _print_all(parts.write_poses(bag, out))
-    if args.wrench:
-        _print_all(parts.write_wrenches(bag, out))
-    if args.images or args.video:
-        _print_all(parts.write_images(bag, out, show, pictures=args.images, video=args.video))
-    if args.areas:
-        _print_all(parts.write_areas(bag, out, show))
-    return 0
-
-
-def _print_all(lines: Iterable[object]) -> None:
-    for line in lines:
+    for line in write_parts(read_bag(args.file), args.out, asked, show):
         print(line)
+    return 0
 
 
 def _repair(args: argparse.Namespace) -> int:
@@ -164,5 +149,6 @@ def _to_lerobot(args: argparse.Namespace) -> int:
 
     wanted = Wanted(args.topics, args.action, args.rate, args.by_log_time)
     show = late_progress("bag to-lerobot")
-    _print_all(to_lerobot(args.files, args.out, wanted, args.task, show, is_video=args.video))
+    for line in to_lerobot(args.files, args.out, wanted, args.task, show, is_video=args.video):
+        print(line)
     return 0

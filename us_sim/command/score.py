@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+
+import pandas as pd
 
 from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import ScoreError
 from us_sim.progress import late_progress
 from us_sim.scoring.exercise import Exercise, Step, read_exercise, result_of
-from us_sim.scoring.metrics import Metric, Scan, metrics_of
+from us_sim.scoring.metrics import metrics_of
 from us_sim.scoring.picture import draw_score
 from us_sim.scoring.settings import ScoreSettings
 from us_sim.share import find_bag
@@ -40,6 +40,7 @@ def score_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _score(args: argparse.Namespace) -> int:
+    from us_sim.evaluation.report import markdown_table
     from us_sim.run.session_score import read_scan
 
     settings = read_settings(args, ScoreSettings)
@@ -49,61 +50,38 @@ def _score(args: argparse.Namespace) -> int:
     if taken:
         raise ScoreError(f"{taken[0]} exists already: choose another folder with --out")
     scan = read_scan(args.session, args.topic, args.wrench, late_progress("score"))
+    metrics = list(metrics_of(scan, settings))
+    rows = [(each.name, each.text, each.unit, each.roles) for each in metrics]
+    table = markdown_table(("metric", "value", "unit", "roles"), rows)
+    missing = [f"left out: {sentence}" for sentence in scan.missing]
     steps = exercise.steps(scan) if exercise is not None else []
-    score = Score(args.session.name, list(metrics_of(scan, settings)), scan, exercise, steps)
-    print(score.table())
-    for sentence in scan.missing:
-        print(f"left out: {sentence}")
-    if exercise is not None:
-        print(score.exercise_table())
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        score.write(out)
-        print(out / "score.md")
+    done = _exercise_table(exercise, steps) if exercise is not None else ""
+    print("\n".join(filter(None, [table, *missing, done])))
+    if out is None:
+        return 0
+    out.mkdir(parents=True, exist_ok=True)
+    values = [(each.name, each.roles, each.unit, each.text) for each in metrics]
+    pd.DataFrame(values, columns=_HEAD).to_csv(out / "score.csv", index=False)
+    draw_score(out / "score.png", args.session.name, scan, steps)
+    page = [
+        f"# Score of {args.session.name}",
+        exercise.description if exercise is not None else "",
+        done,
+        table,
+        "\n".join(f"- {sentence}." for sentence in missing),
+        "![The probe's way over the skin; force and areas over time](score.png)",
+        "The values are in [score.csv](score.csv), too; `docs/scores.md` defines them.",
+    ]
+    text = "\n\n".join(filter(None, page)) + "\n"
+    (out / "score.md").write_text(text, encoding="utf-8")
+    print(out / "score.md")
     return 0
 
 
-@dataclass(frozen=True)
-class Score:
-    """The metrics of one recording, what was done of an exercise, and their page."""
+def _exercise_table(exercise: Exercise, steps: Sequence[Step]) -> str:
+    """Steps of the exercise, whether each is done, what was seen of it; then the result."""
+    from us_sim.evaluation.report import markdown_table
 
-    title: str
-    metrics: Sequence[Metric]
-    scan: Scan
-    exercise: Exercise | None = None
-    steps: Sequence[Step] = ()
-
-    def table(self) -> str:
-        """For a terminal, and for a page."""
-        from us_sim.evaluation.report import markdown_table
-
-        rows = [(each.name, each.text, each.unit, each.roles) for each in self.metrics]
-        return markdown_table(("metric", "value", "unit", "roles"), rows)
-
-    def exercise_table(self) -> str:
-        """Steps of the exercise, whether each is done, what was seen of it; then the result."""
-        from us_sim.evaluation.report import markdown_table
-
-        assert self.exercise is not None
-        rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in self.steps]
-        table = markdown_table((self.exercise.name, "done", "seen"), rows)
-        return f"{table}\n\n{result_of([each.is_done for each in self.steps])}"
-
-    def write(self, folder: Path) -> None:
-        """Write table, picture and page into a folder."""
-        with (folder / "score.csv").open("w", encoding="utf-8", newline="") as stream:
-            rows = [(each.name, each.roles, each.unit, each.text) for each in self.metrics]
-            csv.writer(stream, lineterminator="\n").writerows([_HEAD, *rows])
-        draw_score(folder / "score.png", self.title, self.scan, self.steps)
-        missing = [f"- Left out: {sentence}." for sentence in self.scan.missing]
-        parts = [
-            f"# Score of {self.title}",
-            self.exercise.description if self.exercise else "",
-            self.exercise_table() if self.exercise else "",
-            self.table(),
-            "\n".join(missing),
-            "![The probe's way over the skin; force and areas over time](score.png)",
-            "The values are in [score.csv](score.csv), too; `docs/scores.md` defines them.",
-        ]
-        text = "\n\n".join(filter(None, parts)) + "\n"
-        (folder / "score.md").write_text(text, encoding="utf-8")
+    rows = [(each.what, "yes" if each.is_done else "no", each.seen) for each in steps]
+    table = markdown_table((exercise.name, "done", "seen"), rows)
+    return f"{table}\n\n{result_of([each.is_done for each in steps])}"

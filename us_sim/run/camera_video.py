@@ -7,7 +7,6 @@ scene's body; so the true pose in each image is known.
 from __future__ import annotations
 
 import hashlib
-import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,15 +14,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
-from filelock import FileLock
 from numpy.typing import NDArray
 
 from us_sim.cache import cache_folder
 from us_sim.errors import UsSimError
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import interpolate, rotation_between
+from us_sim.geometry.se3 import rotation_between
 from us_sim.recording.path import ProbePath
+from us_sim.recording.resampling import slerp
 from us_sim.scene.building import camera_body_of, tracker_poses_of
 from us_sim.scene.scene import Scene
 from us_sim.tracking.camera.model import write_camera_info
@@ -34,8 +32,7 @@ CAMERA = WEBCAMS["640x480"]
 RATE = 30.0  # images per second
 _EXPOSURE = 0.008  # s
 _CODEC = "FFV1"  # lossless
-_FORM = 1  # of what is kept: another number for whatever changes the images
-_NAMES = ("video.mkv", "camera.yaml")
+_FORM = 2  # of what is kept: another number for whatever changes the images
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +46,7 @@ class PathVideo:
 
 
 def path_video(
-    scene: Scene, path: ProbePath, progress: Callable[[int, int], None] | None = None
+    scene: Scene, path: ProbePath, progress: Callable[[int, int], None] = lambda *_: None
 ) -> PathVideo:
     """The video of a path, from the user's cache or rendered into it.
 
@@ -70,61 +67,50 @@ def path_video(
         )
     body = camera_body_of(scene)
     registration, calibration = tracker_poses_of(scene)
-    truth = video_poses(path)
-    seen = [registration.inverse() @ pose @ calibration.inverse() for pose in truth]
-    _require_in_view(scene, body, seen)
-    numbers = [CAMERA.matrix, CAMERA.distortion, body.corners, body.ids]
-    numbers += [path.log_times - path.log_times[0], path.positions, path.orientations]
-    for pose in (registration, calibration):
-        numbers += [pose.position, pose.orientation]
-    digest = hashlib.sha256(f"{_FORM} {RATE} {_EXPOSURE} {_CODEC} {body.dictionary}".encode())
-    for array in numbers:
+
+    def seen(late: float) -> list[Pose]:
+        """Where the body is in the camera's frame."""
+        poses = video_poses(path, late)
+        return [registration.inverse() @ pose @ calibration.inverse() for pose in poses]
+
+    begins, middles, ends = (seen(part * _EXPOSURE) for part in (-0.5, 0.0, 0.5))
+    _require_in_view(scene, body, middles)
+    motions = [
+        np.r_[b.position - a.position, rotation_between(a.orientation, b.orientation)]
+        for a, b in zip(begins, ends, strict=True)
+    ]
+    digest = hashlib.sha256(f"{_FORM} {RATE} {_CODEC} {body.dictionary}".encode())
+    shown = [np.r_[pose.position, pose.orientation] for pose in middles]
+    for array in (CAMERA.matrix, CAMERA.distortion, body.corners, body.ids, shown, motions):
         digest.update(np.ascontiguousarray(array).tobytes())
     entry = cache_folder() / f"camera_video_{digest.hexdigest()[:20]}"
+    video, camera_info = entry / "video.mkv", entry / "camera.yaml"
     try:
-        entry.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(entry.with_name(f"{entry.name}.lock")):
-            if not _is_whole(entry):
-                _make(entry, body, _motions(path, registration, calibration), seen, progress)
+        if not entry.is_dir():
+            entry.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=entry.parent) as partial:
+                made = Path(partial, entry.name)
+                made.mkdir()
+                _render(made / video.name, body, middles, motions, progress)
+                write_camera_info(made / camera_info.name, CAMERA, "rendered")
+                made.rename(entry)
     except OSError as error:
         raise UsSimError(
             f"the camera's video cannot be written to {entry.parent} ({error.strerror or error}): "
             f"set US_SIM_CACHE to a folder that can"
         ) from error
-    return PathVideo(entry / _NAMES[0], entry / _NAMES[1], RATE, truth)
+    return PathVideo(video, camera_info, RATE, video_poses(path))
 
 
-def video_poses(path: ProbePath) -> list[Pose]:
-    """Where the probe is in each image of the video."""
-    return [_pose_at(path, moment) for moment in _moments(path)]
-
-
-def _moments(path: ProbePath) -> NDArray[np.float64]:
-    return np.arange(int(path.duration * RATE + 1e-6) + 1) / RATE
-
-
-def _pose_at(path: ProbePath, moment: float) -> Pose:
-    """Between the two poses around a moment (s); at the ends it rests."""
-    times = (path.log_times - path.log_times[0]) * 1e-9
-    after = int(np.clip(np.searchsorted(times, moment, side="right"), 1, max(1, len(times) - 1)))
-    first, last = (path.pose(i) for i in (after - 1, min(after, len(times) - 1)))
-    span = float(times[min(after, len(times) - 1)] - times[after - 1])
-    part = (moment - float(times[after - 1])) / span if span > 0 else 0.0
-    return interpolate(first, last, float(np.clip(part, 0.0, 1.0)))
-
-
-def _motions(path: ProbePath, registration: Pose, calibration: Pose) -> list[NDArray[np.float64]]:
-    motions = []
-    for moment in _moments(path):
-        begin, end = (
-            registration.inverse()
-            @ _pose_at(path, moment + side * 0.5 * _EXPOSURE)
-            @ calibration.inverse()
-            for side in (-1.0, 1.0)
-        )
-        turn = rotation_between(begin.orientation, end.orientation)
-        motions.append(np.concatenate([end.position - begin.position, turn]))
-    return motions
+def video_poses(path: ProbePath, late: float = 0.0) -> list[Pose]:
+    """Where the probe is so many seconds after each image of the video; at the ends it rests."""
+    times, first = np.unique(path.log_times, return_index=True)
+    poses = np.hstack([path.positions, path.orientations])[first]
+    if len(times) == 1:
+        return [path.pose(0)]
+    moments = np.arange(int(path.duration * RATE + 1e-6) + 1) / RATE + late
+    since = np.clip((1e9 * moments).round().astype(np.int64), 0, times[-1] - times[0])
+    return [Pose(each[:3], each[3:]) for each in slerp(times, poses, times[0] + since)]
 
 
 def _require_in_view(scene: Scene, body: RigidBody, seen: list[Pose]) -> None:
@@ -146,43 +132,22 @@ def _require_in_view(scene: Scene, body: RigidBody, seen: list[Pose]) -> None:
         )
 
 
-def _is_whole(entry: Path) -> bool:
-    try:
-        notes = yaml.safe_load((entry / _NAMES[1]).read_text(encoding="utf-8"))
-        return bool((entry / _NAMES[0]).stat().st_size == notes["video_bytes"])
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError):
-        return False
-
-
-def _make(
-    entry: Path,
+def _render(
+    video: Path,
     body: RigidBody,
-    motions: list[NDArray[np.float64]],
     seen: list[Pose],
-    progress: Callable[[int, int], None] | None,
+    motions: list[NDArray[np.float64]],
+    progress: Callable[[int, int], None],
 ) -> None:
-    for left_over in entry.parent.glob(f"{entry.name}.partial-*"):
-        shutil.rmtree(left_over, ignore_errors=True)
-    partial = Path(tempfile.mkdtemp(prefix=f"{entry.name}.partial-", dir=entry.parent))
-    try:
-        video = partial / _NAMES[0]
-        codec, size = cv2.VideoWriter.fourcc(*_CODEC), (CAMERA.width, CAMERA.height)
-        writer = cv2.VideoWriter(str(video), cv2.CAP_FFMPEG, codec, RATE, size, False)
-        if not writer.isOpened():
-            raise UsSimError(
-                f"this OpenCV cannot write {_CODEC} video to {video}: install "
-                f"opencv-python-headless with pip, which has FFmpeg"
-            )
-        room = RenderedView(CAMERA, body)
-        for number, (pose, motion) in enumerate(zip(seen, motions, strict=True)):
-            if progress is not None:
-                progress(number, len(seen))
-            writer.write(room.render(pose, Conditions(), 0, motion, number))
-        writer.release()
-        notes = {"video_bytes": video.stat().st_size, "images": len(seen)}
-        write_camera_info(partial / _NAMES[1], CAMERA, "rendered", notes)
-        if entry.is_dir():
-            shutil.rmtree(entry)
-        partial.rename(entry)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    codec, size = cv2.VideoWriter.fourcc(*_CODEC), (CAMERA.width, CAMERA.height)
+    writer = cv2.VideoWriter(str(video), cv2.CAP_FFMPEG, codec, RATE, size, False)
+    if not writer.isOpened():
+        raise UsSimError(
+            f"this OpenCV cannot write {_CODEC} video to {video}: install "
+            f"opencv-python-headless with pip, which has FFmpeg"
+        )
+    room = RenderedView(CAMERA, body)
+    for number, (pose, motion) in enumerate(zip(seen, motions, strict=True)):
+        progress(number, len(seen))
+        writer.write(room.render(pose, Conditions(), 0, motion, number))
+    writer.release()

@@ -16,13 +16,15 @@ from matplotlib.figure import Figure
 from us_sim.errors import BagError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
-from us_sim.run.session_summary import Session
+from us_sim.run.session_summary import IMAGE, Session
+from us_sim.run.session_tables import SECOND
 from us_sim.scene.building import colour_of, probe_of, scanner_of, volume_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import CASE_PREFIX, Scene
 from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.frame import Frame
+from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.structure_names import Colour, anatomical_colour
 
 _COLUMNS = 4
@@ -42,7 +44,8 @@ def picture_cases(folders: Sequence[Path], file: Path) -> None:
     with Progress("drawing", len(folders), "cases") as bar:
         for number, folder in enumerate(folders):
             axes = figure.add_subplot(rows, columns, number + 1)
-            _draw(axes, load_scene(f"{CASE_PREFIX}{folder}"), folder.name)
+            _draw_case(axes, load_scene(f"{CASE_PREFIX}{folder}"))
+            axes.set_title(folder.name, fontsize=10)
             bar.update(number + 1)
     try:
         figure.savefig(file, dpi=100)
@@ -50,41 +53,38 @@ def picture_cases(folders: Sequence[Path], file: Path) -> None:
         raise UsSimError(f"--picture {file}: cannot be written: {error.strerror}") from error
 
 
-def _draw(axes: Any, scene: Scene, name: str) -> None:
+def _draw_case(axes: Any, scene: Scene) -> None:
     touching = dataclasses.replace(scene.imaging, contact=False)
     scene = dataclasses.replace(scene, imaging=touching)
     volume = volume_of(scene)
     scanner = scanner_of(scene, volume)
-    width, height = 1e3 * scanner.probe.width, 1e3 * scanner.probe.height
-    top = 1e3 * float(scanner.probe.image_to_probe[2, 3]) - height / scanner.probe.rows / 2
-    extent = (-width / 2, width / 2, top + height, top)
-    axes.imshow(scanner.image(Pose()), cmap="gray", vmin=0, vmax=255, extent=extent)
+    _show(axes, scanner.image(Pose()), scanner.probe)
     if volume.labels is not None:
-        numbers = {label: number for number, label in volume.label_names.items()}
+        numbers = {name: label for label, name in volume.label_names.items()}
         colours = {
             numbers[given.label or name]: colour_of(scene, name)
             for name, given in scene.structures.items()
         }
-        draw_outlines(axes, scanner.frame(Pose()), colours, extent)
-    axes.set_title(name, fontsize=10)
+        _draw_outlines(axes, scanner.frame(Pose()), colours)
     axes.set_xlabel("mm", fontsize=8)
-    axes.tick_params(labelsize=7)
 
 
-def draw_outlines(
-    axes: Any,
-    frame: Frame,
-    colours: Mapping[int, Colour],
-    extent: tuple[float, float, float, float],
-) -> None:
-    """Draw the outlines of labels over a frame's image whose extent is in mm."""
-    left, right, bottom, top = extent
+def _show(axes: Any, pixels: Any, probe: Probe) -> None:
+    """Draw an image over its extent in mm."""
+    corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
+    (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
+    axes.imshow(pixels, cmap="gray", vmin=0, vmax=255, extent=(left, right, bottom, top))
+    axes.tick_params(labelsize=8)
+
+
+def _draw_outlines(axes: Any, frame: Frame, colours: Mapping[int, Colour]) -> None:
+    """Draw the outlines of labels over the frame's image."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     scale = np.array([right - left, bottom - top]) / frame.labels.shape[::-1]
     refine = partial(onto_border, frame)
     for label, colour in colours.items():
         for outline in label_outlines(frame.labels, label, refine=refine):
-            x, y = ((outline + 0.5) * scale + (left, top)).T
-            axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=colour, lw=1)
+            axes.fill(*((outline + 0.5) * scale + (left, top)).T, fill=False, ec=colour, lw=1)
     axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
@@ -94,70 +94,67 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
     Raises:
         BagError: the session has no image.
     """
-    moments = _moments(session)
+    moments = pick_moments(session)
     heights = [1.0, 1.0, *[0.55] * (areas is not None)]
-    height = 9.0 if areas is None else 12.5
-    figure = Figure(figsize=(15, height), layout="constrained")
+    figure = Figure(figsize=(15, 9.0 if areas is None else 12.5), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(len(heights), 3, height_ratios=heights)
-    probe = probe_of(scene)
-    corners = np.array([[-0.5, -0.5, 0, 1], [probe.columns - 0.5, probe.rows - 0.5, 0, 1]])
-    (left, _, top), (right, _, bottom) = 1e3 * (corners @ probe.image_to_probe.T)[:, :3]
-    first = min(session.poses)
+    probe, first = probe_of(scene), min(session.poses)
     numbers, scanner = session.scanner_of_vessels(scene)
-    images = session.images_at({stamp for _, stamp in moments})
-    for i, (title, stamp) in enumerate(moments):
-        axes = figure.add_subplot(grid[divmod(i, 3)])
-        extent = (left, right, bottom, top)
-        axes.imshow(images[stamp], cmap="gray", vmin=0, vmax=255, extent=extent)
-        seen = stamp in session.nodes and session.poses[stamp].position[2] > 0.0
-        if scanner is not None and seen:  # through air nothing is
-            frame = scanner.frame(session.poses[stamp], session.nodes[stamp])
+    images = session.images_at({*moments.values()})
+    times = [(stamp - first) / SECOND for stamp in moments.values()]
+    for i, (title, stamp) in enumerate(moments.items()):
+        axes, pose = figure.add_subplot(grid[divmod(i, 3)]), session.poses[stamp]
+        _show(axes, images[stamp], probe)
+        if scanner is not None and stamp in session.nodes and pose.position[2] > 0.0:
+            # Through air nothing is seen.
             lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
-            draw_outlines(axes, frame, lumens, extent)
-        where = _place(session.poses[stamp])
-        axes.set_title(f"{title}: t = {(stamp - first) * 1e-9:.2f} s, {where}", fontsize=11)
-        axes.set_xlabel(_caption(areas, (stamp - first) * 1e-9), fontsize=12)
-        axes.tick_params(labelsize=8)
+            _draw_outlines(axes, scanner.frame(pose, session.nodes[stamp]), lumens)
+        axes.set_title(f"{title}: t = {times[i]:.2f} s, {_place(pose)}", fontsize=11)
+        axes.set_xlabel(_caption(areas, times[i]), fontsize=12)
         if i % 3 == 0:
             axes.set_ylabel("depth, mm")
-    if areas is not None:
-        of_vessels = {name: _colour(scene, name) for name in areas.area}
-        times = [(stamp - first) * 1e-9 for _, stamp in moments]
-        _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, of_vessels)
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
-    notes = [_DARK, *[_AREAS] * (areas is not None)]
-    figure.supxlabel("\n".join(notes), fontsize=11)
+    notes = _DARK
+    if areas is not None:
+        colours = {name: _colour(scene, name) for name in areas.area}
+        _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, colours)
+        notes += _AREAS
+    figure.supxlabel(notes, fontsize=11)
     figure.savefig(file, dpi=80)
 
 
 _DARK = "Beams of the part of the face that does not touch the skin stay dark."
 _AREAS = (
-    "Areas are of the tissue in the image plane, also below a probe in the air. Above 100 % the "
+    "\nAreas are of the tissue in the image plane, also below a probe in the air. Above 100 % the "
     "plane cuts more of the vessel than at rest."
 )
 
 
-def _moments(session: Session) -> list[tuple[str, int]]:
-    stamps = [stamp for stamp in session.images if stamp in session.poses]
+def pick_moments(session: Session) -> dict[str, int]:
+    """Choose the stamps of six images of a press, by what they show.
+
+    Raises:
+        BagError: the session holds no image with a pose.
+    """
+    stamps = [stamp for stamp in session.stamps(IMAGE) if stamp in session.poses]
     if not stamps:
         raise BagError("the session holds no image with a pose, so there is nothing to show")
-    depth = np.array([session.poses[stamp].position[2] for stamp in stamps])
+    places = np.array([session.poses[stamp].position for stamp in stamps])
+    depth = places[:, 2]
     deepest = depth.max()
     full = int(np.argmax(depth >= deepest - 1e-4))
-    touch, half = (int(np.argmax(depth >= part * deepest)) for part in (0.0, 0.5))
-    places = np.array([session.poses[stamp].position for stamp in stamps])
     aside = np.linalg.norm((places - places[full])[:, :2], axis=1)
-    slid = full + int(np.argmax(np.where(depth >= 0.5 * deepest, aside, -1.0)[full:]))
-    picked = [
-        ("before", 0),
-        ("first touch", touch),
-        ("pressing", half),
-        ("full press", full),
-        ("slid aside", slid),
-        ("after", len(stamps) - 1),
-    ]
-    return [(title, stamps[i]) for title, i in picked]
+    slid = np.where(depth >= 0.5 * deepest, aside, -1.0)[full:]
+    picked = {
+        "before": 0,
+        "first touch": int(np.argmax(depth >= 0.0)),
+        "pressing": int(np.argmax(depth >= 0.5 * deepest)),
+        "full press": full,
+        "slid aside": full + int(np.argmax(slid)),
+        "after": -1,
+    }
+    return {title: stamps[i] for title, i in picked.items()}
 
 
 def _place(pose: Pose) -> str:
@@ -189,20 +186,19 @@ def _colour(scene: Scene, name: str) -> Colour:
 
 
 def _plot_areas(
-    axes: Any, areas: LumenAreas, moments: list[float], colours: Mapping[str, Colour]
+    axes: Any, areas: LumenAreas, moments: Sequence[float], colours: Mapping[str, Colour]
 ) -> None:
-    for name in areas.area:
+    for name, colour in colours.items():
         percent = 100 * areas.fraction(name)
-        axes.plot(areas.time, percent, color=colours[name], label=f"{name} lumen", lw=2)
+        axes.plot(areas.time, percent, color=colour, label=f"{name} lumen", lw=2)
     axes.set(xlabel="time, s", ylabel="area, % of the same plane at rest")
     axes.set_ylim(bottom=0)
     axes.margins(x=0.01)
-    for time in moments:
-        axes.axvline(time, color="0.8", lw=1, zorder=0)
+    for moment in moments:
+        axes.axvline(moment, color="0.8", lw=1, zorder=0)
     press = axes.twinx()
     press.plot(areas.time, areas.depth * 1e3, color="0.5", ls="--", label="probe depth")
     press.set_ylabel("probe depth, mm")
-    lines = axes.get_lines()[: len(areas.area)] + press.get_lines()
-    names = [line.get_label() for line in lines]
+    lines = axes.get_lines()[: len(colours)] + press.get_lines()
     place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(lines)}
-    axes.legend(lines, names, frameon=False, **place)
+    axes.legend(handles=lines, frameon=False, **place)

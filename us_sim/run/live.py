@@ -412,8 +412,7 @@ def _report(
         if video is not None:
             from us_sim.run.session_summary import tracked_path
 
-            tracked = tracked_path(session, video)
-            summary["tracked_path"] = tracked.summary
+            summary["tracked_path"], tracked = tracked_path(session, video)
         bar.update(50, "drawing the contact sheet")
         contact_sheet(session, scene, areas, out / "contact_sheet.png")
         bar.update(100)

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from us_sim.errors import BagError, UsSimError, printable
 from us_sim.geometry.se3 import rotation_between
@@ -55,12 +53,11 @@ def _wrench_apart(one: Any, other: Any) -> Measured:
     return float(np.linalg.norm(force)), 1e3 * float(np.linalg.norm(torque))
 
 
-IMAGE = "sensor_msgs/msg/Image"
 QUANTITIES: dict[str, tuple[list[str], Callable[[Any, Any], Measured]]] = {
     "geometry_msgs/msg/PoseStamped": (["position (mm)", "angle (°)"], _pose_apart),
     "sensor_msgs/msg/PointCloud2": (["nodes, rms (mm)", "nodes, worst (mm)"], _nodes_apart),
     "geometry_msgs/msg/WrenchStamped": (["force (N)", "torque (N mm)"], _wrench_apart),
-    IMAGE: (["grey levels, mean", "grey levels, worst"], _image_apart),
+    "sensor_msgs/msg/Image": (["grey levels, mean", "grey levels, worst"], _image_apart),
 }
 """How far apart two decoded messages of a type are."""
 HEAD = ("topic", "difference", "pairs", "same", "only A", "only B", "median", "worst", "at (s)")
@@ -75,7 +72,6 @@ class Difference:
     identical: int = 0  # pairs of the same bytes
     only: tuple[int, int] = (0, 0)  # messages that the other one has not
     refused: str = ""  # why a pair could not be compared
-    worst: tuple[Any, Any] | None = None  # messages that are furthest apart
 
     @property
     def is_none(self) -> bool:
@@ -169,7 +165,7 @@ def _compare(one: Bag, other: Bag, topic: BagTopic) -> Difference:
     pairs = mine.merge(yours, on=["stamp", "again"], suffixes=("", "_of_other"))
     only = len(mine) - len(pairs), len(yours) - len(pairs)
     found = Difference(topic.name, pd.DataFrame(columns=columns, dtype=float), only=only)
-    apart, furthest = [], 0.0
+    apart = []
     firsts = _numbered(one, topic.name, pairs["place"])
     seconds = _numbered(other, topic.name, pairs["place_of_other"])
     for a, b in zip(firsts, seconds, strict=True):
@@ -179,14 +175,10 @@ def _compare(one: Bag, other: Bag, topic: BagTopic) -> Difference:
             found.identical += 1
             continue
         try:
-            pair = one.deserialize(a), other.deserialize(b)
-            apart[-1] = measure(*pair)
+            apart[-1] = measure(one.deserialize(a), other.deserialize(b))
         except UsSimError as error:
             apart[-1] = (np.nan, np.nan)
             found.refused = found.refused or str(error)
-        else:
-            if apart[-1][0] > furthest:
-                found.worst, furthest = pair, apart[-1][0]
     found.apart = pd.DataFrame(apart, index=pairs["stamp"], columns=columns, dtype=float)
     return found
 
@@ -221,43 +213,18 @@ def table(found: SessionDiff) -> str:
     return "\n".join(printable(line) for line in lines)
 
 
-def write(found: SessionDiff, folder: Path) -> list[Path]:
-    """The numbers as ``diff.csv``, and over time as ``diff.png``; their paths.
+def write(found: SessionDiff, folder: Path) -> Path:
+    """The numbers as ``diff.csv``; its path.
 
     Raises:
-        BagError: they are there already, or cannot be written.
+        BagError: it is there already, or cannot be written.
     """
-    files = [folder / "diff.csv", folder / "diff.png"]
-    if there := [file for file in files if file.exists()]:
-        raise BagError(f"{there[0]} exists already: choose another folder with --out")
+    file = folder / "diff.csv"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(found.rows, columns=list(HEAD)).to_csv(files[0], index=False)
-        _draw(found, files[1])
+        pd.DataFrame(found.rows, columns=list(HEAD)).to_csv(file, mode="x", index=False)
+    except FileExistsError:
+        raise BagError(f"{file} exists already: choose another folder with --out") from None
     except OSError as error:
-        raise BagError(f"{folder} cannot be written to: {error.strerror}") from None
-    return files
-
-
-def _draw(found: SessionDiff, file: Path) -> None:
-    """Each topic's first quantity over time, and the images that differ most."""
-    figure = Figure(figsize=(12.0, 2.2 * len(found.topics) + 4.0), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"A {found.paths[0]}\nB {found.paths[1]}", fontsize=9, x=0.01, ha="left")
-    grid = figure.add_gridspec(len(found.topics) + 1, 3)
-    for row, each in enumerate(found.topics):
-        axes = figure.add_subplot(grid[row, :])
-        axes.plot((each.apart.index - each.apart.index.min()) / SECOND, each.apart.iloc[:, 0], ".-")
-        axes.set_title(f"{each.topic}: {each.apart.columns[0]}", fontsize=9, loc="left")
-        axes.set_xlabel("s since the first pair", fontsize=8)
-    shown = (each.worst for each in found.topics if "grey levels, mean" in each.apart)
-    if pair := next(filter(None, shown), None):
-        a, b = map(pixels_from, pair)
-        apart = np.abs(a.astype(np.int16) - b)
-        pictures = {"A, where images differ most": a, "B": b, f"|A - B| to {apart.max()}": apart}
-        for column, (title, pixels) in enumerate(pictures.items()):
-            axes = figure.add_subplot(grid[-1, column])
-            axes.imshow(pixels, cmap="gray", vmin=0, vmax=apart.max() if column == 2 else 255)
-            axes.set_title(title, fontsize=9, loc="left")
-            axes.axis("off")
-    figure.savefig(file, metadata={"Software": None})
+        raise BagError(f"{file} cannot be written: {error.strerror}") from None
+    return file

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,8 @@ from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording,
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
 from us_sim.run.resimulation import scene_of
-from us_sim.run.session_summary import read_session
+from us_sim.run.session_summary import POSE, read_session
+from us_sim.run.session_tables import SECOND, Progress
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scoring.lumen import vessels_in
 from us_sim.scoring.metrics import Force, Scan
@@ -22,14 +22,13 @@ from us_sim.scoring.motion import Motion
 
 _SAMPLES = 200  # images of which areas are measured, at least
 _RATE = 5.0  # and a second
-_POSES, _MARKS = "/probe/pose", f"/{MARKERS}"
 
 
 def read_scan(
     file: Path,
     topic: str | None = None,
     wrench: str | None = None,
-    progress: Callable[[float, str], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
 ) -> Scan:
     """Read a session, any other bag with poses, or a tracker's recording.
 
@@ -37,36 +36,42 @@ def read_scan(
     attached. Without force, areas or marks the scan says so and has none.
 
     Args:
+        file: the recording.
         topic: of the poses, as for `read_path`.
         wrench: topic of the force; by default ``probe/wrench``, or the only one of its type.
+        progress: takes the fraction done, and what is being done.
 
     Raises:
         BagError: there are no poses, or what was named is not there.
         ScoreError: the poses are no motion.
     """
     bag = None if is_tracker_recording(file) else read_bag(file)
-    if topic is None and bag is not None and _has(bag, _POSES, POSE_STAMPED):
-        topic = _POSES
+    types = {each.name: each.type_name for each in bag.topics} if bag is not None else {}
+    if topic is None and types.get(POSE) == POSE_STAMPED:
+        topic = POSE
     path = read_path(file, topic, option="--topic")
     begin = int(path.stamps.min())
     try:
-        motion = Motion(_seconds(path.stamps, begin), path.positions, path.orientations)
+        seconds = (path.stamps - begin) / SECOND
+        motion = Motion(seconds, path.positions, path.orientations)
     except ScoreError as error:
         raise ScoreError(f"{file}: {path.topic}: {error}") from error
     missing = [path.note] if path.note else []
     if bag is None:
         return Scan(motion, missing=(*missing, f"force and areas: {file} holds poses alone"))
-    force = _force(bag, wrench, begin, missing)
-    frozen = None
-    if _has(bag, _MARKS, "std_msgs/msg/String"):
-        texts = [bag.deserialize(message).data for message in bag.messages([_MARKS])]
+    force, frozen, truth = None, None, {}
+    try:
+        force = _force(bag, wrench, begin)
+    except ScoreError as error:
+        missing.append(f"force: {error}")
+    if f"/{MARKERS}" in types:
+        texts = [bag.deserialize(message).data for message in bag.messages([f"/{MARKERS}"])]
         frozen = sum(text.startswith(FROZEN) for text in texts)
     else:
-        missing.append(f"images that were frozen: {file} has no marks on {_MARKS}")
+        missing.append(f"images that were frozen: {file} has no marks on /{MARKERS}")
     try:
-        truth = _truth(file, bag, path, progress)
+        truth = _truth(bag, path, progress)
     except UsSimError as error:
-        truth = {}
         missing.append(f"areas of structures: {error}")
     sections = truth.get("sections", {})
     if truth and not any(np.isfinite(each.fraction).any() for each in sections.values()):
@@ -74,48 +79,42 @@ def read_scan(
     return Scan(motion, force, frozen=frozen, missing=tuple(missing), **truth)
 
 
-def _has(bag: Bag, name: str, kind: str) -> bool:
-    return any((each.name, each.type_name) == (name, kind) for each in bag.topics)
+def _force(bag: Bag, topic: str | None, begin: int) -> Force:
+    """Read the force on the probe.
 
-
-def _seconds(stamps: np.ndarray, begin: int) -> np.ndarray:
-    """(K,) s since the first pose; the difference first, which a float holds exactly enough."""
-    return np.asarray((stamps - begin) * 1e-9)
-
-
-def _force(bag: Bag, topic: str | None, begin: int, missing: list[str]) -> Force | None:
-    topics = [each for each in bag.topics if each.type_name == WRENCH_STAMPED]
-    names = [each.name for each in topics if each.message_count]
+    Raises:
+        BagError: the topic that was named has no wrenches.
+        ScoreError: none was named, and there is none, or several, or no wrench that can be used.
+    """
     if topic is None:
-        preferred = [name for name in names if name.endswith("probe/wrench")]
-        chosen = preferred if len(preferred) == 1 else names
+        wrenches = [each for each in bag.topics if each.type_name == WRENCH_STAMPED]
+        names = [each.name for each in wrenches if each.message_count]
+        chosen = [name for name in names if name.endswith("probe/wrench")]
+        if len(chosen) != 1:
+            chosen = names
         if len(chosen) != 1:
             several = f"wrenches on {', '.join(names)}: name one with --wrench"
-            missing.append(f"force: {bag.path} holds {several if names else 'no wrench'}")
-            return None
+            raise ScoreError(f"{bag.path} holds {several if names else 'no wrench'}")
         topic = chosen[0]
     record = read_wrenches(bag.path, topic)
     newtons = np.linalg.norm(record.wrenches[:, :3], axis=1)
     later = np.r_[True, record.stamps[1:] > np.maximum.accumulate(record.stamps)[:-1]]
     usable = np.isfinite(newtons) & later
     if np.count_nonzero(usable) < 2:
-        missing.append(f"force: {record.topic} holds fewer than two wrenches that can be used")
-        return None
-    return Force(_seconds(record.stamps[usable], begin), newtons[usable])
+        raise ScoreError(f"{record.topic} holds fewer than two wrenches that can be used")
+    return Force((record.stamps[usable] - begin) / SECOND, newtons[usable])
 
 
-def _truth(
-    file: Path, bag: Bag, path: ProbePath, progress: Callable[[float, str], None]
-) -> dict[str, Any]:
+def _truth(bag: Bag, path: ProbePath, progress: Progress) -> dict[str, Any]:
     """Sections, lines and thrombi of the vessels; of five images a second, and two hundred in all.
 
     Raises:
         UsSimError: there is no scene or image, or a file of the scene is missing or another.
     """
-    if path.topic != _POSES:
-        raise BagError(f"they are known for the poses on {_POSES} only, not {path.topic}")
+    if path.topic != POSE:
+        raise BagError(f"they are known for the poses on {POSE} only, not {path.topic}")
     with scene_of(bag) as scene:
-        session = read_session(file)
+        session = read_session(bag.path)
         samples = max(_SAMPLES, int(_RATE * path.duration))
         lines, thrombi = vessels_in(volume_of(scene))
         meter = session.measured_lumens(scene, samples, lambda part: progress(part, "areas"), lines)

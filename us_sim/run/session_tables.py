@@ -13,18 +13,25 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
-from us_sim.recording.path import pose_rows
+from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import Fault
 from us_sim.recording.wrench import WRENCH_STAMPED
+from us_sim.tracking.camera.encodings import decode_image, decompress_image
 
 SECOND = 1_000_000_000  # ns
 _LARGEST = 2**63 - 1
 _COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
+PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
+    "sensor_msgs/msg/Image": decode_image,
+    "sensor_msgs/msg/CompressedImage": decompress_image,
+}
+"""Decoders of images by their types."""
 Progress = Callable[[float, str], None]
 
 
@@ -69,6 +76,13 @@ def read_times(
         name: pd.DataFrame(np.array(held, np.int64).reshape(-1, len(_COLUMNS)), columns=_COLUMNS)
         for name, held in values.items()
     }
+
+
+def bodies_of(bag: Bag) -> list[str]:
+    """Names of topics of PoseStamped with messages, or else of every body of other types."""
+    there = [topic for topic in bag.topics if topic.message_count]
+    stamped = [topic.name for topic in there if topic.type_name == POSE_STAMPED]
+    return stamped or [name for names in bodies_in(bag).values() for name in names]
 
 
 def _components(*vectors: Any) -> Iterator[float]:
