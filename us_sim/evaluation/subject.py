@@ -4,8 +4,9 @@ A subject is a folder with a module that makes one `Subject`, and a page ``repor
 ``pieces`` are the work, by the name of the CSV file that their rows go to; each `Piece` says which
 case it measures, and has a function that returns rows (dicts) when it is called. The engine shows
 the progress, calls one piece after another, adds the case to each row, notes what a piece that
-fails raised, and writes the CSV: the columns stand as they first come up, and a key that the
-subject names as ``hidden`` is for the report alone, such as an array, an image or a whole object.
+fails raised (a row may also name a ``failure`` by itself), and writes the CSV: the columns stand as
+they first come up, and a key that the subject names as ``hidden`` is for the report alone, such as
+an array, an image or a whole object.
 
 The subject's ``report`` gets a pandas DataFrame for each CSV file, in order, failed pieces left
 out, and returns the `Report`: at most five lines for a reader to take home, `Target`s where the
@@ -141,11 +142,10 @@ class Subject:
         tables: dict[str, pd.DataFrame] = {}
         failures: list[str] = []
         for name, pieces in self.pieces(quick, *settings).items():
-            rows, failed = _measure(name, pieces)
+            rows, broken, failed = _measure(name, pieces)
             tables[name] = pd.DataFrame(rows)
-            failures += [f"{piece}: {words}" for piece, words in failed]
-            rows += [{**piece.case, "failure": words} for piece, words in failed]
-            self._write_csv(out / f"{name}.csv", pd.DataFrame(rows))
+            failures += failed
+            self._write_csv(out / f"{name}.csv", pd.DataFrame([*rows, *broken]))
         if any(table.empty for table in tables.values()):
             report = Report(["Nothing was measured."], {})
         else:
@@ -234,17 +234,21 @@ def _check_folder(out: Path, page: Path) -> None:
 
 def _measure(
     name: str, pieces: Sequence[Piece]
-) -> tuple[list[dict[str, Any]], list[tuple[Piece, str]]]:
-    """Rows of all pieces, and the pieces that failed with the words of their errors."""
-    rows, failed = [], []
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[str]]:
+    """Rows of all pieces, those of the pieces that broke off, and what failed in words."""
+    rows, broken, failures = [], [], []
     with Progress(name, len(pieces), "pieces") as progress:
         for done, piece in enumerate(pieces):
             progress.update(done, str(piece))
             try:
                 for row in piece.measure():
                     rows.append({**piece.case, **row})
+                    if row.get("failure"):
+                        failures.append(f"{piece}: {row['failure']}")
             # Whatever breaks in one piece must not take the others' results along.
             except Exception as error:
-                failed.append((piece, f"{type(error).__name__}: {error}".replace("\n", " ")))
+                words = f"{type(error).__name__}: {error}".replace("\n", " ")
+                broken.append({**piece.case, "failure": words})
+                failures.append(f"{piece}: {words}")
         progress.update(len(pieces))
-    return rows, failed
+    return rows, broken, failures

@@ -129,7 +129,7 @@ EVALUATIONS = Choice(
     "evaluation",
     key="subject",
     tissue=Option(f"{_EVALUATION}.tissue.report:TISSUE", _NOTHING),
-    stability=Option(f"{_EVALUATION}.stability.report:evaluate_stability", _NOTHING),
+    stability=Option(f"{_EVALUATION}.stability.report:STABILITY", _NOTHING),
     slice=Option(
         f"{_EVALUATION}.slice.report:evaluate_slice",
         f"{_EVALUATION}.settings:RecordedSweep",
@@ -143,7 +143,7 @@ EVALUATIONS = Choice(
     latency=Option(f"{_EVALUATION}.latency.report:evaluate_latency", _NOTHING),
     viewer=Option(f"{_EVALUATION}.viewer.report:evaluate_viewer", _NOTHING),
     measured=Option(
-        f"{_EVALUATION}.measured.report:evaluate_measured",
+        f"{_EVALUATION}.measured.report:MEASURED",
         f"{_EVALUATION}.settings:MeasuredData",
     ),
 )

@@ -9,13 +9,15 @@ Parameters are fitted on beads on one side of the indenter's axis and judged on 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, cached_property, partial
 from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.sparse import csc_array
@@ -23,10 +25,9 @@ from scipy.sparse.linalg import LinearOperator, splu
 
 from us_sim.errors import SolverError
 from us_sim.evaluation.block import conjugate_gradients
+from us_sim.evaluation.figures import draw_error_over_parameter
 from us_sim.evaluation.measured.beads import FILE, Beads, local_fit, read_beads
-from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
-from us_sim.evaluation.timing import steps
+from us_sim.evaluation.subject import Piece, Place
 from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.linear_tetrahedra import lame_stiffness, shape_gradients
 from us_sim.tissue.elasticity.material import Material
@@ -46,21 +47,18 @@ _SIDES = np.array([[45.2e-6, 48e-6], [365.2e-6, 368e-6]])  # m, of all boxes alo
 _BOTTOM, _TOPS = 24e-6, (60e-6, 72e-6, 92e-6)  # m
 _NEAREST, _NEAREST_OF_HALF = 45, 16
 """Beads of a quadratic fit at a face's node, and of the affine fit of the noise floor."""
-_PLANE = slice(0, 2)  # x and y
 _LAYERS = 1e-6 * np.array([30.0, 48.0, 60.0, 72.0, 80.0, 86.0])  # m, borders
 _MOST_STEPS = 200
 _TOLERANCE = 1e-6  # residual norm over that of the harmonic start
 _FRAMES, _FRAME_TOLERANCE = 30, 1e-3
 _METHODS = ("linear", "nonlinear", "springs", "springs and volume")
-_SHOWN = ("linear", "nonlinear")  # layer by layer
-_BEST, _RIVAL = "nonlinear, graded", "linear, graded"
+BEST = "nonlinear, graded"
 _AXIS = 205.2e-6  # m, along x
 _FITTING_MESH, _MESH = 24e-6, 16e-6  # m
 _UNIT = 1e4  # 1/m, unit of softening in a fit: the modulus falls e-fold over 100 um
 _START, _STEP = np.array([0.45, 0.0]), np.array([0.03, 1.0])  # Poisson's ratio, softening
 _BOUNDS = np.array([[0.0, 0.498], [-2.0, 10.0]])
 _OF_SPRINGS = 0.25  # Poisson's ratio of springs alone
-_SLABS = 10  # along y, between which errors are taken to be independent
 
 
 def noise_floor(beads: Beads, random: np.random.Generator) -> Array:
@@ -132,7 +130,7 @@ class PrescribedBox:
         """
         newton = self._newton(ratio, softening)
         newton.set_displacement(np.ascontiguousarray(self.harmonic.T))
-        _balance(newton, _TOLERANCE * newton.residual_norm)
+        balance(newton, _TOLERANCE * newton.residual_norm)
         return newton.displacement.T.copy()
 
     def springs(self, ratio: float, softening: float = 0.0, *, volume: bool = False) -> Array:
@@ -182,7 +180,7 @@ class PrescribedBox:
         for _ in range(_FRAMES):
             began = time.process_time()
             newton.set_displacement(newton.displacement + step)
-            _balance(newton, goal)
+            balance(newton, goal)
             taken.append(1e3 * (time.process_time() - began))
         return float(np.median(taken))
 
@@ -222,7 +220,12 @@ class PrescribedBox:
         return self.faces + np.asarray(found).reshape(-1, 3)
 
 
-def _balance(newton: Newton, goal: float) -> None:
+def balance(newton: Newton, goal: float) -> None:
+    """Step until the norm of the residual is at most ``goal``, N.
+
+    Raises:
+        SolverError: it stays above.
+    """
     for _ in range(_MOST_STEPS):
         if newton.residual_norm <= goal:
             return
@@ -232,48 +235,9 @@ def _balance(newton: Newton, goal: float) -> None:
 
 def _unbalanced(residual: float, goal: float) -> SolverError:
     return SolverError(
-        f"the hydrogel's balance was not found: its residual stays at {residual:.2g} N "
+        f"no balance was found: the residual stays at {residual:.2g} N "
         f"where {goal:.2g} N is asked for; its faces move too far for its mesh"
     )
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Predictions of the beads in a box of one height, all of them in order of ``beads``."""
-
-    top: float  # m
-    beads: Beads  # inside, which gave no face its displacement
-    judged: NDArray[np.bool_]  # (B,), the side on which nothing was fitted
-    floor: Array  # (B, 3) m
-    errors: dict[str, Array]  # (B, 3) m, by method
-    fitted: dict[str, tuple[float, float]]  # Poisson's ratio and softening in 1/m, by method
-    volume_ratio: dict[str, Array]  # (B,), by method
-
-    def part(self, chosen: NDArray[np.bool_], method: str, axes: slice = slice(None)) -> float:
-        """m, root mean square length of the errors of those judged beads that are chosen."""
-        return _length(self.errors[method][chosen & self.judged, axes])
-
-    def part_floor(self, chosen: NDArray[np.bool_], axes: slice = slice(None)) -> float:
-        """m, the same of the noise floor."""
-        return _length(self.floor[chosen & self.judged, axes])
-
-    def apart(self, method: str, other: str) -> tuple[float, float, float]:
-        """m, by how much more one method errs than another, with the standard error of that, and
-        how far their predictions are apart, all of the judged beads.
-        """
-        one, two = (self.errors[name][self.judged] for name in (method, other))
-        slabs = np.array_split(np.argsort(self.beads.places[self.judged, 1]), _SLABS)
-        more = np.array([_length(one[slab]) - _length(two[slab]) for slab in slabs])
-        return float(more.mean()), float(more.std(ddof=1) / _SLABS**0.5), _length(one - two)
-
-    @property
-    def parts(self) -> dict[str, NDArray[np.bool_]]:
-        """(B,), layers by name that have beads, and the whole box."""
-        z, found = self.beads.places[:, 2], {}
-        for low, high in pairwise(_LAYERS):
-            if high <= self.top - _BAND + 1e-9:
-                found[f"z {low / _MICRON:.0f} to {high / _MICRON:.0f}"] = (z >= low) & (z < high)
-        return found | {"all": np.ones(len(z), dtype=bool)}
 
 
 def _length(vectors: Array) -> float:
@@ -301,239 +265,117 @@ class Case:
         return box.at(field, self.beads.places) - self.beads.displacement
 
 
-def outcome(case: Case, floor: Array, spacing: float) -> Outcome:
-    """Fit on one side of a case's beads, on a coarse mesh, and predict all on a finer one."""
-    coarse, box = case.box(_FITTING_MESH), case.box(spacing)
-    fields, fitted = {"harmonic": box.harmonic}, {}
+def fit_parameters(case: Case, method: str, graded: bool) -> tuple[float, float]:
+    """Fit Poisson's ratio, and the softening in 1/m if ``graded``, to the beads on one side."""
+    coarse = case.box(_FITTING_MESH)
+    free = np.array([method != "springs", graded])
+    start = np.where(free, _START, (_OF_SPRINGS, 0.0))
+
+    def parameters(x: Array) -> tuple[float, float]:
+        all_of_them = start.copy()
+        all_of_them[free] = x
+        return float(all_of_them[0]), _UNIT * float(all_of_them[1])
+
+    def misfit(x: Array) -> float:
+        error = case.error(coarse, coarse.solved(method, *parameters(x)))
+        return 1e6 * _length(error[~case.judged])
+
+    best = start[free]
+    if len(best):
+        simplex = np.vstack([best, best + np.diag(_STEP[free])])
+        best = minimize(
+            *(misfit, best),
+            method="Nelder-Mead",
+            bounds=_BOUNDS[free],
+            options={"initial_simplex": simplex, "xatol": 5e-3},
+        ).x
+    return parameters(best)
+
+
+def predict_beads(case: Case, floor: Array, spacing: float) -> Iterator[dict[str, Any]]:
+    """Fit on one side of a case's beads, on a coarse mesh, and judge on the other on a finer one.
+
+    Args:
+        case: the box.
+        floor: (B, 3) m, of all beads.
+        spacing: m, of the finer mesh.
+    """
+    box, noise = case.box(spacing), floor[case.inner]
+    fields = {"harmonic": (box.harmonic, np.nan, np.nan)}
     for method, graded in product(_METHODS, (False, True)):
-        free = np.array([method != "springs", graded])
-        start = np.where(free, _START, (_OF_SPRINGS, 0.0))
-
-        def parameters(
-            x: Array, free: NDArray[np.bool_] = free, start: Array = start
-        ) -> tuple[float, float]:
-            all_of_them = start.copy()
-            all_of_them[free] = x
-            return float(all_of_them[0]), _UNIT * float(all_of_them[1])
-
-        def misfit(
-            x: Array,
-            method: str = method,
-            parameters: Callable = parameters,  # type: ignore[type-arg]
-        ) -> float:
-            error = case.error(coarse, coarse.solved(method, *parameters(x)))
-            return 1e6 * _length(error[~case.judged])
-
-        best = start[free]
-        if len(best):
-            simplex = np.vstack([best, best + np.diag(_STEP[free])])
-            best = minimize(
-                *(misfit, best),
-                method="Nelder-Mead",
-                bounds=_BOUNDS[free],
-                options={"initial_simplex": simplex, "xatol": 5e-3},
-            ).x
+        fitted = fit_parameters(case, method, graded)
         name = f"{method}, graded" if graded else method
-        fitted[name] = parameters(best)
-        fields[name] = box.solved(method, *fitted[name])
-    errors = {name: case.error(box, field) for name, field in fields.items()}
-    places = case.beads.places
-    ratios = {name: box.volume_ratio(field, places) for name, field in fields.items()}
-    floor = floor[case.inner]
-    return Outcome(case.top, case.beads, case.judged, floor, errors, fitted, ratios)
+        fields[name] = (box.solved(method, *fitted), *fitted)
+    errors = {name: case.error(box, field) for name, (field, *_) in fields.items()}
+    z = case.beads.places[:, 2]
+    parts = {"all": (np.nan, case.judged)}
+    for low, high in pairwise(_LAYERS):
+        if high <= case.top - _BAND + 1e-9:
+            name = f"z {low / _MICRON:.0f} to {high / _MICRON:.0f}"
+            middle = (low + high) / 2 / _MICRON
+            parts[name] = middle, case.judged & (z >= low) & (z < high)
+    for part, (height, chosen) in parts.items():
+        for model, (field, ratio, softening) in fields.items():
+            best = case.top == _TOPS[-1] and model == BEST and part == "all"
+            ratios = box.volume_ratio(field, case.beads.places[chosen])
+            yield {
+                "case": f"box to {case.top / _MICRON:.0f} um, {part}",
+                "quantity": f"rms error, {model}",
+                "unit": "um",
+                "measured": _length(case.beads.displacement[chosen]) / _MICRON,
+                "error": _length(errors[model][chosen]) / _MICRON,
+                "floor": _length(noise[chosen]) / _MICRON,
+                "fitted_on": ""
+                if model in ("harmonic", "springs")
+                else "beads inside, other side of the axis",
+                "ms": box.frame_ms(ratio, softening) if best else np.nan,
+                "panel": f"box to {case.top / _MICRON:.0f} µm",
+                "line": model,
+                "x": height,
+                "poisson_ratio": np.nan if model == "springs" else ratio,
+                "height": 1 / softening / _MICRON if softening else np.nan,
+                "det_measured": float(np.median(case.beads.volume_ratio[chosen])),
+                "det_predicted": float(np.median(ratios)),
+            }
 
 
-def measure_hydrogel(folder: Path, report: ReportFolder) -> Section:
-    """Predict the beads in boxes of three heights, and in the tallest on several meshes."""
-    beads = read_beads(folder / FILE)
-    floor = noise_floor(beads, np.random.default_rng(1))
-    spacings = (24e-6, 16e-6) if report.quick else (24e-6, 16e-6, 12e-6, 8.5e-6)
-    cases = steps(
-        "hydrogel", [Case(beads, top) for top in _TOPS], "boxes", lambda c: f"{c.top:g} m"
+def plan_hydrogel(folder: Path, quick: bool) -> list[Piece]:
+    """Boxes of three heights; of a quick run, the lowest."""
+
+    def predict(top: float) -> Iterator[dict[str, Any]]:
+        beads, floor = _beads_of(folder / FILE)
+        return predict_beads(Case(beads, top), floor, _MESH)
+
+    tops = _TOPS[:1] if quick else _TOPS
+    return [Piece({"study": "hydrogel"}, partial(predict, top)) for top in tops]
+
+
+@cache
+def _beads_of(file: Path) -> tuple[Beads, Array]:
+    beads = read_beads(file)
+    return beads, noise_floor(beads, np.random.default_rng(1))
+
+
+def report_hydrogel(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
+    """Say how far the beads are off, in all and by height."""
+    whole, layers = rows[rows["x"].isna()], rows[rows["x"].notna()]
+    over = whole.assign(over=whole["error"] / whole["floor"])
+    table = over.pivot_table("over", "line", "panel", sort=False).reset_index(names="error / floor")
+    names = {"panel": "box", "line": "model", "poisson_ratio": "Poisson's ratio"}
+    names |= {"height": "height for 1/e of the modulus, µm", "error": "error, µm"}
+    names |= {"floor": "floor, µm", "det_measured": "det F", "det_predicted": "predicted"}
+    figure = draw_error_over_parameter(
+        *(layers, "x", "error", "Beads in a gel: error by height above the glass"),
+        panels="panel",
+        lines="line",
+        log="",
+        labels={"x": "height, µm", "error": "root mean square error, µm"},
     )
-    outcomes = [outcome(case, floor, 16e-6) for case in cases]
-    case, parameters = Case(beads, _TOPS[-1]), outcomes[-1].fitted[_BEST]
-    meshes = [_Mesh.measured(case, spacing, parameters) for spacing in spacings]
-    findings = [
-        Finding(
-            *("hydrogel", f"box to {o.top / _MICRON:.0f} um, {part}", f"rms error, {method}", "um"),
-            measured=_length(o.beads.displacement[chosen & o.judged]) / _MICRON,
-            error=o.part(chosen, method) / _MICRON,
-            floor=o.part_floor(chosen) / _MICRON,
-            fitted_on=""
-            if method in ("harmonic", "springs")
-            else "beads inside, other side of the axis",
-            ms=meshes[1].ms if o is outcomes[-1] and method == _BEST else float("nan"),
-            headline=o is outcomes[-1] and part == "all",
-        )
-        for o in outcomes
-        for part, chosen in o.parts.items()
-        for method in o.errors
-    ]
-    _draw_section(outcomes[-1], report.picture("hydrogel_section"))
-    _draw_errors(outcomes, report.picture("hydrogel_errors"))
-    text = filled(
-        *("measured", "hydrogel"),
-        count=str(len(beads.places)),
-        inside=str(len(outcomes[-1].beads.places)),
-        table=_table(outcomes),
-        methods=_method_table(outcomes),
-        top=f"{case.top / _MICRON:.0f}",
-        tie=", ".join(
-            f"{more / _MICRON:.3f} ± {deviation / _MICRON:.3f}"
-            for more, deviation, _ in (outcomes[-1].apart(_RIVAL, _BEST),)
-        ),
-        apart=f"{outcomes[-1].apart(_RIVAL, _BEST)[2] / _MICRON:.3f}",
-        slabs=str(_SLABS),
-        fitted=_fitted_table(outcomes),
-        meshes=_mesh_table(meshes),
+    best, plain = (whole[whole["line"] == line].iloc[-1] for line in (BEST, "linear, graded"))
+    words = (
+        f"Beads in an indented gel: `{BEST}` is {best['error']:.2f} µm off, `{plain['line']}` "
+        f"{plain['error']:.2f}, where they moved by {best['measured']:.1f} and were seen to "
+        f"{best['floor']:.2f} µm."
     )
-    return Section("Beads inside an indented hydrogel", text, findings)
-
-
-@dataclass(frozen=True)
-class _Mesh:
-    """A mesh of the tallest box, and the error on it in m of the judged beads."""
-
-    spacing: float  # m
-    nodes: int
-    error: float
-    ms: float  # of a frame
-
-    @classmethod
-    def measured(cls, case: Case, spacing: float, parameters: tuple[float, float]) -> _Mesh:
-        box = case.box(spacing)
-        error = case.error(box, box.nonlinear(*parameters))[case.judged]
-        ms = box.frame_ms(*parameters)
-        return cls(spacing, len(box.mesh.nodes), _length(error), ms)
-
-
-def _table(outcomes: list[Outcome]) -> str:
-    shown = ["harmonic", *(f"{method}{more}" for method in _SHOWN for more in ("", ", graded"))]
-    rows = []
-    for o in outcomes:
-        for part, chosen in o.parts.items():
-            floor = o.part_floor(chosen)
-            moved = _length(o.beads.displacement[chosen & o.judged])
-            errors = [o.part(chosen, method) for method in shown]
-            rows.append(
-                (
-                    *(f"{o.top / _MICRON:.0f}", part, str(int((chosen & o.judged).sum()))),
-                    f"{np.median(o.beads.volume_ratio[chosen]):.3f}",
-                    *(f"{np.median(o.volume_ratio[m][chosen]):.3f}" for m in ("nonlinear", _BEST)),
-                    *(f"{length / _MICRON:.2f}" for length in (moved, floor, *errors)),
-                    *(f"{o.part(chosen, m) / floor:.2f}" for m in ("nonlinear", _BEST)),
-                    f"{o.part(chosen, _BEST, _PLANE) / o.part_floor(chosen, _PLANE):.2f}",
-                )
-            )
-    head = ("box to, µm", "layer, µm", "beads", "det F", "nonlinear: det F", "graded: det F")
-    ratios = ("nonlinear over floor", "graded over floor", "the same in plane")
-    return markdown_table((*head, "moved", "floor", *shown, *ratios), rows)
-
-
-def _method_table(outcomes: list[Outcome]) -> str:
-    """Error of the whole box, in µm and over the floor."""
-    rows = []
-    for method in outcomes[0].errors:
-        whole = [(o.part(o.parts["all"], method), o.part_floor(o.parts["all"])) for o in outcomes]
-        rows.append((method, *(f"{e / _MICRON:.2f} ({e / floor:.2f})" for e, floor in whole)))
-    heads = (f"box to {o.top / _MICRON:.0f} µm" for o in outcomes)
-    return markdown_table(("model", *heads), rows)
-
-
-def _fitted_table(outcomes: list[Outcome]) -> str:
-    rows = [
-        (
-            f"{o.top / _MICRON:.0f}",
-            name,
-            "" if name.split(",")[0] == "springs" else f"{ratio:.3f}",
-            f"{1 / softening / _MICRON:.0f}" if softening else "",
-        )
-        for o in outcomes
-        for name, (ratio, softening) in o.fitted.items()
-    ]
-    head = ("box to, µm", "model", "Poisson's ratio", "height for 1/e of the modulus, µm")
-    return markdown_table(head, rows)
-
-
-def _mesh_table(meshes: list[_Mesh]) -> str:
-    rows = [
-        (f"{m.spacing / _MICRON:g}", str(m.nodes), f"{m.error / _MICRON:.3f}", f"{m.ms:.1f}")
-        for m in meshes
-    ]
-    return markdown_table(("mesh, µm", "nodes", "error, µm", "ms a frame"), rows)
-
-
-def _draw_section(o: Outcome, file: Path) -> None:
-    """Beads near the plane through the axis: measured and predicted motion, and the difference."""
-    places = o.beads.places / _MICRON
-    chosen = abs(places[:, 1] - 208) < 12
-    x, z = places[chosen, 0], places[chosen, 2]
-    measured = o.beads.displacement[chosen] / _MICRON
-    error = o.errors[_BEST][chosen] / _MICRON
-    title = "Beads near the indenter's axis: what was measured, what was predicted, the difference"
-    with picture(file, 13, 8.5, title) as figure:
-        panels = figure.subplots(3, 1, sharex=True)
-        shown = (("measured", measured), ("predicted", measured + error), ("difference", error))
-        for panel, (name, vectors) in zip(panels, shown, strict=True):
-            times = 5 if name == "difference" else 1
-            arrows = panel.quiver(
-                *(x, z, vectors[:, 0], vectors[:, 2], np.linalg.norm(vectors, axis=1)),
-                angles="xy",
-                scale_units="xy",
-                scale=1 / times,
-                width=0.0015,
-                cmap="viridis",
-                clim=(0, 10 / times),
-            )
-            drawn = f", drawn {times} times as long" if times > 1 else ""
-            panel.set_title(name + drawn, fontsize=11, loc="left")
-            panel.set(ylabel="z, µm", aspect="equal")
-            plain(panel)
-            figure.colorbar(arrows, ax=panel, label="µm")
-        panels[-1].set_xlabel("x, µm")
-
-
-def _draw_errors(outcomes: list[Outcome], file: Path) -> None:
-    """Error of each method by height, beside the noise floor, a panel a box."""
-    looks = {
-        "harmonic": ("0.6", "o-"),
-        "linear": ("#9ecae1", "o-"),
-        "linear, graded": ("#3182bd", "s-"),
-        "springs and volume": ("#a1d99b", "o-"),
-        "springs and volume, graded": ("#31a354", "s-"),
-        "nonlinear": ("#fdae6b", "o-"),
-        _BEST: ("#d7301f", "s-"),
-    }
-    title = "Error inside the box by height above its bottom, beside the noise of the measurement"
-    with picture(file, 13, 4.4, title) as figure:
-        panels = figure.subplots(1, len(outcomes), sharey=True, sharex=True)
-        for panel, o in zip(panels, outcomes, strict=True):
-            z = o.beads.places[:, 2]
-            borders = np.arange(_BOTTOM + _BAND, o.top - _BAND + 1e-9, 6e-6)
-            layers = [(z >= a) & (z < b) for a, b in pairwise(borders)]
-            middles = (borders[:-1] + borders[1:]) / 2 / _MICRON
-            for name, (colour, look) in looks.items():
-                errors = [o.part(layer, name) / _MICRON for layer in layers]
-                size = 7 if name == _RIVAL else 4  # the other lies on it
-                panel.plot(errors, middles, look, ms=size, color=colour, label=name)
-            floor = np.array([o.part_floor(layer) / _MICRON for layer in layers])
-            panel.plot(floor, middles, "k--", label="noise floor")
-            panel.plot(1.5 * floor, middles, "k:", label="1.5 times that")
-            panel.set_title(f"faces up to {o.top / _MICRON:.0f} µm", fontsize=11, loc="left")
-            panel.set_xlabel("root mean square error, µm")
-            plain(panel)
-        panels[0].set_ylabel("z, µm")
-        panels[0].legend(fontsize=8, frameon=False, loc="upper right")
-
-
-STUDY = Study(
-    "hydrogel",
-    "hydrogel-indentation",
-    "https://github.com/FranckLab/SerialTrack, revision fdb01c6204e10dc66d5c6baff75f2cfbd904a4d2, "
-    f"the file SerialTrack3D/results/{FILE}",
-    "MIT",
-    "J. Yang, Y. Yin, A. K. Landauer, S. Buyukozturk, J. Zhang, L. Summey, A. McGhee, M. K. Fu, "
-    "J. O. Dabiri and C. Franck, SerialTrack, SoftwareX 19, 101204, 2022.",
-    measure_hydrogel,
-)
+    fitted = whole[list(names)].rename(columns=names)
+    return words, {"hydrogel_models": table, "hydrogel": figure, "hydrogel_fitted": fitted}

@@ -1,93 +1,100 @@
-"""`us-sim evaluate measured`: measured.csv, pictures, and measured.md."""
+"""`us-sim evaluate measured`: the simulator beside what others measured."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 from threadpoolctl import threadpool_limits
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.measured import hydrogel, nwires, silicone, vein
-from us_sim.evaluation.measured.study import Section, Study
-from us_sim.evaluation.report import ReportFolder, markdown_table
+from us_sim.evaluation.measured.hydrogel import plan_hydrogel, report_hydrogel
+from us_sim.evaluation.measured.silicone import plan_silicone, report_silicone
+from us_sim.evaluation.measured.vein import plan_vein, report_vein
 from us_sim.evaluation.settings import MeasuredData
-from us_sim.evaluation.timing import steps
+from us_sim.evaluation.subject import Piece, Place, Report, Subject
 
-STUDIES: tuple[Study, ...] = (
-    hydrogel.STUDY,
-    silicone.STUDY,
-    nwires.STUDY,
-    vein.STUDY,
+COLUMNS = (
+    *("case", "quantity", "unit", "measured", "predicted", "error", "floor", "fitted_on", "ms"),
 )
+"""Of a row, besides ``study``; what is not known is empty."""
 
 
-def evaluate_measured(out: Path, quick: bool, settings: MeasuredData | None = None) -> int:
-    """Write the CSV file, the pictures and measured.md, as `us_sim.evaluation` says.
+@dataclass(frozen=True)
+class Study:
+    """One comparison with data that others measured."""
 
-    Studies whose data are not there are left out; the report says where they are to be had.
+    folder: str  # below the folder of all data; empty where the study needs none
+    plan: Callable[[Path, bool], Sequence[Piece]]  # of that folder, and whether it is a quick run
+    report: Callable[[pd.DataFrame], tuple[str, Mapping[str, Place]]]
+    """What to take home from the study's rows, and what stands at its places of the page."""
+
+
+STUDIES = {
+    "hydrogel": Study("hydrogel-indentation", plan_hydrogel, report_hydrogel),
+    "silicone": Study("ecoflex-compression", plan_silicone, report_silicone),
+    "vein": Study("", plan_vein, report_vein),
+}
+
+
+def plan_pieces(quick: bool, settings: MeasuredData | None = None) -> dict[str, list[Piece]]:
+    """List the work of the studies whose data are there; the page says where the others' are.
 
     Raises:
-        UsSimError: besides, there is no study whose data are there, or none in a folder that was
-            named.
+        UsSimError: the folder of all data was named, and is none or has none of them.
     """
-    data = _data(settings.data if settings else None)
-    absent = [study for study in STUDIES if study.folder and not _folder(data, study).is_dir()]
-    present = [study for study in STUDIES if study not in absent]
-    if not any(study.folder or data is None for study in present):
-        folders = ", ".join(study.folder for study in STUDIES if study.folder)
-        raise UsSimError(
-            f"no measured data in {data or 'the present folder'}: name with --data, or with "
-            f"US_SIM_TEST_DATA, the folder that has one or more of these: {folders}"
-        )
-    folder = ReportFolder("measured", out, quick)
-    with threadpool_limits(1):  # as live; threads that wait would count as time of a frame
-        sections = [
-            study.measure(_folder(data, study), folder)
-            for study in steps("measured", present, "studies", lambda study: study.name)
-        ]
-    findings = [finding for section in sections for finding in section.findings]
-    folder.write_rows("measured", findings)
-    shown = [finding for finding in findings if finding.headline]
-    table = markdown_table(list(findings[0].values), [finding.cells for finding in shown])
-    return folder.finish(
-        table,
-        (),
-        ("numpy", "numba", "scipy"),
-        table=table,
-        sections="\n\n".join(map(_section, sections)),
-        absent=_sources("Left out, since the data are not there", absent),
-        sources=_sources("Data", [study for study in present if study.folder]),
-    )
-
-
-def _data(named: Path | None) -> Path | None:
-    """The folder of all data: the one that was named, or that of US_SIM_TEST_DATA."""
     environment = os.environ.get("US_SIM_TEST_DATA")
-    data = named or (Path(environment) if environment else None)
-    if data is not None and not data.is_dir():
+    data = settings.data if settings and settings.data else environment and Path(environment)
+    needed = [study.folder for study in STUDIES.values() if study.folder]
+    if data and not any((data / name).is_dir() for name in needed):
         raise UsSimError(
-            f"{data}, the folder of measured data, is no folder: name another with --data"
+            f"{data}: has no measured data: name with --data, or with US_SIM_TEST_DATA, the folder "
+            f"that has one or more of these: {', '.join(needed)}"
         )
-    return data
+    folders = {name: Path(data or "") / study.folder for name, study in STUDIES.items()}
+    return {
+        "measured": [
+            replace(piece, measure=partial(_measure, piece))
+            for name, study in STUDIES.items()
+            if not study.folder or (data and folders[name].is_dir())
+            for piece in study.plan(folders[name], quick)
+        ]
+    }
 
 
-def _folder(data: Path | None, study: Study) -> Path:
-    return (data or Path()) / study.folder
+def _measure(piece: Piece) -> Iterator[dict[str, Any]]:
+    with threadpool_limits(1):  # as live; threads that wait would count as time of a frame
+        for row in piece.measure():
+            yield {name: row.get(name) for name in COLUMNS} | dict(row)
 
 
-def _section(section: Section) -> str:
-    return f"## {section.heading}\n\n{section.text.strip()}"
+def report_measured(rows: pd.DataFrame) -> Report:
+    """Say what each study found."""
+    rows = rows.astype(dict.fromkeys(("measured", "predicted", "error", "floor", "ms"), float))
+    places: dict[str, Place] = {}
+    take_home = []
+    for name, found in rows.groupby("study", sort=False):
+        words, shown = STUDIES[name].report(found)
+        take_home.append(words)
+        places |= shown
+    left_out = [name for name in STUDIES if name not in set(rows["study"])]
+    if left_out:
+        take_home.append(f"Left out, since the data are not there: {', '.join(left_out)}.")
+    return Report(take_home, places)
 
 
-def _sources(heading: str, studies: Sequence[Study]) -> str:
-    """A heading and a line for each study; empty without studies."""
-    if not studies:
-        return ""
-    lines = [
-        f"- {study.name}: {study.address}, {study.licence}, into the folder `{study.folder}`. "
-        f"{study.citation}"
-        for study in studies
-    ]
-    return f"## {heading}\n\n" + "\n".join(lines)
+MEASURED = Subject(
+    "measured",
+    "Measured: error against the real world",
+    plan_pieces,
+    report_measured,
+    hidden=(
+        *("panel", "line", "x", "curve"),
+        *("poisson_ratio", "height", "det_measured", "det_predicted"),
+    ),
+)

@@ -1,51 +1,51 @@
-"""Silicone cylinders compressed to two thirds, and what the model of the tissue predicts.
+"""Silicone cylinders compressed to two thirds, and what the law of the tissue predicts.
 
 A modulus comes from the compressions below 5 % of the first specimen of a material, and predicts
 the forces on the second one. Nobody said how well the platens slid, so that the truth lies between
-two cases: they slid, so that the cylinder stays one, with a closed form; or they stuck, which
-`stuck_cylinder` solves. Force over shear modulus is then a function of compression alone.
+two cases: they slid, so that the cylinder stays one, with a closed form; or they stuck, which the
+elements of `fem_nonlinear` solve up to a fifth of compression; beyond, the side folds onto them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.measured.stuck_cylinder import StuckCylinder
-from us_sim.evaluation.measured.study import Finding, Section, Study
-from us_sim.evaluation.report import ReportFolder, filled, markdown_table, picture, plain
-from us_sim.evaluation.timing import medians_in_turn, steps
-from us_sim.geometry.pose import Pose
+from us_sim.evaluation.figures import draw_error_over_parameter
+from us_sim.evaluation.measured.hydrogel import balance
+from us_sim.evaluation.subject import Piece, Place
+from us_sim.geometry.collider import Sphere
 from us_sim.tissue.elasticity.material import Material
+from us_sim.tissue.elasticity.materials import uniform_material
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
+from us_sim.tissue.solvers.newton import Newton
 
 Array = NDArray[np.float64]
 
 RADIUS, HEIGHT = 0.025, 0.03  # m
 _STEP = 0.01
 COMPRESSIONS = np.arange(0.0, 0.6651, _STEP)  # parts of the height, at which forces are compared
-_FITTED = 0.05  # Compression up to which a modulus is fitted
-_STIFFENED = 0.60  # Compression at which a stiffening is fitted
-_EARLY = 0.50  # The same, for a prediction of that at 60 %
-_SMALL, _LARGE = (0.1, 0.2, 0.3), (0.4, 0.5, 0.66)  # Compressions at which forces are predicted
-_HEADLINES = (0.3, 0.66)  # Those that the report's first table has
-_COLUMNS = (*_SMALL, *_LARGE[:-1], _STIFFENED, _LARGE[-1])
-# Compressions of the findings, by that at which the stiffening was fitted
-_TOLD = {None: (*_SMALL, _LARGE[-1]), _STIFFENED: _LARGE, _EARLY: (_STIFFENED,)}
-_NODES = (17, 9, 9)  # Of the block under a probe of which a frame is timed
+_FITTED = 0.05  # compression up to which a modulus is fitted
+_STIFFENED = 0.60  # compression at which a stiffening is fitted
+_SLIDING, _STICKING = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.66), (0.05, 0.1, 0.15, 0.2)
 _HEADING = "Time (s)"
-_SHOWN = ("EF10_100T", "EF10_0T", "EF50_0T")
+_POISSON_RATIO = 0.49  # nearly incompressible; 0.4999 resists a small compression by 2 % more
+_BALANCED = 1e-4  # unbalanced force over the platen's
 
 
 def at(compression: float) -> int:
-    """The index in `COMPRESSIONS`."""
+    """Return the index in `COMPRESSIONS`."""
     return round(compression / _STEP)
 
 
@@ -123,255 +123,110 @@ def slipping_force(compression: Array, stiffening: float = 0.0) -> Array:
     return np.asarray(area * (1.0 + stiffening * beyond**2) * (left**-2 - left))
 
 
-class Platens:
-    """Force over shear modulus at `COMPRESSIONS`, for stiffenings between those computed.
+def sticking_force(compressions: Sequence[float], cells: int) -> Array:
+    """(C,) m2, force over shear modulus of a cylinder that sticks to the platens.
 
     Args:
-        curves: (C,) m2 by stiffening.
-    """
-
-    def __init__(self, curves: Mapping[float, Array]) -> None:
-        self._stiffenings = np.array(sorted(curves))
-        self._curves = np.stack([curves[s] for s in self._stiffenings])
-
-    def force(self, stiffening: float = 0.0) -> Array:
-        """(C,) m2."""
-        some = [np.interp(stiffening, self._stiffenings, curve) for curve in self._curves.T]
-        return np.array(some)
-
-    def modulus(self, forces: Array) -> float:
-        """Pa, the shear modulus that fits forces (C,) N up to 5 % of compression best."""
-        small = slice(1, at(_FITTED) + 1)
-        model = self.force()[small]
-        return float(model @ forces[small] / (model @ model))
-
-    def stiffening(self, forces: Array, modulus: float, compression: float) -> float:
-        """The one with the force at a compression, or the nearest that was computed."""
-        there = at(compression)
-        return float(np.interp(forces[there] / modulus, self._curves[:, there], self._stiffenings))
-
-
-def sliding() -> Platens:
-    """Platens along which the cylinder slides. Forces are linear in the stiffening."""
-    return Platens({s: slipping_force(COMPRESSIONS, s) for s in (0.0, 2.0)})
-
-
-def sticking(counts: tuple[int, int], stiffenings: Sequence[float]) -> Platens:
-    """Platens to which the cylinder sticks, of so many cells across and along it."""
-    curves = {}
-    coarse = np.array([0.01, 0.03, *np.arange(0.05, 0.66, 0.05), COMPRESSIONS[-1]])
-    for stiffening in steps("silicone", stiffenings, "cylinders"):
-        forces = StuckCylinder(RADIUS, HEIGHT, counts, stiffening).press(coarse.tolist())
-        ratio = np.interp(COMPRESSIONS, coarse, forces / slipping_force(coarse, stiffening))
-        curves[stiffening] = ratio * slipping_force(COMPRESSIONS, stiffening)
-    return Platens(curves)
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """The second specimen's forces as the first one's constants predict them."""
-
-    silicone: Silicone
-    platens: Platens
-    modulus: float  # Pa, of shear, from up to 5 %
-    stiffening: float  # from 60 %
-    early: float  # the stiffening from 50 %
-
-    @classmethod
-    def of(cls, silicone: Silicone, platens: Platens) -> Prediction:
-        """Fit the first specimen."""
-        mean = silicone.first.mean(axis=0)
-        modulus = platens.modulus(mean)
-        late, early = (platens.stiffening(mean, modulus, there) for there in (_STIFFENED, _EARLY))
-        return cls(silicone, platens, modulus, late, early)
-
-    def force(self, stiffening: float = 0.0) -> Array:
-        """(C,) N."""
-        return self.modulus * self.platens.force(stiffening)
-
-    def error(self, compression: float, stiffening: float = 0.0) -> float:
-        """Of the force, over the second specimen's mean."""
-        there = at(compression)
-        return float(self.force(stiffening)[there] / self.silicone.second[:, there].mean() - 1.0)
-
-
-def measure_silicone(folder: Path, report: ReportFolder) -> Section:
-    """Compare predictions with the compressions in ``folder``, and draw them.
+        compressions: rising, parts of the height.
+        cells: across the cylinder and along it.
 
     Raises:
-        UsSimError: a test is missing or cannot be read.
+        SolverError: the cylinder does not come to balance.
     """
-    silicones = read_silicones(folder / "data")
-    counts, stiffenings = (
-        ((8, 8), (0.0, 0.5)) if report.quick else ((14, 14), (0.0, 0.15, 0.3, 0.6, 1.0))
-    )
-    cases = {"slip": sliding(), "stick": sticking(counts, stiffenings)}
-    made = [
-        {name: Prediction.of(silicone, platens) for name, platens in cases.items()}
-        for silicone in silicones
-    ]
-    file = report.picture("silicone")
-    _draw(file, [each for each in made if each["slip"].silicone.name in _SHOWN] or made[:3])
-    ms = _frame_ms()
-    medians = _medians(made)
-    text = filled(
-        "measured",
-        "silicone",
-        materials=str(len(silicones)),
-        medians=_median_table(medians, [_scatter(made, c) for c in _COLUMNS]),
-        table=_table(made),
-        cells=f"{counts[0]} cells across and {counts[1]} along it",
-        plain=f"{ms[0]:.1f}",
-        stiffening=f"{ms[1]:.1f}",
-        nodes=f"{math.prod(_NODES):,}",
-        picture=file.name,
-    )
-    rows = [
-        Finding(
-            study="silicone",
-            case=f"median of {len(silicones)} silicones",
-            quantity=f"force at {100 * compression:.0f} %, {platens}, {_law(stiffened)}",
-            unit="%",
-            error=error,
-            floor=_scatter(made, compression),
-            fitted_on=f"specimen A: {_fitted_on(stiffened)}",
-            ms=ms[stiffened is not None],
-            headline=compression in _HEADLINES and stiffened != _EARLY,
-        )
-        for (platens, stiffened), errors in medians.items()
-        for compression, error in errors.items()
-        if compression in _TOLD[stiffened]
-    ]
-    return Section("Silicones under compression", text, rows)
+    side, even = np.linspace(-1, 1, cells + 1), np.linspace(0, 1, cells + 1)
+    box = box_mesh(side, side, (even + (1 - np.cos(np.pi * even)) / 2) / 2)  # thinner at platens
+    x, y, z = box.nodes.T
+    disc = np.stack([x * np.sqrt(1 - y**2 / 2), y * np.sqrt(1 - x**2 / 2)])
+    mesh = TetrahedralMesh(np.column_stack([*(RADIUS * disc), HEIGHT * z]), box.tetrahedra)
+    materials = uniform_material(mesh, Material(2 * (1 + _POISSON_RATIO), _POISSON_RATIO))
+    moved = z < 1e-9
+    nobody = np.zeros(0, dtype=np.int32)
+    newton = Newton(TissueModel(mesh, materials, moved | (z > 1 - 1e-9), Sphere(RADIUS), nobody))
+    tissue, slope = NeoHookean(mesh, materials, np.float64), np.empty((3, len(z)))
+    forces, before = [], 0.0
+    for compression in compressions:
+        pressed = newton.displacement.copy()
+        pressed[2] += (compression - before) * HEIGHT * (1 - z)
+        newton.set_displacement(pressed)
+        balance(newton, _BALANCED * float(slipping_force(np.array(compression))))
+        tissue.energy_and_forces(newton.displacement, slope)
+        forces.append(float(slope[2, moved].sum()))
+        before = compression
+    return np.array(forces)
 
 
-def _law(stiffened: float | None) -> str:
-    return "neo-Hookean" if stiffened is None else f"stiffening, s from {100 * stiffened:.0f} %"
+def fit_modulus(forces: Array, per_modulus: Array) -> float:
+    """Pa, the shear modulus that fits forces (C,) N up to 5 % of compression best."""
+    small = slice(1, at(_FITTED) + 1)
+    model = per_modulus[small]
+    return float(model @ forces[small] / (model @ model))
 
 
-def _fitted_on(stiffened: float | None) -> str:
-    small = f"below {100 * _FITTED:.0f} %"
-    return small if stiffened is None else f"{small} and at {100 * stiffened:.0f} %"
+def fit_stiffening(forces: Array, modulus: float) -> float:
+    """Return the stiffening with which the sliding cylinder has the force at 60 %; none below 0."""
+    there = COMPRESSIONS[at(_STIFFENED)]
+    plain, stiff = (float(slipping_force(np.array(there), s)) for s in (0.0, 1.0))
+    return max(0.0, float((forces[at(_STIFFENED)] / modulus - plain) / (stiff - plain)))
 
 
-def _frame_ms() -> tuple[float, float]:
-    """Processor time of a frame of `fem_nonlinear` under a moving sphere, without and with."""
-    work = {
-        name: FemNonlinear(
-            TissueModel.block(nodes=_NODES, material=Material(10e3, stiffening=stiffening))
-        ).deform
-        for name, stiffening in (("without", 0.0), ("with", 0.3))
-    }
-
-    def pose(k: int) -> Pose:
-        return Pose(np.array([0.02 * math.sin(k / 10), 0.0, 0.02 * math.sin(k / 20) ** 2 + 0.005]))
-
-    times = medians_in_turn(work, 60, 10, prepare=pose, all_threads=True)
-    return times["without"], times["with"]
-
-
-def _scatter(made: Sequence[Mapping[str, Prediction]], compression: float) -> float:
-    """%, median over the materials."""
-    return 100 * float(np.median([e["slip"].silicone.scatter[at(compression)] for e in made]))
-
-
-def _table(made: Sequence[Mapping[str, Prediction]]) -> str:
-    """One row a material; two numbers in a cell are with slip and with stick."""
-    rows = []
-    for each in made:
-        silicone, both = each["slip"].silicone, each.values()
-        scatter = [f"{100 * silicone.scatter[at(c)]:.0f}" for c in (*_SMALL, _LARGE[-1])]
-        plain_law = [[its.error(c) for its in both] for c in (*_SMALL, _LARGE[-1])]
-        late = [[its.error(c, its.stiffening) for its in both] for c in _LARGE]
-        rows.append(
-            (
-                silicone.name,
-                ", ".join(f"{3e-3 * its.modulus:.1f}" for its in both),
-                ", ".join(f"{its.stiffening:.2f}" for its in both),
-                ", ".join(scatter),
-                *(", ".join(f"{100 * e:+.0f}" for e in errors) for errors in plain_law + late),
-            )
-        )
-    heads = ["silicone", "E, kPa", "s", "scatter"]
-    heads += [f"{100 * c:.0f} %" for c in (*_SMALL, _LARGE[-1])]
-    return markdown_table([*heads, *(f"{100 * c:.0f} %, s" for c in _LARGE)], rows)
-
-
-_Medians = Mapping[tuple[str, float | None], Mapping[float, float]]
-"""% by compression; for each platens, and the compression at which the stiffening was fitted."""
-
-
-def _medians(made: Sequence[Mapping[str, Prediction]]) -> _Medians:
-    """Median size of the errors over the materials."""
-    medians = {}
-    for name in made[0]:
-        its = [each[name] for each in made]
-        for stiffened, constants in (
-            (None, [0.0 for _ in its]),
-            (_STIFFENED, [one.stiffening for one in its]),
-            (_EARLY, [one.early for one in its]),
-        ):
-            pairs = list(zip(its, constants, strict=True))
-            medians[name, stiffened] = {
-                c: 100 * float(np.median([abs(one.error(c, s)) for one, s in pairs]))
-                for c in _COLUMNS
+def predict_silicones(folder: Path, platens: str, cells: int) -> Iterator[dict[str, Any]]:
+    """Predict the second specimen's forces as the first one's constants say: medians of errors."""
+    silicones = read_silicones(folder)
+    scatter = np.median([silicone.scatter for silicone in silicones], axis=0)
+    laws: dict[str, list[Array]] = {"neo-Hookean": []}
+    if platens == "slip":
+        laws["stiffening, s from 60 %"] = []
+    else:
+        coarse = np.array([0.0, 0.01, 0.03, *_STICKING])
+        ratio = sticking_force(coarse[1:].tolist(), cells) / slipping_force(coarse[1:])
+        per_modulus = slipping_force(COMPRESSIONS) * np.interp(COMPRESSIONS, coarse[1:], ratio)
+    for silicone in silicones:
+        first, second = silicone.first.mean(axis=0), silicone.second.mean(axis=0)
+        curve = slipping_force(COMPRESSIONS) if platens == "slip" else per_modulus
+        modulus = fit_modulus(first, curve)
+        laws["neo-Hookean"].append(modulus * curve / np.maximum(second, 1e-9) - 1)
+        if platens == "slip":
+            stiffer = slipping_force(COMPRESSIONS, fit_stiffening(first, modulus))
+            error = modulus * stiffer / np.maximum(second, 1e-9) - 1
+            laws["stiffening, s from 60 %"].append(error)
+    for law, errors in laws.items():
+        stiffened = law != "neo-Hookean"
+        for compression in _SLIDING if platens == "slip" else _STICKING[1::2]:
+            if stiffened and compression == _STIFFENED:
+                continue  # it is fitted there
+            yield {
+                "case": f"median of {len(silicones)} silicones",
+                "quantity": f"force at {100 * compression:.0f} %, {platens}, {law}",
+                "unit": "%",
+                "error": 100 * float(np.median(np.abs(errors), axis=0)[at(compression)]),
+                "floor": 100 * float(scatter[at(compression)]),
+                "fitted_on": "specimen A: below 5 %" + " and at 60 %" * stiffened,
+                "line": f"{platens}, {law}",
+                "x": 100 * compression,
             }
-    return medians
 
 
-def _median_table(medians: _Medians, scatter: Sequence[float]) -> str:
-    rows = [
-        (name, _law(stiffened), *(f"{error:.1f}" for error in errors.values()))
-        for (name, stiffened), errors in medians.items()
+def plan_silicone(folder: Path, quick: bool) -> list[Piece]:
+    """Predict with platens that slide, and with ones that stick."""
+    run = partial(predict_silicones, folder / "data", cells=8 if quick else 14)
+    return [
+        Piece({"study": "silicone"}, partial(run, platens=platens)) for platens in ("slip", "stick")
     ]
-    rows.append(("", "scatter of tests", *(f"{size:.1f}" for size in scatter)))
-    return markdown_table(["platens", "law", *(f"{100 * c:.0f} %" for c in _COLUMNS)], rows)
 
 
-def _draw(file: Path, shown: Sequence[Mapping[str, Prediction]]) -> None:
-    percent = 100 * COMPRESSIONS
-    title = "Silicones compressed: force of the tests (grey) and as predicted, and its error"
-    with picture(file, 11.0, 6.6, title) as figure:
-        panels = figure.subplots(2, len(shown), squeeze=False, sharex=True)
-        for (upper, lower), each in zip(panels.T, shown, strict=True):
-            silicone = each["slip"].silicone
-            mean = silicone.second.mean(axis=0)
-            tests = np.concatenate([silicone.first, silicone.second])
-            upper.plot(percent, tests.T, color="0.6", lw=0.7)
-            lower.fill_between(
-                percent,
-                *(sign * 100 * silicone.scatter for sign in (-1, 1)),
-                color="0.85",
-                label="scatter",
-            )
-            for stiffens, colour, label in (
-                (False, "tab:orange", "neo-Hookean"),
-                (True, "tab:blue", "stiffening"),
-            ):
-                forces = [its.force(its.stiffening if stiffens else 0.0) for its in each.values()]
-                low, high = np.min(forces, axis=0), np.max(forces, axis=0)
-                upper.fill_between(percent, low, high, color=colour, alpha=0.5, label=label)
-                some = slice(at(0.02), None)
-                parts = [100 * (bound / np.maximum(mean, 1e-9) - 1)[some] for bound in (low, high)]
-                lower.fill_between(percent[some], *parts, color=colour, alpha=0.5, label=label)
-            upper.set_title(silicone.name, fontsize=11, loc="left")
-            lower.set_xlabel("compression, %")
-            lower.set_ylim(-60, 60)
-            plain(upper)
-            plain(lower)
-        panels[0, 0].set_ylabel("force, N")
-        panels[1, 0].set_ylabel("error of the force, %")
-        panels[0, 0].legend(fontsize=8, frameon=False)
-        panels[1, 0].legend(fontsize=8, frameon=False, loc="lower left")
-
-
-STUDY = Study(
-    name="silicone",
-    folder="ecoflex-compression",
-    address="https://github.com/abubakardawood/tissue-phantom-material-database, revision "
-    "52b1271f0f8a966c168e5ddc0886190f12c6551f",
-    licence="CC BY 4.0",
-    citation="A. B. Dawood et al., Tissue Phantom Material Database: Hyperelastic "
-    "Characterisation of Silicone Tissue Phantoms, 2026.",
-    measure=measure_silicone,
-)
+def report_silicone(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
+    """Say how far the forces are off, by compression."""
+    scatter = rows.assign(error=rows["floor"], line="scatter of the tests").drop_duplicates("x")
+    figure = draw_error_over_parameter(
+        *(pd.concat([rows, scatter]), "x", "error", "Silicones: median error of the force"),
+        lines="line",
+        labels={"x": "compression, %", "error": "error of the force, %"},
+    )
+    slip = rows[rows["line"] == "slip, neo-Hookean"].set_index("x")["error"]
+    words = (
+        f"Silicones: a modulus fitted below 5 % of compression predicts the force to "
+        f"{slip[30.0]:.0f} % at 30 %, and to {slip[66.0]:.0f} % at 66 %, where they stiffen."
+    )
+    table = rows.assign(x=rows["x"].map("{:.0f} %".format))
+    table = table.pivot_table("error", "line", "x", sort=False).reset_index()
+    return words, {"silicone": figure, "silicone_table": table}

@@ -1,20 +1,17 @@
 """One solver on one extreme case: finite, bounded, back at rest after release, and truthful?
 
 >>> from us_sim.evaluation.stability.cases import StabilityCase
->>> from us_sim.evaluation.stability.measure import refusal_of, try_case
+>>> from us_sim.evaluation.stability.measure import try_case
 >>> trial = try_case("fem_cg", StabilityCase("soft", young_modulus=1.0))
 >>> trial.finite, trial.bounded, trial.truthful, trial.recovered_mm
 (True, True, True, 0.0)
->>> refusal_of("fem_cg", "a node is not a number").refused
-True
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,31 +19,24 @@ from numpy.typing import NDArray
 
 from us_sim.errors import UsSimError
 from us_sim.evaluation.independent_residual import IndependentResidual, MsdsSettings
-from us_sim.evaluation.report import Row
 from us_sim.evaluation.stability.cases import (
     LIFTED,
     SMALL,
     StabilityCase,
-    mesh_named,
     model_of,
     parts,
     poses_of,
 )
 from us_sim.evaluation.timing import frames_until
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.geometry.collider import Sphere
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.registry import SOLVERS
 from us_sim.settings.setting import rules_of
-from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.elasticity.springs import springs_of
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, signed_volumes
+from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
-
-_RAN = ("finite", "bounded", "recovered_mm", "residual_reported", "residual_checked", "truthful")
-"""Columns of cases that were not refused."""
 
 
 @dataclass(eq=False)
@@ -71,14 +61,16 @@ class Trial:
     actions: list[tuple[str, ...]] = field(default_factory=list)  # that frames reported, each once
 
     @property
-    def refused(self) -> bool:
-        """Whether the method refused the case."""
-        return bool(self.refusal)
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing went wrong."""
-        return self.finite and self.bounded and self.truthful and not self.failure
+    def fault(self) -> str:
+        """The first thing that went wrong; empty where nothing did."""
+        if not (self.failure or self.finite):
+            return "not finite"
+        if not (self.failure or self.bounded):
+            return "not bounded"
+        if self.failure or self.truthful:
+            return self.failure
+        reported, checked = self.residual_reported, self.residual_checked
+        return f"reported a residual of {reported:.3g}, but it is {checked:.3g}"
 
     @property
     def frames_to_balance(self) -> int | None:
@@ -89,60 +81,6 @@ class Trial:
         """Add the actions that a solver reported of a frame."""
         if actions and actions not in self.actions:
             self.actions.append(actions)
-
-
-@dataclass(frozen=True, eq=False)
-class Tried(Row):
-    """A method, the case it was tried on, and the result: a row of stability.csv."""
-
-    digits = 6
-
-    method: str
-    name: str
-    case: StabilityCase | None  # None for input that must be refused
-    trial: Trial
-
-    @property
-    def values(self) -> dict[str, object]:
-        trial, method = self.trial, TISSUE_METHODS[self.method]
-        varied = {entry.name: None for entry in fields(StabilityCase)}
-        if self.case is not None:
-            varied = asdict(self.case)
-            if not method.has_springs:
-                varied |= {"time_step": None, "damping": None, "springs": None}
-            if not method.is_explicit:
-                varied |= {"stabilisation": None}
-        failed = [f"FAILED: {trial.failure}"] if trial.failure else []
-        refused = [f"refused: {trial.refusal}"] if trial.refused else []
-
-        def ran(name: str) -> object:
-            return None if trial.refused else getattr(trial, name)
-
-        return {
-            "method": self.method,
-            **(varied | {"case": self.name}),
-            "recovery_frames": ran("recovery_frames"),
-            "frames_to_1e-3": trial.frames_to_balance if trial.held else None,
-            "held_residual": trial.held[-1] if trial.held else None,
-            "held_inverted": bool(trial.held_inverted) if trial.held else None,
-            "dt_limit_predicted": trial.step_limit_predicted,
-            "dt_limit_observed": trial.step_limit_observed,
-            **{name: ran(name) for name in _RAN},
-            "action": " | ".join([*failed, *refused, *map("; ".join, trial.actions[:3])]),
-        }
-
-    @property
-    def failure(self) -> str:
-        """The first thing that went wrong; empty where nothing did."""
-        trial = self.trial
-        if trial.failure or trial.passed:
-            return trial.failure
-        if not trial.finite:
-            return "not finite"
-        if not trial.bounded:
-            return "not bounded"
-        reported, checked = trial.residual_reported, trial.residual_checked
-        return f"reported a residual of {reported:.3g}, but it is {checked:.3g}"
 
 
 def try_case(method: str, case: StabilityCase) -> Trial:
@@ -343,107 +281,6 @@ def _from_rest(model: TissueModel, nodes: NDArray[np.float64]) -> float:
             here = (here - middle) @ turn
         away = max(away, float(np.linalg.norm(here - there, axis=1).max()))
     return away
-
-
-def refusal_of(method: str, name: str) -> Trial:
-    """Result of a method on one of the inputs of `REFUSALS`."""
-    trial = Trial()
-    try:
-        REFUSALS[name](method)
-    except UsSimError as error:
-        trial.refusal = str(error)
-    except Exception as error:  # whatever it is, a user would see a traceback
-        trial.failure = f"raised {type(error).__name__} instead of refusing: {error}"
-    else:
-        trial.failure = "was not refused"
-    return trial
-
-
-def _moved_node(method: str, node: int, place: list[float]) -> None:
-    mesh = mesh_named("box")
-    nodes = mesh.nodes.copy()
-    nodes[node] = place
-    _solve(method, TetrahedralMesh(nodes, mesh.tetrahedra))
-
-
-def _other_tetrahedra(method: str, tetrahedra: np.ndarray, more_nodes: int = 0) -> None:
-    nodes = mesh_named("box").nodes
-    _solve(method, TetrahedralMesh(np.concatenate([nodes, nodes[:more_nodes] + 1]), tetrahedra))
-
-
-def _inverted(method: str) -> None:
-    tetrahedra = mesh_named("box").tetrahedra.copy()
-    tetrahedra[7] = tetrahedra[7][[0, 2, 1, 3]]
-    _other_tetrahedra(method, tetrahedra)
-
-
-def _flat(method: str) -> None:
-    mesh = mesh_named("tetrahedron")
-    _solve(method, TetrahedralMesh(mesh.nodes * [1.0, 1.0, 1e-12], mesh.tetrahedra))
-
-
-def _doubled_nodes(method: str) -> None:
-    box = mesh_named("box")
-    nodes = np.concatenate([box.nodes, box.nodes])
-    both = np.concatenate([box.tetrahedra, box.tetrahedra + len(box.nodes)])
-    _solve(method, TetrahedralMesh(nodes, both))
-
-
-def _solve(method: str, mesh: TetrahedralMesh) -> None:
-    constants = (np.full(len(mesh.tetrahedra), value) for value in (1e4, 0.45, 1e3))
-    materials = TissueMaterials(*constants)
-    fixed = mesh.nodes[:, 2] >= mesh.nodes[:, 2].max()
-    reached = np.flatnonzero(mesh.nodes[:, 2] <= 0).astype(np.int32)
-    create_solver(method, TissueModel(mesh, materials, fixed, Sphere(0.03), reached))
-
-
-def _constant(method: str, **constants: float) -> None:
-    create_solver(method, model_of(StabilityCase("unused", **constants)))  # type: ignore[arg-type]
-
-
-def _setting(method: str, **settings: Any) -> None:
-    create_solver(method, model_of(StabilityCase("unused")), **settings)
-
-
-def _pose(method: str, pose: Callable[[], Pose]) -> None:
-    create_solver(method, model_of(StabilityCase("unused"))).deform(pose())
-
-
-def _state(method: str, displacement: float, count: int = 64) -> None:
-    solver = create_solver(method, model_of(StabilityCase("unused")))
-    state = TissueState.at_rest(count)
-    state.displacement[0] = displacement
-    solver.take_over(state)
-
-
-REFUSALS: dict[str, Callable[[str], None]] = {
-    "a node is not a number": lambda m: _moved_node(m, 5, [np.nan, 0.0, 0.0]),
-    "a node is at infinity": lambda m: _moved_node(m, 5, [0.0, np.inf, 0.0]),
-    "a node pulled through its neighbours": lambda m: _moved_node(m, 21, [0.2, 0.2, 0.2]),
-    "a node on its neighbour": lambda m: _moved_node(m, 5, mesh_named("box").nodes[6].tolist()),
-    "an inverted tetrahedron": _inverted,
-    "a flat tetrahedron": _flat,
-    "every node twice": _doubled_nodes,
-    "a tetrahedron twice": lambda m: _other_tetrahedra(
-        m, np.concatenate([mesh_named("box").tetrahedra, mesh_named("box").tetrahedra[:1]])
-    ),
-    "a node of no tetrahedron": lambda m: _other_tetrahedra(m, mesh_named("box").tetrahedra, 1),
-    "a node that is not there": lambda m: _other_tetrahedra(m, mesh_named("box").tetrahedra + 9),
-    "no tetrahedra": lambda m: _other_tetrahedra(m, np.empty((0, 4), dtype=np.int32)),
-    "a modulus of zero": lambda m: _constant(m, young_modulus=0.0),
-    "a negative modulus": lambda m: _constant(m, young_modulus=-1e4),
-    "a modulus that is not a number": lambda m: _constant(m, young_modulus=np.nan),
-    "an infinite modulus": lambda m: _constant(m, young_modulus=np.inf),
-    "Poisson's ratio of one half": lambda m: _constant(m, poisson_ratio=0.5),
-    "Poisson's ratio of minus one": lambda m: _constant(m, poisson_ratio=-1.0),
-    "no density": lambda m: _constant(m, density=0.0),
-    "an unknown setting": lambda m: _setting(m, patience=3),
-    "a pose that is not a number": lambda m: _pose(m, lambda: Pose(np.array([0, 0, np.nan]))),
-    "a pose without orientation": lambda m: _pose(m, lambda: Pose(np.zeros(3), np.zeros(4))),
-    "a state that is not a number": lambda m: _state(m, np.nan),
-    "a state of another mesh": lambda m: _state(m, 0.0, 9),
-}
-"""Functions that give a method one broken input, by its fault."""
 
 
 def observed_step_limit(method: str, case: StabilityCase) -> tuple[float, float]:
