@@ -131,7 +131,7 @@ def shorten(messages):
         (
             lambda m: restamp(of(m, "/tissue/nodes")[50], EPOCH + 50 * PERIOD + 1),
             "stamp",
-            "/tissue/nodes has 1 message .* no pose",
+            "/tissue/nodes has 1 message .* without",
         ),
         (shorten, "order stamp stamp stamp", "/probe/pose has 1 message that came too short"),
         (exchange(4), "order", f"{IMAGE} has 1 message .* numbers, first at 0.686 s"),

@@ -12,7 +12,6 @@ import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -61,28 +60,23 @@ class LeRobotWriter:
         if folder.exists():
             raise EpisodeError(f"{folder} exists already: choose another folder")
         self._folder, self._rate, self._is_video = folder, rate, is_video
+        self._partial = folder.with_name(f".{folder.name}.partial")
         self._first: dict[str, Any] | None = None  # shape and names by feature
         self._dataset: Any = None
-        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> LeRobotWriter:
-        with self._telling():
-            self._folder.parent.mkdir(parents=True, exist_ok=True)
-            partial = TemporaryDirectory(
-                prefix=f".{self._folder.name}.partial-",
-                dir=self._folder.parent,
-                ignore_cleanup_errors=True,  # lerobot's threads may still write there
-            )
-        self._partial = Path(self._stack.enter_context(partial)) / self._folder.name
+        shutil.rmtree(self._partial, ignore_errors=True)  # of one that was killed
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        with self._stack:
+        try:
             if self._dataset is not None and error is None:
                 with self._telling():
                     self._dataset.finalize()
                     shutil.rmtree(self._partial / "images", ignore_errors=True)  # empty folders
                     self._partial.rename(self._folder)
+        finally:
+            shutil.rmtree(self._partial, ignore_errors=True)
 
     def write_episode(
         self, frames: Iterable[Frame], names: Mapping[str, Sequence[str]], task: str, origin: str

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from us_sim.errors import printable
 from us_sim.nodes.settings import PoseAgeSettings
@@ -63,6 +64,8 @@ class TopicCheck:
     messages: pd.DataFrame  # as of `read_times`
     has_stamps: bool
     start: int  # ns, of the recording
+    is_cut: bool  # whether the recording ends before its time
+    poses: pd.DataFrame | None  # that the messages follow from, if they follow from any
     findings: list[Finding] = field(default_factory=list)
     interval: float | None = None  # s from message to message as is usual, where there is such
     longest_gap: float | None = None  # s
@@ -115,7 +118,7 @@ class TopicCheck:
                 why = "they were exchanged or doubled, or the recorder's clock was set back"
                 self.tell_rows("order", back, "went back in their numbers", why)
         if lost := self.missing or said:
-            where = f", {said} of them by the recorder's own count" if said else ""
+            where = f", as the recorder counted {said}" if said else ""
             jumps = self.messages["logged"].shift()[steps > 1]
             if self.missing and len(jumps):
                 where += f", the first after {(jumps.iloc[0] - self.start) / SECOND:.3f} s"
@@ -125,23 +128,18 @@ class TopicCheck:
                 f"max_cache_size, and its publisher a depth for a second",
             )
 
-    def check_gaps(self, poses: TopicCheck | None, *, is_cut: bool) -> None:
-        """Find times without messages: of a regular topic, or while poses came.
-
-        Args:
-            poses: that the messages follow from, if they follow from any.
-            is_cut: whether the recording ends before its time.
-        """
-        times = (self.messages["logged"].to_numpy() - self.start) / SECOND
+    def check_gaps(self) -> None:
+        """Find times without messages: of a regular topic, or while poses came."""
+        times = self._times(self.messages)
         steps = np.diff(times)
         if len(times) >= _REGULAR and not self.topic.is_latched:
             usual, long = np.percentile(steps, [50, 90]).tolist()
             self.interval = usual if 0 < long <= 2 * usual else None
-        if poses is not None and len(poses.messages):
+        if self.poses is not None:
             # What follows from poses is missed where poses came, and at the end, too.
-            came = (poses.messages["logged"].to_numpy() - self.start) / SECOND
+            came = self._times(self.poses)
             begins = times if len(times) else came[:1]
-            ends = np.append(begins[1:], begins[-1] if is_cut else max(came[-1], begins[-1]))
+            ends = np.append(begins[1:], begins[-1] if self.is_cut else max(came[-1], begins[-1]))
             steps = ends - begins
             between = np.searchsorted(came, ends) - np.searchsorted(came, begins, "right")
             is_gap = (steps > STALE) & (between > 1)
@@ -158,6 +156,12 @@ class TopicCheck:
             count = counted(int(is_gap.sum()), "gap")
             longest = f"the longest of {steps[worst]:.3f} s at {begins[worst]:.3f} s"
             self.tell("gap", f"has {count}, {longest}, {why}")
+
+    def _times(self, messages: pd.DataFrame) -> NDArray[np.float64]:
+        """When messages were sent, s since the start; or recorded, if another clock sent them."""
+        sent, logged = messages["sent"], messages["logged"]
+        times = sent.where((logged - sent).abs() < _OTHER_TIME * SECOND, logged)
+        return np.sort((times - self.start) / SECOND)
 
     def check_latency(self) -> None:
         """Find messages that came before they were sent, or long after their stamp."""
@@ -176,23 +180,25 @@ class TopicCheck:
         if not self.has_stamps or self.topic.is_latched or not stamp.any():
             return
         self.ages = ages.dropna()
-        most = f"bear stamps up to {-1e3 * ages.min():.1f} ms after their sending"
+        most = f"bore stamps up to {-1e3 * ages.min():.1f} ms after their sending"
         self.tell_rows("latency", ages < -_APART, most, _CLOCKS)
-        if self.topic.name.endswith(tuple(f"/{name}" for name in DERIVED)):
+        if self.poses is not None:
             text = f"followed from poses more than {STALE:.1f} s old"
             remedy = "give its node more processor time, or a coarser scene"
             self.tell_rows("latency", ages > STALE, text, remedy)
 
-    def check_pairs(self, poses: TopicCheck, *, is_cut: bool) -> None:
+    def check_pairs(self) -> None:
         """Find messages without their pose.
 
         Nobody knows those before the first recorded one, and after the last where the bag was cut.
         """
-        stamps, known = self.messages["stamp"], poses.messages["stamp"]
+        if self.poses is None:
+            return
+        stamps, known = self.messages["stamp"], self.poses["stamp"]
         unknown = (stamps < known.min()) & (stamps > known.min() - SECOND)
-        alone = ~stamps.isin(known) & ~unknown & ~(is_cut & (stamps > known.max()))
+        alone = ~stamps.isin(known) & ~unknown & ~(self.is_cut & (stamps > known.max()))
         self.unpaired = int(alone.sum())
-        text = f"have no pose of their stamp on {poses.topic.name}"
+        text = f"came without the {POSES} of their stamp"
         remedy = "see whether poses were lost, or its node stamps by itself"
         self.tell_rows("stamp", alone, text, remedy)
 
@@ -241,30 +247,27 @@ def check(bag: Bag, progress: Progress = lambda *_: None) -> BagCheck:
     faults: list[Fault] = []
     tables = read_times(bag, None, faults, progress)
     start, is_cut, lost = bag.start or 0, bool(bag.opening_faults), bag.lost()
-    topics = {
-        topic.name: TopicCheck(
-            topic, tables[topic.name], stamp_reader(bag, topic) is not None, start
-        )
-        for topic in sorted(bag.topics, key=lambda topic: topic.name)
-    }
-    heard = [each.messages["number"] for each in topics.values() if len(each.messages)]
+    heard = [table["number"] for table in tables.values() if len(table)]
     one_counter = len(heard) > 1 and pd.concat(heard).is_unique
-    findings = [*_check_index(bag, faults)]
-    for name, each in topics.items():
-        derived = next((topic for topic in DERIVED if name.endswith(f"/{topic}")), None)
-        poses = topics.get(f"{name.removesuffix(derived)}{POSES}") if derived else None
+    findings, topics = [*_check_index(bag, faults)], list[TopicCheck]()
+    for topic in sorted(bag.topics, key=lambda topic: topic.name):
+        derived = next((name for name in DERIVED if topic.name.endswith(f"/{name}")), None)
+        poses = tables.get(f"{topic.name.removesuffix(derived)}{POSES}") if derived else None
+        followed = poses if poses is not None and len(poses) else None
+        has_stamps = stamp_reader(bag, topic) is not None
+        each = TopicCheck(topic, tables[topic.name], has_stamps, start, is_cut, followed)
         each.check_order()
-        each.check_numbers(lost[name], one_counter=one_counter)
-        each.check_gaps(poses, is_cut=is_cut)
+        each.check_numbers(lost[topic.name], one_counter=one_counter)
+        each.check_gaps()
         each.check_latency()
-        if poses is not None and len(poses.messages):
-            each.check_pairs(poses, is_cut=is_cut)
+        each.check_pairs()
+        topics.append(each)
         findings += each.findings
     damaged = sum(fault.messages for fault in faults)
-    if damaged > 0 and sum(each.missing or 0 for each in topics.values()) <= damaged:
+    if damaged > 0 and sum(each.missing or 0 for each in topics) <= damaged:
         # The damaged parts held what is missing, and the poses of these stamps.
         findings = [finding for finding in findings if finding.kind not in ("loss", "stamp")]
-    return BagCheck(bag, [*topics.values()], findings, time.monotonic() - began)
+    return BagCheck(bag, topics, findings, time.monotonic() - began)
 
 
 def _check_index(bag: Bag, faults: list[Fault]) -> Iterator[Finding]:

@@ -17,8 +17,9 @@ from us_sim.recording.path import is_pose
 from us_sim.recording.reader import Bag
 from us_sim.recording.wrench import WRENCH_STAMPED
 from us_sim.run.resimulation import scene_of
+from us_sim.run.session_lerobot import PIXELS
 from us_sim.run.session_summary import read_session
-from us_sim.run.session_tables import PIXELS, SECOND, Progress, bodies_of, read_times, read_values
+from us_sim.run.session_tables import SECOND, Progress, bodies_of, read_times, read_values
 from us_sim.settings.spelling import counted
 
 _KINDS = (("", "m"), ("f", "n"), ("t", "nm"))  # of numbers: position, force, torque

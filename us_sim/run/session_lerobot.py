@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +23,6 @@ from us_sim.recording.path import is_pose
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.resampling import Times, latest, linear, slerp
 from us_sim.run.session_tables import (
-    PIXELS,
     SECOND,
     VALUES,
     Progress,
@@ -31,7 +31,13 @@ from us_sim.run.session_tables import (
     read_values,
 )
 from us_sim.settings.spelling import counted
+from us_sim.tracking.camera.encodings import decode_image, decompress_image
 
+PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
+    "sensor_msgs/msg/Image": decode_image,
+    "sensor_msgs/msg/CompressedImage": decompress_image,
+}
+"""Decoders of images by their types."""
 _HIGHEST_RATE = 1000  # Hz
 _MOST_FRAMES = 10_000_000
 """Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
@@ -22,16 +21,10 @@ from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import Fault
 from us_sim.recording.wrench import WRENCH_STAMPED
-from us_sim.tracking.camera.encodings import decode_image, decompress_image
 
 SECOND = 1_000_000_000  # ns
 _LARGEST = 2**63 - 1
 _COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
-PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
-    "sensor_msgs/msg/Image": decode_image,
-    "sensor_msgs/msg/CompressedImage": decompress_image,
-}
-"""Decoders of images by their types."""
 Progress = Callable[[float, str], None]
 
 
