@@ -69,6 +69,7 @@ setup(
     package_data={
         "us_sim.environment": ["*.md"],
         "us_sim.evaluation": ["*/*.md"],
+        "us_sim.nodes": ["*.yaml"],
         "us_sim.viewer": ["assets/**/*", "panels/*.js"],
     },
     python_requires=">=3.11",

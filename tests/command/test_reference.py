@@ -7,7 +7,7 @@ import pytest
 
 from us_sim.command.main import main
 from us_sim.command.reference import reference_page, reference_sections
-from us_sim.nodes.settings import COMPRESSED, NODES, CompressedSettings, parameters_of
+from us_sim.nodes.settings import NODES, parameters_of
 from us_sim.scene.reading import load_scene
 from us_sim.settings.registry import SOLVERS, TRACKERS
 from us_sim.settings.setting import rules_of
@@ -33,8 +33,6 @@ def test_every_parameter_of_every_node_is_on_it():
         told = keys_in(sections[node]) | keys_in(sections["scene_nodes"])
         told |= {f"strain.{key}" for key in keys_in(sections["strain"])}
         told |= keys_in(sections["imaging"]) | keys_in(sections["probe.geometry.linear"])
-        for prefix in COMPRESSED.values():
-            told |= {prefix + name for name in rules_of(CompressedSettings)}
         for name in SOLVERS:
             told |= {f"{name}.{key}" for key in keys_in(sections[f"tissue.settings.{name}"])}
         for name in ("one_euro", "kalman"):

@@ -172,13 +172,6 @@ def test_a_model_survives_its_message():
         1_234_567_890_123_456_789, pose, random.normal(size=6), stiffness + stiffness.T
     )
     message = contact_model_message(model)
-    # A stride counts the numbers from there to the end.
-    assert [(part.label, part.size, part.stride) for part in message.layout.dim] == [
-        ("stamp", 2, 51),
-        ("pose", 7, 49),
-        ("wrench", 6, 42),
-        ("stiffness", 36, 36),
-    ]
     back = contact_model_from(message)
     assert back.stamp == model.stamp
     np.testing.assert_allclose(back.pose.matrix, pose.matrix, atol=1e-15)

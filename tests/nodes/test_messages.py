@@ -19,12 +19,12 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
     affine_message,
     cloud_message,
-    colour_image_message,
+    image_message,
     mesh_message,
     pose_message,
     pose_text,
     stamp_message,
-    structure_markers,
+    surface_markers,
 )
 from us_sim.recording.decoding import (
     affine_from,
@@ -214,7 +214,7 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
         marker.color.r, marker.color.g, marker.color.b, marker.color.a = colour
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in vertices[triangles.ravel()].tolist()]
         expected.markers.append(marker)
-    serialized = structure_markers(given_ones, STAMP, frame)
+    serialized = surface_markers(given_ones, STAMP, frame)
     # Not byte for byte: what fills the gaps between numbers is up to the middleware.
     assert len(serialized) == len(serialize_message(expected))
     assert deserialize_message(serialized, MarkerArray) == expected
@@ -225,7 +225,7 @@ def test_structure_markers_are_what_rclpy_would_serialize(surfaces, frame):
 @given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
 def test_colour_images_hold_red_green_blue_of_each_pixel(pixels):
     for view in (pixels, pixels[:, ::-1]):
-        message = colour_image_message(view, STAMP, "probe")
+        message = image_message(view, STAMP, "probe")
         rows, columns = pixels.shape[:2]
         assert (message.height, message.width, message.encoding) == (rows, columns, "rgb8")
         assert message.step * rows == 3 * columns * rows == len(message.data)

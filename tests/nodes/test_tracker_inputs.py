@@ -10,13 +10,12 @@ from bench import pose_at
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Joy
 
 from us_sim.errors import SceneError, TrackingError, UsSimError
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.probe_tracker import ProbeTracker
 from us_sim.nodes.tf import TFMessage
-from us_sim.recording.path import ProbePath, write_path
 from us_sim.tracking.camera.encodings import decompress_image
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import SHARP, RenderedView
@@ -261,104 +260,12 @@ def test_a_compressed_image_larger_than_can_be_decoded_is_refused():
         decompress_image(CompressedImage(format="png", data=png + chunk(b"IEND", b"")), "GRAY")
 
 
-STEP = 10_000_000  # ns
+def test_a_recorded_path_comes_on_the_topic_of_poses(bench, tracker):
+    _, poses = tracker("{source: path}")
+    bench.publisher(PoseStamped, "tracker/pose").publish(pose_at(0.01, 7))
+    bench.spin_until(lambda: poses)
 
 
-@pytest.fixture
-def bag(tmp_path):
-    stamps = 1_600_000_000_000_000_000 + STEP * np.arange(20)
-    positions = np.zeros((20, 3))
-    positions[:, 2] = 1e-3 * np.arange(20)
-    orientations = np.tile([0.0, 0, 0, 1], (20, 1))
-    file = tmp_path / "path.mcap"
-    write_path(file, ProbePath("/tracker/pose", "patient", stamps, positions, orientations))
-    return file
-
-
-@pytest.fixture
-def recording(tmp_path):
-    """Three samples of a probe and a reference that has moved by 5 mm, one of them not seen."""
-    lines = ["ObjectType = Image", "NDims = 3", "DimSize = 0 0 3", "ElementType = MET_OTHER"]
-    for number in range(3):
-        frame = f"Seq_Frame{number:04}_"
-        lines += [
-            f"{frame}ProbeToTrackerTransform = 1 0 0 {number + 1} 0 1 0 0 0 0 1 0 0 0 0 1",
-            f"{frame}ProbeToTrackerTransformStatus = {'INVALID' if number == 1 else 'OK'}",
-            f"{frame}ReferenceToTrackerTransform = 1 0 0 -5 0 1 0 0 0 0 1 0 0 0 0 1",
-            f"{frame}Timestamp = {100 + 0.02 * number}",
-        ]
-    file = tmp_path / "tracker.igs.mha"
-    file.write_text("\n".join([*lines, "ElementDataFile = LOCAL", ""]))
-    return file
-
-
-def scene_with(tmp_path, small_scene, **tracker):
-    file = tmp_path / "scene.yaml"
-    lines = [f"  {key}: {value}" for key, value in {"source": "path", **tracker}.items()]
-    file.write_text("\n".join([small_scene.read_text(), "tracker:", *lines, ""]))
-    return str(file)
-
-
-def publish_the_rest(bench):
-    """The topics by which the scene's other nodes say that they are ready."""
-    bench.peer.create_publisher(Image, "ultrasound/image", 10)
-    for topic in ("tissue/nodes", "skin/nodes"):
-        bench.peer.create_publisher(PointCloud2, topic, 10)
-
-
-def test_a_bags_poses_come_once_and_as_far_apart_as_recorded(bench, tmp_path, small_scene, bag):
-    scene = scene_with(tmp_path, small_scene, file=bag)
-    node = bench.make(ProbeTracker, scene=scene)
-    poses = bench.collect(PoseStamped, "probe/pose")
-    bench.spin_for(60)
-    assert node.health.received == 0, "it began though the other nodes are not ready"
-    publish_the_rest(bench)
-    before = node.get_clock().now().nanoseconds
-    bench.spin_until(lambda: len(poses) == 20)
-    bench.spin_for(5)
-    assert len(poses) == 20
-    np.testing.assert_allclose([p.pose.position.z for p in poses], 1e-3 * np.arange(20))
-    stamps = [p.header.stamp.sec * 10**9 + p.header.stamp.nanosec for p in poses]
-    np.testing.assert_array_equal(np.diff(stamps), STEP)
-    assert before <= stamps[0]
-    assert stamps[-1] <= node.get_clock().now().nanoseconds
-
-
-def test_a_recording_of_plus_leads_from_the_probe_to_the_reference(
-    bench, tmp_path, small_scene, recording
-):
-    scene = scene_with(
-        tmp_path, small_scene, file=recording, body="ProbeToReference", frame="Reference"
-    )
-    bench.make(ProbeTracker, scene=scene)
-    publish_the_rest(bench)
-    poses = bench.collect(PoseStamped, "probe/pose")
-    bench.spin_until(lambda: len(poses) == 2)
-    np.testing.assert_allclose([p.pose.position.x for p in poses], [0.006, 0.008])
-
-
-def test_another_source_may_be_named_at_the_start(bench, tmp_path, small_scene):
-    scene = scene_with(tmp_path, small_scene)
-    bench.make(ProbeTracker, scene=scene, source="pose", lockstep=True)
-    bench.publisher(PoseStamped, "tracker/pose")
-
-
-@pytest.mark.parametrize(
-    ("tracker", "parameters", "fact"),
-    [
-        ({}, {}, r"tracker\.file: "),
-        ({"file": "{bag}"}, {"lockstep": True}, "--path"),
-        ({"file": "{recording}", "body": "ProbeToTracker", "frame": "moon"}, {}, "'Tracker'"),
-        ({"file": "{bag}", "body": "nothing"}, {}, "nothing"),
-        ({"file": "{recording}"}, {}, r"tracker\.body.*ProbeToTracker, Ref"),
-        ({}, {"source": "moon"}, r"probe_tracker\.source: 'moon' .*pose, pose_array"),
-    ],
-)
-def test_what_cannot_be_played_is_refused_in_a_sentence(
-    bench, tmp_path, small_scene, bag, recording, tracker, parameters, fact
-):
-    files = {"bag": bag, "recording": recording}
-    tracker = {key: value.format(**files) for key, value in tracker.items()}
-    scene = scene_with(tmp_path, small_scene, **tracker)
-    with pytest.raises(UsSimError, match=fact):
-        bench.make(ProbeTracker, scene=scene, **parameters)
+def test_a_source_that_there_is_not_is_refused(tracker):
+    with pytest.raises(UsSimError, match=r"probe_tracker\.source: 'moon' .*pose, pose_array"):
+        tracker("{source: pose}", source="moon")

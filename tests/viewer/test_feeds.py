@@ -23,12 +23,10 @@ from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import (
     affine_message,
     cloud_message,
-    colour_image_message,
     image_message,
     mesh_message,
-    structure_markers,
+    surface_markers,
     tetrahedra_message,
-    transducer_markers,
     wrench_message,
 )
 from us_sim.nodes.qos import LATCHED
@@ -95,7 +93,7 @@ def test_pictures_keep_their_colours(bench, watcher, kind, topic):
     picture[:, :32] = 200, 60, 30  # red
     feed.watch(nothing)
     publisher = bench.publisher(Image, topic)
-    publisher.publish(colour_image_message(picture, Time(), "probe"))
+    publisher.publish(image_message(picture, Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 1)
     decoded = cv2.imdecode(np.frombuffer(feed.newest().payload, np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(decoded[24, 10].astype(int) - (30, 60, 200)).max() <= 6
@@ -168,7 +166,7 @@ def test_what_cannot_be_shown_is_said_and_the_next_is_shown(
     assert watcher.health.problems("volume") == 1
     assert sentence in watcher.health._last_problem
     good = speckle(4, 4, 3)
-    sound = colour_image_message(good, Time(), "probe") if kind == "annotated" else None
+    sound = image_message(good, Time(), "probe") if kind == "annotated" else None
     publisher.publish(sound or image_message(good[..., 0], Time(), "probe"))
     bench.spin_until(lambda: feed.sequence == 2)
     assert feed.newest() is not None
@@ -196,7 +194,7 @@ def test_of_two_images_beside_each_other_the_left_ones_pixels_are_known(bench, w
     publisher = bench.publisher(Image, "ultrasound/image_annotated")
 
     def header():
-        message = colour_image_message(np.zeros((40, 60, 3), np.uint8), Time(), "probe")
+        message = image_message(np.zeros((40, 60, 3), np.uint8), Time(), "probe")
         publisher.publish(message)
         packet = feed.newest()
         return packet.header if packet and "matrix" in packet.header else None
@@ -344,7 +342,7 @@ def test_structures_are_heard_once_and_carried_from_then_on(graph):
     vein = ("vein", (0.2, 0.4, 0.8, 1.0), SMALL + np.array([0, 0, 0.002]), CLOSED)
     nodes.publish(cloud(deformed, second=4))
     nodes.publish(cloud(deformed, second=5))
-    markers.publish(structure_markers([vein], Time(sec=5), "patient"))
+    markers.publish(surface_markers([vein], Time(sec=5), "patient"))
     packet = graph.newest("structures")
     count = packet.header["vertices"]
     nodes_of = np.frombuffer(packet.payload, np.uint32, 4 * count).reshape(-1, 4)
@@ -360,7 +358,7 @@ def test_the_probe_comes_with_its_shape_its_pose_and_its_force(graph):
     parts = transducer_mesh(RoundedBox(length=0.046, width=0.014, height=0.04, rounding=0.004))
     surfaces = [(part.name, (*part.colour, 1.0), part.vertices, part.triangles) for part in parts]
     outline = np.array([[-0.02, 0, 0], [0.02, 0, 0], [0.02, 0, 0.04], [-0.02, 0, 0.04]])
-    graph.latch(MarkerArray, "probe/marker", transducer_markers(surfaces, outline, Time(), "probe"))
+    graph.latch(MarkerArray, "probe/marker", surface_markers(surfaces, Time(), "probe", outline))
     for kind in ("probe_mesh", "probe"):
         graph.feeds[kind].watch(unused)
     told = graph.newest("probe_mesh")

@@ -162,7 +162,7 @@ def _names(names: Iterable[str]) -> str:
 
 def _nodes() -> Iterator[Section]:
     """The parameters of each node."""
-    from us_sim.nodes.settings import COMPRESSED, NODES, CompressedSettings, SceneNodeSettings
+    from us_sim.nodes.settings import NODES, SceneNodeSettings
     from us_sim.slicing.settings import Imaging
 
     common = "Every node that works on a scene"
@@ -183,9 +183,6 @@ def _nodes() -> Iterator[Section]:
             keys = _OF_THE_SCENE[node].items()
             links = ", ".join(f"{key} of [{title}](#{anchor(title)})" for key, title in keys)
             text.append(f"While running, with the scene's defaults, where it names them: {links}.")
-        if node == "slice_interpolator":
-            companions = _names(f"{prefix}KEY" for prefix in COMPRESSED.values())
-            text += [f"{companions}:", _parameters(CompressedSettings)]
         yield Section(node, node, "\n\n".join(text))
 
 

@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from us_sim.errors import TrackingError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.mailbox import Mailbox
-from us_sim.nodes.messages import bgr_image_message, image_message, stamp_message
+from us_sim.nodes.messages import image_message, stamp_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
 from us_sim.nodes.sessions.playback import CHECK_S, Awaited
@@ -43,7 +43,7 @@ class CameraDriver(GuardedNode):
         settings = declared(self, CameraDriverSettings())
         source, info = settings.source, settings.camera_info
         self._frame, self._loop = settings.frame_id, settings.loop
-        self._grey = settings.encoding == "mono8"
+        self._encoding = settings.encoding
         self._latency = round(1e9 * settings.latency)
         self._begun = round(1e9 * settings.begun)  # ns, when a file's first image was due
         self._camera = read_camera_info(full_path(info)) if info else None
@@ -141,7 +141,7 @@ class CameraDriver(GuardedNode):
             taken: ns, when it came from the camera.
         """
         stamp = taken - self._latency
-        pixels = self._video.pixels(grey=self._grey)
+        pixels = self._video.pixels(grey=self._encoding == "mono8")
         if pixels is None:
             return False
         self._taken.put((stamp, pixels))
@@ -169,9 +169,8 @@ class CameraDriver(GuardedNode):
                 f"the images are {columns} × {rows} pixels, but the camera was calibrated at "
                 f"{camera.width} × {camera.height}: calibrate it at the size it is used at",
             )
-        make = image_message if self._grey else bgr_image_message
         self._descriptions.publish(_info(camera, (columns, rows), stamp, self._frame))
-        self._images.publish(make(pixels, stamp, self._frame))
+        self._images.publish(image_message(pixels, stamp, self._frame, self._encoding))
         self.health.published("camera/image_raw", stamp)
 
 

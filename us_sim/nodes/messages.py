@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -97,37 +97,30 @@ def wrench_serialized(wrench: NDArray[np.float64], stamp: int, frame: str) -> by
 
 
 _LARGEST_OF_CONTACT = 1e10  # N, N/m or s: products of larger ones would end in a hand as infinite
-_CONTACT_PARTS = (("stamp", 2), ("pose", 7), ("wrench", 6), ("stiffness", 36))
-"""Numbers of a contact model: seconds and nanoseconds; position and quaternion of the probe;
-force and torque; six rows of six."""
 
 
 def contact_model_message(model: ContactModel) -> Float64MultiArray:
-    """Stamp, pose, wrench and stiffness one after another, each a labelled dimension."""
-    message = Float64MultiArray()
-    left = sum(size for _, size in _CONTACT_PARTS)
-    for label, size in _CONTACT_PARTS:
-        message.layout.dim.append(MultiArrayDimension(label=label, size=size, stride=left))
-        left -= size
-    values = (divmod(model.stamp, 1_000_000_000), model.pose.position, model.pose.orientation)
-    message.data = packed("d", np.concatenate([*values, model.wrench, model.stiffness.ravel()]))
-    return message
+    """Make one of 51 numbers, in SI units.
+
+    Seconds and nanoseconds; position and quaternion of the probe; force and torque; the six rows
+    of the stiffness.
+    """
+    values = (divmod(model.stamp, SECOND), model.pose.position, model.pose.orientation)
+    numbers = np.concatenate([*values, model.wrench, model.stiffness.ravel()])
+    return Float64MultiArray(data=packed("d", numbers))
 
 
 def contact_model_from(message: Float64MultiArray) -> ContactModel:
-    """The model of the contact in a message.
+    """Return the model of the contact in a message.
 
     Raises:
         TrackingError: it has other parts, or a number that cannot be.
         StampError: its stamp is no time.
     """
-    parts = tuple((dimension.label, dimension.size) for dimension in message.layout.dim)
     values = np.array(message.data, dtype=np.float64)
-    is_sound = len(values) == 51 and bool((np.abs(values) <= _LARGEST_OF_CONTACT).all())
-    if parts != _CONTACT_PARTS or not is_sound:
+    if len(values) != 51 or not (np.abs(values) <= _LARGEST_OF_CONTACT).all():
         raise TrackingError(
-            f"a model of the contact needs {', '.join(f'{n} of {k}' for k, n in _CONTACT_PARTS)}, "
-            f"51 numbers of a sensible size in all, not {len(values)} in {list(parts)}"
+            f"a model of the contact is 51 numbers of a sensible size, not {len(values)} or others"
         )
     stamp = nanoseconds_since(int(values[0]), int(values[1]))
     try:
@@ -177,33 +170,25 @@ def _points(vertices: NDArray[np.floating]) -> list[Point]:
     return [Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
 
 
-def image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
-    """A ``mono8`` image of (rows, columns) pixels."""
-    return _image(pixels, "mono8", 1, stamp, frame)
+def image_message(
+    pixels: NDArray[Any], stamp: Time, frame: str, encoding: str | None = None
+) -> Image:
+    """Make an image of (rows, columns) or (rows, columns, channels) pixels.
 
-
-def colour_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
-    """An ``rgb8`` image of (rows, columns, 3) pixels: red, green, blue."""
-    return _image(pixels, "rgb8", 3, stamp, frame)
-
-
-def bgr_image_message(pixels: NDArray[np.uint8], stamp: Time, frame: str) -> Image:
-    """A ``bgr8`` image of (rows, columns, 3) pixels, as OpenCV has them."""
-    return _image(pixels, "bgr8", 3, stamp, frame)
-
-
-def field_message(values: NDArray[np.float32], stamp: Time, frame: str) -> Image:
-    """A ``32FC…`` image of (rows, columns) values, or of (rows, columns, K); NaN is none there."""
-    count = 1 if values.ndim == 2 else values.shape[2]
-    return _image(values, f"32FC{count}", 4 * count, stamp, frame)
-
-
-def _image(pixels: NDArray[Any], encoding: str, size: int, stamp: Time, frame: str) -> Image:
+    Args:
+        pixels: by default bytes are grey values (``mono8``), or red, green and blue (``rgb8``);
+            float32 are values of as many channels (``32FC…``), where NaN is none there.
+        stamp, frame: of its header.
+        encoding: another one, such as ``bgr8``.
+    """
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    if encoding is None:
+        of_bytes = "mono8" if channels == 1 else "rgb8"
+        encoding = f"32FC{channels}" if pixels.dtype == np.float32 else of_bytes
     message = Image(header=Header(stamp=stamp, frame_id=frame))
     message.height, message.width = pixels.shape[:2]
     message.encoding = encoding
-    message.is_bigendian = 0
-    message.step = size * message.width
+    message.step = pixels.itemsize * channels * message.width
     message.data = packed("B", pixels)
     return message
 
@@ -231,72 +216,61 @@ _MARKER_TAIL = struct.pack(
 """Fields of a Marker after its points: colors, textures, text and meshes, all empty."""
 
 
-def surface_marker(
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.integer],
+def surface_marker(surface: Surface, stamp: Time, frame: str) -> bytes:
+    """A TRIANGLE_LIST marker of one surface, serialized."""
+    return b"".join([CDR_LITTLE_ENDIAN, *_serialized(_triangles(surface), stamp, frame, 0)])
+
+
+def surface_markers(
+    surfaces: Sequence[Surface],
     stamp: Time,
     frame: str,
-    opacity: float,
+    outline: NDArray[np.floating] | None = None,
 ) -> bytes:
-    """A skin-coloured TRIANGLE_LIST marker, serialized; an opacity of 1 hides everything below."""
-    skin = ("skin", (0.85, 0.65, 0.55, opacity), vertices, triangles)
-    return b"".join([CDR_LITTLE_ENDIAN, *_marker(skin, stamp, frame, 0)])
+    """A MarkerArray with a TRIANGLE_LIST of each surface in its own namespace, serialized.
 
-
-def structure_markers(surfaces: Sequence[Surface], stamp: Time, frame: str) -> bytes:
-    """A MarkerArray with a TRIANGLE_LIST of each surface in its own namespace, serialized."""
-    parts = [CDR_LITTLE_ENDIAN, struct.pack("@I", len(surfaces))]
-    for surface in surfaces:
-        parts += _marker(surface, stamp, frame, sum(map(len, parts[1:])))
+    With an outline (P, 3) m of an image, a closed LINE_STRIP ``image`` is the last.
+    """
+    shapes = list(map(_triangles, surfaces))
+    if outline is not None:
+        closed = np.concatenate([outline, outline[:1]]).astype(np.float64)
+        width = (_LINE_WIDTH, 0.0, 0.0)
+        shapes.append(_Shape("image", Marker.LINE_STRIP, width, _OUTLINE_COLOUR, closed))
+    parts = [CDR_LITTLE_ENDIAN, struct.pack("@I", len(shapes))]
+    for shape in shapes:
+        parts += _serialized(shape, stamp, frame, sum(map(len, parts[1:])))
     return b"".join(parts)
 
 
-def transducer_markers(
-    parts: Sequence[Surface], outline: NDArray[np.floating], stamp: Time, frame: str
-) -> bytes:
-    """The same with a LINE_STRIP around an image, (P, 3) m, as the last, serialized."""
-    whole = [CDR_LITTLE_ENDIAN, struct.pack("@I", len(parts) + 1)]
-    for part in parts:
-        whole += _marker(part, stamp, frame, sum(map(len, whole[1:])))
-    closed = np.concatenate([outline, outline[:1]]).astype(np.float64)
-    whole += _serialized(
-        *("image", Marker.LINE_STRIP, (_LINE_WIDTH, 0, 0), _OUTLINE_COLOUR, closed),
-        *(stamp, frame, sum(map(len, whole[1:]))),
-    )
-    return b"".join(whole)
+class _Shape(NamedTuple):
+    """What differs between the markers that are sent."""
+
+    namespace: str
+    kind: int  # of a Marker
+    scale: tuple[float, float, float]
+    colour: tuple[float, float, float, float]  # red, green, blue, alpha
+    points: NDArray[np.float64]  # (P, 3), m
 
 
-def _marker(surface: Surface, stamp: Time, frame: str, offset: int) -> list[bytes]:
-    """The parts of a serialized TRIANGLE_LIST marker that begins at that offset of a message."""
+def _triangles(surface: Surface) -> _Shape:
     namespace, colour, vertices, triangles = surface
-    points = vertices.astype(np.float64)[triangles.ravel()]
-    return _serialized(
-        namespace, Marker.TRIANGLE_LIST, (1, 1, 1), colour, points, stamp, frame, offset
-    )
+    corners = vertices.astype(np.float64)[triangles.ravel()]
+    return _Shape(namespace, Marker.TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, corners)
 
 
-def _serialized(
-    namespace: str,
-    kind: int,
-    scale: tuple[float, float, float],
-    colour: tuple[float, float, float, float],
-    points: NDArray[np.float64],
-    stamp: Time,
-    frame: str,
-    offset: int,
-) -> list[bytes]:
-    """The parts of a serialized marker of points (P, 3) m at that offset of a message.
+def _serialized(shape: _Shape, stamp: Time, frame: str, offset: int) -> list[bytes]:
+    """The parts of a serialized marker that begins at that offset of a message.
 
     It holds an object for each point, too slow to make one by one. So the CDR is written here:
     native alignment in `struct` is CDR's, and ``0d`` aligns what follows.
     """
-    name, place = namespace.encode() + b"\0", frame.encode() + b"\0"
+    name, place = shape.namespace.encode() + b"\0", frame.encode() + b"\0"
     identity = (0, 0, 0, 0, 0, 0, 1)
-    before = offset % 8
+    before, count = offset % 8, len(shape.points)
     head = struct.pack(
-        f"@{before}xiII{len(place)}sI{len(name)}siii10d4fiI?I" + ("0d" if len(points) else ""),
+        f"@{before}xiII{len(place)}sI{len(name)}siii10d4fiI?I" + ("0d" if count else ""),
         *(stamp.sec, stamp.nanosec, len(place), place, len(name), name),
-        *(0, kind, Marker.ADD, *identity, *scale, *colour),
-        *(0, 0, False, len(points)),
+        *(0, shape.kind, Marker.ADD, *identity, *shape.scale, *shape.colour),
+        *(0, 0, False, count),
     )
-    return [head[before:], points.tobytes(), _MARKER_TAIL]
+    return [head[before:], shape.points.tobytes(), _MARKER_TAIL]

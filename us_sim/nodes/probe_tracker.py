@@ -16,7 +16,7 @@ from us_sim.nodes.messages import (
     pose_message,
     pose_text,
     stamp_message,
-    transducer_markers,
+    surface_markers,
     transform_message,
 )
 from us_sim.nodes.parameters import Group, LiveSettings
@@ -103,7 +103,7 @@ class ProbeTracker(Device):
         parts = transducer_mesh(collider_of(self.scene)) if section is not None else []
         surfaces = [(p.name, (*p.colour, 1.0), p.vertices, p.triangles) for p in parts]
         outline = image_outline(probe_of(self.scene))
-        return transducer_markers(surfaces, outline, TimeMessage(), "probe")
+        return surface_markers(surfaces, TimeMessage(), "probe", outline)
 
     def _use(self, values: dict[str, Any]) -> None:
         self._tracking.filter = _filter(values)

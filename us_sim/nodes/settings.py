@@ -32,8 +32,8 @@ _AGE = Quantity("time", 0.01, 3600.0)
 
 
 @dataclass(frozen=True)
-class PoseAgeSettings(Settings):
-    """Of ``slice_interpolator``: when an image's pose is old."""
+class AnnotatedImageSettings(Settings):
+    """Of ``slice_interpolator``: the contents of the annotated image, and when its pose is old."""
 
     live = True
 
@@ -43,14 +43,6 @@ class PoseAgeSettings(Settings):
     lost_after: float = setting(
         _AGE, "without a new pose before the probe counts as lost", default=2.0
     )
-
-
-@dataclass(frozen=True)
-class AnnotatedImageSettings(Settings):
-    """Of ``slice_interpolator``: the contents of the annotated image."""
-
-    live = True
-
     overlay: str = setting(
         description="colours over the annotated image, where the scene can provide them",
         choices=(*OVERLAYS, "none"),
@@ -68,40 +60,12 @@ class AnnotatedImageSettings(Settings):
     )
 
 
-@dataclass(frozen=True)
-class CompressedSettings(Settings):
-    """How image_transport's plugin ``compressed`` encodes a topic; names and defaults are its."""
-
-    live = True
-
-    format: str = setting(
-        description="JPEG, which is small, or PNG, which loses nothing",
-        choices=("jpeg", "png"),
-        default="jpeg",
-    )
-    jpeg_quality: int = setting(
-        Quantity("number", 1, 100), "of JPEG: higher is better and larger", default=95
-    )
-    png_level: int = setting(
-        Quantity("number", 0, 9), "of PNG: higher is smaller and slower", default=3
-    )
-
-
-COMPRESSED = {
-    topic: f"{topic.replace('/', '.')}.compressed."
-    for topic in ("ultrasound/image", "ultrasound/image_annotated")
-}
-"""Topics that have such a companion, each with the prefix of its parameters."""
-
-
 def image_parameters(scene: Scene) -> Iterator[tuple[str, type[Settings]]]:
     """Settings of a scene that are parameters, too, each with the prefix of their names."""
     yield "", type(probe_of(scene))
     yield "acoustics.", SoundSettings
     for label in scene.imaging.acoustics.tissues:
         yield f"{TISSUE_PARAMETERS}{label}.", TissueAcoustics
-    for prefix in COMPRESSED.values():
-        yield prefix, CompressedSettings
     yield "m_mode.", type(scene.m_mode)
     if scene.tissue is not None:
         yield "strain.", type(scene.strain)
@@ -487,7 +451,7 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "probe_tracker": (SceneNodeSettings, ProbeTrackerSettings),
     "tissue_deformer": (SceneNodeSettings, TissueDeformerSettings, StructureMarkersSettings),
     "skin_deformer": (SceneNodeSettings, SkinDeformerSettings),
-    "slice_interpolator": (SceneNodeSettings, PoseAgeSettings, AnnotatedImageSettings, Imaging),
+    "slice_interpolator": (SceneNodeSettings, AnnotatedImageSettings, Imaging),
     "haptic_renderer": (SceneNodeSettings,),
     "scorer": (SceneNodeSettings, ScorerSettings, ScoreSettings),
     "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),

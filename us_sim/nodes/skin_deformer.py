@@ -21,6 +21,8 @@ from us_sim.scene.building import membrane_of
 from us_sim.settings.setting import rules_of
 from us_sim.skin.settings import MembraneSettings, SkinSettings
 
+_COLOUR = (0.85, 0.65, 0.55)  # red, green, blue
+
 
 class SkinDeformer(SceneNode):
     """``probe/pose`` in; ``skin/nodes`` and ``skin/marker`` out; rest surface latched.
@@ -73,9 +75,9 @@ class SkinDeformer(SceneNode):
             )
             self.health.published("skin/nodes", stamp)
         if shown:
-            opacity = self._settings.values["markers"].marker_opacity
-            marker = surface_marker(skin.vertices, self._triangles, stamp, "patient", opacity)
-            self._marker.publish(marker)
+            colour = (*_COLOUR, self._settings.values["markers"].marker_opacity)
+            surface = ("skin", colour, skin.vertices, self._triangles)
+            self._marker.publish(surface_marker(surface, stamp, "patient"))
             self.health.published("skin/marker")
         self.health.state = "running"
         self.health.values = {"residual": f"{skin.residual:.3g}", "action": skin.action}

@@ -166,7 +166,7 @@ class SliceInterpolator(SceneNode):
 
     def _pose(self, message: PoseStamped) -> Pose:
         pose = pose_from(message, "patient")
-        self._annotated.pose_came(message.header.stamp)
+        self._annotated.pose_came()
         return pose
 
     def _image_unpaired(self) -> None:

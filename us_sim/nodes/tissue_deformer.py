@@ -24,7 +24,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.nodes.messages import (
     cloud_message,
     contact_model_message,
-    structure_markers,
+    surface_markers,
     tetrahedra_message,
     wrench_message,
 )
@@ -136,7 +136,7 @@ class StructureMarkers:
             (made.name, (*made.colour, 1.0), made.surface.carry(nodes), made.surface.triangles)
             for made in self._structures
         ]
-        self._publisher.publish(structure_markers(surfaces, stamp, "patient"))
+        self._publisher.publish(surface_markers(surfaces, stamp, "patient"))
         self._node.health.published(STRUCTURES)
 
     def _make(self) -> None:

@@ -55,16 +55,6 @@ def nanoseconds_since(seconds: int, nanoseconds: int) -> int:
     return int(SECOND * seconds + nanoseconds)
 
 
-def require_stamp(message: Any) -> None:
-    """Check the stamp that a message has in its header.
-
-    Raises:
-        StampError: there is one, and it is no time.
-    """
-    if hasattr(message, "header"):
-        nanoseconds_of(message.header.stamp)
-
-
 def require_frame(header: Any, frame: str | None) -> None:
     """Check the frame of a message; None is any.
 

@@ -207,18 +207,19 @@ def _spin(
         failure = next(filter(None, (getattr(node, "last_failure", "") for node in nodes)), "")
         if failure:  # the node itself would go on
             raise UsSimError(failure)
-        state = (writer.count, recorder.health.received + writer.truth.count)
+        images, files = writer.counts["ultrasound/image"], writer.counts.total()
+        state = (images, recorder.health.received + files)
         now = clock.now().nanoseconds
         if state != last:
             if state[0] != last[0]:
                 progress(state[0], total)
             changed, last = now, state
         silence = (now - changed) * 1e-9
-        is_complete = writer.truth.count == len(truth) * writer.count
+        is_complete = files == (1 + len(truth)) * images
         if player.finished.done() and silence > QUIET_S and is_complete:
-            return int(writer.count)
+            return int(images)
         if silence > 60.0:
             what = "image" if is_complete else f"{' or '.join(truth)} of each image"
             raise UsSimError(
-                f"no {what} came for pose {writer.count} in a minute; the path is rendered up to it"
+                f"no {what} came for pose {images} in a minute; the path is rendered up to it"
             )

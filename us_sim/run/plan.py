@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from us_sim.errors import UsSimError
+from us_sim.errors import SceneError, UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
 from us_sim.run.ros_arguments import namespace, ros_arguments
 from us_sim.scene.building import path_of
@@ -170,6 +170,7 @@ def plan_of(request: Request) -> Plan:
     Raises:
         UsSimError: a parameter will not do, or the file to be played cannot be.
     """
+    request = _with_path_of_tracker(request)
     scene, parameters = request.scene, dict(request.parameters)
 
     def taken(node: str) -> dict[str, object]:
@@ -220,6 +221,22 @@ def plan_of(request: Request) -> Plan:
     poses = None if settings.get("stay") else len(path)
     loops = bool(processes[-1].all_parameters.get("loop"))
     return Plan(processes, poses, request.duration, loops=loops, topic=path.topic)
+
+
+def _with_path_of_tracker(request: Request) -> Request:
+    """The same, which plays the scene's own recording where that is its tracker, and holds its end.
+
+    Raises:
+        SceneError: the scene names no recording.
+    """
+    tracker = request.scene.tracker
+    if tracker.source.name != "path" or request.by_hand or request.path or request.video:
+        return request
+    if tracker.file is None:
+        raise SceneError(
+            f"{request.scene.origin}: tracker.file: is missing; name the bag or recording to play"
+        )
+    return replace(request, path=Path(tracker.file), playing={"stay": True})
 
 
 def simulation_nodes(

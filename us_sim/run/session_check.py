@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from us_sim.errors import printable
-from us_sim.nodes.settings import PoseAgeSettings
+from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.topics import TOPICS
 from us_sim.recording.reader import Bag
 from us_sim.recording.stamps import stamp_reader
@@ -33,7 +33,7 @@ DERIVED = [
 ]
 """Topics whose messages carry the stamp of the pose that they follow from."""
 
-STALE = PoseAgeSettings().stale_after
+STALE = AnnotatedImageSettings().stale_after
 """s without a message after which there is a gap: an image is called stale then."""
 TITLES = ("topic", "count", "Hz", "gap s", "age ms: median", "p99", "worst", "lost", "unpaired")
 """Of the printed columns; the age is from the stamp of a message to its publication."""

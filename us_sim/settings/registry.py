@@ -108,7 +108,7 @@ TRACKERS = Choice(
         f"{_INPUTS}.openigtlink_input:OpenIGTLinkInput",
         "us_sim.tracking.settings:OpenIGTLinkSettings",
     ),
-    path=Option(f"{_INPUTS}.path_input:PathInput", _NOTHING),
+    path=Option(f"{_INPUTS}.topic_inputs:PoseInput", _NOTHING),
 )
 
 _EXERCISES = "us_sim.scoring.exercise"

@@ -35,7 +35,6 @@ from us_sim.recording.decoding import (
     nanoseconds_of,
     pixels_from,
     pose_from,
-    require_stamp,
     tetrahedra_from,
     triangles_from,
     vectors_from,
@@ -69,9 +68,7 @@ def made_of(
     """The result of ``make`` for a message's bytes; None, and reported, where it refuses them."""
 
     def made() -> Any:
-        message = deserialize_message(data, message_type)
-        require_stamp(message)
-        return make(message)
+        return make(deserialize_message(data, message_type))
 
     return node.guarded(node.resolve_topic_name(topic), made)()
 

@@ -6,14 +6,9 @@ Only those are there that a scene and its volume can provide.
 from __future__ import annotations
 
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.streams.stream import (
-    BModeStream,
-    DisplacementStream,
-    FrameStream,
-    LabelStream,
-    MModeStream,
-)
+from us_sim.nodes.streams.stream import IMAGE, FrameStream, MModeStream
 from us_sim.slicing.probe.probe import Probe
+from us_sim.slicing.strain import displacement
 from us_sim.volume.volume import Volume
 
 
@@ -25,11 +20,12 @@ def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameSt
     """
     further: list[FrameStream] = []
     if volume.labels is not None:
-        further.append(LabelStream(node))
+        further.append(FrameStream(node, "ultrasound/labels", lambda frame: frame.labels))
     if node.scene.tissue is not None:
         from us_sim.nodes.streams.strain import strain_streams
 
-        further += [DisplacementStream(node), *strain_streams(node)]
+        further.append(FrameStream(node, "ultrasound/displacement", displacement))
+        further += strain_streams(node)
     if node.scene.flows:
         from us_sim.nodes.streams.doppler import doppler_streams
 
@@ -38,4 +34,4 @@ def frame_streams(node: SceneNode, volume: Volume, probe: Probe) -> list[FrameSt
     for stream in further:
         stream.prepare(probe)
     # Whoever waits for the images may begin when their topic is there, so it comes last.
-    return [BModeStream(node), *further]
+    return [FrameStream(node, IMAGE, lambda frame: frame.pixels), *further]

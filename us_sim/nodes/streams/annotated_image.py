@@ -13,13 +13,11 @@ from sensor_msgs.msg import Image
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.guarded_node import GuardedNode
-from us_sim.nodes.messages import colour_image_message
+from us_sim.nodes.messages import image_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode, poses_ended
-from us_sim.nodes.settings import AnnotatedImageSettings, PoseAgeSettings
-from us_sim.nodes.streams.compressed import Compressed
+from us_sim.nodes.settings import AnnotatedImageSettings
 from us_sim.nodes.streams.stream import FrameStream
-from us_sim.recording.decoding import nanoseconds_of
 from us_sim.scene.building import colour_of
 from us_sim.slicing.drawing.annotation import Annotation, Badge
 from us_sim.slicing.drawing.label_outlines import onto_border
@@ -29,65 +27,36 @@ from us_sim.slicing.probe.probe import Probe
 from us_sim.slicing.settings import OVERLAYS
 
 _TOPIC = "ultrasound/image_annotated"
-REMEMBERED = 256  # poses whose arrival is kept for the images at them
 
 
-class PoseAge:
-    """The age of the newest pose, and the badge of an image at it.
+class Age:
+    """The time since something came last, whatever its stamp says.
 
-    A pose ages from its arrival: its stamp may be of another clock, such as that of a tracker
-    which is ahead, or of the day it was recorded. It ages while ROS's time goes on, and never by
-    more than has really passed: that time may be set, and stands still while a bag is paused. How
-    long is too long are the parameters of `PoseAgeSettings`.
+    A stamp may be of another clock, such as that of a tracker which is ahead, or of the day it was
+    recorded. What came ages while ROS's time goes on, and never by more than has really passed:
+    that time may be set, and stands still while a bag is paused.
 
     Args:
-        node: whose clock is used, and which gets the parameters.
+        node: whose clock is used.
     """
 
     def __init__(self, node: GuardedNode) -> None:
         self._node = node
-        self._arrivals: dict[int, tuple[int, int]] = {}  # ns, as `_now`, by stamps in ns
-        self._settings = LiveSettings(node, {"age": Group(PoseAgeSettings())})
+        self._came: tuple[int, int] | None = None  # ns, as `_now`
 
-    def came(self, stamp: TimeMessage) -> None:
-        """A pose with that stamp has come."""
-        nanoseconds = nanoseconds_of(stamp)
-        self._arrivals.pop(nanoseconds, None)  # so that the newest comes last
-        self._arrivals[nanoseconds] = self._now()
-        if len(self._arrivals) > REMEMBERED:
-            del self._arrivals[next(iter(self._arrivals))]
+    def restart(self) -> None:
+        """Count from now on."""
+        self._came = self._now()
 
     @property
-    def pose(self) -> float | None:
-        """Age of the newest pose, s; None before the first."""
-        if not self._arrivals:
+    def seconds(self) -> float | None:
+        """The age, s; None before the first has come."""
+        if self._came is None:
             return None
-        newest = next(reversed(self._arrivals))
-        return self._since(newest)
-
-    def image(self, stamp: TimeMessage) -> float:
-        """Age of an image of the pose with that stamp, s, or of the oldest that is remembered."""
-        if not self._arrivals:
-            return 0.0
-        nanoseconds = nanoseconds_of(stamp)
-        known = nanoseconds in self._arrivals
-        return self._since(nanoseconds if known else next(iter(self._arrivals)))
-
-    def word(self, age: float | None) -> str:
-        """``live``, ``stale``, ``lost``, or ``waiting`` for the first."""
-        if age is None:
-            return "waiting"
-        limits = self._settings.values["age"]
-        if age > limits.lost_after:
-            return "lost"
-        return "stale" if age > limits.stale_after else "live"
-
-    def _since(self, stamp: int) -> float:
-        now, real = self._now()
-        came, really = self._arrivals[stamp]
-        if came > now:  # time was set back, as when a bag starts again
-            self._arrivals[stamp] = came, really = now, real
-        return 1e-9 * min(now - came, real - really)
+        now, came = self._now(), self._came
+        if came[0] > now[0]:  # time was set back, as when a bag starts again
+            self._came = came = now
+        return 1e-9 * min(now[0] - came[0], now[1] - came[1])
 
     def _now(self) -> tuple[int, int]:
         """ns of ROS's time, and of one that nobody sets."""
@@ -97,7 +66,6 @@ class PoseAge:
 CHECKS = 5.0  # times a second that the age of the newest pose is looked at
 
 _AMBER, _RED, _GREY = (255, 176, 0), (235, 45, 45), (150, 150, 150)
-_NEVER = TimeMessage()  # the stamp of a picture of no pose: zero
 
 Pixels = NDArray[np.uint8]
 
@@ -108,7 +76,7 @@ class AnnotatedImage:
     A picture is drawn for each image while somebody subscribes, with the colours of the stream
     that the parameter ``overlay`` chooses. When no pose has come for a while, the last image is
     sent again with a badge, under its own stamp; before the first pose a black one. In lockstep
-    nothing ages.
+    nothing ages. Its parameters are those of `AnnotatedImageSettings`.
 
     Args:
         node: that publishes it.
@@ -130,10 +98,10 @@ class AnnotatedImage:
         self._overlays = {
             name: by_topic[mode.topic] for name, mode in OVERLAYS.items() if mode.topic in by_topic
         }
-        self._settings = LiveSettings(
+        self._live = LiveSettings(
             node, {"shown": Group(AnnotatedImageSettings())}, self._require_overlay
         )
-        self._require_overlay(self._settings.values)
+        self._require_overlay(self._live.values)
         numbers = {name: number for number, name in label_names.items()}
         self._structures = {
             numbers[given.label or name]: (name, colour_of(node.scene, name))
@@ -141,43 +109,44 @@ class AnnotatedImage:
             if not given.file and (given.label or name) in numbers
         }
         self._publisher = node.stream(Image, _TOPIC)
-        self._compressed = Compressed(node, _TOPIC)
-        self._came = self._missing = False
-        self._stamp = _NEVER
+        self._missing = False
+        self._pose_age, self._image_age = Age(node), Age(node)
         self.show_probe(probe)
-        self._age: PoseAge | None = None
         if not node.lockstep:
-            self._age = PoseAge(node)
             node.create_timer(1.0 / CHECKS, self._check)
 
     @property
+    def _settings(self) -> AnnotatedImageSettings:
+        settings: AnnotatedImageSettings = self._live.values["shown"]
+        return settings
+
+    @property
     def is_wanted(self) -> bool:
-        """Whether somebody subscribes, maybe to the compressed companion."""
-        return bool(self._publisher.get_subscription_count() > 0) or self._compressed.is_wanted
+        """Whether somebody subscribes."""
+        return bool(self._publisher.get_subscription_count() > 0)
 
     @property
     def state(self) -> str:
         """Of the probe's pose: ``waiting`` for the first, ``live``, ``stale`` or ``lost``."""
-        if self._age is None:
-            return "live" if self._came else "waiting"
-        return self._age.word(self._age.pose)
+        age = self._pose_age.seconds
+        if age is None:
+            return "waiting"
+        if self._node.lockstep or age <= self._settings.stale_after:
+            return "live"
+        return "lost" if age > self._settings.lost_after else "stale"
 
     def show_probe(self, probe: Probe) -> None:
         """The images that come are of another probe; those before it are not shown again."""
         self._probe = probe
-        self._annotation = Annotation(
-            probe, self._structures, is_flipped=self._settings.values["shown"].flip
-        )
+        self._annotation = Annotation(probe, self._structures, is_flipped=self._settings.flip)
         self._frame: Frame | None = None
         self._labels: Pixels | None = None
         self._is_outlined = False
-        self._stamp = _NEVER
+        self._stamp = TimeMessage()  # zero: of a picture of no pose
 
-    def pose_came(self, stamp: TimeMessage) -> None:
+    def pose_came(self) -> None:
         """A pose that can be used has come, whether or not an image is made at it."""
-        self._came = True
-        if self._age is not None:
-            self._age.came(stamp)
+        self._pose_age.restart()
 
     def show(self, frame: Frame, stamp: TimeMessage) -> None:
         """Keep the frame of the pose with that stamp, and send its picture if wanted.
@@ -190,6 +159,7 @@ class AnnotatedImage:
         self._frame, self._stamp = frame, stamp
         self._labels = None
         self._is_outlined = not self._structures
+        self._image_age.restart()
         if self.is_wanted:
             self._send(self._badge())
 
@@ -209,11 +179,11 @@ class AnnotatedImage:
             warning = f"{why}: the image is frozen"
             if not self._missing:
                 node.get_logger().info(f"{warning} until somebody does")
-        elif missing and not self._missing and self._age is not None:
+        elif missing and not self._missing:
             node.health.problem(
                 "pose age",
-                f"the newest probe pose is {self._age.pose:.1f} s old: the image is frozen; look "
-                f"at the tracker",
+                f"the newest probe pose is {self._pose_age.seconds:.1f} s old: the image is "
+                f"frozen; look at the tracker",
             )
         elif self._missing and state == "live":
             node.get_logger().info("probe poses come again")
@@ -221,43 +191,38 @@ class AnnotatedImage:
         node.health.warning = warning
 
     def _badge(self) -> Badge | None:
-        if self._age is None:
+        state, pose_age, image_age = self.state, self._pose_age.seconds, self._image_age.seconds
+        if self._node.lockstep:
             return None
-        word = self.state
-        if word == "waiting":
+        if state == "waiting" or pose_age is None:
             return Badge("NO PROBE POSE", _GREY)
-        if word == "lost":
+        if state == "lost":
             return Badge("LOST", _RED)
-        if self._frame is None:
+        if self._frame is None or image_age is None:
             return Badge("NO IMAGE YET", _GREY)
-        age = self._age.image(self._stamp)
-        if self._age.word(age) == "live":
+        age = max(pose_age, image_age)  # an image may be made again at an old pose
+        if age <= self._settings.stale_after:
             return None
         return Badge(f"STALE {age:.1f} s", _AMBER)
 
     def _send(self, badge: Badge | None) -> None:
-        frame, overlay = self._frame, None
+        frame, overlay, shown = self._frame, None, self._settings
         if frame is None:
             image = np.zeros((self._probe.rows, self._probe.columns), np.uint8)
         else:
             image = frame.pixels
             self._outline(frame)
             overlay = self._overlay(frame)
-        shown = self._settings.values["shown"]
         if self._annotation.is_flipped != shown.flip:
-            self._annotation = Annotation(
-                self._probe, self._structures, is_flipped=not self._annotation.is_flipped
-            )
+            self._annotation = Annotation(self._probe, self._structures, is_flipped=shown.flip)
         lines = [line for each in self._streams if each.is_wanted for line in each.lines]
         refine = None if frame is None else partial(onto_border, frame)
         picture = self._annotation.draw(image, self._labels, badge, overlay, lines, refine)
         if shown.beside:
             plain = image[:, ::-1] if shown.flip else image
             picture = np.hstack([np.repeat(plain[:, :, None], 3, axis=2), picture])
-        message = colour_image_message(picture, self._stamp, "probe")
-        self._publisher.publish(message)
+        self._publisher.publish(image_message(picture, self._stamp, "probe"))
         self._node.health.published(_TOPIC)
-        self._compressed.send(message)
 
     def _outline(self, frame: Frame) -> None:
         if self._is_outlined:
@@ -269,7 +234,7 @@ class AnnotatedImage:
             self._node.health.problem("labels", f"{error}; nothing is outlined")
 
     def _overlay(self, frame: Frame) -> Overlay | None:
-        stream = self._overlays.get(self._settings.values["shown"].overlay)
+        stream = self._overlays.get(self._settings.overlay)
         try:
             return stream.overlay(frame) if stream else None
         except UsSimError as error:

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import Image
 
-from us_sim.nodes.messages import colour_image_message, field_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.stream import FrameStream, SettableStream
@@ -20,8 +17,7 @@ from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.flow.blood import Blood
 from us_sim.slicing.flow.doppler import ColourDoppler, Spectrum, nearest_vessel, warm_up
 from us_sim.slicing.frame import Frame
-from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.settings import ColourSettings, DopplerSettings, SpectrumSettings
+from us_sim.slicing.settings import DopplerSettings
 from us_sim.volume.volume import Volume
 
 EVERY_S = 0.2  # between two searches for the vessel; of the frames' time
@@ -59,16 +55,12 @@ _OPACITY = 0.9
 class ColourStream(SettableStream[ColourDoppler]):
     """``ultrasound/velocity_estimate``, and the colours of the same; parameters ``colour.…``."""
 
-    topic = "ultrasound/velocity_estimate"
-
     def __init__(self, node: SceneNode, blood: Blood) -> None:
-        super().__init__(node, node.scene.colour, "colour.")
+        topic = "ultrasound/velocity_estimate"
+        super().__init__(node, topic, self._estimate, ColourDoppler, node.scene.colour, "colour.")
         self._blood = blood
         self._following = Following(node, "colour.", blood)
         self._frame: Frame | None = None
-
-    def _make(self, probe: Probe, settings: ColourSettings) -> ColourDoppler:
-        return ColourDoppler(probe, settings)
 
     def velocity(self, frame: Frame) -> NDArray[np.float32]:
         """m/s towards the probe along the box's beams (rows, columns), exact; NaN outside blood."""
@@ -78,9 +70,6 @@ class ColourStream(SettableStream[ColourDoppler]):
         """The estimate in colours, and its box."""
         doppler = self.for_frame(frame)
         return Overlay(self._estimate(frame), doppler.scale, _OPACITY, outline=doppler.outline)
-
-    def _message(self, frame: Frame, stamp: Time) -> Image:
-        return field_message(self._estimate(frame), stamp, "probe")
 
     def _estimate(self, frame: Frame) -> NDArray[np.float32]:
         """Made once, since frames before it count, too."""
@@ -94,26 +83,12 @@ class ColourStream(SettableStream[ColourDoppler]):
         return self._shown
 
 
-class VelocityStream(FrameStream):
-    """``ultrasound/velocity``: exact, along the beams of colour Doppler, in the whole image."""
-
-    topic = "ultrasound/velocity"
-
-    def __init__(self, node: SceneNode, colour: ColourStream) -> None:
-        super().__init__(node)
-        self._colour = colour
-
-    def _message(self, frame: Frame, stamp: Time) -> Image:
-        return field_message(self._colour.velocity(frame), stamp, "probe")
-
-
 class SpectrumStream(SettableStream[Spectrum]):
     """``ultrasound/spectrum``: velocities at the gate over time; parameters ``spectrum.…``."""
 
-    topic = "ultrasound/spectrum"
-
     def __init__(self, node: SceneNode, blood: Blood) -> None:
-        super().__init__(node, node.scene.spectrum, "spectrum.")
+        topic = "ultrasound/spectrum"
+        super().__init__(node, topic, self._picture, Spectrum, node.scene.spectrum, "spectrum.")
         self._blood = blood
         self._following = Following(node, "spectrum.", blood)
 
@@ -122,18 +97,15 @@ class SpectrumStream(SettableStream[Spectrum]):
         """The gate's ends and the angle that is set."""
         return self._made.lines if self._made else ()
 
-    def _make(self, probe: Probe, settings: SpectrumSettings) -> Spectrum:
-        return Spectrum(probe, settings)
-
     def _go_on(self, made: Spectrum, before: Spectrum) -> None:
         made.go_on(before)
 
-    def _message(self, frame: Frame, stamp: Time) -> Image:
+    def _picture(self, frame: Frame) -> NDArray[np.uint8]:
         spectrum = self.for_frame(frame)
         self._following.update(frame, spectrum.settings, spectrum.settings.steering)
         picture = spectrum.show(self._blood, frame)
         self._node.health.values["no_spectrum"] = spectrum.absence(self._blood, frame).value
-        return colour_image_message(picture, stamp, "probe")
+        return picture
 
 
 def doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
@@ -159,4 +131,5 @@ def doppler_streams(node: SceneNode, volume: Volume) -> list[FrameStream]:
     flows = LiveSettings(node, given, require, use)
     use(flows.values)
     colour = ColourStream(node, blood)
-    return [VelocityStream(node, colour), colour, SpectrumStream(node, blood)]
+    velocity = FrameStream(node, "ultrasound/velocity", colour.velocity)
+    return [velocity, colour, SpectrumStream(node, blood)]

@@ -5,12 +5,9 @@ from __future__ import annotations
 from abc import abstractmethod
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image
 
 from us_sim.errors import ProbeError
-from us_sim.nodes.messages import field_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
 from us_sim.nodes.streams.stream import FrameStream
@@ -41,10 +38,10 @@ def strain_streams(node: SceneNode) -> list[FrameStream]:
 
 
 class _StrainImages(FrameStream):
-    """Base of both: values as a message, or as colours with a note."""
+    """Base of both: values as such, or as colours with a note."""
 
-    def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
-        super().__init__(node)
+    def __init__(self, node: SceneNode, topic: str, parameters: LiveSettings) -> None:
+        super().__init__(node, topic, self._of)
         self._parameters = parameters
         self._end = FollowingEnd()
         self._latest: tuple[Frame, Strain, NDArray[np.float32] | None] | None = None
@@ -53,10 +50,6 @@ class _StrainImages(FrameStream):
     def _settings(self) -> Strain:
         settings: Strain = self._parameters.values["strain"]
         return settings
-
-    def _message(self, frame: Frame, stamp: Time) -> Image | None:
-        values = self._of(frame)
-        return None if values is None else field_message(values, stamp, "probe")
 
     def overlay(self, frame: Frame) -> Overlay | None:
         """The strain in colours, and the quality of the compression."""
@@ -86,10 +79,8 @@ class _StrainImages(FrameStream):
 class StrainStream(_StrainImages):
     """``ultrasound/strain``: of the tissue itself, since rest or since an image before."""
 
-    topic = "ultrasound/strain"
-
     def __init__(self, node: SceneNode, parameters: LiveSettings) -> None:
-        super().__init__(node, parameters)
+        super().__init__(node, "ultrasound/strain", parameters)
         self._strain: AxialStrain | None = None
         self._made_for: tuple[object, str] = (None, "")
         self._earlier = Earlier(lambda frame: frame.nodes)
@@ -123,10 +114,8 @@ class StrainEstimateStream(_StrainImages):
         probes: where the probe that images come of is put, for checks of parameters.
     """
 
-    topic = "ultrasound/strain_estimate"
-
     def __init__(self, node: SceneNode, parameters: LiveSettings, probes: list[Probe]) -> None:
-        super().__init__(node, parameters)
+        super().__init__(node, "ultrasound/strain_estimate", parameters)
         self._probes = probes
         self._earlier = Earlier(lambda frame: frame.pixels)
         self._correlation = 0.0

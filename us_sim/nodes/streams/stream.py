@@ -1,30 +1,32 @@
-"""A topic of images made from frames; B-mode, labels, displacement and M-mode as such."""
+"""A topic of images made from frames, also by what a person sets while it runs."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar, Generic, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
-from us_sim.nodes.messages import colour_image_message, field_message, image_message
+from us_sim.nodes.messages import image_message
 from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.scene_node import SceneNode
-from us_sim.nodes.streams.compressed import Compressed
 from us_sim.settings.setting import Settings
 from us_sim.slicing.drawing.overlay import Overlay
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.m_mode import MMode
 from us_sim.slicing.probe.probe import Probe
-from us_sim.slicing.settings import MModeSettings
-from us_sim.slicing.strain import displacement
+
+IMAGE = "ultrasound/image"
+"""The topic whose age counts as the node's latency."""
+
+Draw = Callable[[Frame], "NDArray[Any] | None"]
+"""The pixels of a frame, as `image_message` takes them; None where there are none."""
 
 
-class FrameStream(ABC):
+class FrameStream:
     """One topic of images, made from each frame while somebody subscribes.
 
     A part that has parameters declares them when it is made. What is costly is taken from the
@@ -32,13 +34,13 @@ class FrameStream(ABC):
 
     Args:
         node: that publishes it.
+        topic: its name.
+        draw: the pixels of a frame.
     """
 
-    topic: ClassVar[str]  # its name
-
-    def __init__(self, node: SceneNode) -> None:
-        self._node = node
-        self._publisher = node.stream(Image, self.topic)
+    def __init__(self, node: SceneNode, topic: str, draw: Draw) -> None:
+        self._node, self.topic, self._draw = node, topic, draw
+        self._publisher = node.stream(Image, topic)
 
     @property
     def is_wanted(self) -> bool:
@@ -55,14 +57,10 @@ class FrameStream(ABC):
 
     def show(self, frame: Frame, stamp: Time) -> None:
         """Send the image made of the frame, under the stamp of its pose."""
-        message = self._message(frame, stamp)
-        if message is not None:
-            self._publisher.publish(message)
-            self._node.health.published(self.topic)
-
-    @abstractmethod
-    def _message(self, frame: Frame, stamp: Time) -> Image | None:
-        """The message of a frame; None where there is none."""
+        pixels = self._draw(frame)
+        if pixels is not None:
+            self._publisher.publish(image_message(pixels, stamp, "probe"))
+            self._node.health.published(self.topic, stamp if self.topic == IMAGE else None)
 
     @property
     def lines(self) -> Sequence[NDArray[np.float64]]:
@@ -83,12 +81,24 @@ class SettableStream(FrameStream, Generic[M]):
 
     Args:
         node: that publishes it.
+        topic: its name.
+        draw: the pixels of a frame, by the object that `for_frame` returns.
+        make: makes the object; a ProbeError refuses what is set.
         settings: the parameters by default.
         prefix: before their names.
     """
 
-    def __init__(self, node: SceneNode, settings: Settings, prefix: str) -> None:
-        super().__init__(node)
+    def __init__(
+        self,
+        node: SceneNode,
+        topic: str,
+        draw: Draw,
+        make: Callable[[Probe, Any], M],
+        settings: Settings,
+        prefix: str,
+    ) -> None:
+        super().__init__(node, topic, draw)
+        self._make = make
         self._made: M | None = None
         self._is_outdated = False  # by a parameter that was set
         self._probe: Probe | None = None
@@ -105,14 +115,6 @@ class SettableStream(FrameStream, Generic[M]):
         made = self._make(probe, self._settings.values["set"])
         if self._probe is None:
             self._probe, self._made = probe, made
-
-    @abstractmethod
-    def _make(self, probe: Probe, settings: Any) -> M:
-        """The object that makes the topic.
-
-        Raises:
-            ProbeError: what is set lies outside the images of this probe.
-        """
 
     def for_frame(self, frame: Frame) -> M:
         """The object that makes the topic of this frame."""
@@ -135,68 +137,21 @@ class SettableStream(FrameStream, Generic[M]):
         self._is_outdated = True
 
 
-class BModeStream(FrameStream):
-    """``ultrasound/image``, whose age counts as the node's latency, and its companion."""
-
-    topic = "ultrasound/image"
-
-    def __init__(self, node: SceneNode) -> None:
-        self._compressed = Compressed(node, self.topic)
-        super().__init__(node)
-
-    @property
-    def is_wanted(self) -> bool:
-        """Whether somebody subscribes to one of both."""
-        return super().is_wanted or self._compressed.is_wanted
-
-    def show(self, frame: Frame, stamp: Time) -> None:
-        """Send the picture, under the stamp of its pose."""
-        message = self._message(frame, stamp)
-        self._publisher.publish(message)
-        self._node.health.published(self.topic, stamp)
-        self._compressed.send(message)
-
-    def _message(self, frame: Frame, stamp: Time) -> Image:
-        return image_message(frame.pixels, stamp, "probe")
-
-
-class LabelStream(FrameStream):
-    """``ultrasound/labels``: the number of the volume's label at each pixel, 0 for nothing."""
-
-    topic = "ultrasound/labels"
-
-    def _message(self, frame: Frame, stamp: Time) -> Image:
-        return image_message(frame.labels, stamp, "probe")
-
-
-class DisplacementStream(FrameStream):
-    """``ultrasound/displacement``: lateral and axial, m, of each pixel's tissue since rest."""
-
-    topic = "ultrasound/displacement"
-
-    def _message(self, frame: Frame, stamp: Time) -> Image:
-        return field_message(displacement(frame), stamp, "probe")
-
-
 class MModeStream(SettableStream[MMode]):
     """``ultrasound/m_mode``: the image along a line over time; parameters ``m_mode.…``."""
 
-    topic = "ultrasound/m_mode"
-
     def __init__(self, node: SceneNode) -> None:
-        super().__init__(node, node.scene.m_mode, "m_mode.")
+        super().__init__(
+            *(node, "ultrasound/m_mode", self._strip, MMode, node.scene.m_mode, "m_mode.")
+        )
 
     @property
     def lines(self) -> Sequence[NDArray[np.float64]]:
         """The line in the image."""
         return [self._made.places] if self._made else ()
 
-    def _make(self, probe: Probe, settings: MModeSettings) -> MMode:
-        return MMode(probe, settings)
-
     def _go_on(self, made: MMode, before: MMode) -> None:
         made.go_on(before)
 
-    def _message(self, frame: Frame, stamp: Time) -> Image:
-        picture = self.for_frame(frame).show(frame.pixels, frame.time)
-        return colour_image_message(picture, stamp, "probe")
+    def _strip(self, frame: Frame) -> NDArray[np.uint8]:
+        return self.for_frame(frame).show(frame.pixels, frame.time)

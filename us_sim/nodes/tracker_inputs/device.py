@@ -116,9 +116,3 @@ class Device(SceneNode):
     def now(self) -> int:
         """Return the present, ns."""
         return int(self.get_clock().now().nanoseconds)
-
-    def is_awaited(self) -> bool:
-        """Return whether the simulation's other nodes are there and listen to the probe."""
-        return bool(self.count_subscribers("probe/pose")) and all(
-            self.count_publishers(topic) for topic in self.scene.ready_topics
-        )

@@ -25,7 +25,7 @@ from us_sim.tracking.settings import HapticSettings, SixDofMouseSettings
 
 
 class PoseInput(TrackerInput):
-    """``tracker/pose`` in the frame that the scene names.
+    """``tracker/pose`` in the frame that the scene names; a driver's, or ``path_player``'s.
 
     Where that is another one than ``patient``, a pose in ``patient`` is the probe's own: who knows
     where the patient is needs neither registration nor calibration.
