@@ -24,6 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#999999")
@@ -118,8 +119,11 @@ def draw_lines(
             draw = panel.axhline if limit.startswith("y:") else panel.axvline
             draw(value, **_LIMIT)
         panel.set(xlabel=labels.get(x, x), ylabel=labels.get(y, y))
-        panel.set_xscale("log" if "x" in log else "linear")
-        panel.set_yscale("log" if "y" in log else "linear")
+        for letter, axis in (("x", panel.xaxis), ("y", panel.yaxis)):
+            if letter in log:
+                panel.set(**{f"{letter}scale": "log"})
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axis.set_minor_formatter(NullFormatter())
         _clear(panel)
     shown = names if lines else []
     keys = [

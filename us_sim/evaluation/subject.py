@@ -61,7 +61,7 @@ class Piece:
     measure: Callable[[], Iterable[Mapping[str, Any]]]
 
     def __str__(self) -> str:
-        return ", ".join(str(value) for value in list(self.case.values())[:4])
+        return ", ".join(_cell(value, ".4g") for value in list(self.case.values())[:4])
 
 
 @dataclass(frozen=True)

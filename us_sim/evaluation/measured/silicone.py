@@ -220,6 +220,7 @@ def report_silicone(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
     figure = draw_error_over_parameter(
         *(pd.concat([rows, scatter]), "x", "error", "Silicones: median error of the force"),
         lines="line",
+        log="",
         labels={"x": "compression, %", "error": "error of the force, %"},
     )
     slip = rows[rows["line"] == "slip, neo-Hookean"].set_index("x")["error"]
