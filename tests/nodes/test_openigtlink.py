@@ -43,7 +43,7 @@ tracker:
     poses = bench.collect(PoseStamped, "probe/pose")
     states = bench.collect(DiagnosticStatus, "probe/status", latched=True)
     bench.spin_until(lambda: node.health.problems("connection") > 0)
-    for _ in range(2):
+    for turn in (1, 2):
         poses.clear()
         with pyigtl_server(port) as server:
             bench.spin_until(server.is_connected)
@@ -53,12 +53,12 @@ tracker:
                 return len(poses) > 3
 
             bench.spin_until(arrives)
-        bench.spin_until(lambda: states[-1].message == "lost")
+        for word in ("tracked", "lost"):
+            bench.spin_until(
+                lambda word=word, turn=turn: [s.message for s in states].count(word) >= turn
+            )
     position = poses[-1].pose.position
     np.testing.assert_allclose([position.x, position.y, position.z], [0.01, 0.02, 0.03], atol=1e-8)
-    said = [status.message for status in states]
-    assert said.count("tracked") >= 2
-    assert said.count("lost") >= 2
 
 
 @pytest.mark.parametrize("reference", ["volume", "patient"])
@@ -117,7 +117,6 @@ def test_the_image_is_served_where_it_lies(bench, tmp_path, small_scene, referen
 @pytest.mark.parametrize(
     ("bad", "fact"),
     [
-        ({"world": "moon"}, r"openigtlink_bridge\.world: 'moon' .*ras, lps"),
         ({"reference": "x"}, r"openigtlink_bridge\.reference: 'x' .*volume, patient"),
         ({"port": -1}, "port"),
     ],

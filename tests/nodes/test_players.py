@@ -86,14 +86,6 @@ def test_a_path_that_would_be_over_ends_unless_it_loops(bench, path, loop, ends)
         assert [round(pose.pose.position.z * 1e3) for pose in poses] == [9]
 
 
-def test_recorded_stamps_can_be_kept(bench, path):
-    poses = bench.collect(PoseStamped, "tracker/pose")
-    player = bench.make(PathPlayer, path=str(path), restamp=False, rate=10.0)
-    bench.spin_until(player.finished.done)
-    bench.spin_until(lambda: len(poses) == 10)
-    assert [nanoseconds(pose) for pose in poses] == [EPOCH + STEP * k for k in range(10)]
-
-
 def test_in_lockstep_the_next_pose_waits_for_the_image(bench, path):
     poses = bench.collect(PoseStamped, "tracker/pose")
     player = bench.make(PathPlayer, path=str(path), lockstep=True)

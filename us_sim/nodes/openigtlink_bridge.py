@@ -37,10 +37,9 @@ class OpenIGTLinkBridge(SceneNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("openigtlink_bridge", **kwargs)
         settings = declared(self, OpenIGTLinkBridgeSettings())
-        self._world = settings.world
         volume = self.scene.volume.pose.pose
-        # Volumes are read in LPS; RAS has x and y turned round.
-        self._from_patient = np.diag([-1.0, -1.0, 1.0, 1.0] if self._world == "ras" else np.ones(4))
+        # Volumes are read in LPS; RAS, as 3D Slicer has it, has x and y turned round.
+        self._from_patient = np.diag([-1.0, -1.0, 1.0, 1.0])
         if settings.reference == "volume":
             self._from_patient = self._from_patient @ volume.inverse().matrix
         self._image_to_probe: NDArray[np.float64] | None = None
@@ -102,7 +101,7 @@ class OpenIGTLinkBridge(SceneNode):
         pixels = pixels_from(message)
         matrix = self._poses[stamp] @ self._image_to_probe
         name = "Image_Reference"
-        self._server.send(name, image_message(name, stamp, pixels, matrix, self._world))
+        self._server.send(name, image_message(name, stamp, pixels, matrix, "ras"))
         self.health.published(name, message.header.stamp)
         self._send_transform("ImageToReference", stamp, matrix, per_pixel=True)
 

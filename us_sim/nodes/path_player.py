@@ -198,7 +198,7 @@ class PathPlayer(GuardedNode):
         if self._settings.lockstep:
             self._playhead.go_to(int(self._ages[i]), self._playback.now)
         stamp = self._playback.tell_time()
-        if self._settings.lockstep or not self._settings.restamp:
+        if self._settings.lockstep:
             stamp = stamp_message(int(self._stamps[i]))
         self._poses.publish(pose_message(self._path.pose(i), stamp, self._path.frame_id))
         self.health.published("tracker/pose")

@@ -140,9 +140,6 @@ class PathPlayerSettings(PlayerSettings):
     topic: str | None = setting(
         description="in the bag; not given: the only one of PoseStamped", default=None
     )
-    restamp: bool = setting(
-        description="stamp poses when they are sent, else as recorded", default=True
-    )
     lockstep: bool = setting(
         description="send the next pose when the image of the last has come", default=False
     )
@@ -431,9 +428,6 @@ class OpenIGTLinkBridgeSettings(Settings):
         description="frame that images lie in: the volume file's own, or patient",
         choices=("volume", "patient"),
         default="volume",
-    )
-    world: str = setting(
-        description="axes: ras as 3D Slicer has them, or lps", choices=("ras", "lps"), default="ras"
     )
 
 
