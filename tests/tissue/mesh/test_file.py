@@ -125,6 +125,13 @@ def test_the_second_file_of_a_pair_is_named_where_it_is_missing(tmp_path, missin
         read_mesh(there)
 
 
+def test_a_surface_is_refused_before_meshio_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "meshio", None)
+    (tmp_path / "beam.stl").write_bytes(b"solid beam")
+    with pytest.raises(MeshError, match="surface"):
+        read_mesh(tmp_path / "beam.stl")
+
+
 def test_a_missing_meshio_is_named_where_it_is_needed(small, monkeypatch):
     monkeypatch.setitem(sys.modules, "meshio", None)
     with pytest.raises(MeshError, match="meshio"):

@@ -19,6 +19,12 @@ _NO_MESH = (
     "an unstructured grid"
 )
 
+_SURFACES = (".stl", ".obj", ".off", ".ply")  # which hold triangles and no tetrahedra
+_IS_SURFACE = (
+    "this is a surface, and tissue needs its inside as tetrahedra: mesh that, such as with Gmsh, "
+    "and give the Gmsh, VTK or VTU file"
+)
+
 _SIZES = (1e-3, 2.5)  # Sizes of bodies, m: a smaller or larger one is in the wrong unit
 _USUAL_SIZES = (0.01, 0.8)  # m, sizes of organs: any other is remarked on
 # Cells that a volume mesh may hold beside tetrahedra: their corners, edges and faces.
@@ -78,6 +84,8 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
                 "the file is of Gmsh's format 1: save it as 4.1, by `gmsh FILE -save -format msh41 "
                 "-o NEW.msh`"
             )
+    if path.suffix.lower() in _SURFACES:
+        raise MeshError(_IS_SURFACE)
     content = read_with_meshio(path, _NO_MESH)
     parts: list[NDArray[np.integer]] = []
     report = []
@@ -93,9 +101,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.integer], tuple[s
                 f"tetrahedra only"
             )
     if not sum(map(len, parts)):
-        raise MeshError(
-            "the file has no tetrahedra: give a mesh of the body's volume, not of its surface"
-        )
+        raise MeshError(f"the file has no tetrahedra: {_IS_SURFACE}")
     points = np.asarray(content.points, dtype=np.float64)
     return points, np.concatenate(parts), tuple(report)
 
