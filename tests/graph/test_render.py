@@ -14,7 +14,6 @@ from us_sim.geometry.pose import Pose
 from us_sim.recording.path import read_path
 from us_sim.recording.reader import read_bag
 from us_sim.scene.reading import load_scene
-from us_sim.tissue.solvers.fem import FemSettings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.volume import Volume
 
@@ -28,7 +27,7 @@ def first(played_scene, tmp_path_factory):
     What is known of its images is written beside them, which changes nothing in them.
     """
     out = tmp_path_factory.mktemp("first") / "out"
-    options = ["--param", "tissue_deformer.fem.contact=sticking", "--truth", "--out", out]
+    options = ["--param", "tissue_deformer.solver=fem_nonlinear", "--truth", "--out", out]
     result = us_sim("render", played_scene, *options)
     assert result.returncode == 0, result.stderr
     return out
@@ -78,8 +77,7 @@ def test_messages_are_identical(first, again):
 def test_the_same_poses_make_the_same_images_without_ros(first, played_scene):
     """But for the topics' 32 bits: a node is 2e-9 m off, and few pixels round otherwise."""
     scene = load_scene(played_scene)
-    settings = {"fem": FemSettings(contact="sticking")}
-    simulation = Simulation(replace(scene, tissue=replace(scene.tissue, settings=settings)))
+    simulation = Simulation(replace(scene, tissue=replace(scene.tissue, solver="fem_nonlinear")))
     files = sorted((first / "images").glob("*.png"))
     path = read_path(first / "session.mcap", "/probe/pose")
     apart = []

@@ -19,7 +19,7 @@ from us_sim.scene.building import (
     volume_of,
 )
 from us_sim.scene.case_tissue import keep_tissue, kept_tissue
-from us_sim.scene.reading import load_scene
+from us_sim.scene.reading import check_files, load_scene
 from us_sim.scoring.exercise import read_exercise
 from us_sim.scoring.live import LiveScan
 from us_sim.settings.reading import Reader
@@ -239,6 +239,17 @@ def test_a_volume_and_a_tissue_of_its_own_may_take_a_cases_volume(tmp_path, case
     assert scene.volume.case == str(cases / "block")
     assert volume_of(scene).labels is not None
     assert scene.volume.name == "case block"
+
+
+def test_label_0_without_a_material_is_said_to_be_the_tissue_between_structures(tmp_path):
+    file = scene_file(
+        tmp_path,
+        "name: bare\nvolume: {case: block}\nprobe: {aperture: 3 cm, depth: 4 cm, collider: "
+        "{shape: sphere, radius: 2 cm}}\ntissue: {mesh: {lower: [-2 cm, -2 cm, 0], upper: [2 cm, "
+        "2 cm, 4 cm], nodes: [4, 4, 4]}, materials: {vein: {young_modulus: 8 kPa}}}\n",
+    )
+    with pytest.raises(SceneError, match="label 0, the tissue between structures"):
+        check_files(load_scene(file))
 
 
 PROBE = "probe: {depth: 4 cm, aperture: 3 cm}\n"

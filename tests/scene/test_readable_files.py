@@ -82,3 +82,10 @@ def test_a_recording_in_place_of_a_tracker_is_read_too(tmp_path):
     file.write_text("based_on: upper_arm_path\ntracker: {file: broken.mcap}\n", encoding="utf-8")
     with pytest.raises(UsSimError, match=r"broken\.mcap"):
         check_files(load_scene(file))
+
+
+def test_a_label_without_a_material_is_named_before_the_volume_is_made(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text("based_on: upper_arm\ntissue: {materials: {fat: null}}\n", encoding="utf-8")
+    with pytest.raises(UsSimError, match=r"tissue\.materials\.fat"):
+        check_files(load_scene(file))

@@ -39,7 +39,7 @@ def test_only_the_settings_of_the_methods_in_use_are_shown():
             "n", "compare_with", Kind.TEXT, "", choices=methods, may_be_nothing=True
         ),
     }
-    parameters |= known("fem.friction", "msds.steps", "fem_cg.iterations", "marker_rate")
+    parameters |= known("msds.steps", "fem_cg.iterations", "marker_rate")
     parameters |= known(
         *(f"materials.{s}.{p}" for s in ("fat", "bone") for p in ("young_modulus", "density"))
     )

@@ -42,6 +42,11 @@ _COMMANDS = (
         "fit_stiffness",
         "Young's moduli of a scene's structures, from a recorded press with force",
     ),
+    (
+        "press",
+        "press",
+        "the depth at which a probe pushes with a force, and the strain of each label",
+    ),
     ("dataset", "dataset", "images with every truth, of episodes drawn by a seed"),
     ("reconstruct", "volumes", "make a volume or a case of a tracked sweep"),
     (

@@ -88,8 +88,7 @@ def neo_hookean_forces(
         - slope
         + _cofactors(slope)
     )
-    stiffer = shear * (1 + materials.stiffening * np.maximum(_distortion(slope), 0.0) ** 2)
-    stress = pressure[:, None, None] * cofactor - stiffer[:, None, None] * difference
+    stress = pressure[:, None, None] * cofactor - shear[:, None, None] * difference
     return _gathered(mesh, volume, gradient, stress, np.zeros(len(volume)))
 
 
@@ -204,12 +203,6 @@ def _swelling(slope: Array) -> Array:
     """(M,) J - 1 as a polynomial in the displacement's gradient, so that nothing cancels."""
     minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
     return np.asarray(_trace(slope) + minors + np.linalg.det(slope))
-
-
-def _distortion(slope: Array) -> Array:
-    """(M,) (I1 - 3) / 2 - (J - 1), as a polynomial likewise."""
-    minors = (_trace(slope) ** 2 - _trace(slope @ slope)) / 2
-    return np.asarray((slope**2).sum(axis=(1, 2)) / 2 - minors - np.linalg.det(slope))
 
 
 def _trace(matrices: Array) -> Array:

@@ -186,7 +186,8 @@ class TissueDeformer(SceneNode):
     once in lockstep; what cannot be made is said and set back. With ``compare_with`` another method
     runs on the same poses, and diagnostics say how far its nodes are from those published. Once a
     second they estimate how far the frame's nodes are from the continuum's
-    (``discretisation_error_percent``), where the method can.
+    (``discretisation_error_percent``) and the force from its (``force_error_percent``), where the
+    method can.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -378,9 +379,14 @@ class TissueDeformer(SceneNode):
         """Estimate the error of the first frame after a report."""
         if self._is_estimate_due:
             self._is_estimate_due = False
-            error = self._tissue.solver.discretisation_error()
-            found = {} if error is None else {"discretisation_error_percent": f"{100 * error:.2g}"}
-            self._estimated = found
+            solver = self._tissue.solver
+            found = {
+                "discretisation_error_percent": solver.discretisation_error(),
+                "force_error_percent": solver.force_error(),
+            }
+            self._estimated = {
+                name: f"{100 * error:.2g}" for name, error in found.items() if error is not None
+            }
 
     def _take_estimate(self) -> dict[str, str]:
         self._is_estimate_due = True

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from us_sim.geometry.pose import Pose
 from us_sim.progress import Progress
 from us_sim.settings.registry import SLICERS, SOLVERS
 
@@ -39,8 +38,6 @@ def parts() -> Iterator[Part]:
         yield solver, partial(_use_solver, solver, box=True)
     for solver in SOLVERS.importable:
         yield f"{solver} on any mesh", partial(_use_solver, solver, box=False)
-    for solver in ("fem", "fem_nonlinear"):
-        yield f"{solver} with friction", partial(_use_friction, solver)
     yield "materials", _count_labels
     yield "skin", _use_skin
     for method in SLICERS:
@@ -66,14 +63,6 @@ def _use_solver(name: str, *, box: bool) -> None:
     from us_sim.tissue.solvers.solver import create_solver
 
     create_solver(name, _block(box=box)).warm_up()
-
-
-def _use_friction(name: str) -> None:
-    from us_sim.tissue.solvers.solver import create_solver
-
-    solver = create_solver(name, _block(box=True), contact="coulomb")
-    for across in (0.0, 0.001, 0.002):
-        solver.deform(Pose(np.array([across, 0.0, 0.005])))
 
 
 def _count_labels() -> None:

@@ -201,6 +201,7 @@ def tissue_model_of(
         fixed=fixed,
         collider=collider_of(scene),
         contact_nodes=contact,
+        gravity=np.array(section.gravity),
     )
 
 
@@ -241,25 +242,45 @@ def _materials(
 ) -> TissueMaterials:
     from us_sim.tissue.elasticity.materials import average_over_labels, uniform_material
 
-    materials = dict(materials)
+    require_materials(scene, materials, volume.label_names if fractions else None)
     if fractions is None:
+        return uniform_material(mesh, materials["tissue"])
+    by_label = {label: materials[name] for label, name in volume.label_names.items()}
+    return average_over_labels(fractions, by_label)
+
+
+def require_materials(
+    scene: Scene, materials: Mapping[str, Material], label_names: Mapping[int, str] | None
+) -> None:
+    """Check that each label has a material, and each material a label.
+
+    Args:
+        scene: of which it is told.
+        materials: by label name.
+        label_names: by number; None where the volume has no labels, and needs one material.
+
+    Raises:
+        SceneError: one has none.
+    """
+    if label_names is None:
         if list(materials) != ["tissue"]:
             raise SceneError(
                 f"{scene.origin}: tissue.materials: this volume has no labels, so it takes one "
                 f"material named `tissue`, not {', '.join(materials)}{_TAKEN_BACK}"
             )
-        return uniform_material(mesh, materials["tissue"])
-    by_label = {}
-    for label, name in volume.label_names.items():
+        return
+    for label, name in label_names.items():
         if name not in materials:
-            raise SceneError(f"{scene.origin}: tissue.materials.{name}: is missing")
-        by_label[label] = materials.pop(name)
-    if materials:
+            which = "label 0, the tissue between structures, " if label == 0 else ""
+            raise SceneError(
+                f"{scene.origin}: tissue.materials.{name}: is missing: {which}needs a material too"
+            )
+    others = [name for name in materials if name not in label_names.values()]
+    if others:
         raise SceneError(
-            f"{scene.origin}: tissue.materials.{next(iter(materials))}: the volume has no such "
-            f"label; it has {', '.join(volume.label_names.values())}{_TAKEN_BACK}"
+            f"{scene.origin}: tissue.materials.{others[0]}: the volume has no such "
+            f"label; it has {', '.join(label_names.values())}{_TAKEN_BACK}"
         )
-    return average_over_labels(fractions, by_label)
 
 
 def skin_surface_of(scene: Scene) -> TriangleSurface:

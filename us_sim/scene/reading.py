@@ -22,7 +22,14 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 from us_sim.errors import CaseError, ProbeError, SceneError, UsSimError
-from us_sim.scene.building import camera_body_of, path_of, probe_of, source_settings, tracking_of
+from us_sim.scene.building import (
+    camera_body_of,
+    path_of,
+    probe_of,
+    require_materials,
+    source_settings,
+    tracking_of,
+)
 from us_sim.scene.scene import CASE_PREFIX, Scene, TissueSettings
 from us_sim.settings.choice import Choice
 from us_sim.settings.reading import Reader
@@ -30,6 +37,7 @@ from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.settings.spelling import nearest, shown
 from us_sim.settings.text_files import LARGEST_YAML, read_yaml
 from us_sim.share import full_path, shared_roots
+from us_sim.volume.settings import VOXEL_SIZE
 
 BASE = "based_on"
 """The key that names another scene; what a scene says goes before what its base says."""
@@ -182,6 +190,8 @@ def check_files(scene: Scene) -> list[str]:
         if case.has_labels:
             case.check_grids()
         checked.append("volume.case (its headers)")
+    if scene.tissue is not None:
+        require_materials(scene, scene.tissue.materials, _label_names(scene))
     if scene.tissue is not None and scene.tissue.mesh.file:
         checked.append(f"tissue.mesh.file ({'; '.join(_mesh_remarks(scene.tissue))})")
     surfaces = {f"structures.{name}.file": s.file for name, s in scene.structures.items()}
@@ -217,6 +227,21 @@ def check_files(scene: Scene) -> list[str]:
         read_path(Path(scene.path), option="--topic")
         checked.append("path")
     return checked
+
+
+def _label_names(scene: Scene) -> Mapping[int, str] | None:
+    """The labels' names by their numbers, without the volume; None where it has no labels."""
+    if scene.volume.case:
+        from us_sim.volume.cases.case import read_case
+
+        case = read_case(scene.volume.case)
+        return case.settings.label_names if case.has_labels else None
+    if scene.volume.phantom:
+        from us_sim.volume.phantom.phantom import cached_phantom
+
+        coarsest = cached_phantom(scene.volume.phantom, scene.volume.seed, VOXEL_SIZE.maximum)
+        return coarsest.label_names
+    return None
 
 
 def _mesh_remarks(tissue: TissueSettings) -> list[str]:

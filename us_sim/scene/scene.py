@@ -64,6 +64,11 @@ class TissueSettings(Settings):
     fixed: tuple[str, ...] = setting(
         description="faces (top, bottom, sides, ...) and labels that are held", default=("bottom",)
     )
+    gravity: tuple[float, float, float] = setting(
+        Quantity("acceleration", -100.0, 100.0),
+        "in `patient`, on tissue whose mesh is its shape without; for fem and fem_nonlinear",
+        default=(0.0, 0.0, 0.0),
+    )
     solver: str = setting(
         description="method; may be switched while running", choice=SOLVERS, default="fem"
     )

@@ -33,6 +33,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "rate": {"Hz": 1.0, "/min": 1 / 60},
     "attenuation": {"dB/cm/MHz": 1.0},
     "acoustic impedance": {"Rayl": 1.0, "MRayl": 1e6},
+    "acceleration": {"m/s2": 1.0, "m/s^2": 1.0},
     "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
     "angular speed": {"rad/s": 1.0, "deg/s": math.pi / 180, "°/s": math.pi / 180},
     "force": {"N": 1.0, "mN": 1e-3},

@@ -9,7 +9,6 @@
 | `poisson_ratio` | -0.99 to 0.49999 | 0.45 | Poisson's ratio |
 | `density` | 0.001 to 1000000 kg/m3 | 1000 kg/m3 | mass per volume |
 | `lumen_pressure` | 1 Pa to 100 kPa | none | of a vessel's blood, which leaves if pressed by more |
-| `stiffening` | 0 to 1000 | 0 | shear modulus grows by stiffening (I1 - 3)^2 / 4 of itself |
 >>> from us_sim.scene.scene import TissueSettings
 >>> [section.title for section in sections_of(TissueSettings, "tissue")][:3]
 ['tissue', 'tissue.mesh', 'tissue.mesh.pose']

@@ -6,22 +6,30 @@
 (216, 36)
 >>> f"{model.lumped_mass.sum():.3f} kg"
 '1.000 kg'
+>>> fat, muscle = Material(10e3), Material(15e3)
+>>> layered = TissueModel.block(layers=[(0.02, fat), (0.03, muscle)], gravity=[0.0, 0.0, 9.81])
+>>> f"{np.ptp(layered.mesh.nodes[:, 2]):.2f} m, {layered.load.sum(axis=0)[2]:.3g} N"
+'0.05 m, 4.91 N'
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Flag, auto
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import MeshError
 from us_sim.geometry.collider import Collider, Sphere
 from us_sim.tissue.elasticity.material import Material
-from us_sim.tissue.elasticity.materials import LabelFractions, TissueMaterials, uniform_material
+from us_sim.tissue.elasticity.materials import (
+    LabelFractions,
+    TissueMaterials,
+    average_over_labels,
+)
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
 # Faces of a box by name, as (axis, at its maximum). In frame patient z points into the tissue, so
@@ -161,6 +169,10 @@ class TissueState:
 _SOFT = Material(young_modulus=10e3, poisson_ratio=0.45, density=1000.0)
 
 
+def _no_load() -> NDArray[np.float64]:
+    return np.zeros(3)
+
+
 @dataclass(frozen=True, eq=False)
 class TissueModel:
     """A tissue and the probe that can press it.
@@ -176,6 +188,8 @@ class TissueModel:
     fixed: NDArray[np.bool_]  # (N,), held at rest
     collider: Collider
     contact_nodes: NDArray[np.int32]  # (C,), which the probe can touch
+    gravity: NDArray[np.float64] = field(default_factory=_no_load)  # (3,), m/s2
+    forces: NDArray[np.float64] = field(default_factory=_no_load)  # (N, 3), or the same on all, N
 
     @classmethod
     def block(
@@ -184,29 +198,60 @@ class TissueModel:
         nodes: tuple[int, int, int] = (6, 6, 6),
         *,
         material: Material = _SOFT,
+        layers: Sequence[tuple[float, Material]] = (),
         collider: Collider | None = None,
         held: Sequence[str] = ("bottom",),
+        gravity: ArrayLike = (0.0, 0.0, 0.0),
     ) -> TissueModel:
-        """A box of one material with its top around the origin, for examples and tests.
+        """A box of one material, or of layers, with its top around the origin.
 
         Args:
             size: m, along x, y and z.
             nodes: of its mesh, along x, y and z.
             material: soft tissue by default.
+            layers: thickness (m) and material of each from the top on, in place of the height and
+                the material; nodes lie where two of them meet.
             collider: a sphere of 30 mm radius by default.
             held: names of the faces that are fixed, as `face_nodes` takes them. The probe can
                 touch the top.
+            gravity: (3,) m/s2.
+
+        Raises:
+            MeshError: there are too few nodes for the layers.
         """
+        layers = layers or [(size[2], material)]
+        ends = np.cumsum([0.0, *(thickness for thickness, _ in layers)])
+        if nodes[2] <= len(layers):
+            raise MeshError(f"{len(layers)} layers need {len(layers) + 1} nodes along z or more")
+        # Of the cells beyond one a layer, most go to the thickest.
+        cells = np.ones(len(layers), dtype=int)
+        for _ in range(nodes[2] - 1 - len(layers)):
+            cells[np.argmax(np.diff(ends) / cells)] += 1
+        planes = [
+            uniform_planes(ends[k], ends[k + 1], count + 1)[k > 0 :]
+            for k, count in enumerate(cells)
+        ]
         mesh = box_mesh(
             uniform_planes(-size[0] / 2, size[0] / 2, nodes[0]),
             uniform_planes(-size[1] / 2, size[1] / 2, nodes[1]),
-            uniform_planes(0.0, size[2], nodes[2]),
+            np.concatenate(planes),
         )
         fixed = np.zeros(len(mesh.nodes), dtype=bool)
         for face in held:
             fixed[face_nodes(mesh, face)] = True
-        materials = uniform_material(mesh, material)
-        return cls(mesh, materials, fixed, collider or Sphere(0.03), face_nodes(mesh, "top"))
+        depth = mesh.nodes[mesh.tetrahedra, 2].mean(axis=1)
+        layer = np.searchsorted(ends[1:-1], depth).astype(np.uint8)
+        number = np.arange(len(layers), dtype=np.uint8)
+        fractions = LabelFractions(number, (layer[:, None] == number).astype(np.float64))
+        materials = average_over_labels(fractions, dict(enumerate(m for _, m in layers)))
+        return cls(
+            mesh,
+            materials,
+            fixed,
+            collider or Sphere(0.03),
+            face_nodes(mesh, "top"),
+            np.array(gravity, dtype=np.float64),
+        )
 
     def __post_init__(self) -> None:
         count = len(self.mesh.nodes)
@@ -230,6 +275,11 @@ class TissueModel:
             )
         if len(np.unique(contact)) != len(contact):
             raise MeshError("contact_nodes names a node twice: list each node once")
+        for name, shapes in (("gravity", [(3,)]), ("forces", [(3,), (count, 3)])):
+            given = np.array(getattr(self, name), dtype=np.float64)
+            if given.shape not in shapes or not np.isfinite(given).all():
+                raise MeshError(f"{name} has the shape {given.shape}: give {shapes[-1]} numbers")
+            object.__setattr__(self, name, given)
         object.__setattr__(self, "fixed", fixed)
         object.__setattr__(self, "contact_nodes", contact.astype(np.int32))
 
@@ -247,6 +297,13 @@ class TissueModel:
         if len(ends) == 0:
             return 0.0
         return float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)))
+
+    @cached_property
+    def load(self) -> NDArray[np.float64]:
+        """(N, 3) N, what gravity and forces at nodes pull on each; nothing at fixed nodes."""
+        load = self.lumped_mass[:, None] * self.gravity + self.forces
+        load[self.fixed] = 0.0
+        return load
 
     @cached_property
     def lumped_mass(self) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from tissue_block import block_mesh, irregular
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material, volumetric_split
-from us_sim.tissue.elasticity.neo_hookean import NeoHookean, Overstress, PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 
 RATIOS = pytest.mark.parametrize("ratio", [0.3, 0.49])
@@ -274,23 +274,3 @@ def test_a_field_that_is_not_finite_is_seen_and_leaves_nothing_behind(mesh):
     assert tissue.inverted(broken) > 0
     assert tissue.forces(displacement).tobytes() == before[0].tobytes()
     assert tissue.energy(displacement) == before[1]
-
-
-@pytest.mark.parametrize("interval", [0.02, 0.3, 2.0])
-def test_overstress_of_a_steady_stretch_that_is_then_held_is_a_maxwell_elements(interval):
-    """At a constant rate r it is g K r T (1 - exp(-t / T)), and falls as exp(-t / T) afterwards:
-    exactly so at each frame's end, however long a frame is."""
-    modulus, relaxation_time, moving = 0.7, 0.5, 8
-    tissue = NeoHookean(CELLS, uniform(0.3), np.float64)
-    overstress = Overstress(PronyBranch(modulus, relaxation_time, interval), tissue, tissue)
-    rate = random_field(1e-3)
-    for frame in range(1, 2 * moving):
-        stretched = min(frame, moving) * interval
-        held = frame * interval - stretched
-        expected = modulus * relaxation_time * -np.expm1(-stretched / relaxation_time)
-        expected *= np.exp(-held / relaxation_time)
-        force = np.zeros_like(rate)
-        overstress.add_forces(stretched * rate, force)
-        elastic = tissue.tangent_product(rate)
-        np.testing.assert_allclose(force, expected * elastic, atol=1e-9 * abs(elastic).max())
-        overstress.relax(stretched * rate)

@@ -101,24 +101,3 @@ def test_where_local_corrections_stall_it_takes_few_iterations():
     ]
     assert counts[1] < 40
     assert counts[0] > 3 * counts[1], counts
-
-
-def test_it_stiffens_as_the_tissue_does():
-    nodes = (9, 5, 5)
-    mesh = block_mesh(nodes)
-    layer = mesh.nodes[mesh.tetrahedra].mean(axis=1)[:, 2] < 0.05
-    ones = np.ones(len(layer))
-    plain = TissueMaterials(1e4 * ones, 0.4 * ones, 1e3 * ones)
-    stiff = TissueMaterials(1e4 * ones, 0.4 * ones, 1e3 * ones, stiffening=100.0 * layer)
-    tissue = NeoHookean(mesh, stiff, np.float64)
-    pressed = np.ascontiguousarray(mesh.nodes.T * [[0.4], [0.4], [-0.5]])
-    tissue.linearise(pressed)
-    force = np.zeros((3, len(mesh.nodes)))
-    force[2, block(nodes).movable_contact_nodes] = 1.0
-    counts = []
-    for materials in (stiff, plain):
-        factored = FactoredStiffness(block(nodes, materials=materials))
-        factored.prepare(pressed, *NONE)
-        solution = conjugate_gradients(tissue.tangent_product, factored, force.copy(), 400, 1e-4)
-        counts.append(solution.iterations)
-    assert 2 * counts[0] < counts[1], counts

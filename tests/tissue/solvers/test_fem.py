@@ -9,7 +9,6 @@ from tissue_block import block, block_mesh
 
 from us_sim.geometry.collider import Capsule, RoundedBox, Sphere
 from us_sim.geometry.pose import Pose
-from us_sim.tissue.contact.compliant_contact import FrictionalContact
 from us_sim.tissue.contact.probe_gap import push_out
 from us_sim.tissue.elasticity.linear_tetrahedra import averaged_pressure
 from us_sim.tissue.elasticity.material import Material
@@ -20,7 +19,7 @@ from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.fem import Fem, FemSettings
+from us_sim.tissue.solvers.fem import Fem
 from us_sim.tissue.solvers.solver import create_solver
 
 PRESSED = Pose(np.array([0.004, 0.0, 0.012]))
@@ -248,53 +247,6 @@ def test_what_takes_long_is_kept_and_mended(cache, monkeypatch, caplog):
     twice, computed = deformed(other)
     assert computed
     assert np.linalg.norm(twice.force) == pytest.approx(2 * np.linalg.norm(made.force))
-
-
-def test_one_node_sticks_and_slips_as_coulomb_says():
-    """On springs of 50 N/m under a flat probe: drag and push are known by hand."""
-    flat = RoundedBox(0.1, 0.1, 0.03, 0.001)
-    contact = FrictionalContact(flat, np.zeros((1, 3)), 0.02, np.eye(3) / 50.0, 0.5)
-    for x, drag in ((0.0, 0.0), (0.001, 0.05), (0.004, 0.2), (0.006, 0.25), (0.02, 0.25)):
-        assert contact.press(Pose(np.array([x, 0.0, 0.01])))
-        np.testing.assert_allclose(contact.forces, [[drag, 0.0, 0.5]], atol=1e-9)
-    assert contact.press(Pose(np.array([0.02 - 0.008, 0.0, 0.01])))
-    np.testing.assert_allclose(contact.forces, [[0.25 - 0.4, 0.0, 0.5]], atol=1e-9)
-
-
-@pytest.mark.slow
-def test_forces_stay_in_the_friction_cone_and_the_wrench_with_them():
-    model = block((17, 9, 9))
-    solver = Fem(model, FemSettings(contact="coulomb", friction=0.3))
-    slid = 0
-    for i in range(16):
-        pose = Pose(np.array([0.002 * max(i - 5, 0), 0.0, 0.002 * min(i, 5)]))
-        deformation = solver.deform(pose)
-        if len(deformation.contact_nodes) == 0:
-            continue
-        assert not deformation.action
-        forces = nodal_forces(model, deformation.nodes)[deformation.contact_nodes]
-        touched = deformation.nodes[deformation.contact_nodes]
-        gap, normal = push_out(model.collider, pose, touched, model.contact_spacing)
-        assert np.abs(gap).max() <= 1e-9
-        push = np.einsum("ij,ij->i", forces, normal)
-        drag = np.linalg.norm(forces - push[:, None] * normal, axis=1)
-        assert push.min() > 0
-        assert (drag <= 0.3 * push * (1 + 1e-4) + 1e-7).all()
-        slid += (drag > 0.2999 * push).all() and i > 5
-    assert slid > 0  # in the end the whole contact slides
-    assert deformation.force[0] < -0.5
-
-
-def test_sticking_nodes_go_where_the_probe_goes():
-    model = block((13, 9, 7))
-    solver = Fem(model, FemSettings(contact="sticking"))
-    first = solver.deform(Pose(np.array([0.0, 0.0, 0.01])))
-    second = solver.deform(Pose(np.array([0.002, 0.0, 0.01])))
-    both = np.intersect1d(first.contact_nodes, second.contact_nodes)
-    assert len(both) > 2
-    moved = second.nodes[both] - first.nodes[both]
-    np.testing.assert_allclose(moved, np.broadcast_to([0.002, 0.0, 0.0], moved.shape), atol=1e-8)
-    assert second.force[0] < first.force[0] - 0.1
 
 
 YOUNG = 10e3  # Pa

@@ -99,12 +99,12 @@ STEP = Step("fitted stiffness to a press", {"confidence": 0.95}, {"poses": 48})
 def test_constants_change_and_nothing_else(make_case):
     folder = make_case()
     before = read_case(folder).settings
-    constants = {"young_modulus": 9876.0, "stiffening": 0.4}
+    constants = {"young_modulus": 9876.0, "lumen_pressure": 400.0}
     write_constants_into(folder, {"vein": {"young_modulus": 2345.0}, "tissue": constants}, STEP)
     case = read_case(folder)
     assert case.settings.material_of("vein").young_modulus == 2345.0
     assert case.settings.material_of("tissue").young_modulus == 9876.0
-    assert case.settings.material_of("tissue").stiffening == 0.4
+    assert case.settings.material_of("tissue").lumen_pressure == 400.0
     for name in ("vein", "tissue"):
         was, now = before.material_of(name), case.settings.material_of(name)
         assert (now.poisson_ratio, now.density) == (was.poisson_ratio, was.density)

@@ -20,34 +20,12 @@ point's own, g(x), by the relief
 where x_i are the corners of the point's triangle. It is not negative, since the probe is convex,
 and zero below a flat face. It is measured before each of Newton's steps, and stays during that.
 
-With friction each touched point is attached to the place of the probe where it was touched, by a
-spring along the surface as stiff as the one square to it begins, which slips at a greatest force.
-With t the spring's force, stretched by s, the energy is
-
-    t^2 / (2 k) up to |t| = c, and c |t| / k - c^2 / (2 k) beyond,    t = k s.
-
-Coulomb's bound c, the coefficient times the normal force, is that of the frame before or of a
-prediction, and stays while a frame's energy is minimised (M. Li et al., Incremental Potential
-Contact, ACM Trans. Graph. 39, 2020, section 5). Between frames the anchors of points that slipped
-follow them, until their springs hold c again (return mapping; J. C. Simo and T. J. R. Hughes,
-Computational Inelasticity, 1998, section 1.4). So nothing creeps under a probe at rest.
-
->>> from us_sim.geometry.collider import RoundedBox, Sphere
+>>> from us_sim.geometry.collider import Sphere
 >>> probe = FlaredProbe(Sphere(0.03), spacing=0.01)
 >>> contact = PenaltyContact(probe, np.array([1e4]), np.array([15.0]), stiffening=1e-3)
 >>> contact.set_pose(Pose(position=[0.0, 0.0, 1e-4]), np.zeros((1, 3)))
 >>> contact.normal_force.round(9), contact.normal
 (array([1.01]), array([[0., 0., 1.]]))
->>> plate, point = FlaredProbe(RoundedBox(0.1, 0.1, 0.03, 0.001), 0.01), np.zeros((1, 3))
->>> contact = PenaltyFriction(plate, np.array([1e4]), np.array([50.0]), 1.0, friction=0.5)
->>> contact.set_pose(Pose([0.0, 0.0, 1e-3]), point)
->>> contact.set_friction_bound(contact.normal_force)
-True
->>> for x in (2e-4, 1e-3):
-...     contact.set_pose(Pose([x, 0.0, 1e-3]), point)
-...     print(contact.force.round(3))  # sticking, and slipping
-[[ 2.  0. 10.]]
-[[ 5.  0. 10.]]
 """
 
 from __future__ import annotations
@@ -192,16 +170,6 @@ class PenaltyContact:
         changed = np.abs(self._relief - before)[gap < 0.0]
         return float(changed.max(initial=0.0))
 
-    def relief_change(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) m, by how much reliefs change, to first order, as points move by (P, 3) m."""
-        along = np.einsum("pk,pk->p", self.normal, moved)
-        change = np.zeros_like(along)
-        inside = self._inside
-        error = np.einsum("pk,pk->p", self._weights, along[self._corners]) - along[inside]
-        relief = self._relief[inside]
-        change[inside] = _RELIEF * error * ((relief > 0.0) & (relief < self._most_relief))
-        return change
-
     def update_gaps(self, positions: NDArray[np.float64]) -> None:
         """Update gaps, normals and forces at other positions (P, 3) m."""
         if self._pose is None:
@@ -222,12 +190,6 @@ class PenaltyContact:
     def energy(self) -> float:
         """J, of all springs."""
         return self._energy
-
-    def normal_force_at(self, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) N, pushes at other gaps (P,) m."""
-        push = np.zeros_like(gap)
-        _normal_forces(self.near, gap, *self._law, push)
-        return push
 
     @property
     def slope(self) -> NDArray[np.float64]:
@@ -278,14 +240,6 @@ class PenaltyContact:
             return turned[:0], np.zeros((0, 3, 3))
         return turned, push[turned, None, None] * self.curvature(positions[turned])
 
-    def set_friction_bound(self, push: NDArray[np.float64]) -> bool:  # noqa: ARG002
-        """As `PenaltyFriction.set_friction_bound`; there is no friction to bound."""
-        return False
-
-    def update_friction(self) -> float:
-        """As `PenaltyFriction.update_friction`; there is none."""
-        return 0.0
-
     def work_along(
         self, start: NDArray[np.float64], change: NDArray[np.float64], length: float
     ) -> float:
@@ -303,7 +257,7 @@ class PenaltyContact:
     ) -> float:
         """How much of a change, along which the tissue's forces are linear, lowers the energy most.
 
-        It is less than all where points come to be touched, to stick, or turn back.
+        It is less than all where points come to be touched.
 
         Args:
             start: (P, 3) m, how far the points have moved before.
@@ -379,173 +333,3 @@ def _work(near, gap, normal, start, change, length, stiffness, deepest, stiffeni
         if reached < 0.0:
             total += along * _spring_force(min(-reached, deepest[i]), stiffness[i], stiffening)
     return total
-
-
-class PenaltyFriction(PenaltyContact):
-    """Penalty contact with Coulomb's friction, or with a probe to which touched points stick.
-
-    Args:
-        probe, stiffness, greatest_force, stiffening: as for `PenaltyContact`. No point is held
-            along the surface by more than the greatest force either.
-        friction: coefficient; infinite for a probe to which points stick while it pushes them.
-    """
-
-    def __init__(
-        self,
-        probe: FlaredProbe,
-        stiffness: NDArray[np.float64],
-        greatest_force: NDArray[np.float64],
-        stiffening: float,
-        friction: float,
-        corners: NDArray[np.integer] | None = None,
-        weights: NDArray[np.float64] | None = None,
-    ) -> None:
-        self._friction = friction
-        super().__init__(probe, stiffness, greatest_force, stiffening, corners, weights)
-
-    def clear(self) -> None:
-        """Take the probe away."""
-        super().clear()
-        shape = self.normal.shape
-        self._attached = np.zeros(len(self.gap), bool)  # (P,) points on springs along the surface
-        self._anchor = np.zeros(shape)  # (P, 3) m, on the probe, of their springs
-        self._positions = np.zeros(shape)  # (P, 3) m, of the points at the last update
-        self._attach(np.zeros(len(self.gap)))
-
-    def set_pose(self, pose: Pose, positions: NDArray[np.float64]) -> None:
-        """As `PenaltyContact.set_pose`; anchors go where the probe went."""
-        self._return_map()
-        before, push = self._pose, self.normal_force
-        super().set_pose(pose, positions)
-        self._positions = positions
-        if before is not None:
-            self._anchor = pose.apply(before.inverse().apply(self._anchor))
-        self._attached &= push > 0.0
-        self._attach(np.where(np.isfinite(self.gap), push, 0.0))
-
-    def update_gaps(self, positions: NDArray[np.float64]) -> None:
-        """Update gaps, normals, forces and slips at other positions (P, 3) m."""
-        super().update_gaps(positions)
-        self._positions = positions
-
-    def set_friction_bound(self, push: NDArray[np.float64]) -> bool:
-        """Bound friction by normal forces (P,) N that are likely at the new pose.
-
-        Returns:
-            Whether forces change by it.
-        """
-        self._attach(push)
-        return True
-
-    def update_friction(self) -> float:
-        """End a frame: slipping points are held as far as the normal force allows now.
-
-        Returns:
-            m, by how much springs are longer or shorter for it at most.
-        """
-        before = self.force
-        self._return_map()
-        self._attached &= self.normal_force > 0.0
-        self._attach(self.normal_force)
-        changed = np.linalg.norm(self.force - before, axis=1) / self.stiffness
-        return float(changed.max(initial=0.0))
-
-    def _return_map(self) -> None:
-        """Let the anchors of points that slipped follow them."""
-        trial = self._trial_force(self._positions)
-        size = np.linalg.norm(trial, axis=1)
-        slipped = size > self._bound
-        points, trial = self._points[slipped], trial[slipped]
-        too_long = (1.0 - self._bound[slipped] / size[slipped]) / self._shear[slipped]
-        self._anchor[points] += too_long[:, None] * trial
-
-    def _attach(self, push: NDArray[np.float64]) -> None:
-        """Set friction's bounds by ``push`` (P,) N and the normals there."""
-        fresh = (push > 0.0) & ~self._attached
-        self._anchor[fresh] = self._positions[fresh]
-        self._attached |= fresh
-        self._points = points = np.flatnonzero(self._attached)
-        self._normal = self.normal[points]
-        self._shear = self.stiffness[points]
-        greatest_force = self._greatest_force[points]
-        if math.isinf(self._friction):
-            self._bound = np.where(push[points] > 0.0, greatest_force, 0.0)
-        else:
-            self._bound = np.minimum(self._friction * push[points], greatest_force)
-
-    def _trial_force(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(K, 3) N, t above with points at positions (P, 3) m."""
-        points = self._points
-        slip = _along(positions[points] - self._anchor[points], self._normal)
-        trial: NDArray[np.float64] = self._shear[:, None] * slip
-        return trial
-
-    @property
-    def energy(self) -> float:
-        """J, of all springs."""
-        size = np.linalg.norm(self._trial_force(self._positions), axis=1)
-        pull = np.minimum(size, self._bound)
-        return super().energy + float((pull * (size - pull / 2) / self._shear).sum())
-
-    @property
-    def force(self) -> NDArray[np.float64]:
-        """(P, 3) N, on the tissue."""
-        return self._with_drag(super().force, self._positions)
-
-    def force_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P, 3) N, `force` after points moved by ``change`` (P, 3) m, as normals are now."""
-        return self._with_drag(super().force_after(change), self._positions + change)
-
-    def work_along(
-        self, start: NDArray[np.float64], change: NDArray[np.float64], length: float
-    ) -> float:
-        """As `PenaltyContact.work_along`."""
-        trial = self._trial_force(self._positions + start + length * change)
-        drag = trial * _fraction_held(trial, self._bound)[:, None]
-        work = super().work_along(start, change, length)
-        return work - float((drag * change[self._points]).sum())
-
-    def _with_drag(
-        self, force: NDArray[np.float64], positions: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        trial = self._trial_force(positions)
-        force[self._points] -= trial * _fraction_held(trial, self._bound)[:, None]
-        return force
-
-    def springs_after(
-        self, change: NDArray[np.float64]
-    ) -> tuple[NDArray[np.integer], NDArray[np.float64], NDArray[np.float64]]:
-        """As `PenaltyContact.springs_after`, with two springs along the surface where points stick,
-        and one across the way where they slip.
-        """
-        pushed, normal, stiffness = super().springs_after(change)
-        trial = self._trial_force(self._positions + change)
-        kept = _fraction_held(trial, self._bound)
-        along = _directions(trial, self._normal)
-        across = np.cross(self._normal, along)
-        sticks, turns = kept == 1.0, kept > 0.0
-        points = np.concatenate([pushed, self._points[sticks], self._points[turns]])
-        directions = np.concatenate([normal, along[sticks], across[turns]])
-        stiffness = np.concatenate([stiffness, self._shear[sticks], (self._shear * kept)[turns]])
-        return points, directions, stiffness
-
-
-def _along(vectors: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K, 3), vectors (K, 3) without their parts along unit normals (K, 3)."""
-    across = np.einsum("ij,ij->i", vectors, normal)
-    left: NDArray[np.float64] = vectors - across[:, None] * normal
-    return left
-
-
-def _fraction_held(trial: NDArray[np.float64], bound: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K,) fractions of trial forces (K, 3) N that bounds (K,) N allow."""
-    size = np.linalg.norm(trial, axis=1)
-    return np.divide(bound, size, out=np.ones_like(size), where=size > bound)
-
-
-def _directions(trial: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K, 3) unit vectors along the surface: those of trial forces, any one where there is none."""
-    axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    size = np.linalg.norm(trial, axis=1)
-    some = np.where((size > 0.0)[:, None], trial, _along(axis, normal))
-    return some / np.linalg.norm(some, axis=1)[:, None]

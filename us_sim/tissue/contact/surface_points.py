@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from us_sim.geometry.triangles import TriangleParts, part_size
 from us_sim.kernels import njit
-from us_sim.tissue.contact.penalty_contact import PenaltyContact, PenaltyFriction
+from us_sim.tissue.contact.penalty_contact import PenaltyContact
 from us_sim.tissue.contact.probe_gap import FlaredProbe
 from us_sim.tissue.elasticity.linear_tetrahedra import nodal_shear_stiffness
 from us_sim.tissue.elasticity.neo_hookean_material import barrier_strength
@@ -55,15 +55,8 @@ _GREATEST_FORCE = 25.0
 tetrahedron resists, so that no probe turns one inside out."""
 
 
-def surface_contact(
-    model: TissueModel, friction: float = 0.0
-) -> tuple[SurfacePoints, PenaltyContact]:
-    """Points on the surface of a tissue, and the contact at these.
-
-    Args:
-        model: of the tissue and the probe.
-        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
-    """
+def surface_contact(model: TissueModel) -> tuple[SurfacePoints, PenaltyContact]:
+    """Points on the surface of a tissue, and the contact of its probe at these."""
     # A lone node has no neighbour to be apart from.
     spacing = model.contact_spacing or float(np.ptp(model.mesh.nodes, axis=0).min())
     points = SurfacePoints(model, part_size(float(model.collider.offset_box[3]), spacing))
@@ -72,8 +65,6 @@ def surface_contact(
     probe = FlaredProbe(model.collider, spacing)
     law = (probe, stiffness, greatest, _STIFFENING * spacing)
     triangles = points.corners, points.weights
-    if friction:
-        return points, PenaltyFriction(*law, friction, *triangles)
     return points, PenaltyContact(*law, *triangles)
 
 

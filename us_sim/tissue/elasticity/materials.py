@@ -35,12 +35,11 @@ class TissueMaterials:
     lumen_pressure: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(0)
     )  # (M,), Pa, 0 without lumen
-    stiffening: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (M,)
 
     def __post_init__(self) -> None:
         for name in vars(self):
             values = np.array(getattr(self, name), dtype=np.float64)
-            if name.startswith(("lumen", "stiffening")) and values.size == 0:
+            if name.startswith("lumen") and values.size == 0:
                 values = np.zeros(len(self.young_modulus))
             if values.ndim != 1 or len(values) != len(self.young_modulus):
                 raise MaterialError(f"{name} needs one number for each tetrahedron")
@@ -49,7 +48,6 @@ class TissueMaterials:
             "young_modulus": ~(np.isfinite(self.young_modulus) & (self.young_modulus > 0)),
             "poisson_ratio": ~((self.poisson_ratio > -1) & (self.poisson_ratio < 0.5)),
             "density": ~(np.isfinite(self.density) & (self.density > 0)),
-            "stiffening": ~(np.isfinite(self.stiffening) & (self.stiffening >= 0)),
         }
         for name, bad in unphysical.items():
             if bad.any():
@@ -58,8 +56,7 @@ class TissueMaterials:
                 raise MaterialError(
                     f"{name} of tetrahedron {where}{others} is out of range, "
                     f"{getattr(self, name)[where]:g}: moduli and densities are above zero, "
-                    f"Poisson's ratio is above -1 and below 0.5, and stiffening is not below zero, "
-                    f"or tissue would soften until it holds no load"
+                    f"Poisson's ratio is above -1 and below 0.5"
                 )
         hollow = self.lumen_fraction > 0
         wrong = ~((self.lumen_fraction >= 0) & (self.lumen_fraction <= 1))
@@ -83,7 +80,6 @@ def uniform_material(mesh: TetrahedralMesh, material: Material) -> TissueMateria
         np.full(count, material.density),
         np.full(count, float(pressure is not None)),
         np.full(count, pressure or 0.0),
-        np.full(count, material.stiffening),
     )
 
 
@@ -144,8 +140,6 @@ def average_over_labels(
 ) -> TissueMaterials:
     """Constants of each tetrahedron: the average of its labels' constants by volume fraction.
 
-    The stiffening is weighted by the modulus too, since it is a fraction of it.
-
     Args:
         materials: of each label that occurs in them.
 
@@ -166,16 +160,14 @@ def average_over_labels(
                 m.density,
                 float(m.lumen_pressure is not None),
                 m.lumen_pressure or 0.0,
-                m.young_modulus * m.stiffening,
             )
             for m in (materials[int(label)] for label in fractions.labels)
         ]
     )
     averages = (fractions.fractions @ constants).T
-    young_modulus, poisson_ratio, density, lumen, pressure, stiffened = averages
+    young_modulus, poisson_ratio, density, lumen, pressure = averages
     np.divide(pressure, lumen, out=pressure, where=lumen > 0)  # of the lumen alone
-    stiffening = stiffened / young_modulus
-    return TissueMaterials(young_modulus, poisson_ratio, density, lumen, pressure, stiffening)
+    return TissueMaterials(young_modulus, poisson_ratio, density, lumen, pressure)
 
 
 def _simplex_points(count: int) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Nearly incompressible neo-Hookean tissue without a matrix, and its viscous overstress.
+"""Nearly incompressible neo-Hookean tissue without a matrix.
 
 Linear tetrahedra have the energy of `neo_hookean_material`. The nodal part of `volumetric_split`
 resists the average change of volume around each node:
@@ -8,28 +8,11 @@ resists the average change of volume around each node:
 
 with c = V nodal / 4, plus the term against being crushed. Tetrahedra with a lumen have its energy
 in place of all but the shear's. Without them, linearised at rest, it is linear elasticity with the
-same split. Tissue that stiffens has the energy of `stiffening` besides. Kernels gather nodes into
+same split. Kernels gather nodes into
 rows of `LANES` tetrahedra, whose loops LLVM vectorises.
-
-Viscosity is one branch of a Prony series in quasi-static form: beside the tissue's own energy there
-is that of a spring of g times its stiffness K at rest, whose other end v follows the displacement u
-with a time constant,
-
-    g/2 (u - v)' K (u - v),    dv/dt = (u - v) / time.
-
-Where u changes evenly from frame to frame, h apart, the force at a frame's end is exactly
-
-    g (1 - exp(-h / time)) time / h K (u - v),    v = exp(-h / time) v + (1 - exp(-h / time)) u
-
-with v, u on the right those of the frame before (R. L. Taylor, K. S. Pister and G. L. Goudreau,
-Thermomechanical analysis of viscoelastic solids, Int. J. Numer. Methods Eng. 2, 1970). It is
-linear: tissue that turns as a whole is stressed until it has relaxed.
 """
 
 from __future__ import annotations
-
-import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -75,7 +58,6 @@ from us_sim.tissue.elasticity.nodal_sums import (
     scatter_scalar,
     three,
 )
-from us_sim.tissue.elasticity.stiffening import Stiffening
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 _ROW = np.int64(LANES)  # no literal, for which numba would compile `lumen_energy_at` again
@@ -312,9 +294,6 @@ class NeoHookean:
         total = np.zeros(self.count)
         np.add.at(total, mesh.tetrahedra, weight[:, None])
         self._averaged = bool(total.any())
-        self._stiffening: Stiffening | None = None
-        if materials.stiffening.any():
-            self._stiffening = Stiffening(mesh, materials, self.dtype)
         with np.errstate(divide="ignore"):
             self._inverse = np.where(total > 0, 1 / total, 0).astype(self.dtype)
         self._nodal = np.zeros(self.count if self._averaged else 0, dtype=self.dtype)
@@ -345,8 +324,6 @@ class NeoHookean:
         energy += sums.energy_and_forces(
             displacement, self._nodal, sums.nodes, sums.constants, sums.lumens, sums.lanes, out
         )
-        if self._stiffening is not None:
-            energy += self._stiffening.add_forces(displacement, out)
         return energy
 
     def linearise(self, displacement: NDArray) -> None:
@@ -358,8 +335,6 @@ class NeoHookean:
             self._nodal *= self._inverse
         arrays = sums.nodes, sums.constants, sums.lumens, sums.lanes, sums.tangent
         sums.linearise(displacement, self._nodal, *arrays)
-        if self._stiffening is not None:
-            self._stiffening.linearise(displacement)
 
     def tangent_product(self, change: NDArray, out: NDArray | None = None) -> NDArray:
         """(3, N) N, the slope of the forces times a change (3, N) of the displacement."""
@@ -372,8 +347,6 @@ class NeoHookean:
             sums.volume_slopes(change, *arrays, self._nodal)
             self._nodal *= self._inverse
         sums.tangent_product(change, self._nodal, *arrays, out)
-        if self._stiffening is not None:
-            self._stiffening.add_product(change, out)
         return out
 
     def diagonal_blocks(self) -> NDArray:
@@ -385,8 +358,6 @@ class NeoHookean:
         sums = self._sums
         sums.diagonal_blocks(sums.nodes, sums.constants, sums.tangent, sums.lanes, blocks)
         blocks += self._nodal_blocks
-        if self._stiffening is not None:
-            self._stiffening.add_blocks(blocks)
         return blocks
 
     def smallest_volume_ratio(self, displacement: NDArray) -> float:
@@ -438,63 +409,3 @@ def _nodal_blocks(mesh: TetrahedralMesh, weight: NDArray, total: NDArray) -> NDA
         products = sums[i] * sums[j] / total[pairs // count]
         blocks[entry] = np.bincount(pairs % count, products, count)
     return blocks
-
-
-@dataclass(frozen=True)
-class PronyBranch:
-    """A spring and a damper in series."""
-
-    modulus: float  # of the spring, over the tissue's own
-    relaxation_time: float  # s
-    interval: float  # s, from frame to frame
-
-
-class Overstress:
-    """The viscous overstress of a tissue: one Prony branch and its internal variable.
-
-    Args:
-        branch: its constants.
-        tissue: in double precision, linearised at rest.
-        single: the same in the precision of `add_product`.
-    """
-
-    def __init__(self, branch: PronyBranch, tissue: NeoHookean, single: NeoHookean) -> None:
-        frames = branch.interval / branch.relaxation_time
-        self._kept = math.exp(-frames)
-        #: Stiffness within a frame, over the tissue's own at rest.
-        self.stiffness = branch.modulus * -math.expm1(-frames) / frames
-        self._tissue = tissue
-        self._single = single
-        self.relaxed = np.zeros((3, tissue.count))  # (3, N) m, the internal variable v
-        self.load = 0.0  # N, norm of the forces when last added
-        self._image = np.empty((3, tissue.count), single.dtype)
-
-    def stiffened(self, field: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(3, N) N, the stiffness at rest, the branch's included, times a field (3, N) m."""
-        product: NDArray[np.floating] = (1 + self.stiffness) * self._tissue.tangent_product(field)
-        return product
-
-    def energy(self, displacement: NDArray[np.float64]) -> float:
-        """J, at a displacement (3, N) m."""
-        change = displacement - self.relaxed
-        return self.stiffness / 2 * float((change * self._tissue.tangent_product(change)).sum())
-
-    def add_forces(self, displacement: NDArray[np.float64], force: NDArray[np.float64]) -> None:
-        """Add the energy's slope at a displacement (3, N) m to ``force`` (3, N) N."""
-        own = self.stiffness * self._tissue.tangent_product(displacement - self.relaxed)
-        self.load = float(np.linalg.norm(own))
-        force += own
-
-    def add_product(self, change: NDArray[np.floating], image: NDArray[np.floating]) -> None:
-        """Add the tangent of `add_forces` times ``change`` to ``image``, both (3, N)."""
-        self._single.tangent_product(change, self._image)
-        self._image *= self._image.dtype.type(self.stiffness)
-        image += self._image
-
-    def relax(self, displacement: NDArray[np.float64]) -> None:
-        """Advance the internal variable by a frame that ended at a displacement (3, N) m."""
-        self.relaxed = displacement + self._kept * (self.relaxed - displacement)
-
-    def reset(self, displacement: NDArray[np.float64]) -> None:
-        """Relax fully at a displacement (3, N) m."""
-        self.relaxed = displacement.copy()

@@ -174,12 +174,6 @@ def barrier_term(change):
 
 
 @njit(**INLINED)
-def shear_energy(h):
-    """(|F|^2 - 3) / 2 - (J - 1), which the shear modulus multiplies."""
-    return HALF * inner(h, h) - _volume_change_beyond_trace(h)
-
-
-@njit(**INLINED)
 def energy_density(h, shear, bulk, wall):
     """The energy density above."""
     beyond = _volume_change_beyond_trace(h)

@@ -210,6 +210,21 @@ def surface_compliance(
     return kept(_key(model), _FORM, lambda: _compute(model, progress), waiting)
 
 
+def loaded_displacement(model: TissueModel) -> NDArray[np.float64]:
+    """(N, 3) m, of linear tissue under the model's own load, without a probe.
+
+    Raises:
+        SolverError: the tissue is not held, or its moduli are too different.
+    """
+    require_held(model.mesh, model.fixed)
+    if not model.load.any():
+        return np.zeros_like(model.mesh.nodes)
+    system = averaged_pressure(model.mesh, model.materials)
+    with threadpool_limits(1, user_api="blas"):
+        eliminated = eliminate(model.mesh, system, model.fixed, np.flatnonzero(~model.fixed))
+        return eliminated.field(model.load).astype(np.float64)
+
+
 def _compute(
     model: TissueModel,
     progress: Callable[[float, str], None] | None,

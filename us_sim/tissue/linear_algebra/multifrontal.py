@@ -154,8 +154,17 @@ class Eliminated:
         loads = (3 * nodes[:, None] + np.arange(3)).ravel()
         fields: NDArray[np.floating] = np.zeros((self._unknowns, len(loads)), self._precision)
         fields[loads, np.arange(len(loads))] = 1.0
-        loaded = np.zeros(self._unknowns, dtype=bool)
-        loaded[loads] = True
+        return self._solved(fields)
+
+    def field(self, load: NDArray[np.float64]) -> NDArray[np.floating]:
+        """(N, 3) m, displacement by forces (N, 3) N on nodes that `eliminate` was told."""
+        right: NDArray[np.floating] = np.zeros((self._unknowns, 1), self._precision)
+        right[: 3 * self._nodes, 0] = load.ravel()
+        return self._solved(right)[:, :, 0]
+
+    def _solved(self, fields: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(N, 3, K) m, displacements by forces (unknowns, K), which are overwritten."""
+        loaded = np.asarray(fields.any(axis=1))
         for front in self._fronts:
             if front.inverse is not None and loaded[front.own].any():
                 loaded[front.around] = True

@@ -38,7 +38,6 @@ class FactoredStiffness:
         self._shear = mesh.volumes * made.shear
         self._bulk = mesh.volumes * (made.element + made.nodal)
         self._wall = mesh.volumes * made.wall
-        self._stiffening = model.materials.stiffening
         self._hollow = np.flatnonzero(made.lumen[:, 0] > 0.0)
         self._lumen = made.lumen_energies(mesh)[self._hollow]
         self.fixed: NDArray[np.integer] = np.flatnonzero(model.fixed)
@@ -99,15 +98,7 @@ class FactoredStiffness:
         bulk = self._bulk + _wall_slopes(ratio - 1.0, self._wall)
         bulk[self._hollow] += _lumen_slopes(ratio[self._hollow] - 1.0, self._lumen)
         values = bulk[:, None, None] * pull[:, :, None] * pull[:, None, :]
-        shear = self._shear
-        if self._stiffening.any():
-            # As `stiffening`: e at this place, and its derivative F - cof F.
-            beyond = np.maximum(((deformed**2).sum(axis=(1, 2)) - 1.0) / 2 - ratio, 0.0)
-            pull = np.einsum("eij,eaj->eai", deformed - cofactor, gradients).reshape(-1, 12)
-            rise = 2 * shear * self._stiffening * beyond
-            values += rise[:, None, None] * pull[:, :, None] * pull[:, None, :]
-            shear = shear * (1.0 + self._stiffening * beyond**2)
-        alike = shear[:, None, None] * np.einsum("eai,ebi->eab", gradients, gradients)
+        alike = self._shear[:, None, None] * np.einsum("eai,ebi->eab", gradients, gradients)
         values += np.einsum("eab,ij->eaibj", alike, np.eye(3)).reshape(-1, 12, 12)
         size = 3 * len(self._free)
         entries = (values.ravel()[self._kept], (self._row, self._column))

@@ -13,8 +13,17 @@ error estimator and adaptive procedure, Int. J. Numer. Methods Eng. 24, 1987), t
 derivatives along the edges, and so the quadratic functions that are missing; the part is their L2
 norm. Where materials meet, gradients jump, and that counts as error too.
 
+**Force.** Nodes may be nearly where they belong while a force is far off: linear tetrahedra are too
+stiff against bending, and a beam of few cells across hardly shows it in its shape. The mesh is too
+stiff by the energy of the strains that it lacks over that of those it has; so much the force of a
+press is too great, and the deflection by a load too small. These strains are the difference to
+the mean around the nodes, weighted by shear stiffness; changes of volume are left out, as the
+tetrahedra of nearly incompressible tissue have some that cancel.
+
 An error of the model, such as linear strain in a deep press, is no part of it.
 
+>>> from us_sim.tissue.elasticity.material import Material
+>>> from us_sim.tissue.elasticity.materials import uniform_material
 >>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 >>> side = np.linspace(0.0, 1.0, 9)
 >>> mesh = box_mesh(side, side, side)
@@ -34,6 +43,8 @@ from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import predict_forces
 from us_sim.tissue.contact.probe_gap import FlaredProbe
+from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
+from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.linear_algebra.compliance import SurfaceCompliance
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
@@ -85,6 +96,33 @@ def contact_error(
     held = np.ascontiguousarray(forces[nodes])
     change = predict_forces(compliance.matrix, gap, normal, held, np.zeros(len(nodes)), reach)
     return compliance.field(change)
+
+
+def force_error(
+    mesh: TetrahedralMesh, materials: TissueMaterials, displacement: NDArray[np.float64]
+) -> float:
+    """By how much, relative, the mesh is too stiff for a displacement (N, 3) m that is not zero.
+
+    >>> side = np.linspace(0.0, 1.0, 5)
+    >>> mesh = box_mesh(side, side, side)
+    >>> bent = np.stack([-mesh.nodes[:, 0] * mesh.nodes[:, 2], *np.zeros((2, 125))], axis=1)
+    >>> materials = uniform_material(mesh, Material(1e4))
+    >>> 0.02 < force_error(mesh, materials, 1e-6 * bent) < 0.2  # four cells across: 1 / 15
+    True
+    """
+    slope = np.einsum("eai,eaj->eij", displacement[mesh.tetrahedra], shape_gradients(mesh))
+    slope += np.eye(3)
+    strain = np.einsum("eki,ekj->eij", slope, slope) / 2  # Green's, and half the unit matrix
+    strain -= np.einsum("ekk->e", strain)[:, None, None] * np.eye(3) / 3
+    strain = strain.reshape(-1, 9)
+    shear = mesh.volumes * materials.young_modulus / (2 * (1 + materials.poisson_ratio))
+    around, count = mesh.tetrahedra.ravel(), len(mesh.nodes)
+    weighted = np.repeat(shear[:, None] * strain, 4, axis=0)
+    total = np.stack([np.bincount(around, column, count) for column in weighted.T], axis=1)
+    mean = total / np.bincount(around, np.repeat(shear, 4), count)[:, None]
+    lacking = mean[mesh.tetrahedra] - strain[:, None]
+    squares = (lacking**2).sum(axis=(1, 2)) + (lacking.sum(axis=1) ** 2).sum(axis=1)
+    return float(shear @ squares / 20 / (shear @ (strain**2).sum(axis=1)))
 
 
 def interpolation_error(

@@ -26,17 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.settings.setting import setting
-from us_sim.tissue.contact.compliant_contact import (
-    COEFFICIENT,
-    CONTACTS,
-    CompliantContact,
-    FrictionalContact,
-)
+from us_sim.tissue.contact.compliant_contact import CompliantContact
 from us_sim.tissue.contact.probe_gap import wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.elasticity.stability import count_inverted, watched_tetrahedra
-from us_sim.tissue.linear_algebra.compliance import surface_compliance
+from us_sim.tissue.linear_algebra.compliance import loaded_displacement, surface_compliance
 from us_sim.tissue.model import Deformation, TissueModel, TissueState
 from us_sim.tissue.solvers.solver import Progress, SolverSettings, TissueSolver
 
@@ -50,24 +44,14 @@ class FemSettings(SolverSettings):
 
     section = "fem"
 
-    contact: str = setting(
-        choices=CONTACTS,
-        default="frictionless",
-        description="what holds between probe and tissue; sticking: a touched node keeps its place "
-        "on the probe until it is pulled",
-    )
-    friction: float = setting(
-        COEFFICIENT, "Coulomb's coefficient, where contact is coulomb", default=0.3
-    )
-
 
 class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
     The residual is the error of the stored fields, by rounding or compression, together with the
-    forces along the surface of a curved probe (without friction) or the last change of the forces
-    (with friction). Of rounding it is exact, by products of what it leaves unbalanced in the fields
-    of unit forces; of compression a median, as measured when the fields were made.
+    forces along the surface of a curved probe. Of rounding it is exact, by products of what it
+    leaves unbalanced in the fields of unit forces; of compression a median, as measured when the
+    fields were made.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -82,6 +66,7 @@ class Fem(TissueSolver):
         "linear elasticity, fastest: for light presses, too stiff or too soft for deep ones"
     )
     must_be_held: ClassVar[bool] = True
+    bears_load: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
 
     Settings = FemSettings
@@ -95,19 +80,15 @@ class Fem(TissueSolver):
         settings = settings or FemSettings()
         self._compliance = surface_compliance(model, progress)
         self._reached = self._compliance.nodes
-        surface = (
+        self._loaded = loaded_displacement(model)
+        self._contact = CompliantContact(
             model.collider,
-            model.mesh.nodes[self._reached],
+            (model.mesh.nodes + self._loaded)[self._reached],
             model.contact_spacing,
             self._compliance.matrix,
         )
-        if settings.contact == "frictionless":
-            self._contact = CompliantContact(*surface)
-        else:
-            coefficient = settings.friction if settings.contact == "coulomb" else math.inf
-            self._contact = FrictionalContact(*surface, coefficient)
         self._watched = watched_tetrahedra(model)
-        self._displacement = np.zeros_like(model.mesh.nodes)
+        self._displacement = self._loaded.copy()
         super().__init__(model, settings, progress)
 
     @property
@@ -115,13 +96,15 @@ class Fem(TissueSolver):
         """Where the tissue is; a quasi-static solver has no velocity."""
         return TissueState(self._displacement.copy(), np.zeros_like(self._displacement))
 
+    @property
+    def _sag(self) -> NDArray[np.float64]:
+        return self._loaded
+
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Exact without friction; with it, how much a node may be dragged is not known."""
+        """Exact, as the tissue is linear."""
         pushed = np.flatnonzero(self._contact.forces.any(axis=1))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
-        if isinstance(self._contact, FrictionalContact):
-            return None
         touched = self._reached[pushed]
         return contact_stiffness(
             self.model.collider,
@@ -157,9 +140,10 @@ class Fem(TissueSolver):
         pushed = np.flatnonzero(contact.forces.any(axis=1))
         if pose is None or len(pushed) == 0:
             contact.clear()
-            self._displacement = np.zeros_like(self._displacement)
+            self._displacement = self._loaded.copy()
             return self._resting()
         displacement[self._reached[contact.near]] = contact.displacement[contact.near]
+        displacement += self._loaded
         self._displacement = displacement
         nodes = self.model.mesh.nodes + displacement
         touched = self._reached[pushed]

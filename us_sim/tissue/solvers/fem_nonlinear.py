@@ -3,9 +3,9 @@
 Quasi-static: every frame the energy of tissue and contact is made least, by Newton's method
 (`us_sim.tissue.solvers.newton`), from where the frame before ended. A new pose of the probe is met
 with the exact linear answer to it first (contact is a complementarity problem on the surface
-compliance). Friction and viscous tissue, where they are asked for, remember the frames before. What
-a frame's time does not allow for (`us_sim.tissue.solvers.frame_budget`) goes on in the next; under
-a probe at rest, until the forces balance. A tissue that is inside out is worked on but never shown.
+compliance). What a frame's time does not allow for (`us_sim.tissue.solvers.frame_budget`) goes on
+in the next; under a probe at rest, until the forces balance. A tissue that is inside out is worked
+on but never shown.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
@@ -31,11 +31,9 @@ from us_sim.geometry.se3 import interpolate
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.tissue.contact.complementarity import predict_forces
-from us_sim.tissue.contact.compliant_contact import COEFFICIENT, CONTACTS
 from us_sim.tissue.contact.probe_gap import GAP_TOLERANCE, wrench_on_probe
 from us_sim.tissue.contact.stiffness import compliance_between, contact_stiffness
 from us_sim.tissue.elasticity.linear_tetrahedra import require_held
-from us_sim.tissue.elasticity.neo_hookean import PronyBranch
 from us_sim.tissue.elasticity.neo_hookean_material import require_solid
 from us_sim.tissue.linear_algebra.compliance import surface_compliance
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
@@ -81,42 +79,15 @@ class FemNonlinearSettings(SolverSettings):
     tolerance: float = setting(
         TOLERANCE, "residual at which the tissue under an unmoved probe has settled", default=1e-5
     )
-    contact: str = setting(
-        choices=CONTACTS,
-        default="frictionless",
-        description="what holds between probe and tissue; sticking: a touched node keeps its place "
-        "on the probe until it is let go",
-    )
-    friction: float = setting(
-        COEFFICIENT,
-        "Coulomb's coefficient, where contact is coulomb; the default is a choice, meant for gel",
-        default=0.07,
-    )
-    viscosity: float = setting(
-        Quantity("number", 0.0, 10.0),
-        "stiffness that relaxes while a deformation lasts, over the one that stays: tissue gives "
-        "way slowly and creeps back when it is let go; 0: none",
-        default=0.0,
-    )
-    relaxation_time: float = setting(
-        Quantity("time", 1e-3, 1e3),
-        "time in which that falls to 37 percent (1/e)",
-        default=0.5,
-    )
-    frame_interval: float = setting(
-        Quantity("time", 1e-4, 10.0),
-        "time that is taken to pass from one frame to the next, for viscous tissue; a frame is "
-        "one pose of the probe",
-        default=0.0167,
-    )
 
 
 class FemNonlinear(TissueSolver):
     """Stable neo-Hookean finite elements under a probe, by Newton's method.
 
     The residual is the norm of the unbalanced nodal forces, of tissue and contact together, over
-    the norm of the contact forces (without any, over the largest since rest, and before there are
-    any, over the first unbalanced), in double precision and of the displacement that is returned.
+    the norm of the contact forces and the tissue's own load (without any, over the largest since
+    rest, and before there are any, over the first unbalanced), in double precision and of the
+    displacement that is returned.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
@@ -131,6 +102,7 @@ class FemNonlinear(TissueSolver):
         "large deformation of nearly incompressible tissue, slowest: for deep presses"
     )
     must_be_held: ClassVar[bool] = True
+    bears_load: ClassVar[bool] = True
     farthest: ClassVar[float] = 3.0  # fixed nodes hold it
     # Of the residual and of the estimated error. Of 102 generated presses of 2,000 nodes by four
     # probes, the first Newton step that came so far was within 7 % of the balance that followed in
@@ -149,6 +121,7 @@ class FemNonlinear(TissueSolver):
         require_held(model.mesh, model.fixed)
         require_solid(model.mesh, model.materials)
         settings = settings or FemNonlinearSettings()
+        self._newton = Newton(model)
         super().__init__(model, settings, progress)
         self._surface = model.movable_contact_nodes
         smallest = float(np.ptp(model.mesh.nodes, axis=0).min())
@@ -156,9 +129,6 @@ class FemNonlinear(TissueSolver):
         self._settled_motion = TUNING.settled_motion * settings.tolerance * spacing  # m
         self._reported_depth = TUNING.reported_depth * spacing  # m
         self._predicted_gap = TUNING.predicted_gap * smallest  # m
-        laws = {"frictionless": 0.0, "coulomb": settings.friction, "sticking": math.inf}
-        branch = PronyBranch(settings.viscosity, settings.relaxation_time, settings.frame_interval)
-        self._newton = Newton(model, laws[settings.contact], branch if settings.viscosity else None)
         self._budget = FrameBudget()
         self._recovery = Recovery(self._newton.displacement)
         if len(self._surface):
@@ -171,19 +141,21 @@ class FemNonlinear(TissueSolver):
         displacement = self._recovery.upright.T.copy()
         return TissueState(displacement, np.zeros_like(displacement))
 
+    @property
+    def _sag(self) -> NDArray[np.float64]:
+        return self._newton.rest.T
+
     def contact_stiffness(self) -> NDArray[np.float64] | None:
-        """Approximate: tissue as at rest, forces that do not turn. Unknown with friction."""
+        """Approximate: tissue as at rest, forces that do not turn."""
         newton, contact = self._newton, self._newton.contact
         law = contact.slope, contact.gap, contact.normal
         gap, normal, softness = newton.points.nodal_springs(*law)
         pushed = np.flatnonzero(np.isfinite(gap[self._surface]))
         if self._pose is None or len(pushed) == 0:
             return np.zeros((6, 6))
-        if self.settings.contact != "frictionless":
-            return None
         nodes = self._surface[pushed]
         # The springs of the contact and the tissue give way one after the other.
-        compliance = compliance_between(self._compliance.matrix, pushed) / self._stiffening
+        compliance = compliance_between(self._compliance.matrix, pushed)
         across = normal[nodes, :, None] * normal[nodes, None, :]
         compliance += block_diag(*(softness[nodes, None, None] * across))
         return contact_stiffness(
@@ -197,12 +169,12 @@ class FemNonlinear(TissueSolver):
         )
 
     def discretisation_error(self) -> float | None:
-        """See `us_sim.tissue.solvers.discretisation_error`. Unknown with friction, and of frames
-        that are not in balance.
+        """See `us_sim.tissue.solvers.discretisation_error`. Unknown of frames that are not in
+        balance.
         """
         last, rest = self._last, self.model.mesh.nodes
         known = last.is_balanced and not last.interventions and len(self._surface)
-        if not known or self.settings.contact != "frictionless" or np.array_equal(last.nodes, rest):
+        if not known or np.array_equal(last.nodes, rest):
             return None
         return relative_error(
             self.model,
@@ -212,12 +184,6 @@ class FemNonlinear(TissueSolver):
             self._newton.contact_forces.T,
             self._predicted_gap,
         )
-
-    @property
-    def _stiffening(self) -> float:
-        """Stiffness within a frame, over the one that stays."""
-        overstress = self._newton.overstress
-        return 1.0 if overstress is None else 1.0 + overstress.stiffness
 
     def _restore(self, state: TissueState) -> None:
         self._newton.reset()
@@ -231,8 +197,6 @@ class FemNonlinear(TissueSolver):
             # The way out of tissue inside out may end in a minimum where it is folded over.
             if self._newton.tissue.smallest_volume_ratio(displacement) > 0.0:
                 self._newton.set_displacement(displacement)
-                if self._newton.overstress is not None:
-                    self._newton.overstress.reset(displacement)
         self._recovery.reset(self._newton.displacement)
 
     def _rehearse(self) -> None:
@@ -248,9 +212,8 @@ class FemNonlinear(TissueSolver):
             moved=moved,
             restarted=self._recovery.take_restart(),
         )
-        newton.relax()
         if self._is_unloaded(pose):
-            # Nothing reaches the undeformed tissue: it is the solution.
+            # Nothing reaches the tissue at rest: it is the solution.
             self._restore(TissueState.at_rest(len(self.model.mesh.nodes)))
             self._settled = True
             return self._resting()
@@ -297,7 +260,7 @@ class FemNonlinear(TissueSolver):
         """
         newton, budget = self._newton, self._budget
         while self._exceeds(tolerance) and budget.iterations_left > 0:
-            goal = tolerance * newton.contact_norm if start is None else 0.0
+            goal = tolerance * newton.applied_norm if start is None else 0.0
             if newton.residual_norm <= goal:  # what is left is the error of the displacement
                 goal = 0.0
             budget.begin_step()
@@ -321,7 +284,7 @@ class FemNonlinear(TissueSolver):
     @property
     def _reference(self) -> float:
         """N, norm by which that of the residual is divided."""
-        return self._newton.contact_norm or self._greatest_norm
+        return self._newton.applied_norm or self._greatest_norm
 
     def _exceeds(self, tolerance: float) -> bool:
         """Whether the residual is greater, or in contact the displacement's estimated error."""
@@ -331,10 +294,7 @@ class FemNonlinear(TissueSolver):
         return newton.contact_norm > 0.0 and newton.displacement_error > tolerance
 
     def _is_unloaded(self, pose: Pose | None) -> bool:
-        """Whether nothing reaches the undeformed tissue, nor does it remember anything."""
-        overstress = self._newton.overstress
-        if overstress is not None and np.abs(overstress.relaxed).max() > self._settled_motion:
-            return False
+        """Whether nothing reaches the tissue at rest."""
         return pose is None or self._newton.depth_at_rest(pose) <= GAP_TOLERANCE
 
     def _next_step(self, pose: Pose) -> Pose:
@@ -369,7 +329,6 @@ class FemNonlinear(TissueSolver):
         """(3, N) m, set a new pose and return the linear answer to it."""
         newton, contact, points = self._newton, self._newton.contact, self._newton.points
         held = newton.contact_forces[:, self._surface].T.copy()
-        before = contact.normal_force
         newton.set_pose(pose)
         self._target = pose
         # As if each node had the springs of its points to itself.
@@ -379,18 +338,13 @@ class FemNonlinear(TissueSolver):
             self._compliance.matrix,
             gap[self._surface],
             normal[self._surface],
-            held / self._stiffening,
-            softness[self._surface] * self._stiffening,
+            held,
+            softness[self._surface],
             self._predicted_gap,
         )
         field = np.zeros(newton.displacement.shape, np.float32)
         self._compliance.add_field(change, field)
-        start = field.astype(np.float64)
-        if self.settings.contact != "frictionless":
-            along = np.einsum("ij,ij->i", contact.normal, points.moved(start))
-            predicted = contact.normal_force_at(contact.gap + along)
-            newton.set_friction_bound(np.where(before > 0.0, before, predicted))
-        return start
+        return field.astype(np.float64)
 
     def _obstacle(self) -> str:
         """The node and the tetrahedron at which a tissue cannot be balanced, for a person."""
@@ -413,7 +367,7 @@ class FemNonlinear(TissueSolver):
             actions.append("still inside out, so the last upright state is shown")
             interventions |= Intervention.SHOWED_UPRIGHT
             newton.set_displacement(recovery.upright)
-        self._greatest_norm = max(self._greatest_norm, newton.contact_norm) or newton.residual_norm
+        self._greatest_norm = max(self._greatest_norm, newton.applied_norm) or newton.residual_norm
         reference = self._reference
         residual = newton.residual_norm / reference if reference else 0.0
         depth = -float(newton.contact.gap.min(initial=np.inf))
@@ -427,10 +381,8 @@ class FemNonlinear(TissueSolver):
         if pose is not None:
             force, torque = wrench_on_probe(pose, nodes[touched], forces)
         if not recovery.inverted_frames:
-            tolerance, overstress = self.settings.tolerance, newton.overstress
-            relaxed = overstress is None or overstress.load <= tolerance * reference
-            balanced = residual <= tolerance and motion <= self._settled_motion
-            self._settled = relaxed and (self._settled or balanced)
+            balanced = residual <= self.settings.tolerance and motion <= self._settled_motion
+            self._settled |= balanced
         elif recovery.must_restart(hurried=self._budget.is_hurried and not self._catches_up):
             actions.append("begun anew from rest")
             interventions |= Intervention.RESTARTED

@@ -1,12 +1,12 @@
 """Mechanics of ``fem_nonlinear``: Newton's method for the energy of tissue and contact together.
 
-The energy is that of `neo_hookean` and `penalty_contact`, and of `overstress` for viscous tissue. A
-step minimises its quadratic model, in which points come to touch and are let go as the displacement
-says, by conjugate gradients with the exact tangent; then a line search takes as much of it as
-lowers the energy itself. Where the tangent is indefinite or a step had to be cut, the model is made
-stiffer (K. Levenberg, A method for the solution of certain non-linear problems in least squares, Q.
-Appl. Math. 2, 1944), and softer again as steps succeed. The iterates may be inside out, which the
-energy allows for; whoever shows them has to wait.
+The energy is that of `neo_hookean` and `penalty_contact`. A step minimises its quadratic model, in
+which points come to touch and are let go as the displacement says, by conjugate gradients with the
+exact tangent; then a line search takes as much of it as lowers the energy itself. Where the tangent
+is indefinite or a step had to be cut, the model is made stiffer (K. Levenberg, A method for the
+solution of certain non-linear problems in least squares, Q. Appl. Math. 2, 1944), and softer again
+as steps succeed. The iterates may be inside out, which the energy allows for; whoever shows them
+has to wait.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.model import TissueModel
@@ -26,9 +26,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.errors import SolverError
 from us_sim.geometry.pose import Pose
 from us_sim.tissue.contact.surface_points import add_springs, add_turns, surface_contact
-from us_sim.tissue.elasticity.neo_hookean import NeoHookean, Overstress, PronyBranch
+from us_sim.tissue.elasticity.neo_hookean import NeoHookean
 from us_sim.tissue.linear_algebra.sparse_factors import FactoredStiffness
 from us_sim.tissue.linear_algebra.two_level import (
     CoarseGrid,
@@ -48,8 +49,6 @@ class Newton:
 
     Args:
         model: of the tissue and the probe.
-        friction: Coulomb's coefficient, infinite for a probe to which tissue sticks.
-        branch: of viscous tissue.
     """
 
     energy: float  # J, of tissue and contact
@@ -59,9 +58,7 @@ class Newton:
     residual_norm: float  # N
     iterations: int  # of the last step
 
-    def __init__(
-        self, model: TissueModel, friction: float = 0.0, branch: PronyBranch | None = None
-    ) -> None:
+    def __init__(self, model: TissueModel) -> None:
         self._model = model
         self._factored: FactoredStiffness | None = None  # made where it is first needed
         #: Whether a factor takes no longer than a frame.
@@ -77,33 +74,53 @@ class Newton:
         # Conjugate gradients only correct; what they correct is in double precision.
         self._tangent = NeoHookean(mesh, model.materials, self._dtype)
         self._fixed = np.flatnonzero(model.fixed)
-        self.overstress: Overstress | None = None
-        if branch is not None:
-            tangent = NeoHookean(mesh, model.materials, self._dtype)
-            self.overstress = Overstress(branch, self.tissue, tangent)
-        stiffened = self.overstress.stiffened if self.overstress else None
-        product = stiffened or self.tissue.tangent_product
-        grid = CoarseGrid(mesh, model.fixed, product, self._dtype)
+        grid = CoarseGrid(mesh, model.fixed, self.tissue.tangent_product, self._dtype)
         rest = self.tissue.diagonal_blocks()
         self._rest_blocks: NDArray[np.floating] = rest.astype(self._dtype)
         most = largest_local_eigenvalue(rest, self.tissue.tangent_product, self._fixed)
         self._two_level = TwoLevel(grid, self._fixed, TUNING.local_weight / most)
-        self.points, self.contact = surface_contact(model, friction)
+        self.points, self.contact = surface_contact(model)
         self.displacement = np.zeros((3, len(mesh.nodes)))  # m
+        self._load = np.ascontiguousarray(model.load.T)  # (3, N) N, besides that of the probe
+        self.load_norm = _norm(self._load)  # N
+        self.rest = self.displacement  # (3, N) m, under that load alone
+        self._points_at_rest = self.points.rest  # (P, 3) m
         self._tissue_forces = np.zeros_like(self.displacement)  # N, slope of the tissue's energy
+        self.reset()
+        if self.load_norm > 0.0:
+            self._find_rest()
+
+    def _find_rest(self) -> None:
+        """Let the tissue sag under its own load, which is its rest from then on.
+
+        Raises:
+            SolverError: no balance is found.
+        """
+        self.may_factor = True
+        for _ in range(TUNING.rest_steps):
+            if self.residual_norm <= TUNING.rest_residual * self.load_norm or self.has_stagnated:
+                break
+            self.step(self.iteration_limit)
+        self.may_factor = False
+        left = self.residual_norm / self.load_norm
+        if not left <= 1e3 * TUNING.rest_residual:
+            raise SolverError(
+                f"the tissue finds no balance under its own load, of which {left:.1g} is left: its "
+                f"gravity or forces are too much for its moduli"
+            )
+        self.rest = self.displacement
+        self._points_at_rest = self.points.placed(self.rest)
         self.reset()
 
     def reset(self) -> None:
-        """Put the tissue to rest: undeformed, and touched nowhere."""
-        self.displacement = np.zeros_like(self.displacement)
-        self._positions = self.points.rest  # (P, 3) m, of the points near the probe
+        """Put the tissue to rest: under no load but its own, and touched nowhere."""
+        self.displacement = self.rest.copy()
+        self._positions = self._points_at_rest  # of the points near the probe
         self.contact.clear()
         # N, contact forces before the pose was set, until a step is taken from there
         self._carried_norm = 0.0
         # (P,) N, normal forces of the last state that was not just hit
         self._carried_force = self.contact.normal_force
-        if self.overstress is not None:
-            self.overstress.reset(self.displacement)
         self._damping = 0.0
         self._conditioner: Preconditioner | None = None  # of the last step
         self.iteration_limit = TUNING.first_iteration_limit  # of the next step
@@ -121,8 +138,8 @@ class Newton:
         self._factors_left = TUNING.most_factors  # that may be made at this pose
 
     def depth_at_rest(self, pose: Pose) -> float:
-        """How deep (m) a probe would be in the undeformed tissue."""
-        return self.contact.depth(pose, self.points.rest)
+        """How deep (m) a probe would be in the tissue at rest."""
+        return self.contact.depth(pose, self._points_at_rest)
 
     def depth(self, pose: Pose) -> float:
         """How deep (m) a probe would be in the tissue as it is."""
@@ -147,29 +164,18 @@ class Newton:
         self._damping = 0.0
         self._assemble_contact()
 
-    def relax(self) -> None:
-        """Let the time from frame to frame pass for viscous tissue; nothing moves."""
-        if self.overstress is not None:
-            self.overstress.relax(self.displacement)
-            self._assemble()
-
     def update_contact(self) -> float:
-        """Update friction and the direction of contact forces at the end of a frame.
+        """Update the direction of contact forces at the end of a frame.
 
         Returns:
             m, by how much tissue may move for it; infinite where that is not known.
         """
-        change = max(self.contact.update_friction(), self.contact.update_relief())
+        change = self.contact.update_relief()
         self._positions = self.points.placed(self.displacement)
         if self.contact.drop_planes(self._positions):
             change = np.inf
         self._assemble_contact()
         return change
-
-    def set_friction_bound(self, normal_force: NDArray[np.float64]) -> None:
-        """Bound friction by normal forces (P,) N that are likely at the pose; nothing moves."""
-        if self.contact.set_friction_bound(normal_force):
-            self._assemble_contact()
 
     def set_displacement(self, displacement: NDArray[np.float64]) -> None:
         """Put the tissue elsewhere: (3, N) m."""
@@ -184,8 +190,6 @@ class Newton:
     def _assemble(self, energy: float | None = None) -> None:
         """Find energy, unless `_evaluate` has just returned it, and residual."""
         self.energy = self._evaluate() if energy is None else energy
-        if self.overstress is not None:
-            self.overstress.add_forces(self.displacement, self._tissue_forces)
         self._assemble_contact(self.energy)
 
     def _assemble_contact(self, energy: float | None = None) -> None:
@@ -203,10 +207,11 @@ class Newton:
         self.contact_norm = _norm(free)
 
     def _evaluate(self) -> float:
-        """J, energy at the displacement; finds the tissue's forces there too."""
+        """J, energy at the displacement; finds the tissue's forces there too, less its load."""
         self._tissue_energy = self.tissue.energy_and_forces(self.displacement, self._tissue_forces)
-        if self.overstress is not None:
-            self._tissue_energy += self.overstress.energy(self.displacement)
+        if self.load_norm > 0.0:
+            self._tissue_energy -= _dot(self._load, self.displacement)
+            self._tissue_forces -= self._load
         return self._tissue_energy + self.contact.energy
 
     def rehearse(self) -> None:
@@ -258,6 +263,11 @@ class Newton:
             self._assemble_contact()
 
     @property
+    def applied_norm(self) -> float:
+        """N, norm of the tissue's own load and the contact's forces."""
+        return math.hypot(self.contact_norm, self.load_norm)
+
+    @property
     def has_stagnated(self) -> bool:
         """Whether even the shortest steps lead no further."""
         return self._damping >= TUNING.most_damping
@@ -290,8 +300,6 @@ class Newton:
         damping = self._damping
         if damping > 0.0:
             blocks += self._dtype(damping) * self._rest_blocks
-        if (overstress := self.overstress) is not None:
-            blocks += self._dtype(overstress.stiffness) * self._rest_blocks
         # Just hit, points are pushed far more than they will be.
         force = np.minimum(contact.normal_force, self._carried_force)
         turned, turn = contact.geometric_stiffness(self._positions, force)
@@ -302,8 +310,6 @@ class Newton:
             tangent.tangent_product(change, image)
             if damping > 0.0:
                 add_blocks(self._rest_blocks, damping, change, image)
-            if overstress is not None:
-                overstress.add_product(change, image)
             if len(turned):
                 add_turns(*geometric, change, image)
 

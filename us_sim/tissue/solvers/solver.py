@@ -36,6 +36,7 @@ from us_sim.settings.setting import Settings
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh
 from us_sim.tissue.model import Deformation, Intervention, TissueModel, TissueState
+from us_sim.tissue.solvers.discretisation_error import force_error
 
 Progress = Callable[[float, str], None]
 """Told the fraction done of what takes long, and what is being made."""
@@ -77,6 +78,8 @@ class TissueSolver(ABC):
     callback that is told the fraction done and what is being made, or None."""
     must_be_held: ClassVar[bool] = False
     """Whether every part of the mesh needs fixed nodes that hold it, as `require_held` says."""
+    bears_load: ClassVar[bool] = False
+    """Whether gravity and forces at nodes are among its equations."""
     farthest: ClassVar[float] = 10.0
     """A node that moved by this many times the mesh's longest side has left the tissue."""
     most_unbalanced: ClassVar[float] = math.inf
@@ -93,6 +96,10 @@ class TissueSolver(ABC):
         self.settings = settings if settings is not None else self.Settings()
         #: s, of the clock on the wall, that a frame may take where frames must keep up; or None.
         self.frame_limit: float | None = None
+        if model.load.any() and not self.bears_load:
+            raise SolverError(
+                f"{self.name} knows no gravity and no forces at nodes: use fem or fem_nonlinear"
+            )
         self._pose: Pose | None = None
         self._settled = True
         self._failures = 0  # frames in a row that failed
@@ -169,7 +176,8 @@ class TissueSolver(ABC):
             raise SolverError("the state to take over moves fixed nodes: it is of another model")
         self._restore(state)
         self._pose = None
-        self._settled = not (state.displacement.any() or state.velocity.any())
+        moves = state.displacement.any() or state.velocity.any() or self.model.load.any()
+        self._settled = not moves
         self._last = replace(self._resting(), nodes=self.model.mesh.nodes + state.displacement)
 
     def warm_up(self) -> None:
@@ -215,6 +223,17 @@ class TissueSolver(ABC):
         """
         return None
 
+    def force_error(self) -> float | None:
+        """Estimate by how much, relative, the mesh is too stiff, and so the last frame's force off.
+
+        Returns:
+            None where nothing is deformed, or the method does not balance an elastic solid.
+        """
+        moved = self._last.nodes - self.model.mesh.nodes
+        if not (self.bears_load and self._last.is_balanced and moved.any()):
+            return None
+        return force_error(self.model.mesh, self.model.materials, moved)
+
     @abstractmethod
     def _advance(self, pose: Pose | None) -> Deformation:
         """One frame; sets ``_settled``. ``_pose`` is still the frame before's."""
@@ -231,10 +250,14 @@ class TissueSolver(ABC):
             bool(np.isfinite(number).all()) for number in numbers
         )
 
+    @property
+    def _sag(self) -> NDArray[np.float64]:
+        """(N, 3) m, displacement by the model's own load, where the probe is away."""
+        return np.zeros_like(self.model.mesh.nodes)
+
     def _resting(self) -> Deformation:
-        return Deformation(
-            self.model.mesh.nodes.copy(), np.empty(0, np.int32), np.zeros(3), np.zeros(3), 0.0
-        )
+        nodes = self.model.mesh.nodes + self._sag
+        return Deformation(nodes, np.empty(0, np.int32), np.zeros(3), np.zeros(3), 0.0)
 
 
 def create_solver(
@@ -265,8 +288,7 @@ def create_solver(
 
 def rehearsal_model(model: TissueModel) -> TissueModel:
     """A tissue of eight cells, like another in what decides which kernels are used: a box mesh or
-    another, the highest Poisson's ratio, how far moduli are apart, lumens, stiffening, and the
-    probe.
+    another, the highest Poisson's ratio, how far moduli are apart, lumens, and the probe.
     """
     side = np.linspace(-0.01, 0.01, 3)
     mesh = box_mesh(side, side, side + 0.01)
@@ -282,7 +304,6 @@ def rehearsal_model(model: TissueModel) -> TissueModel:
             np.full(count, own.density.max()),
             hollow * own.lumen_fraction.max(),
             hollow * own.lumen_pressure.max(),
-            np.full(count, own.stiffening.max()),
         ),
         mesh.nodes[:, 2] > 0.015,
         model.collider,

@@ -66,6 +66,12 @@ class Tuning:
     single_bulk: float = 1e3
     """Bulk over shear modulus beyond which they need it, since rounding hides the shear's."""
 
+    # Rest under gravity and forces at nodes (`us_sim.tissue.solvers.newton`)
+    rest_steps: int = 200
+    """Steps at most to it. A beam that hangs by its own length takes 20."""
+    rest_residual: float = 1e-8
+    """Residual norm, over the load's, with which it is found; a thousand times that will do."""
+
     # Load steps and prediction (`us_sim.tissue.solvers.fem_nonlinear`)
     load_step: float = 3e-3
     """m, longest way of a probe in tissue that is gone at once. Tissue that is hit or swept aside
