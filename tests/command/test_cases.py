@@ -1,5 +1,7 @@
 """`us-sim cases` says what there is, draws it, and says what is wrong with the rest."""
 
+import re
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -49,9 +51,11 @@ def test_a_broken_case_is_said_beside_the_good_ones(cases, capsys):
     (cases / "bad").mkdir()
     (cases / "bad" / "case.yaml").write_text("name: bad\n")
     assert main(["cases"]) == 1
-    said = capsys.readouterr().out
-    assert "arm" in said
-    assert "bad: is no case, as it has no volume.nrrd" in said
+    titles, arm, bad = capsys.readouterr().out.splitlines()
+    assert titles.split() == ["case", "region", "probe", "size", "structures"]
+    facts = ["arm", "upper arm", "linear, 40 mm deep", "60 × 40 × 50 mm, voxels of 2 mm", "vein"]
+    assert re.split(" {2,}", arm.strip()) == facts
+    assert "bad: is no case, as it has no volume.nrrd" in bad
 
 
 @pytest.mark.parametrize(

@@ -111,3 +111,16 @@ def test_the_second_is_refused_until_the_first_has_ended():
             pass
     with alone_on_domain():
         pass
+
+
+def test_a_killed_one_leaves_the_domain_free():
+    waits = "with alone_on_domain(): print(flush=True); input()"
+    program = f"from us_sim.run.monitored import alone_on_domain\n{waits}"
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe) as first:
+        first.stdout.readline()
+        with pytest.raises(UsSimError, match="runs already"):
+            alone_on_domain().__enter__()
+        first.kill()
+    with alone_on_domain():
+        pass

@@ -1,12 +1,16 @@
 """Mistakes in a scene's file: one sentence with file, key and what is right."""
 
+import copy
+import functools
 import pathlib
+import shutil
 
 import pytest
 import yaml
 
 from us_sim.errors import SceneError
 from us_sim.scene.reading import load_scene
+from us_sim.share import shared_path
 
 RIGHT = yaml.safe_load(
     """
@@ -35,10 +39,10 @@ def scene_text(**sections: str) -> str:
     return yaml.safe_dump(document) + "".join(f"{k}: {v}\n" for k, v in sections.items())
 
 
-def refusal_of(file: pathlib.Path, where: str) -> str:
+def refusal_of(file: pathlib.Path, where: str, volume: pathlib.Path | None = None) -> str:
     """The one sentence of the error about a scene file; it begins with the file and a place."""
     with pytest.raises(SceneError) as caught:
-        load_scene(file)
+        load_scene(file, volume=volume)
     said = str(caught.value)
     assert said.startswith(": ".join([str(file), *([where] if where else []), ""]))
     assert "\n" not in said
@@ -77,6 +81,28 @@ def test_a_mistake_in_a_file_is_one_short_sentence(tmp_path, section, text, key,
     said = refusal_of(file, key)
     assert fact in said
     assert len(said) < len(str(file)) + 250
+
+
+def keys_of(document, path=()):
+    """Each key of a scene, with those that lead to it; names of things and axes are none."""
+    for key, value in document.items():
+        if not {"materials", "planes", "structures", "tissues"} & set(path[-1:]):
+            yield *path, key
+        if isinstance(value, dict):
+            yield from keys_of(value, (*path, key))
+
+
+@pytest.mark.parametrize("name", [f.name for f in shared_path("config/scenes").glob("*.yaml")])
+def test_a_misspelt_key_is_refused_at_every_place(tmp_path, name):
+    shutil.copytree(shared_path("config"), tmp_path / "config")
+    file = tmp_path / "config" / "scenes" / name
+    right = yaml.safe_load(file.read_text())
+    for *path, key in keys_of(right):
+        wrong = copy.deepcopy(right)
+        section = functools.reduce(dict.__getitem__, path, wrong)
+        section[f"{key}q"] = section.pop(key)
+        file.write_text(yaml.safe_dump(wrong))
+        refusal_of(file, ".".join([*path, f"{key}q"]), volume=file)
 
 
 @pytest.mark.parametrize(

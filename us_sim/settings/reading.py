@@ -157,6 +157,9 @@ class Reader:
         if choice.key in mapping:
             name = self._name(choice, mapping[choice.key], joined(path, choice.key))
         if rule.place == "named":
+            for key in mapping:
+                if choice.key not in mapping and key not in {*beside, *choice.names}:
+                    raise self._unknown_key(key, {*beside, choice.key}, path)
             for other in choice.names:
                 if other in mapping and other != name:
                     raise self._refused(
