@@ -53,19 +53,16 @@ def call(package, tmp_path):
     return run
 
 
-def test_a_second_process_compiles_nothing(call):
+def test_a_second_process_compiles_what_changed_in_a_called_function_and_nothing_else(
+    call, package
+):
     assert call() == (["21", "0"], "")
     assert call() == (["21", "1"], "")
-
-
-def test_a_called_function_that_changed_is_compiled_again(call, package):
-    call()
     (package / "called.py").write_text(CALLED.replace("3 * x", "11 * x"))
     assert call() == (["77", "0"], "")
-    (package / "node.py").write_text("nothing = 'of what is compiled'\n")
-    assert call() == (["77", "1"], "")
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_kept_kernels_work_all_the_same(call, tmp_path):
     (tmp_path / "file").touch()
     for _ in range(2):
@@ -75,6 +72,7 @@ def test_where_nothing_can_be_kept_kernels_work_all_the_same(call, tmp_path):
         assert "cannot be written" in said
 
 
+@pytest.mark.slow
 def test_folders_of_old_sources_are_removed_but_for_the_newest(call, tmp_path):
     place = tmp_path / "cache" / "kernels"
     for days in range(8):
@@ -94,6 +92,7 @@ def test_every_kernel_of_the_package_is_kept_so():
             assert not [line for line in lines if line.startswith("import numba")], file
 
 
+@pytest.mark.slow
 def test_what_a_kernel_is_made_of_stands_in_files_whose_hash_names_the_folder():
     root = PACKAGE.parent
     hashed = {file.relative_to(root) for file in source_files()}

@@ -123,6 +123,7 @@ def test_an_episode_that_fails_is_told_and_the_others_go_on(scene, tmp_path, mon
     assert not (out / "00-short-000001.tar").exists()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_sentence_and_the_command_goes_on_later(scene, tmp_path, capsys):
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limit[1]))  # of a file, as a disk's end

@@ -306,7 +306,7 @@ def test_forces_that_overflow_leave_the_latest_shape_and_say_so():
 
 
 STIFFNESS, LENGTH = 40.0, 0.01  # N/m, m
-EDGE = np.array([[0, 1]])
+EDGE = np.array([[0, 1]], np.int32)
 REST = np.array([[0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0]])
 
 

@@ -38,6 +38,7 @@ def test_a_late_force_settles_below_the_bound_and_not_above():
         assert swing < 0.1 if settles else swing > 4.0
 
 
+@pytest.mark.slow
 def test_the_least_damping_without_overshoot():
     stiffness, delay = 1000.0, 0.1
     least = math.e * stiffness * delay

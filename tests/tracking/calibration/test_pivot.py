@@ -47,6 +47,7 @@ def test_exact_poses_give_the_tip_exactly(tip, hole, seed):
     assert found.rejected == 0
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_deviations_say():
     rng = np.random.default_rng(4)
     noise = 0.3e-3

@@ -84,6 +84,7 @@ def test_the_probe_of_a_real_sweep_is_found_from_its_volume_alone(shared_data):
     assert probe.array.given.depth == pytest.approx(0.177, abs=4e-3)
 
 
+@pytest.mark.slow
 def test_a_start_is_a_pose_that_was_scanned_where_these_are_known():
     def vessel(x, y, z):
         return 3 * (np.hypot(x, z - 0.07) < 0.01) * (abs(y - 0.004) < 5e-3)

@@ -73,6 +73,7 @@ def test_structures_of_any_seed_keep_apart(seed):
         assert (nearest[0] + nearest[1]).min() > 0.2e-3
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_one_moves_and_redraws(arm):
     again, other = (upper_arm(seed=seed, voxel_size=COARSE) for seed in (1, 2))
     assert again.intensities.tobytes() == arm.intensities.tobytes()
