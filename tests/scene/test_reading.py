@@ -59,6 +59,8 @@ def changed(key: str, value: object) -> dict:
         ("probe.geometry", "convex", "my.yaml: probe.aperture: "),
         ("probe.geometry", "sector", "my.yaml: probe.opening_angle: "),
         ("probe.collider", None, "my.yaml: probe.collider: "),
+        ("probe.collider.shape", "capsule", "my.yaml: probe.collider.length: .*capsule"),
+        ("probe.collider.width", 0.01, "my.yaml: probe.collider.width: .*sphere"),
         ("volume", None, "my.yaml: volume: "),
         ("volume", {}, "my.yaml: volume.file: .*--volume"),
         ("volume.file", "a.mha", "my.yaml: .*`file` and `phantom`"),
@@ -141,19 +143,6 @@ def test_a_probe_that_cannot_be_is_refused_when_the_scene_is_read(given, fact):
     sector = {"geometry": "sector", "opening_angle": "90 deg", "depth": "16 cm"}
     with pytest.raises(SceneError, match=f"my.yaml: probe.{fact}"):
         scene_with_probe(**sector, **given)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "fact"),
-    [
-        ("probe.collider.shape", "capsule", "length: .*capsule"),
-        ("probe.collider", {"shape": "convex", "radius": 0.05, "length": 0.05}, "width: .*radius"),
-        ("probe.collider.width", 0.01, "width: .*sphere"),
-    ],
-)
-def test_a_collider_needs_its_own_dimensions_and_no_others(key, value, fact):
-    with pytest.raises(SceneError, match=f"probe.collider.{fact}"):
-        parse_scene(changed(key, value))
 
 
 @pytest.mark.parametrize(

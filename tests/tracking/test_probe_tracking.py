@@ -172,17 +172,6 @@ def test_nonsense_is_not_believed_when_the_probe_is_lost_either():
     assert answers[4].pose.position[0] == 0.3
 
 
-@pytest.mark.parametrize("method", FILTERS.names)
-def test_after_nonsense_the_filter_starts_where_the_probe_is_found(method):
-    rng = np.random.default_rng(8)
-    tracked = tracking(method, GateSettings())
-    take(tracked, *(at(20 * k, 0.001 * k) for k in range(10)))
-    take(tracked, *(at(200 + 20 * k, x) for k, x in enumerate(rng.permutation(100) + 1)))
-    found = take(tracked, at(2200, 0.02))[0]
-    assert found.pose.position[0] == 0.02
-    assert tracked.restarts == {"gap": 1}
-
-
 @pytest.fixture(scope="module")
 def recorded(shared_file):
     """Seconds and (4, 4) matrices, mm, of the transforms of a PLUS recording of 500 samples.

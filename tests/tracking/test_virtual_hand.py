@@ -172,14 +172,6 @@ def test_speed_and_acceleration_have_their_limits_whatever_the_goals(course):
     assert np.linalg.norm(accelerations, axis=1).max(initial=0.0) <= 2 * SPEED / TAU * (1 + 1e-6)
 
 
-@settings(max_examples=40, deadline=None)
-@given(goals)
-def test_it_ends_at_the_goal(goal):
-    approach = towards(goal)
-    approach.advance(float(np.linalg.norm(goal)) / SPEED + 25 * TAU)
-    assert approach.distance() < 1e-9
-
-
 def at(angle: float, **held: float) -> Stance:
     return Stance([RADIUS * math.sin(angle), 0.0, RADIUS * (1 - math.cos(angle))], **held)
 
@@ -192,19 +184,6 @@ def test_a_jump_around_the_arm_goes_over_its_skin():
         distance = math.hypot(position[0], position[2] - RADIUS)
         assert distance == pytest.approx(RADIUS - 0.003, abs=2e-5)
     assert motion.is_at_rest
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.floats(0.0, 0.02), st.floats(-3, 3), st.floats(-1, 1), st.lists(st.floats(0.002, 0.05)))
-def test_poses_do_not_depend_on_the_steps(press, rotation, fan, steps):
-    coarse, fine = Motion(Stance()), Motion(Stance())
-    goal = Stance([0.01, 0.02, 0.0], press, rotation, fan)
-    coarse.aim(goal)
-    fine.aim(goal)
-    advance_both(coarse, fine, steps)
-    first, second = coarse.stance.pose(CYLINDER), fine.stance.pose(CYLINDER)
-    np.testing.assert_allclose(first.position, second.position, atol=1e-9)
-    assert np.abs(rotation_between(first.orientation, second.orientation)).max() < 1e-6
 
 
 def test_who_takes_the_probe_begins_where_it_is():

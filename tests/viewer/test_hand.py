@@ -218,26 +218,6 @@ def test_over_a_frozen_image_the_probe_stays_and_that_is_said(page: Any, viewer:
     assert [[*wish["by"]] for wish in viewer.asked] == [["rotation"]]
 
 
-def test_a_burst_of_movements_is_one_wish_a_picture(page: Any, viewer: FakeHand) -> None:
-    took = page.evaluate(
-        """() => {
-            const began = performance.now();
-            const place = document.querySelector("#ultrasound");
-            const tell = (type, y) => place.dispatchEvent(new PointerEvent(type,
-                {pointerId: 7, clientX: 900, clientY: y, button: 0, bubbles: true}));
-            place.setPointerCapture = () => {};
-            place.hasPointerCapture = () => true;
-            tell("pointerdown", 200);
-            for (let i = 1; i <= 200; i++) tell("pointermove", 200 + i / 2);
-            tell("pointerup", 300);
-            return performance.now() - began; // ms
-        }"""
-    )
-    metres = 320 * PIXEL / box_of_image(page)["height"]
-    viewer.until(lambda: viewer.total("press") == pytest.approx(100 * metres, rel=0.07))
-    assert len(viewer.asked) <= 2 + took / 14
-
-
 def test_two_fingers_press_and_rotate(page: Any, viewer: FakeHand) -> None:
     page.evaluate(
         """() => {

@@ -177,20 +177,6 @@ def test_measures_are_put_and_moved_by_keys_alone(page: Any, tool: str) -> None:
     assert values(page) == ["vein"]
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "known"),  # 4 a E(m) with E of Abramowitz and Stegun, table 17.1
-    [(2, 1, 9.688448220547675), (5, 4, 28.361667888974484), (1, 0, 4)],
-)
-def test_circumferences_are_those_of_the_elliptic_integral(
-    page: Any, a: float, b: float, known: float
-) -> None:
-    found = page.evaluate(
-        f"import('{TOOLS}/measures.js').then(m => [m.circumference({a}, {b}), "
-        f"m.circumference({b}, {a})])"
-    )
-    assert found == pytest.approx([known, known], rel=1e-12)
-
-
 def test_frozen_the_page_takes_no_image_and_goes_through_the_last(
     page: Any, images: Images
 ) -> None:

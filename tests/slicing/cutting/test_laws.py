@@ -158,37 +158,6 @@ def test_a_vessel_pressed_more_near_the_skin_loses_the_area_that_the_map_takes(m
 
 @pytest.mark.slow
 @every_method
-@settings(max_examples=15, deadline=None, derandomize=True)  # a case may overlap itself unseen
-@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(["box", "cloud", "through_nodes"]))
-def test_the_order_of_nodes_and_tetrahedra_does_not_matter(method, kind, seed):
-    rng = np.random.default_rng(seed)
-    rest, tetrahedra, nodes, plane, volume = random_case(kind, seed)
-    if rng.random() < 0.3:
-        nodes = rest + 0.3 * (nodes - rest)
-    slicer = create_slicer(method, volume, rest, tetrahedra)
-    image, found = slicer.image(nodes, plane), slicer.rest_coordinates(nodes, plane)
-    skipped = slicer.skipped
-
-    order = rng.permutation(len(rest))
-    renamed = np.argsort(order)[tetrahedra]
-    other = create_slicer(method, volume, rest[order], renamed)
-    np.testing.assert_array_equal(other.image(nodes[order], plane), image)
-    assert other.skipped == skipped
-
-    turned = tetrahedra[:, rng.permutation(4)]
-    other = create_slicer(method, volume, rest, turned)
-    same = other.rest_coordinates(nodes, plane)
-    if skipped:  # overlapping tetrahedra may be met in either order
-        np.testing.assert_array_equal(np.isnan(same), np.isnan(found))
-    else:
-        np.testing.assert_allclose(same, found, rtol=0, atol=2e-5)
-        assert np.abs(other.image(nodes, plane).astype(int) - image).max() <= 1
-        shuffled = create_slicer(method, volume, rest, turned[rng.permutation(len(turned))])
-        assert np.abs(shuffled.image(nodes, plane).astype(int) - image).max() <= 1
-
-
-@pytest.mark.slow
-@every_method
 @pytest.mark.parametrize("kind", KINDS)
 def test_threads_do_not_change_a_byte(method, kind):
     for seed in range(4):

@@ -32,35 +32,6 @@ def ramp():
     return Volume(voxels.astype(np.uint8), np.diag([1e-3, 1e-3, 1e-3, 1.0]), voxels.astype("u1"))
 
 
-def test_a_tetrahedron_that_is_stretched_twofold():
-    """Half the way in x at rest: 5 grey values a pixel in it, 10 in the rigid rest."""
-    slicer = PerPixel(ramp(), CORNER, ONE)
-    nodes = CORNER * [2.0, 1.0, 1.0]
-    expected = [
-        [100, 105, 110, 115, 120, 125, 130, 135],
-        [101, 106, 111, 116, 121, 126, 131, 171],
-        [102, 107, 112, 117, 122, 152, 162, 172],
-        [103, 108, 113, 133, 143, 153, 163, 173],
-    ]
-    np.testing.assert_array_equal(slicer.image(nodes, millimetres(8, 4)), expected)
-    # The nearest voxel's label, the greater index where two are as near.
-    assert slicer.labels(nodes, millimetres(8, 4))[1].tolist() == [101, 111, 111, 121, 121, 131,
-                                                                   131, 171]  # fmt: skip
-
-
-def test_a_tetrahedron_that_moved_away_leaves_black():
-    """By 2 mm in x: black is what it covered at rest, its surface included, and no longer does."""
-    slicer = PerPixel(ramp(), CORNER, ONE)
-    nodes = CORNER + np.array([2e-3, 0, 0])
-    image = slicer.image(nodes, millimetres(8, 4))
-    np.testing.assert_array_equal(image[0], [0, 0, 100, 110, 120, 130, 140, 170])
-    np.testing.assert_array_equal(image[3], [0, 0, 103, 113, 143, 153, 163, 173])
-    rest = slicer.rest_coordinates(nodes, millimetres(8, 4))
-    assert np.isnan(rest[3, :2]).all()
-    np.testing.assert_allclose(rest[3, 3], [1e-3, 0, 3e-3], atol=1e-15)
-    np.testing.assert_allclose(rest[3, 4], [4e-3, 0, 3e-3], atol=1e-15)
-
-
 def test_only_spans_are_shown():
     spans = np.array([[[0, 2], [5, 8]], [[3, 3], [0, 0]]], dtype=np.int32)
     plane = millimetres(8, 2, spans=spans)

@@ -1,6 +1,5 @@
 """Pixels, beams, outlines and places of each kind of transducer, in millimetres."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -90,28 +89,6 @@ def test_shown_pixels_are_those_in_the_outline(probe):
     assert (mask(probe, -1e-7) <= shown).all()
     assert (shown <= mask(probe, 1e-7)).all()
     np.testing.assert_array_equal(np.isfinite(probe.pixel_beams), [shown, shown])
-
-
-def test_pixels_whose_centre_is_on_the_edge_are_shown():
-    # The edges, at 60 degrees, pass through the centre of a pixel of each row as far as the arc.
-    probe = SectorProbe(0.02, 120 * DEGREE, 0.1, columns=100, rows=100)
-    width = probe.plane(Pose()).is_shown().sum(axis=1)
-    np.testing.assert_array_equal(width[:50], 2 * (np.arange(50) + 1))
-
-
-@settings(deadline=None, max_examples=60)
-@given(probe)
-def test_the_outline_fills_the_image(probe):
-    """The rectangle is the smallest: its four sides are touched."""
-    probe = dataclasses.replace(probe, lines=4096)
-    ends = probe.beam_starts + probe.depth * probe.beam_directions
-    outline = np.concatenate([probe.beam_starts, ends])
-    corner = (probe.image_to_probe @ [-0.5, -0.5, 0, 1])[[0, 2]]
-    size = np.array([probe.width, probe.height])
-    # The outermost lines are half a line within the edges: by less than a thousandth of the size.
-    assert (np.abs(outline.min(axis=0) - corner) < 1e-3 * size.max()).all()
-    assert (np.abs(outline.max(axis=0) - corner - size) < 1e-3 * size.max()).all()
-    np.testing.assert_allclose(probe.pixel_spacing * [probe.columns, probe.rows], size)
 
 
 @pytest.mark.parametrize(
