@@ -146,7 +146,6 @@ PROBES = {
         aperture=0.02, opening_angle=1.2, depth=0.05, columns=90, rows=100, lines=30, radius=0.012
     ),
 }
-LAYERS = {name: GelLayer(probe) for name, probe in PROBES.items()}
 
 
 def graded(probe, gap):
@@ -165,7 +164,7 @@ def test_the_layer_shows_the_tissue_beyond_it_mirrored(name, first, last):
     probe = PROBES[name]
     gap = np.linspace(first, last, probe.lines)
     image, surface = graded(probe, gap)
-    filled = LAYERS[name].filled(image, gap, np.ones(probe.lines))
+    filled = GelLayer(probe).filled(image, gap, np.ones(probe.lines))
     depth = probe.pixel_beams[1]
     pixel = float(np.hypot(*probe.pixel_spacing))
     layer = depth < surface

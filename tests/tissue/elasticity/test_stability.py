@@ -24,7 +24,6 @@ from us_sim.tissue.model import Intervention, TissueState
 from us_sim.tissue.solvers.msds import Msds, MsdsSettings
 
 MESH = block_mesh((4, 3, 3))
-SPRINGS = springs_of(MESH, uniform_material(MESH, SOFT))
 
 
 def chain(count, stiffness=100.0):
@@ -144,7 +143,7 @@ def test_beyond_the_limit_the_last_good_state_is_kept_and_it_is_said():
 
 def test_masses_are_scaled_where_needed_and_it_is_said():
     model = block((4, 3, 3))
-    factors = [SPRINGS.factor(MESH.nodes)]
+    factors = [springs_of(MESH, uniform_material(MESH, SOFT)).factor(MESH.nodes)]
     mass, substeps, action = stabilise(model, factors, 0.01, 0.1, "mass_scaling", 100)
     assert substeps == 1
     assert (mass >= model.lumped_mass).all()
@@ -156,7 +155,7 @@ def test_masses_are_scaled_where_needed_and_it_is_said():
 
 def test_substeps_are_counted_or_refused():
     model = block((4, 3, 3))
-    factors = [SPRINGS.factor(MESH.nodes)]
+    factors = [springs_of(MESH, uniform_material(MESH, SOFT)).factor(MESH.nodes)]
     mass, substeps, action = stabilise(model, factors, 0.01, 0.1, "substeps", 100)
     np.testing.assert_array_equal(mass, model.lumped_mass)
     assert substeps > 1
