@@ -116,7 +116,7 @@ def press(venous: float, count: int, moduli: Mapping[str, float] | None = None) 
 def mean_pressure(model: TissueModel, nodes: Array) -> Array:
     """(M,) Pa, minus a third of the trace of the Cauchy stress of each solid tetrahedron.
 
-    From the energy that `neo_hookean_material` states, without its barrier and without stiffening.
+    From the energy that `neo_hookean_material` states, without its barrier.
     """
     tetrahedra, materials = model.mesh.tetrahedra, model.materials
     rest, now = ((x[tetrahedra[:, 1:]] - x[tetrahedra[:, :1]]) for x in (model.mesh.nodes, nodes))
