@@ -60,10 +60,9 @@ def read_times(
             stamp = read(message.data) or 0 if read is not None else 0
         except (struct.error, IndexError):
             is_short = 1
-        logged, sent = (min(t, _LARGEST) for t in (message.log_time, message.publish_time))
-        values[message.topic].extend(
-            (stamp, logged, sent, message.sequence, len(message.data), is_short)
-        )
+        logged, sent = min(message.log_time, _LARGEST), min(message.publish_time, _LARGEST)
+        row = (stamp, logged, sent, message.sequence, len(message.data), is_short)
+        values[message.topic].extend(row)
     progress(1.0, "")
     return {
         name: pd.DataFrame(np.array(held, np.int64).reshape(-1, len(_COLUMNS)), columns=_COLUMNS)
