@@ -24,7 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#999999")
@@ -122,6 +122,7 @@ def draw_lines(
         for letter, axis in (("x", panel.xaxis), ("y", panel.yaxis)):
             if letter in log:
                 panel.set(**{f"{letter}scale": "log"})
+                axis.set_major_locator(LogLocator(numticks=6))
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
                 axis.set_minor_formatter(NullFormatter())
         _clear(panel)
@@ -133,7 +134,7 @@ def draw_lines(
     keys += [Line2D([], [], **_LIMIT, label=name.removeprefix("y:")) for name in limits]
     if keys:
         beside: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0)}
-        axes[min(3, len(axes)) - 1].legend(handles=keys, fontsize=8, frameon=False, **beside)
+        axes[_columns(len(axes)) - 1].legend(handles=keys, fontsize=8, frameon=False, **beside)
     return figure
 
 
@@ -176,14 +177,19 @@ def draw_image_grid(
 def _figure(
     title: str, count: int, width: float, height: float, share_y: bool
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels of a size (inches), up to three in a row."""
-    columns = min(3, count)
+    """A figure with so many panels of a size (inches)."""
+    columns = _columns(count)
     rows = -(-count // columns)
     figure = _empty(title, width * columns + 2.0, height * rows + 0.7)
     axes = figure.subplots(rows, columns, squeeze=False, sharey=share_y)
     for panel in axes.flat[count:]:
         panel.set_visible(False)
     return figure, list(axes.flat[:count])
+
+
+def _columns(count: int) -> int:
+    """Panels in a row, of so many."""
+    return 2 if count == 4 else min(3, count)
 
 
 def _empty(title: str, width: float, height: float) -> Figure:

@@ -163,9 +163,10 @@ def report_stability(rows: pd.DataFrame) -> Report:
         ratio = limits["dt_limit_observed"].astype(float) / limits["dt_limit_predicted"].astype(
             float
         )
-        places["limits"] = f"{len(limits)} cases; {100 * (ratio - 1).abs().median():.2f} %"
+        deviation = 100 * (ratio - 1)
+        places["limits"] = f"{deviation.abs().median():.2f} % in the median of {len(limits)} cases"
         places["limit"] = draw_error_over_parameter(
-            limits.assign(deviation=100 * (ratio - 1)),
+            limits.assign(deviation=deviation),
             *("dt_limit_predicted", "deviation", "Observed step limit over the predicted one"),
             lines="method",
             looks=LOOKS,
