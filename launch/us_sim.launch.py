@@ -14,7 +14,7 @@ from launch_ros.actions import Node
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER
 from us_sim.run.monitored import alone_on_domain
-from us_sim.run.plan import Request, enclave_of, plan_of
+from us_sim.run.plan import Request, enclave_of, plan_of, require_new
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import find_bag
@@ -41,8 +41,8 @@ def start_session(context):
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     scene = load_scene(given["scene"], volume=given["volume"] or None)
     record = Path(given["record"]).expanduser().resolve() if given["record"] else None
-    if record is not None and record.exists():
-        raise UsSimError(f"{record} exists already: choose another name or remove it")
+    if record is not None:
+        require_new(record)
     path = find_bag(given["path"]) if given["path"] else None
     if given["view"] not in ("true", "false"):
         raise UsSimError(f"view:={given['view']}: must be true or false")
@@ -69,7 +69,7 @@ def create_action(process, restarts):
         package="us_sim",
         executable=process.node,
         name=process.node,
-        parameters=[process.all_parameters | further],
+        parameters=[process.parameters | further],
         ros_arguments=["--enclave", enclave_of(process.node)],
         output="screen",
         respawn=restarts > 0,

@@ -27,7 +27,7 @@ LONG = "x" * 300  # more than a file's name may have
             ["run", "upper_arm", "--dry-run", "--param", "skin.a=1"],
             "--param skin: this scene does not run such a node",
         ),
-        (["run", "upper_arm", "--record", "a.bag"], "--record: a.bag: must be a file that ends"),
+        (["run", "upper_arm", "--record", "a.bag"], "must be a file that ends in .mcap"),
         (["play", "press_and_slide.mcap", "--rate", "-1"], "--rate: -1 is outside 0.01 to 100"),
         (["view", "--attach", "--param", "skin.a=1"], "--param skin: --attach starts the viewer"),
         (["run", "upper_arm", "--port", "3"], "are the viewer's: add --view"),
@@ -106,7 +106,7 @@ def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):
     with Progress("running", 1, "s") as bar:
         bar.update(0.5, hostile)
     group = ProcessGroup()
-    group._show(hostile)
+    group._show("scorer", hostile)
     error = capsys.readouterr().err
     assert not set("\x1b\x07\u202e") & set(error)
     assert len(error) < 6_000

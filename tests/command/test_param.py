@@ -45,44 +45,6 @@ def node():
 
 NAMES = "  deep.count\n  fixed\n  names\n  numbers\n  on\n  rate\n  small\n"
 NAMES += "  start_type_description_service\n  use_sim_time\n  word\n"
-DESCRIBED = """\
-Parameter name: rate
-  Type: double
-  Description: how often, Hz
-  Constraints:
-    Min value: 1.0
-    Max value: 60.0
-Parameter name: deep.count
-  Type: integer
-  Constraints:
-    Min value: 0
-    Max value: 10
-    Step: 1
-Parameter name: fixed
-  Type: string
-  Constraints:
-    Read only: true
-"""
-DUMPED = """\
-/left/sample:
-  ros__parameters:
-    deep:
-      count: 3
-    fixed: x
-    names:
-    - vein
-    - artery
-    numbers:
-    - 1
-    - 2
-    'on': true
-    rate: 30.0
-    small: 1.0e-06
-    start_type_description_service: true
-    use_sim_time: false
-    word: x
-
-"""
 
 
 @pytest.mark.parametrize(
@@ -91,8 +53,6 @@ DUMPED = """\
         ("list left/sample", NAMES),
         ("get /left/sample names", "String values are: ['vein', 'artery']\n"),
         ("get /left/sample on", "Boolean value is: True\n"),
-        ("describe /left/sample rate deep.count fixed", DESCRIBED),
-        ("dump /left/sample", DUMPED),
     ],
 )
 def test_parameters_are_shown_as_ros2_param_shows_them(words, printed, capsys) -> None:
@@ -116,22 +76,6 @@ def test_a_value_is_set_by_its_yaml(node, name, text, value, capsys) -> None:
     node.set_parameters([before])
 
 
-def test_a_file_is_loaded_and_each_refusal_told(node, tmp_path, capsys) -> None:
-    file = tmp_path / "settings.yaml"
-    file.write_text(DUMPED.replace("rate: 30.0", "rate: 99.0").replace("count: 3", "count: 4"))
-    assert main(["param", "load", "/left/sample", str(file)]) == 1
-    told = capsys.readouterr()
-    assert "Set parameter deep.count successful\n" in told.out
-    assert "Set parameter rate failed: Parameter rate out of range" in told.err
-    assert (node.get_parameter("deep.count").value, node.get_parameter("rate").value) == (4, 30.0)
-    file.write_text("/**: {ros__parameters: {deep: {count: 1}}}\nsample: {ros__parameters: {}}\n")
-    assert main(["param", "load", "/left/sample", str(file)]) == 0
-    assert node.get_parameter("deep.count").value == 1
-    file.write_text("{/right: {ros__parameters: {on: true}}}")
-    assert main(["param", "load", "/left/sample", str(file)]) == 1
-    assert "has no `ros__parameters` below `/left/sample`" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "sentence"),
@@ -139,7 +83,6 @@ def test_a_file_is_loaded_and_each_refusal_told(node, tmp_path, capsys) -> None:
         ("get /left/sampel rate", "node not found: '/left/sampel' is not one of /left/sample; did"),
         ("set /left/sample ratee 1.0", "did you mean 'rate'?"),
         ("set /left/sample rate 99.0", "Setting parameter failed: Parameter rate out of range"),
-        ("load /left/sample nowhere.yaml", "nowhere.yaml: cannot be read"),
     ],
 )
 def test_a_mistake_is_one_sentence(words, sentence, capsys) -> None:

@@ -95,7 +95,7 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     assert 0 < float(told["record_room_bytes"]) <= shutil.disk_usage(tmp_path).total
     ask(simulation, control, replay=PATH, replay_rate=0.5)
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder", "path_player"}
-    player = supervisor.plan.processes[-1].all_parameters
+    player = supervisor.plan.processes[-1].parameters
     assert (player["rate"], player["stay"]) == (0.5, True)
     ask(simulation, control, replay_time=3.0)
     assert control.to_player[-1] == ("path_player", {"time": 3.0})

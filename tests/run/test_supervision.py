@@ -94,7 +94,6 @@ def test_a_player_at_its_end_is_no_loss(session):
     supervisor.update()
     assert supervisor.finished
     assert not supervisor.losses
-    assert not supervisor.gave_up("path_player")
     assert supervisor.outcome(1.0).sentence() == ""
 
 
@@ -109,7 +108,7 @@ def test_a_player_at_its_end_is_no_loss(session):
 )
 def test_images_that_were_not_to_be_recorded_are_not_lost(tmp_path, settings, lost):
     group = Group()
-    recorder = NodeProcess("session_recorder", {"file": str(tmp_path / "a.mcap")}, settings)
+    recorder = NodeProcess("session_recorder", {"file": str(tmp_path / "a.mcap")} | settings)
     plan = Plan([recorder, NodeProcess("slice_interpolator")])
     supervisor = Supervisor(plan, group, Monitor(group), SupervisionSettings())
     (tmp_path / "a.mcap").touch()
@@ -180,9 +179,9 @@ def test_without_its_player_the_run_is_over(session):
         assert not supervisor.finished
         group.ended = {"path_player": INTERRUPTED}
         supervisor.update()
-    assert supervisor.gave_up("path_player")
+    assert supervisor.losses[-1].given_up
     assert supervisor.finished
-    assert group.started[3].given == {"begun": 1700000000.5}
+    assert group.started[3].parameters["begun"] == 1700000000.5
 
 
 def test_a_recorder_goes_on_in_a_further_file_and_all_are_found(session, tmp_path):
@@ -191,7 +190,7 @@ def test_a_recorder_goes_on_in_a_further_file_and_all_are_found(session, tmp_pat
     (tmp_path / "session.mcap").touch()
     group.ended = {"session_recorder": -9}
     supervisor.update()
-    again = group.started[3].all_parameters
+    again = group.started[3].parameters
     assert (again["file"], again["if_exists"]) == (str(tmp_path / "session.mcap"), "further")
     (tmp_path / "session_1.mcap").touch()
     files = supervisor.outcome(1.0).files

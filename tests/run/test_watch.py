@@ -72,17 +72,17 @@ def test_what_cannot_be_is_refused(wrong):
 def test_a_player_goes_on_where_its_path_would_be():
     player = NodeProcess("path_player", {"path": "a.mcap"})
     again = going_on(player, {"played": "120", "begun": "1700000000.250000000"})
-    assert again.all_parameters == {"path": "a.mcap", "begun": 1700000000.25}
+    assert again.parameters == {"path": "a.mcap", "begun": 1700000000.25}
     assert going_on(player, {"state": "waiting"}) is player
     assert going_on(player, {"begun": "soon"}) is player
 
 
 def test_a_viewer_goes_on_where_pages_look_for_it():
     viewer = NodeProcess("viewer", {"host": "127.0.0.1", "port": 0})
-    assert going_on(viewer, {"port": "41234"}).all_parameters["port"] == 41234
-    assert going_on(viewer, {"port": "any"}).all_parameters["port"] == 0
+    assert going_on(viewer, {"port": "41234"}).parameters["port"] == 41234
+    assert going_on(viewer, {"port": "any"}).parameters["port"] == 0
 
 
 def test_others_start_as_they_did():
-    tissue = NodeProcess("tissue_deformer", {"scene": "upper_arm"}, {"solver": "msds"})
+    tissue = NodeProcess("tissue_deformer", {"scene": "upper_arm", "solver": "msds"})
     assert going_on(tissue, {"state": "ready"}) is tissue

@@ -1,4 +1,7 @@
-"""The command `us-sim param`: what `ros2 param` does and prints, where ros2cli is not installed."""
+"""The command `us-sim param`: list, get and set as `ros2 param`, where ros2cli is not installed.
+
+`us-sim reference NODE` says what parameters mean.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,12 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
-
-import yaml
 
 from us_sim.command.options import add_network_option
 from us_sim.errors import UsSimError
 from us_sim.settings.spelling import unknown
-from us_sim.settings.text_files import YamlError, load_yaml, read_yaml
+from us_sim.settings.text_files import YamlError, load_yaml
 
 DISCOVERY_S = 7.0  # to discover a node: Fast DDS may miss an announcement, and repeats it after 3 s
 ALL_S = 3.5  # to discover all of them
@@ -35,14 +35,10 @@ def param_options(parser: argparse.ArgumentParser) -> None:
         ("list", _list, ("node?",), "names of a node's parameters, or of those of all nodes"),
         ("get", _get, ("node", "name"), "value of a parameter"),
         ("set", _set, ("node", "name", "value"), "set a parameter; floats need a decimal point"),
-        ("describe", _describe, ("node", "names+"), "type, range and meaning of parameters"),
-        ("dump", _dump, ("node",), "all parameters of a node, as YAML for --params-file"),
-        ("load", _load, ("node", "file"), "set the parameters that such a file has for a node"),
     ):
         subparser = commands.add_parser(name, help=text)
         for argument in arguments:
-            count = argument[-1] if argument[-1] in "?+" else None
-            subparser.add_argument(argument.rstrip("?+"), nargs=count)
+            subparser.add_argument(argument.rstrip("?"), nargs="?" if "?" in argument else None)
         add_network_option(subparser)
         subparser.set_defaults(command=partial(_run, command))
 
@@ -80,7 +76,7 @@ def _get(asker: _Asker, args: argparse.Namespace) -> int:
     node = asker.find(args.node)
     values = asker.ask(node, "get_parameters", [args.name]).values
     if not values:
-        asker.refuse_unknown(node, [args.name])
+        asker.refuse_unknown(node, args.name)
         raise UsSimError(f"{args.name} of {node} is not set")
     kind, _, is_array = _TYPES[values[0].type].partition(" ")
     said = f"{kind.capitalize()} {'values are' if is_array else 'value is'}:"
@@ -94,80 +90,13 @@ def _set(asker: _Asker, args: argparse.Namespace) -> int:
         value = load_yaml(args.value)
     node = asker.find(args.node)
     is_text = value is None or isinstance(value, dict)
-    (result,) = asker.set(node, {args.name: args.value if is_text else value})
+    result = asker.set(node, args.name, args.value if is_text else value)
     reason = f": {result.reason}" if result.reason else ""
     if not result.successful:
-        asker.refuse_unknown(node, [args.name])
+        asker.refuse_unknown(node, args.name)
         raise UsSimError(f"Setting parameter failed{reason}")
     print(f"Set parameter successful{reason}")
     return 0
-
-
-def _describe(asker: _Asker, args: argparse.Namespace) -> int:
-    node = asker.find(args.node)
-    descriptors = asker.ask(node, "describe_parameters", args.names).descriptors
-    if not descriptors:
-        asker.refuse_unknown(node, args.names)
-    for each in descriptors:
-        print("Parameter name:", each.name)
-        print("  Type:", _TYPES[each.type])
-        if each.description:
-            print("  Description:", each.description)
-        print("  Constraints:")
-        if each.read_only:
-            print("    Read only: true")
-        for limits in [*each.floating_point_range, *each.integer_range][:1]:
-            print("    Min value:", limits.from_value)
-            print("    Max value:", limits.to_value)
-            if limits.step:
-                print("    Step:", limits.step)
-        if each.additional_constraints:
-            print("    Additional constraints:", each.additional_constraints)
-    return 0
-
-
-def _dump(asker: _Asker, args: argparse.Namespace) -> int:
-    from rclpy.parameter import parameter_value_to_python
-
-    node = asker.find(args.node)
-    names = asker.names(node)
-    values = asker.ask(node, "get_parameters", names).values
-    nested: dict[str, Any] = {}
-    for name, value in zip(names, values, strict=False):
-        *groups, last = name.split(".")
-        inner = nested
-        for group in groups:
-            inner = inner.setdefault(group, {})
-        inner[last] = parameter_value_to_python(value)
-    print(yaml.safe_dump({node: {"ros__parameters": nested}}, default_flow_style=False))
-    return 0
-
-
-def _load(asker: _Asker, args: argparse.Namespace) -> int:
-    node = asker.find(args.node)
-    content = read_yaml(Path(args.file), UsSimError)
-    values: dict[str, Any] = {}
-    for key in ("/**", node.rpartition("/")[2], node):  # its own go before those of all
-        part = content.get(key) if isinstance(content, dict) else None
-        values |= _flat(part.get("ros__parameters")) if isinstance(part, dict) else {}
-    if not values:
-        raise UsSimError(f"{args.file}: has no `ros__parameters` below `{node}` or `/**`")
-    results = asker.set(node, values)
-    for name, result in zip(values, results, strict=True):
-        reason = f": {result.reason}" if result.reason else ""
-        if result.successful:
-            print(f"Set parameter {name} successful{reason}")
-        else:
-            print(f"Set parameter {name} failed{reason}", file=sys.stderr)
-    return int(not all(result.successful for result in results))
-
-
-def _flat(nested: Any, prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in nested.items() if isinstance(nested, dict) else ():
-        inner = _flat(value, f"{prefix}{key}.")
-        flat |= inner if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
 
 
 class _Asker:
@@ -218,17 +147,15 @@ class _Asker:
     def names(self, node: str) -> list[str]:
         return sorted(self.ask(node, "list_parameters").result.names)
 
-    def set(self, node: str, values: dict[str, Any]) -> list[Any]:
-        """Set parameters; those for which ROS has no type are texts."""
+    def set(self, node: str, name: str, value: Any) -> Any:
+        """Set a parameter; a value for which ROS has no type is a text."""
         from rclpy.parameter import Parameter
 
-        parameters = []
-        for name, value in values.items():
-            try:
-                parameters.append(Parameter(name, value=value))
-            except (TypeError, ValueError):  # a mapping, or a list of several types
-                parameters.append(Parameter(name, value=str(value)))
-        return list(self.ask(node, "set_parameters", parameters).results)
+        try:
+            parameter = Parameter(name, value=value)
+        except (TypeError, ValueError):  # a mapping, or a list of several types
+            parameter = Parameter(name, value=str(value))
+        return self.ask(node, "set_parameters", [parameter]).results[0]
 
     def ask(self, node: str, request: str, *arguments: Any) -> Any:
         """Return a node's answer; raise UsSimError when none comes."""
@@ -243,9 +170,8 @@ class _Asker:
             raise UsSimError(f"{node} did not answer within {ANSWER_S:g} s")
         return answer.result()
 
-    def refuse_unknown(self, node: str, names: list[str]) -> None:
-        """Raise UsSimError when a node has no parameter of one of these names."""
+    def refuse_unknown(self, node: str, name: str) -> None:
+        """Raise UsSimError when a node has no parameter of that name."""
         known = self.names(node)
-        for name in names:
-            if name not in known:
-                raise UsSimError(f"{node} has no such parameter: {unknown(name, known)}")
+        if name not in known:
+            raise UsSimError(f"{node} has no such parameter: {unknown(name, known)}")

@@ -79,13 +79,6 @@ class RunSettings(Settings):
     record: Path | None = setting(description="record the session to this MCAP", default=None)
     duration: float | None = setting(Quantity("time", 1e-3, 1e7), "end after so long", default=None)
 
-    def check(self) -> None:
-        """Refuse a recording that cannot be made, before anything is started."""
-        if self.record is not None and self.record.suffix != ".mcap":
-            raise self.refused("record", f"{self.record}: must be a file that ends in .mcap")
-        if self.record is not None and self.record.exists():
-            raise self.refused("record", f"{self.record}: exists already; choose another name")
-
 
 def run_options(run: argparse.ArgumentParser) -> None:
     add_setting_options(run, RunSettings)

@@ -6,6 +6,7 @@ A kernel is compiled where it is first called, and kept for all processes of the
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING
@@ -42,8 +43,8 @@ def parts() -> Iterator[Part]:
     yield "skin", _use_skin
     for method in SLICERS:
         yield method, partial(_make_image, method)
-    yield "strain", _strain
-    yield "blood", _show_blood
+    yield "strain", partial(_warm_up, "us_sim.slicing.strain_estimate")
+    yield "blood", partial(_warm_up, "us_sim.slicing.flow.doppler")
     yield "camera", _track_marker
     yield "reconstruction", _reconstruct
 
@@ -65,6 +66,10 @@ def _use_solver(name: str, *, box: bool) -> None:
     create_solver(name, _block(box=box)).warm_up()
 
 
+def _warm_up(module: str) -> None:
+    importlib.import_module(module).warm_up()
+
+
 def _count_labels() -> None:
     from us_sim.tissue.elasticity.materials import label_fractions
 
@@ -77,12 +82,6 @@ def _use_skin() -> None:
     from us_sim.skin.surface import plane_surface
 
     SkinMembrane(plane_surface((0.04, 0.04), 0.01), Sphere(0.03)).warm_up()
-
-
-def _show_blood() -> None:
-    from us_sim.slicing.flow.doppler import warm_up
-
-    warm_up()
 
 
 def _make_image(method: str) -> None:
@@ -107,12 +106,6 @@ def _make_image(method: str) -> None:
     muscle = TissueAcoustics(attenuation=0.57, impedance=1.6e6, fibres=(0.0, 1.0, 0.0))
     sound = Acoustics(artefacts="live", noise=-90.0, tissues={"nothing": muscle})
     BMode(volume, probe, imaging, method=method).prepare(probe, imaging, sound)
-
-
-def _strain() -> None:
-    from us_sim.slicing.strain_estimate import warm_up
-
-    warm_up()
 
 
 def _track_marker() -> None:

@@ -19,6 +19,7 @@ from us_sim.run.plan import (
     Plan,
     Request,
     plan_of,
+    require_new,
     viewer_process,
 )
 from us_sim.run.processes import ProcessGroup, prepare_ros
@@ -111,54 +112,42 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
 
 
 def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
-    began = time.monotonic()
+    began, duration = time.monotonic(), supervisor.plan.duration
     ended: float | None = None
-    while True:
-        plan = supervisor.plan
-        total, unit = _shown(plan)
-        with Progress("running", total, unit) as bar:
-            while _shown(plan) == (total, unit):
-                update()
-                plan, now = supervisor.plan, time.monotonic()
-                played = monitor.node.reports.get(plan.player, {}).get("played", "")
-                is_known = played.isdecimal() and len(played) < 12
-                done = now - began if plan.poses is None else float(played) if is_known else 0.0
-                ended = ended or now if supervisor.finished else None
-                if ended is not None and not supervisor.gave_up(plan.player):
-                    done = total or done
-                bar.update(min(done, total or done), _status(plan, monitor, at_end=bool(ended)))
-                if plan.duration is not None and now - began > plan.duration:
-                    return
-                if ended is not None and now - ended > SETTLE_S:
-                    return
+    with Progress("running", duration, "s") as bar:
+        while True:
+            update()
+            now = time.monotonic()
+            ended = ended or now if supervisor.finished else None
+            bar.update(now - began, _status(supervisor.plan, monitor))
+            if duration is not None and now - began > duration:
+                return
+            if ended is not None and now - ended > SETTLE_S:
+                return
 
 
-def _shown(plan: Plan) -> tuple[float | None, str]:
-    """The end of a progress bar, and its unit."""
-    if plan.poses is None:
-        return plan.duration, "s"
-    return None if plan.loops else plan.poses, "poses" if plan.player == "path_player" else "images"
-
-
-def _status(plan: Plan, monitor: Monitored, *, at_end: bool = False) -> str:
-    page = _page(plan, monitor)
-    if IMAGER not in plan.nodes and (page or plan.poses is not None):  # what images runs elsewhere
-        state = monitor.node.reports.get(plan.player, {}).get("state", "")
-        waits = f"waiting for the simulation on ROS domain {domain()}"
-        return page or (waits if state == "waiting" else state)
-    again = ""
-    if plan.loops:
-        when = "at its end" if plan.poses is None else f"every {plan.poses} {_shown(plan)[1]}"
-        again = f"begins again {when}; "
+def _status(plan: Plan, monitor: Monitored) -> str:
+    """Return how far what plays is, which images there are, and where the page is."""
+    player = monitor.node.reports.get(plan.player, {})
     slicer = monitor.node.reports.get(IMAGER, {})
-    count = monitor.node.count(IMAGER, IMAGES)
-    if not count:
-        heard = slicer.get("received", "0") != "0"
-        poses = monitor.node.reports.get(plan.player, {}).get("awaited", "poses")
-        awaited = "nobody subscribes to ultrasound/image" if heard else f"waiting for {poses}"
-        return "; ".join(filter(None, (again + awaited, page)))
-    rate = "" if at_end else f"{slicer.get('rate_hz', '?')}/s, "  # of the last second
-    return f"{again}{count} images, {rate}p99 latency {slicer.get('latency_p99_ms', '?')} ms"
+    images = monitor.node.count(IMAGER, IMAGES)
+    told = []
+    if plan.poses is not None and "played" in player:
+        told.append(f"{player['played']} of {plan.poses} played")
+    elif player.get("state") == "playing":
+        told.append(f"{player.get('position')} of {player.get('duration')} s played")
+    if plan.loops:
+        told.append("begins again at its end")
+    if images:
+        latency, rate = slicer.get("latency_p99_ms", "?"), slicer.get("rate_hz", "?")
+        told.append(f"{images} images, {rate}/s, p99 latency {latency} ms")
+    elif slicer.get("received", "0") != "0":
+        told.append("nobody subscribes to ultrasound/image")
+    elif IMAGER in plan.nodes:
+        told.append(f"waiting for {player.get('awaited', 'poses')}")
+    elif player.get("state") == "waiting":
+        told.append(f"waiting for the simulation on ROS domain {domain()}")
+    return "; ".join(filter(None, [*told, _page(plan, monitor)]))
 
 
 def _page(plan: Plan, monitor: Monitored) -> str:
@@ -167,14 +156,16 @@ def _page(plan: Plan, monitor: Monitored) -> str:
     port = monitor.node.reports.get(VIEWER, {}).get("port", "")
     if viewer is None or not port:
         return ""
-    host = str(viewer.all_parameters["host"])
+    host = str(viewer.parameters["host"])
     if not is_loopback(host):
         return "open the address with its token, above"
     return f"open http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 def dry_run(request: Request) -> str:
-    """The processes that :func:`run` would start or leave out, and why, one line each."""
+    """Return what :func:`run` would start or leave out, and why, one line each."""
+    if request.record is not None:
+        require_new(full_path(request.record))
     plan_of(request)
     scene, view = request.scene, request.view
     rows = [
@@ -220,14 +211,20 @@ def run(
     """
     if request.topic and request.path is None:
         raise UsSimError(f"--topic {request.topic}: is of a path: name its file with --path")
+    if request.record is not None:
+        require_new(full_path(request.record))
     prepare_ros(network=network)
-    plan = plan_of(request).with_free_port()
-    prepare_volume(request.scene, request.path, plan.topic)
-    outcome = follow(plan, None, supervision, request)
+    outcome = _simulate(request, None, supervision)
     for file in outcome.files:
         print(f"recorded to {file}")
     _require_nothing_lost(outcome)
     return 0
+
+
+def _simulate(request: Request, log: Path | None, supervision: SupervisionSettings) -> Outcome:
+    plan = plan_of(request).with_free_port()
+    prepare_volume(request.scene, request.path, plan.topic)
+    return follow(plan, log, supervision, request)
 
 
 def demo(
@@ -285,10 +282,8 @@ def demo(
     video = _prepared_video(scene, file, topic) if source == "camera" else None
     played = file if video is None else None
     request = Request(scene, parameters, recording, played, topic, video=video, view=view)
-    plan = plan_of(request).with_free_port()
-    prepare_volume(scene, played, plan.topic)
     started = time.monotonic()
-    outcome = follow(plan, out / "nodes.log", supervision, request)
+    outcome = _simulate(request, out / "nodes.log", supervision)
     try:
         _report(scene, out, outcome, time.monotonic() - started, video)
     except UsSimError as error:

@@ -76,10 +76,7 @@ def render_scene(
         raise UsSimError(f"{scene.origin}: path: is missing; give a bag with --path")
     if out.exists() and any(out.iterdir()):
         raise UsSimError(f"--out {out}: is not empty; choose another folder")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsSimError(f"--out {out}: cannot be made: {error.strerror}") from error
+    out.mkdir(parents=True, exist_ok=True)
     topic = path_of(scene, path, topic).topic
     prepare_volume(scene, path, topic)
     folders = truth_folders(scene, out) if truth else {}
@@ -99,18 +96,15 @@ def truth_folders(scene: Scene, out: Path) -> dict[str, Path]:
     Beside the labels goes a table of what their numbers mean, ``labels.csv``.
 
     Raises:
-        UsSimError: nothing is known of them, or the table cannot be written.
+        UsSimError: nothing is known of them.
     """
     volume = volume_of(scene)
     folders = {}
     if volume.labels is not None:
         folders["labels"] = out / "labels"
         names = {0: "nothing", **volume.label_names}
-        try:
-            with (out / "labels.csv").open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file).writerows([("number", "name"), *sorted(names.items())])
-        except OSError as error:
-            raise UsSimError(f"--out {out}: cannot be written: {error.strerror}") from error
+        with (out / "labels.csv").open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([("number", "name"), *sorted(names.items())])
     if scene.tissue is not None:
         folders["displacement"] = out / "displacement"
     if not folders:
@@ -154,7 +148,7 @@ def render(
     nodes: list[Any] = []
     try:
         for process in _processes(scene, path, topic, out, parameters or {}, truth or {}):
-            nodes.append(node_in_process(process.node, process.all_parameters, context))
+            nodes.append(node_in_process(process.node, process.parameters, context))
             executor.add_node(nodes[-1])
         return _spin(executor, nodes, progress, [*(truth or {})])
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import time
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from us_sim.errors import BagError
-from us_sim.recording.reader import read_bag
 from us_sim.run.plan import NodeProcess
 
 IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
@@ -90,13 +90,13 @@ def files_of(recording: Path) -> list[Path]:
 
 def images_in(files: Sequence[Path], name: str = f"/{IMAGES}") -> int:
     """The images in recordings, by their topic's name; a file that cannot be read has none."""
+    from us_sim.recording.reader import read_bag  # takes long to import, and starts need it not
+
     count = 0
     for file in files:
-        try:
+        with contextlib.suppress(BagError):
             topics = read_bag(file).topics
-        except BagError:
-            continue
-        count += sum(topic.message_count for topic in topics if topic.name == name)
+            count += sum(topic.message_count for topic in topics if topic.name == name)
     return count
 
 
@@ -109,7 +109,7 @@ class Recordings:
 
     def begin(self, recorder: NodeProcess) -> None:
         """Note that a recorder is about to be started."""
-        file = Path(str(recorder.all_parameters["file"]))
+        file = Path(str(recorder.parameters["file"]))
         self._begun.setdefault(file, (set(files_of(file)), time.monotonic()))
 
     def progress(self, file: Path) -> dict[str, str]:

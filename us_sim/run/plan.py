@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from us_sim.errors import SceneError, UsSimError
+from us_sim.errors import SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
 from us_sim.run.ros_arguments import namespace, ros_arguments
 from us_sim.scene.building import path_of
@@ -54,11 +54,10 @@ class NodeProcess:
 
     node: str
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
-    given: dict[str, object] = field(default_factory=dict)  # by a person; take precedence
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
 
     def __post_init__(self) -> None:
-        require_texts(self.all_parameters)
+        require_texts(self.parameters)
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
@@ -67,14 +66,9 @@ class NodeProcess:
     def arguments(self) -> list[str]:
         """ROS arguments: its enclave, those that all nodes get, and its parameters."""
         arguments = ["--ros-args", "--enclave", enclave_of(self.node), *ros_arguments()]
-        for name, value in self.all_parameters.items():
+        for name, value in self.parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments
-
-    @property
-    def all_parameters(self) -> dict[str, object]:
-        """Parameters by name, those given by a person in place of the others."""
-        return self.parameters | self.given
 
 
 def require_texts(parameters: Mapping[str, object]) -> None:
@@ -147,9 +141,19 @@ class Plan:
         """
         for process in self.processes:
             if process.node == VIEWER:
-                parameters = process.all_parameters
+                parameters = process.parameters
                 require_free(str(parameters["host"]), int(str(parameters["port"])))
         return self
+
+
+def require_new(recording: Path) -> None:
+    """Raise SettingsError where this recording cannot be begun."""
+    if recording.suffix != ".mcap":
+        raise SettingsError(f"record: {recording}: must be a file that ends in .mcap")
+    if recording.exists():
+        raise SettingsError(f"record: {recording}: exists already; choose another name")
+    if not recording.absolute().parent.is_dir():
+        raise SettingsError(f"record: {recording}: there is no such folder; make it first")
 
 
 def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
@@ -160,7 +164,7 @@ def goes_on(running: NodeProcess, wanted: NodeProcess | None) -> bool:
     decisive = {RECORDER: ("file",), "path_player": ("path", "topic"), "session_player": ("path",)}
     if wanted is None or running.node not in decisive:
         return running == wanted
-    before, after = running.all_parameters, wanted.all_parameters
+    before, after = running.parameters, wanted.parameters
     return all(before.get(name) == after.get(name) for name in decisive[running.node])
 
 
@@ -195,7 +199,7 @@ def plan_of(request: Request) -> Plan:
             settings["path"] = played
         if request.video is not None:
             settings["exclude"] = ["camera/image_raw"]  # the video is there already
-        processes.append(NodeProcess(RECORDER, settings, recorder))
+        processes.append(NodeProcess(RECORDER, settings | recorder))
     driver = taken("camera_driver") if request.video is not None else {}
     is_played = request.by_hand or request.path is not None
     processes += simulation_nodes(scene, parameters, played=is_played)
@@ -210,16 +214,17 @@ def plan_of(request: Request) -> Plan:
             "camera_info": str(video.camera_info),
             **_awaited(["camera/camera_info", *scene.ready_topics], awaited),
         }
-        processes.append(NodeProcess("camera_driver", settings, driver))
+        processes.append(NodeProcess("camera_driver", settings | driver))
         loops = bool(driver.get("loop"))
         return Plan(processes, len(video.poses), request.duration, "camera_driver", loops)
     if request.path is None:
         return Plan(processes, duration=request.duration)
     path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
     settings = player_settings(scene, request.path, awaited, path.topic) | dict(request.playing)
-    processes.append(NodeProcess("path_player", settings, player))
     poses = None if settings.get("stay") else len(path)
-    loops = bool(processes[-1].all_parameters.get("loop"))
+    settings |= player
+    processes.append(NodeProcess("path_player", settings))
+    loops = bool(settings.get("loop"))
     return Plan(processes, poses, request.duration, loops=loops, topic=path.topic)
 
 
@@ -257,8 +262,9 @@ def simulation_nodes(
     nodes = [
         NodeProcess(
             part.node,
-            common | ({"source": "pose"} if played and part.node == "probe_tracker" else {}),
-            checked_parameters(part.node, scene, given.pop(part.node, {})),
+            common
+            | ({"source": "pose"} if played and part.node == "probe_tracker" else {})
+            | checked_parameters(part.node, scene, given.pop(part.node, {})),
         )
         for part in scene.parts()
         if part.needed
@@ -276,7 +282,7 @@ def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None)
     settings: dict[str, object] = {"host": view.host, "port": view.port}
     if view.recordings:
         settings["recordings"] = view.recordings
-    return NodeProcess(VIEWER, settings, given or {}, secrets={TOKEN: _viewer_token()})
+    return NodeProcess(VIEWER, settings | (given or {}), {TOKEN: _viewer_token()})
 
 
 @functools.cache
@@ -295,7 +301,7 @@ def scene_settings(scene: Scene) -> dict[str, object]:
 
 def parameters_file(processes: Sequence[NodeProcess]) -> str:
     """The parameters of nodes as ROS reads them with ``--params-file``."""
-    document = {process.node: {"ros__parameters": process.all_parameters} for process in processes}
+    document = {process.node: {"ros__parameters": process.parameters} for process in processes}
     text: str = yaml.safe_dump(document, sort_keys=False)
     return text
 
@@ -326,7 +332,7 @@ def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | N
     """The settings of the recorder among them."""
     for process in processes:
         if process.node == RECORDER:
-            known = rules_of(SessionRecorderSettings).keys() & process.all_parameters
-            values: Any = {name: process.all_parameters[name] for name in known}
+            known = rules_of(SessionRecorderSettings).keys() & process.parameters
+            values: Any = {name: process.parameters[name] for name in known}
             return SessionRecorderSettings(**values)
     return None

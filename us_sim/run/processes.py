@@ -56,10 +56,10 @@ class RunningNode:
 
     Args:
         node: what it runs.
-        show: what is done with its lines.
+        show: what is done with each line of a node.
     """
 
-    def __init__(self, node: NodeProcess, show: Callable[[str], None]) -> None:
+    def __init__(self, node: NodeProcess, show: Callable[[str, str], None]) -> None:
         self.node = node
         self.process = subprocess.Popen(
             node.command(),
@@ -85,7 +85,7 @@ class RunningNode:
                 self.last_words = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
             if line.startswith(COMPLAINT):
                 self.complaint = self.last_words
-            self._show(line)
+            self._show(self.node.node, line)
 
 
 class ProcessGroup:
@@ -108,21 +108,15 @@ class ProcessGroup:
         remove_abandoned_segments()  # of one that is replaced
         for process in processes:
             if not (self.is_running(process.node) and self._running[process.node].node == process):
-                show = self._show_to_person if process.node == VIEWER else self._show
-                self._running[process.node] = RunningNode(process, show)
+                self._running[process.node] = RunningNode(process, self._show)
 
-    def _show(self, line: str) -> None:
+    def _show(self, node: str, line: str) -> None:
         if self._log is not None:
             with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
                 self._log.write(line)
                 self._log.flush()
-        elif not line.startswith(COMPLAINT):  # which is said when the node has ended
-            tqdm.write(printable(line.rstrip()), file=sys.stderr)
-
-    def _show_to_person(self, line: str) -> None:
-        """Show a line that says where the page is on the terminal, too."""
-        self._show(line)
-        if self._log is not None and not line.startswith(COMPLAINT):
+        is_for_person = self._log is None or node == VIEWER  # which says where its page is
+        if is_for_person and not line.startswith(COMPLAINT):  # which is said when it has ended
             tqdm.write(printable(line.rstrip()), file=sys.stderr)
 
     @property

@@ -14,7 +14,6 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from us_sim.errors import BagError
 from us_sim.nodes.sessions.attachments import checksum, parts_of
@@ -162,16 +161,14 @@ def _parameters(session: Path, attached: Mapping[str, BagAttachment], scene: Sce
     """The recorded parameters of the nodes that run again."""
     try:
         document = load_yaml(_text(attached, "parameters.yaml")) or {}
-        given: dict[str, Any] = {
-            node: document[node]["ros__parameters"]
-            for node in (process.node for process in simulation_nodes(scene, played=True))
-            if node in document
-        }
         return {
-            node: {
-                name: json.dumps(value) for name, value in values.items() if name not in _OF_THE_RUN
+            process.node: {
+                name: json.dumps(value)
+                for name, value in document[process.node]["ros__parameters"].items()
+                if name not in _OF_THE_RUN
             }
-            for node, values in given.items()
+            for process in simulation_nodes(scene, played=True)
+            if process.node in document
         }
     except (YamlError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise BagError(

@@ -11,10 +11,9 @@ from typing import Any
 
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
-from us_sim.recording.reader import read_bag
 from us_sim.run.background import Background, bags_in_reach
 from us_sim.run.monitored import Monitored
-from us_sim.run.plan import Request, plan_of
+from us_sim.run.plan import Request, plan_of, require_new
 from us_sim.run.supervision import Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene
@@ -91,14 +90,22 @@ class Simulation:
             load_scene(wanted.scene, volume=wanted.volume)
             return
         if "record" in named and wanted.record:
-            self._check_recording(full_path(wanted.record), wanted)
+            require_new(full_path(wanted.record))
+            if self._request.everything or (wanted.replay and wanted.replay_as == "recording"):
+                raise SettingsError(
+                    f"record: {wanted.record}: a recording is played in place of the simulation; "
+                    f"end the replay first"
+                )
         if {"replay", "replay_as"} & set(named) and wanted.replay:
             file = find_bag(wanted.replay)
             if wanted.replay_as == "path":
                 path_of(self._request.scene, file)
-            elif not read_bag(file).message_count:
+                return
+            from us_sim.recording.reader import read_bag  # which takes long to import
+
+            if not read_bag(file).message_count:
                 raise BagError(f"{file}: holds no message, so there is nothing to play")
-            elif self._request.record is not None:
+            if self._request.record is not None:
                 raise SettingsError(
                     f"replay: {file}: as a recording it takes the place of the simulation, which "
                     f"is being recorded to {self._request.record}: end that first"
@@ -128,19 +135,6 @@ class Simulation:
         self._change(request)
         self._steer(wanted, named)
 
-    def _check_recording(self, file: Path, wanted: SessionControlSettings) -> None:
-        if file.suffix != ".mcap":
-            raise SettingsError(f"record: {file}: must be a file that ends in .mcap")
-        if file.exists():
-            raise SettingsError(f"record: {file}: exists already; choose another name")
-        if not file.absolute().parent.is_dir():
-            raise SettingsError(f"record: {file}: there is no such folder; make it first")
-        if self._request.everything or (wanted.replay and wanted.replay_as == "recording"):
-            raise SettingsError(
-                f"record: {file}: a recording is played in place of the simulation; end the "
-                f"replay first"
-            )
-
     def _steer(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         values: dict[str, object] = {
             name: getattr(wanted, key) for key, name in _OF_PLAYER.items() if key in named
@@ -163,16 +157,16 @@ class Simulation:
         if making is None:
             return
         has_ended = making.has_ended  # before what it has said, so that nothing is missed
+        refused = f"{self._asked[0]}: what makes it ended without a word"
         for said in making.said():
-            if "refused" in said or "ready" in said:
-                self._making = None
-                making.end()
-                self._begin(str(said.get("refused", "")))
-                return
-            self._made = float(said["fraction"]), str(said["text"])
+            if "fraction" in said:
+                self._made = float(said["fraction"]), str(said["text"])
+            else:
+                has_ended, refused = True, str(said.get("refused", ""))
         if has_ended:
             self._making = None
-            self._begin(f"{self._asked[0]}: what makes it ended without a word")
+            making.end()
+            self._begin(refused)
 
     def _begin(self, refused: str) -> None:
         name, volume = self._asked
@@ -240,31 +234,30 @@ class Simulation:
         elif waiting:
             fraction = (count - len(waiting)) / max(count, 1)
             state = f"starting: {count - len(waiting)} of {count} nodes"
-        player = self._monitor.node.reports.get(self._supervisor.plan.player, {})
-        playing: dict[str, str] = {
-            key: player[key] for key in ("position", "duration") if request.path and key in player
-        }
-        recorder = self._monitor.node.reports.get(RECORDER, {})
+        reports, replay = self._monitor.node.reports, self._control.values
+        player: dict[str, str] = {}
+        if request.path:
+            player = reports.get(self._supervisor.plan.player, {})
         record = full_path(request.record) if request.record else None
         if time.monotonic() - self._recording_at > _RECORDING_EVERY_S:
             self._recording_at = time.monotonic()
             self._recording = self._supervisor.recordings.progress(record) if record else {}
-        values = {
+        values: dict[str, str] = {
             "scene": request.scene.name,
             "origin": request.scene.origin,
             "volume": request.scene.volume.name,
             "loading": self._asked[0] if self._making is not None else "",
             "fraction": f"{fraction:.2f}",
             "record": str(record or ""),
-            "record_note": recorder.get("note", "") if record else "",
+            "record_note": reports.get(RECORDER, {}).get("note", "") if record else "",
             **(self._recording if record else {}),
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",
             "replay_state": player.get("state", "starting") if request.path else "",
-            "replay_rate": f"{self._control.values.replay_rate:g}",
-            "replay_loop": str(self._control.values.replay_loop).lower(),
-            "replay_paused": str(self._control.values.replay_paused).lower(),
-            **playing,
+            "replay_rate": f"{replay.replay_rate:g}",
+            "replay_loop": str(replay.replay_loop).lower(),
+            "replay_paused": str(replay.replay_paused).lower(),
+            **{key: player[key] for key in ("position", "duration") if key in player},
         }
         self._control.tell(state, values, self._problem)
 
@@ -288,11 +281,9 @@ class Simulation:
 
 
 def _volume_of(scene: Scene) -> str | None:
-    """A volume file that takes the place of the scene's own."""
-    if scene.volume.file is None:
-        return None
-    try:
-        own = load_scene(scene.origin).volume.file
-    except SceneError:  # it has none of its own
-        own = None
+    """Return a volume file that takes the place of the scene's own."""
+    own = None
+    if scene.volume.file is not None:
+        with contextlib.suppress(SceneError):  # it has none of its own
+            own = load_scene(scene.origin).volume.file
     return scene.volume.file if scene.volume.file != own else None

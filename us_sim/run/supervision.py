@@ -102,10 +102,6 @@ class Supervisor:
         given_up = (loss for loss in self.losses if loss.given_up and loss.node in late)
         return str(next(given_up, ""))
 
-    def gave_up(self, node: str) -> bool:
-        """Return whether a node has ended and is not started again."""
-        return any(loss.given_up for loss in self.losses if loss.node == node)
-
     def update(self) -> None:
         """Take new reports, and restart nodes that have ended or hang.
 
@@ -232,4 +228,4 @@ def going_on(process: NodeProcess, report: Mapping[str, str]) -> NodeProcess:
             more = {"begun": float(report["begun"])}
         except (KeyError, ValueError):  # it does not play, or what it said is no number
             return process
-    return replace(process, given=process.given | more)
+    return replace(process, parameters=process.parameters | more)

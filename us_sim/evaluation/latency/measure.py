@@ -307,7 +307,7 @@ def _in_lockstep(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
 def _live(case: Case, scene: Scene, folder: Path, tell: Tell) -> Point:
     file = folder / "session.mcap"
     processes = [
-        replace(process, given={"realtime": case.realtime})
+        replace(process, parameters=process.parameters | {"realtime": case.realtime})
         for process in simulation_nodes(scene, played=True)
     ]
     if case.recorder:
@@ -370,7 +370,7 @@ def _started(case: Case, processes: list[NodeProcess], folder: Path) -> Iterator
         finally:
             group.stop()
         return
-    nodes = [(process.node, process.all_parameters) for process in processes]
+    nodes = [(process.node, process.parameters) for process in processes]
     child = start_program("nodes", json.dumps(nodes))
     try:
         yield _Running(
