@@ -74,7 +74,7 @@ def press_to_force(
                 f"{solver.name} finds no balance {1e3 * depth:.1f} mm deep, of residual "
                 f"{found.residual:.1g}; it reaches {-found.force[2]:.3g} N: press less, or use fem"
             )
-        return Press(depth, -float(found.force[2]), pose, found)
+        return Press(depth, 0.0 - float(found.force[2]), pose, found)  # no minus nothing
 
     curve = [press(0.0)]
     while curve[-1].force < force:
