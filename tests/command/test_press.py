@@ -24,5 +24,6 @@ def test_a_press_of_a_scene_to_a_force_is_told_label_by_label(small_scene, tmp_p
 def test_a_place_beside_the_tissue_is_said(small_scene, tmp_path, capsys):
     out = str(tmp_path / "curve.csv")
     words = ["press", str(small_scene), "--at", "0.5", "0.5", "--solver", "fem", "--out", out]
+    words += ["--deepest", "3 mm"]
     assert main(words) == 1
     assert "above" in capsys.readouterr().err
