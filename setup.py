@@ -87,7 +87,7 @@ setup(
         "platformdirs>=4",
         "pynrrd>=1.1",
         "PyYAML>=6.0.1",
-        "rosbags>=0.10.9",
+        "rosbags>=0.11",
         "scikit-image>=0.22",
         "scipy>=1.11.4",
         "setproctitle>=1.3.3",

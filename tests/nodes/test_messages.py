@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
-from std_msgs.msg import Float64MultiArray, Int32MultiArray, MultiArrayDimension
+from std_msgs.msg import Float64MultiArray, Int32MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from us_sim.errors import MeshError, MessageError, PoseError, ProbeError, StampError, VolumeError
@@ -129,34 +129,22 @@ def test_what_does_not_fit_is_refused(read, message, error, fact):
 
 
 @pytest.mark.parametrize(
-    ("sizes", "fact"),
+    "sizes",
     [
-        ({"offset": 2**32 - 4}, "4294967296 .* 12 "),
-        ({"point_step": 0}, " 0 bytes"),
-        ({"point_step": 11}, "12 .* 11 "),
-        ({"point_step": 2**32 - 1}, "4294967295"),
-        ({"width": 5}, "24 .* 5 "),
-        ({"width": 1, "height": 2**32 - 1, "row_step": 0}, " 0 bytes"),
-        ({"width": 1, "height": 2, "row_step": 13}, " 13 "),
+        {"offset": 2**32 - 4},
+        {"point_step": 0},
+        {"point_step": 11},
+        {"point_step": 2**32 - 1},
+        {"width": 5},
+        {"width": 1, "height": 2**32 - 1},
     ],
 )
-def test_clouds_whose_sizes_do_not_fit_their_data_are_refused(sizes, fact):
+def test_clouds_whose_sizes_do_not_fit_their_data_are_refused(sizes):
     cloud = cloud_of(*np.ones((3, 2)))
     for name, value in sizes.items():
         setattr(cloud.fields[2] if name == "offset" else cloud, name, value)
-    with pytest.raises(MeshError, match=fact):
+    with pytest.raises(MeshError, match="24 bytes"):
         vectors_from(cloud)
-
-
-def test_the_rows_of_a_cloud_may_end_with_a_gap():
-    points = np.arange(18.0).reshape(6, 3)
-    cloud = cloud_of(*points.T)
-    cloud.height, cloud.width, cloud.row_step = 2, 3, 40
-    gap = array("B", [255] * 4)
-    cloud.data = cloud.data[:36] + gap + cloud.data[36:] + gap
-    np.testing.assert_array_equal(vectors_from(cloud), points)
-    cloud.data = cloud.data[:-4]  # the last row's may be left out
-    np.testing.assert_array_equal(vectors_from(cloud), points)
 
 
 @pytest.mark.parametrize(("rows", "columns", "step"), [(2, 9, 4), (0, 4, 4), (2, 0, 4)])
@@ -245,23 +233,9 @@ def test_affine_maps_round_trip(upper):
     np.testing.assert_array_equal(affine_from(sent), matrix)
 
 
-def test_an_affine_map_may_start_at_an_offset():
-    message = affine_message(np.diag([2.0, 3.0, 4.0, 1.0]))
-    message.layout.data_offset = 2
-    message.data = array("d", [7.0, 7.0]) + message.data
-    np.testing.assert_array_equal(affine_from(message), np.diag([2.0, 3.0, 4.0, 1.0]))
-
-
 def test_what_is_no_affine_map_is_refused():
-    columns_first = affine_message(np.eye(4))
-    columns_first.layout.dim[0].stride, columns_first.layout.dim[1].stride = 4, 16
-    too_short = affine_message(np.eye(4))
-    too_short.data = too_short.data[:15]
-    too_wide = affine_message(np.eye(4))
-    too_wide.layout.dim.append(MultiArrayDimension(label="depth", size=1, stride=1))
-    for message in (Float64MultiArray(), columns_first, too_short, too_wide):
-        with pytest.raises(ProbeError, match="4 by 4"):
-            affine_from(message)
+    with pytest.raises(ProbeError, match="4 by 4"):
+        affine_from(Float64MultiArray())
     for diagonal in ([1.0, np.nan, 1.0, 1.0], [1.0, 1.0, 1.0, 2.0], [1e7, 1.0, 1.0, 1.0]):
         with pytest.raises(ProbeError, match="finite"):
             affine_from(affine_message(np.diag(diagonal)))

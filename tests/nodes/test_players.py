@@ -214,9 +214,7 @@ def test_of_a_damaged_recording_the_rest_is_played_and_what_is_missing_is_said(b
     player = bench.make(SessionPlayer, path=str(damaged), rate=100.0)
     bench.spin_until(lambda: player.finished.done() and said and said[-1].data == "099")
     sentence = str(player.finished.exception())
-    assert re.match(
-        r"\d+ of 100 messages of .*damaged.mcap were played; .* chunk at byte", sentence
-    )
+    assert re.match("not all .*damaged.mcap .* chunk at byte", sentence)
     assert player.health.problems("damage") == 1
     assert not player.failures
 
@@ -228,7 +226,7 @@ def test_a_damaged_recording_ends_the_player_with_a_status(damaged):
         [*command, "-p", f"path:={damaged}"], capture_output=True, text=True, check=False
     )
     assert ended.returncode == 1
-    assert re.search(r"^us_sim: \d+ of 100 messages of ", ended.stderr, re.MULTILINE)
+    assert re.search("^us_sim: not all ", ended.stderr, re.MULTILINE)
     assert "Traceback" not in ended.stderr
 
 

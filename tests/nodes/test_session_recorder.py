@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -114,25 +113,6 @@ def test_each_simulator_on_a_domain_is_recorded_alone(bench, tmp_path, small_sce
     }
     ordered = "/a/ultrasound/labels"
     assert heard == {ordered} | {f"{space}/ultrasound/image" for space in ("", "/a", "/b")}
-
-
-@pytest.mark.slow
-def test_diagnostics_say_that_a_recording_beside_another_gets_no_metadata(bench, tmp_path):
-    def notes():
-        said = [status for message in reports for status in message.status]
-        recorder = [status for status in said if status.name.endswith("session_recorder")]
-        return [{each.key: each.value for each in status.values}.get("note") for status in recorder]
-
-    reports = bench.collect(DiagnosticArray, "diagnostics")
-    first = bench.make(SessionRecorder, file=str(tmp_path / "first.mcap"))
-    bench.spin_until(notes)
-    assert set(notes()) == {None}
-    bench.executor.remove_node(first)
-    first.destroy_node()
-    reports.clear()
-    bench.make(SessionRecorder, file=str(tmp_path / "second.mcap"))
-    bench.spin_until(lambda: notes() and notes()[-1])
-    assert "metadata.yaml in this folder belongs to another recording" in notes()[-1]
 
 
 GIVEN_BACK = """

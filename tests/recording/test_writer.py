@@ -3,6 +3,7 @@
 import errno
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -71,7 +72,7 @@ def test_a_real_bag_written_again_is_the_same_bag(shared_data, tmp_path, name):
 def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
     file = tmp_path / "session.mcap"
     latched = QosProfile(depth=1, durability="transient_local")
-    with BagWriter(file, compression=compression) as bag:
+    with BagWriter(file, compression=compression, chunk_size=400) as bag:
         bag.custom_data["scene"] = "upper_arm"
         bag.add_topic("/a", STRING, [QosProfile()])
         bag.add_topic("/b", STRING, [latched, QosProfile(reliability="best_effort")])
@@ -94,7 +95,7 @@ def test_rosbags_and_mcap_read_what_was_written(tmp_path, compression):
         assert [int(profile.depth) for profile in b.ext.offered_qos_profiles] == [1, 10]
     with file.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        assert reader.get_summary().statistics.chunk_count == 30
+        assert reader.get_summary().statistics.chunk_count > 30
         times = [(m.log_time, m.publish_time) for _, _, m in reader.iter_messages()]
     assert times == [(EPOCH + k * 10**8, EPOCH + k) for k in range(300)]
     assert read_bag(tmp_path).metadata.custom_data == {"scene": "upper_arm"}
@@ -182,15 +183,24 @@ def test_what_a_full_disk_did_not_take_is_written_when_there_is_room(tmp_path, c
 
 
 @pytest.mark.parametrize("room", [3000, 3300, 3500])
-def test_what_a_disk_that_stays_full_did_not_take_is_counted(tmp_path, room):
+@pytest.mark.parametrize("reserve", [0, 100_000])
+def test_a_disk_that_stays_full_costs_nothing_where_there_is_a_reserve(tmp_path, room, reserve):
     bag = BagWriter(tmp_path / "session.mcap", chunk_size=300)
-    disk_under(bag, room)
+    disk = disk_under(bag, room)
+    kept_free = bag._file._reserve
+    bag._file._reserve = SimpleNamespace(close=lambda: setattr(disk, "room", room + reserve))
     written = note_until_full(bag)
-    with pytest.raises(BagError, match=r"No space left.*index.*`us-sim bag repair`"):
+    if reserve:
         bag.close()
-    kept = repair(tmp_path / "session.mcap", tmp_path / "repaired").message_count
-    assert 0 < kept == bag.message_count == written - bag.lost["/note"]
-    assert read_bag(tmp_path).message_count == kept
+        assert read_bag(tmp_path).is_indexed
+        assert read_bag(tmp_path).message_count == written
+    else:
+        with pytest.raises(BagError, match=r"No space left.*index.*`us-sim bag repair`"):
+            bag.close()
+        kept = repair(tmp_path / "session.mcap", tmp_path / "repaired").message_count
+        assert 0 < kept < written
+        assert f"{written - kept} were lost" in read_bag(tmp_path).note
+    kept_free.close()
 
 
 def test_an_empty_bag_is_a_bag(tmp_path):

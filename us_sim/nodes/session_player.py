@@ -25,7 +25,6 @@ from us_sim.recording.topic import BagMessage, BagTopic, Fault
 from us_sim.share import find_bag
 
 DEPTH = 10  # messages that publishers keep
-_MOST_SAID = 10  # topics that are left out, of which a person is told each
 
 START_S = 0.5  # for subscribers to find the publishers before the first message
 _SHOWN = 100_000_000
@@ -56,15 +55,14 @@ class SessionPlayer(GuardedNode):
         offered = [topic for topic in self._bag.topics if topic.name not in exclude]
         left_out = [why for topic in offered if (why := self._offer(topic))]
         if not any(self._bag.topic(name).message_count for name in self._topics):
-            raise BagError(f"{path} holds nothing that can be played: {_joined(left_out)}")
+            why = "; ".join(left_out) or "no topic of it has a message"
+            raise BagError(f"{path} holds nothing that can be played: {why}")
         if left_out:
-            self.health.warning = f"{_joined(left_out)}: left out"
+            self.health.warning = f"{'; '.join(left_out)}: left out"
             self.get_logger().warning(self.health.warning)
         if self._bag.note:
             self.get_logger().warning(self._bag.note)
-        self._count = sum(self._bag.topic(name).message_count for name in self._topics)
         self._damage: list[Fault] = []
-        self._sent = 0
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
         self._first = self._bag.start or 0
@@ -75,7 +73,7 @@ class SessionPlayer(GuardedNode):
             self._first,
             (self._bag.end or 0) - self._first,
             self._go_to,
-            lambda: self._end(early=True),
+            self._end,
             self._say_progress,
         )
         self._playhead = self._playback.head
@@ -140,21 +138,15 @@ class SessionPlayer(GuardedNode):
     def _send(self, message: BagMessage) -> None:
         self._topics[message.topic].publish(message.data)
         self.health.published(message.topic)
-        self._sent += 1
         self._waiting = self._next()
 
-    def _end(self, *, early: bool = False) -> None:
+    def _end(self) -> None:
         self._playback.finish()
         if self._settings.stay:
             return
-        is_cut = early or self._waiting is not None
-        if self._damage or (self._sent < self._count and not is_cut):
-            self.finished.set_exception(
-                BagError(
-                    f"{self._sent} of {self._count} messages of {self._bag.path} were played"
-                    + "".join(f"; {fault.text}" for fault in self._damage[:1])
-                )
-            )
+        if self._damage:
+            text = f"not all of the recording was played: {self._damage[0].text}"
+            self.finished.set_exception(BagError(text))
         else:
             self.finished.set_result(None)
 
@@ -174,7 +166,6 @@ class SessionPlayer(GuardedNode):
         if since is not None:
             for message in self._bag.latest(self._latched, since, DEPTH):
                 self._topics[message.topic].publish(message.data)
-        self._sent = 0 if since is None else self._count  # what is passed over counts as played
         self._messages = iter(self._bag.messages(list(self._topics), self._damage, since))
         self._waiting = self._next()
         self._shown = position + _SHOWN if position and at is None else -1
@@ -191,12 +182,6 @@ class SessionPlayer(GuardedNode):
         for fault in self._damage[known:]:
             self.health.problem("damage", fault.text)
         return message
-
-
-def _joined(sentences: list[str]) -> str:
-    more = len(sentences) - _MOST_SAID
-    shown = "; ".join(sentences[:_MOST_SAID]) or "no topic of it has a message"
-    return f"{shown}; and {more} more" if more > 0 else shown
 
 
 main = partial(run_node, SessionPlayer)

@@ -34,6 +34,7 @@ from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
 _M_MMAP_THRESHOLD, _LARGE = -3, 1 << 17  # of glibc's malloc.h; bytes
+_RESERVE = 16 * 1024 * 1024  # bytes of the disk, for the index of some hours
 _WITHOUT_METADATA = (
     "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
     "be read and played without"
@@ -120,25 +121,22 @@ class SessionRecorder(GuardedNode):
 
     def _begin(self) -> None:
         settings = self._settings
-        further = settings.if_exists == "further"
-        beside = Path(settings.file).parent / "metadata.yaml"
-        taken = settings.file.endswith(".mcap") and os.path.exists(beside)
-        note = _WITHOUT_METADATA if taken and not further else ""
-        if note:
-            self.get_logger().info(note)
+        taken = os.path.exists(Path(settings.file).parent / "metadata.yaml")
+        taken = taken and settings.file.endswith(".mcap")
+        if taken and settings.if_exists != "further":
+            self.get_logger().info(_WITHOUT_METADATA)
         compression: Any = settings.compression
         bag = BagWriter(
             settings.file,
             compression=compression,
             sidecar=not taken,
-            further=further,
+            further=settings.if_exists == "further",
+            reserve=_RESERVE,
         )
         self._bag = WriteBehind(bag, settings.max_cache_size)
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
             self._bag.attach(name, media_type, data, now)
-        if note:
-            self.health.values["note"] = note
         self._tell_state()
         self.get_logger().info(f"recording to {bag.path}")
 

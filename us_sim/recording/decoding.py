@@ -155,7 +155,7 @@ def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
     """The x, y, z fields of a cloud, (N, 3) m.
 
     Args:
-        message: of one row of points or of several.
+        message: of points one after the other.
         frame: that it must be in; None is any.
 
     Raises:
@@ -164,42 +164,30 @@ def vectors_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
         FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
-    # In Python's integers, which are as wide as need be.
-    rows, columns, step = int(message.height), int(message.width), int(message.point_step)
-    stride = int(message.row_step) if rows > 1 else columns * step
-    kinds = {name: _kind_of(message, name) for name in "xyz"}
-    needed = (rows - 1) * stride + columns * step if rows * columns else 0
-    if stride < columns * step or len(message.data) < needed:
+    fields = {field.name: field for field in message.fields}
+    count, order = int(message.height) * int(message.width), "<>"[message.is_bigendian]
+    try:
+        layout: Any = {
+            "names": ["x", "y", "z"],
+            "formats": [order + _KINDS[fields[name].datatype] for name in "xyz"],
+            "offsets": [fields[name].offset for name in "xyz"],
+            "itemsize": message.point_step,
+        }
+        points = np.ndarray(count, np.dtype(layout), message.data)
+    except KeyError as error:
+        raise MeshError(f"the point cloud has no float field for {error} of x, y and z") from None
+    except (ValueError, TypeError, OverflowError, MemoryError) as error:
         raise MeshError(
-            f"the point cloud holds {len(message.data)} bytes, but says it has {rows * columns} "
-            f"points of {step} bytes" + (f" in rows of {stride} bytes" if rows > 1 else "")
-        )
-    vectors = np.empty((rows * columns, 3))
-    for axis, (kind, offset) in enumerate(kinds.values() if len(vectors) else ()):
-        grid = np.ndarray((rows, columns), kind, message.data, offset, (stride, step))
-        vectors[:, axis] = grid.ravel()
+            f"the point cloud's {len(message.data)} bytes are not its {count} points of "
+            f"{message.point_step} bytes: {error}"
+        ) from None
+    vectors = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
     if not (np.abs(vectors) <= _FARTHEST).all():  # nor is it for what is no number
         raise MeshError(
             "the point cloud has a coordinate that is not finite, or beyond any place: it must be "
             "in metres"
         )
     return vectors
-
-
-def _kind_of(message: Any, name: str) -> tuple[str, int]:
-    """NumPy's name of a field's type, and where in its point it begins."""
-    fields = {field.name: field for field in message.fields}
-    field = fields.get(name)
-    kind = _KINDS.get(field.datatype) if field is not None else None
-    if field is None or kind is None or field.count > 1:
-        raise MeshError(f"the point cloud has no float field for '{name}'; it needs x, y and z")
-    offset, end = int(field.offset), int(field.offset) + int(kind[1])
-    if end > message.point_step:
-        raise MeshError(
-            f"the point cloud's field '{name}' ends {end} bytes into a point of "
-            f"{message.point_step} bytes"
-        )
-    return (">" if message.is_bigendian else "<") + kind, offset
 
 
 def tetrahedra_from(message: Any) -> NDArray[np.int32]:
@@ -306,15 +294,9 @@ def affine_from(message: Any) -> NDArray[np.float64]:
         ProbeError: it is no 4 by 4 matrix, its last row is not 0 0 0 1, or a number of it is not
             finite, or so large that products of it would not be.
     """
-    sizes = tuple(dimension.size for dimension in message.layout.dim)
-    strides = tuple(dimension.stride for dimension in message.layout.dim)
-    count, offset = len(message.data), message.layout.data_offset
-    if sizes != (4, 4) or strides[1] != 4 or count != offset + 16:
-        raise ProbeError(
-            f"the matrix has {count} numbers from {offset} on in dimensions {list(sizes)} with "
-            f"strides {list(strides)}; it must be 4 by 4, row after row (strides 16 and 4)"
-        )
-    matrix = np.array(message.data[offset:], dtype=np.float64).reshape(4, 4)
+    if len(message.data) != 16:
+        raise ProbeError(f"the matrix has {len(message.data)} numbers; it must be 4 by 4")
+    matrix = np.array(message.data, dtype=np.float64).reshape(4, 4)
     if not (
         (np.abs(matrix) <= _LARGEST_OFFSET).all() and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()
     ):

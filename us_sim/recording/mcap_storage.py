@@ -1,37 +1,31 @@
-"""Reading one MCAP file: by the index in its summary, else by what `salvage` finds of it.
+"""Reading one MCAP file: by the index in its summary, or else by a walk through its records.
 
-The index and the records are mcap's. Its ``iter_messages`` is not used: it ends at the first
-damaged chunk, and takes 3.4 times as long as this for small messages.
+The records are mcap's. Its ``iter_messages`` is not used: it ends at the first damaged chunk and
+before the end of a file that was cut, and takes 3.4 times as long as this for small messages.
 """
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterator, Set
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from us_sim.errors import BagError
-from us_sim.recording.salvage import (
-    DAMAGE,
-    HEADER,
-    MESSAGE,
-    Contents,
-    Place,
-    Run,
-    parsed,
-    parsed_attachment,
-    records_in,
-    salvage,
-)
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import (
     BagAttachment,
@@ -42,12 +36,72 @@ from us_sim.recording.topic import (
     qos_from_yaml,
 )
 
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary and its offsets, CRC
-_CRC_AND_MAGIC = 12  # bytes at the end of the file that its checksum does not cover
+_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK = struct.Struct("<QQQII")  # start, end, size, CRC, length of the compression's name
+_LENGTH = 8  # bytes
+_CRC = struct.Struct("<I")
 _LAST = 2**63 - 1  # ns
 _PLACES_TOLD = 3
 
+_DAMAGE = (
+    *(McapError, zstandard.ZstdError, struct.error, RuntimeError),  # the last one of lz4
+    *(OverflowError, ValueError, KeyError, MemoryError),
+)
+"""Errors that the parsers raise for damaged bytes."""
+
+
+class _Run(NamedTuple):
+    """A stretch of the file that holds messages: a chunk, or a message outside of chunks."""
+
+    start: int  # ns, lowest log time in it
+    offset: int  # bytes, of its record's opcode
+    end: int  # ns, highest log time in it
+    length: int  # bytes of its record
+    channels: tuple[int, ...]  # of its messages; none where the index does not say
+
+
+_Place = tuple[int, int]  # offset and length of a record, bytes
 _Ordered = tuple[int, int, int, BagMessage]  # log time, offset of the run, place in it, message
+
+
+@dataclass
+class _Contents:
+    """What a file holds, and where."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)  # messages by channel
+    runs: list[_Run] = field(default_factory=list)
+    attachments: list[_Place] = field(default_factory=list)
+    notes: list[_Place] = field(default_factory=list)
+
+    def add(self, offset: int, record: bytes) -> None:
+        """Note what a record holds.
+
+        Raises:
+            _DAMAGE: it is not sound.
+        """
+        opcode = record[0]
+        if opcode == Opcode.ATTACHMENT:
+            self.attachments.append((offset, len(record)))
+        elif opcode == Opcode.METADATA:
+            self.notes.append((offset, len(record)))
+        heads = []
+        for inner, content in _records_in(record):
+            if inner == Opcode.MESSAGE:
+                heads.append(_MESSAGE.unpack_from(content))
+            elif inner == Opcode.SCHEMA:
+                schema = _parsed(Schema, content)
+                self.schemas[schema.id] = schema
+            elif inner == Opcode.CHANNEL:
+                channel = _parsed(Channel, content)
+                self.channels[channel.id] = channel
+        if heads:
+            times = [time for _, _, time, _ in heads]
+            counts = Counter(channel for channel, *_ in heads)
+            self.runs.append(_Run(min(times), offset, max(times), len(record), tuple(counts)))
+            self.counts += counts
 
 
 class McapStorage:
@@ -60,33 +114,36 @@ class McapStorage:
     def __init__(self, path: Path, label: str) -> None:
         self._path = path
         self._label = label
+        self.faults: list[Fault] = []
         with path.open("rb") as stream:
-            index = _index(stream)
-            self._held = index or salvage(stream, label)
-        self.is_indexed = index is not None
-        self.faults, self.start, self.end = self._held.faults, self._held.start, self._held.end
+            indexed = _indexed(stream)
+            self._held = indexed or self._walked(stream)
+        self.is_indexed = indexed is not None
         self._held.runs.sort()
+        self.start = min((run.start for run in self._held.runs), default=None)
+        self.end = max((run.end for run in self._held.runs), default=None)
         self.topics = self._topics()
 
     def attachments(self, damage: list[Fault] | None) -> Iterator[BagAttachment]:
         """The files within this one; ``damage`` and errors are as in `Bag.attachments`."""
-        for place in self._held.attachments:
+        for content in self._contents(self._held.attachments):
             try:
-                record = parsed_attachment(self._content(place))
-            except DAMAGE as error:
-                self._tell(damage, f"its attached file {place.name}: {error}")
+                record = _parsed(Attachment, content)
+                (crc,) = _CRC.unpack_from(content, len(content) - _CRC.size)
+                if crc and zlib.crc32(content[: -_CRC.size]) != crc:
+                    raise ValueError(f"the checksum of {record.name} does not match")
+            except _DAMAGE as error:
+                self._tell(damage, f"is damaged in an attached file: {error}")
             else:
                 yield BagAttachment(record.name, record.media_type, record.log_time, record.data)
 
     def notes(self, damage: list[Fault] | None) -> Iterator[BagNote]:
         """The metadata records; ``damage`` and errors are as those of `attachments`."""
-        for place in self._held.notes:
+        for content in self._contents(self._held.notes):
             try:
-                record = parsed(Metadata, self._content(place))
-                if record.name != place.name:
-                    raise ValueError("the index calls it differently")
-            except DAMAGE as error:
-                self._tell(damage, f"its metadata record {place.name}: {error}")
+                record = _parsed(Metadata, content)
+            except _DAMAGE as error:
+                self._tell(damage, f"is damaged in a metadata record: {error}")
             else:
                 yield BagNote(record.name, record.metadata)
 
@@ -103,10 +160,13 @@ class McapStorage:
         Raises:
             BagError: a chunk is damaged, and ``damage`` is None.
         """
-        wanted = self._wanted(topics)
-        total = sum(self._held.counts[id] for id in wanted)
-        read = outside = 0
-        broken: list[Fault] = []
+        wanted = {
+            id: (channel.topic, _type_name(self._held.schemas.get(channel.schema_id)))
+            for id, channel in self._held.channels.items()
+            if channel.topic in topics
+        }
+        broken: list[str] = []
+        read, total = 0, sum(self._held.counts[id] for id in wanted)
         # Chunks overlap in time; a message leaves the heap when no later chunk can precede it.
         # Of messages with the same log time the one that is earlier in the file comes first.
         pending: list[_Ordered] = []
@@ -120,72 +180,61 @@ class McapStorage:
                     for each in _messages(stream, run, wanted):
                         read += 1
                         if since is None or each[0] >= since:
-                            outside += not run.start <= each[0] <= run.end
                             heapq.heappush(pending, each)
-                except DAMAGE as error:
-                    where = f"its chunk at byte {run.offset}: {error}"
-                    self._tell(broken if damage is not None else None, where)
+                except _DAMAGE as error:
+                    broken.append(f"its chunk at byte {run.offset}: {error}")
+                    if damage is None:
+                        self._tell(None, f"is damaged in {broken[0]}")
         while pending:
             yield heapq.heappop(pending)[-1]
-        if read < total and since is None:
-            told = [fault.text for fault in broken[:_PLACES_TOLD]]
-            if broken[_PLACES_TOLD:]:
-                told.append(f"and {len(broken) - _PLACES_TOLD} more places")
-            lost = f"{self._label}: {total - read} of its {total} messages cannot be read"
-            broken = [Fault("; ".join([*told, lost]), total - read)]
-            if damage is None:
-                raise BagError(broken[0].text)
-        if damage is not None:
-            damage += broken
-            if outside:
-                text = f"{self._label} has {outside} messages at other times than its index says"
-                damage.append(Fault(f"{text}, so that seeking misses them"))
+        lost = total - read if since is None else 0
+        if broken or lost:
+            where = "; ".join(broken[:_PLACES_TOLD]) or "its index"
+            count = f": {lost} of its {total} messages cannot be read" if lost else ""
+            self._tell(damage, f"is damaged in {where}{count}", lost)
 
-    def latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
-        """The last messages of each of these topics before a time; sound ones alone.
-
-        Args:
-            topics: their names.
-            before: log time, ns.
-            count: messages of each channel of a topic.
-        """
-        found: list[BagMessage] = []
-        with self._path.open("rb") as stream:
-            for id, kind in self._wanted(topics).items():
-                kept: list[_Ordered] = []
-                only = {id}
-                runs = [r for r in self._held.runs if r.start < before and _may_hold(r, only)]
-                for run in sorted(runs, key=lambda run: run.end, reverse=True):
-                    if len(kept) == count and run.end < kept[0][0]:
-                        break  # as do all that end earlier
-                    with contextlib.suppress(*DAMAGE):
-                        held = _messages(stream, run, {id: kind})
-                        kept += [each for each in held if each[0] < before]
-                    kept = sorted(kept)[-count:]
-                found += [message for *_, message in kept]
+    def _walked(self, stream: BinaryIO) -> _Contents:
+        """Find the contents of a file without an index, up to where it was cut."""
+        found, position, is_ended = _Contents(), len(MCAP0_MAGIC), False
+        size = stream.seek(-len(MCAP0_MAGIC), 2) + len(MCAP0_MAGIC)
+        has_magic = stream.read() == MCAP0_MAGIC
+        while position + _HEADER.size <= size and not is_ended:
+            stream.seek(position)
+            opcode, length = _HEADER.unpack(stream.read(_HEADER.size))
+            end = position + _HEADER.size + length
+            if end > size or not opcode:  # zeros are what a power cut leaves
+                break
+            is_ended = opcode == Opcode.DATA_END
+            stream.seek(position)
+            try:
+                found.add(position, stream.read(end - position))
+            except _DAMAGE as error:
+                self._tell(self.faults, f"is damaged in its record at byte {position}: {error}")
+            position = end
+        if not (is_ended and has_magic):
+            times = [time for run in found.runs for time in (run.start, run.end)] or [0]
+            text = (
+                f"was not ended properly (it breaks off at byte {position} of {size}): "
+                f"{found.counts.total()} messages over {(max(times) - min(times)) / 1e9:.1f} s "
+                f"were recovered"
+            )
+            self._tell(self.faults, text)
         return found
 
-    def _wanted(self, topics: Collection[str]) -> dict[int, tuple[str, str]]:
-        """Name and type of each channel of these topics."""
-        return {
-            id: (channel.topic, _type_name(self._held.schemas.get(channel.schema_id)))
-            for id, channel in self._held.channels.items()
-            if channel.topic in topics
-        }
-
-    def _tell(self, damage: list[Fault] | None, place: str) -> None:
-        """Note damage, or raise it as a BagError."""
-        text = f"{self._label} is damaged in {place}"
-        if damage is None:
+    def _tell(self, faults: list[Fault] | None, what: str, lost: int = 0) -> None:
+        """Note a fault, or raise it as a BagError."""
+        if faults is None:
             remedy = "`us-sim bag repair` writes all that can be read as a new bag"
-            raise BagError(f"{text}; {remedy}") from None
-        damage.append(Fault(text))
+            raise BagError(f"{self._label} {what}; {remedy}") from None
+        faults.append(Fault(f"{self._label} {what}", lost))
 
-    def _content(self, place: Place) -> memoryview:
-        """A record without opcode and length."""
+    def _contents(self, places: list[_Place]) -> Iterator[memoryview]:
+        """Records without opcode and length."""
+        size = self._path.stat().st_size
         with self._path.open("rb") as stream:
-            stream.seek(place.offset + HEADER.size)
-            return memoryview(stream.read(place.length - HEADER.size))
+            for offset, length in places:
+                stream.seek(min(offset, size))
+                yield memoryview(stream.read(min(length, size)))[_HEADER.size :]
 
     def _topics(self) -> tuple[BagTopic, ...]:
         topics: dict[str, BagTopic] = {}
@@ -208,58 +257,95 @@ class McapStorage:
         return tuple(topics.values())
 
 
-def _may_hold(run: Run, channels: Set[int]) -> bool:
+def _indexed(stream: BinaryIO) -> _Contents | None:
+    """Read the contents of a file by its index; None where there is none of every chunk."""
+    try:
+        summary = make_reader(stream).get_summary()
+    except (*_DAMAGE, OSError):
+        return None
+    said = summary.statistics if summary else None
+    if (
+        summary is None
+        or said is None
+        or len(summary.chunk_indexes) != said.chunk_count
+        or (said.message_count and not said.chunk_count)
+        or not summary.channels.keys() >= said.channel_message_counts.keys()
+    ):
+        return None
+    runs = [
+        _Run(
+            each.message_start_time,
+            each.chunk_start_offset,
+            each.message_end_time,
+            each.chunk_length,
+            tuple(each.message_index_offsets),
+        )
+        for each in summary.chunk_indexes
+    ]
+    return _Contents(
+        summary.schemas,
+        summary.channels,
+        Counter(said.channel_message_counts),
+        runs,
+        [(each.offset, each.length) for each in summary.attachment_indexes],
+        [(each.offset, each.length) for each in summary.metadata_indexes],
+    )
+
+
+def _parsed(kind: Any, content: memoryview) -> Any:
+    return kind.read(ReadDataStream(BytesIO(content)))
+
+
+def _records_in(record: bytes) -> Iterator[tuple[int, memoryview]]:
+    """Opcode and content of each record in a chunk; of another record, its own.
+
+    Raises:
+        _DAMAGE: it is not sound.
+    """
+    content = memoryview(record)[_HEADER.size :]
+    if record[0] != Opcode.CHUNK:
+        yield record[0], content
+        return
+    *_, crc, name = _CHUNK.unpack_from(content)
+    held, position = content[_CHUNK.size + name + _LENGTH :], 0
+    if name:  # of a compression
+        stream, size = get_chunk_data_stream(_parsed(Chunk, content), validate_crc=True)
+        held = memoryview(stream.read(size))
+    elif crc and zlib.crc32(held) != crc:  # here, since mcap copies what is not compressed
+        raise ValueError("its checksum does not match")
+    while position < len(held):
+        opcode, length = _HEADER.unpack_from(held, position)
+        position += _HEADER.size + length
+        if position > len(held):
+            raise ValueError("its records break off")
+        yield opcode, held[position - length : position]
+
+
+def _may_hold(run: _Run, channels: Set[int]) -> bool:
     return not run.channels or not channels.isdisjoint(run.channels)
 
 
-def _messages(stream: BinaryIO, run: Run, wanted: dict[int, tuple[str, str]]) -> Iterator[_Ordered]:
+def _messages(
+    stream: BinaryIO, run: _Run, wanted: dict[int, tuple[str, str]]
+) -> Iterator[_Ordered]:
     """The messages of a run on channels of which name and type are given.
 
     Raises:
-        DAMAGE: it is not sound.
+        _DAMAGE: it is not sound.
     """
     stream.seek(run.offset)
-    record = memoryview(stream.read(run.length))
-    is_chunk = record[:1] != bytes([Opcode.MESSAGE])
-    held = records_in(record) if is_chunk else [(int(Opcode.MESSAGE), record[HEADER.size :])]
-    for place, (opcode, content) in enumerate(held):
+    record = stream.read(run.length)
+    if record[:1] not in (bytes([Opcode.CHUNK]), bytes([Opcode.MESSAGE])):
+        raise ValueError("the index says that there is one")
+    for place, (opcode, content) in enumerate(_records_in(record)):
         if opcode == Opcode.MESSAGE:
-            channel, sequence, time, sent = MESSAGE.unpack_from(content)
+            channel, sequence, time, sent = _MESSAGE.unpack_from(content)
             if channel in wanted:
                 if time > _LAST or sent > _LAST:
                     raise ValueError("a message is of a time after the year 2262")
-                data = bytes(content[MESSAGE.size :])
+                data = bytes(content[_MESSAGE.size :])
                 message = BagMessage(*wanted[channel], time, sent, data, sequence)
                 yield time, run.offset, place, message
-
-
-def _index(stream: BinaryIO) -> Contents | None:
-    """Read the contents of a file that has a sound index of every chunk."""
-    try:
-        summary = make_reader(stream).get_summary()
-        stream.seek(-_FOOTER.size - len(MCAP0_MAGIC), 2)
-        _, _, start, _, crc = _FOOTER.unpack(stream.read(_FOOTER.size))
-        stream.seek(start)
-        covered = stream.read()[:-_CRC_AND_MAGIC]
-    except (*DAMAGE, OSError):
-        return None
-    statistics = summary.statistics if summary else None
-    if summary is None or statistics is None or (crc and zlib.crc32(covered) != crc):
-        return None
-    found = Contents()
-    found.schemas, found.channels = dict(summary.schemas), dict(summary.channels)
-    for each in summary.chunk_indexes:
-        times = each.message_start_time, each.chunk_start_offset, each.message_end_time
-        found.runs.append(Run(*times, each.chunk_length, tuple(each.message_index_offsets)))
-    found.attachments = [Place(e.offset, e.length, e.name) for e in summary.attachment_indexes]
-    found.notes = [Place(e.offset, e.length, e.name) for e in summary.metadata_indexes]
-    if statistics.message_count:
-        found.start, found.end = statistics.message_start_time, statistics.message_end_time
-    found.counts.update(statistics.channel_message_counts)
-    is_whole = len(found.runs) == statistics.chunk_count and (
-        found.runs or not statistics.message_count
-    )
-    return found if is_whole and found.channels.keys() >= found.counts.keys() else None
 
 
 def _type_name(schema: Schema | None) -> str:

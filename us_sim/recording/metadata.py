@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,41 +19,32 @@ _NO_TIME = 2**63 - 1  # ns, the starting time that rosbag2 gives a bag without m
 
 
 @dataclass(frozen=True)
-class FileEntry:
-    """One file of a bag; its path is relative to the bag's folder."""
-
-    path: str
-    start: int = _NO_TIME  # ns since the epoch, lowest log time
-    duration: int = 0  # ns
-    message_count: int = 0
-
-
-@dataclass(frozen=True)
 class BagMetadata:
     """Contents of a ``metadata.yaml``."""
 
-    files: tuple[FileEntry, ...]
+    files: tuple[str, ...]  # relative to the bag's folder
     topics: tuple[BagTopic, ...] = ()
     start: int = _NO_TIME  # ns since the epoch, lowest log time
     duration: int = 0  # ns
     message_count: int = 0
-    storage: str = "mcap"
-    compression_format: str = ""
     compression_mode: str = ""  # "", "FILE" or "MESSAGE"
-    ros_distro: str = "jazzy"
     custom_data: Mapping[str, str] = field(default_factory=dict)
 
     def document(self) -> str:
-        """The text of the file."""
+        """The text of the file, for a bag of one MCAP file."""
         return as_yaml({_KEY: self.information()})
 
     def information(self) -> dict[str, Any]:
         """What rosbag2 also stores inside an MCAP file, without the outer key."""
+        extent = {
+            "starting_time": {"nanoseconds_since_epoch": self.start},
+            "duration": {"nanoseconds": self.duration},
+            "message_count": self.message_count,
+        }
         return {
             "version": _NEWEST_VERSION,
-            "storage_identifier": self.storage,
-            **_extent(self.start, self.duration),
-            "message_count": self.message_count,
+            "storage_identifier": "mcap",
+            **extent,
             "topics_with_message_count": [
                 {
                     "topic_metadata": {
@@ -66,27 +58,13 @@ class BagMetadata:
                 }
                 for topic in self.topics
             ],
-            "compression_format": self.compression_format,
+            "compression_format": "",
             "compression_mode": self.compression_mode,
-            "relative_file_paths": [file.path for file in self.files],
-            "files": [
-                {
-                    "path": file.path,
-                    **_extent(file.start, file.duration),
-                    "message_count": file.message_count,
-                }
-                for file in self.files
-            ],
+            "relative_file_paths": [*self.files],
+            "files": [{"path": file, **extent} for file in self.files],
             "custom_data": dict(self.custom_data) or None,
-            "ros_distro": self.ros_distro,
+            "ros_distro": os.environ.get("ROS_DISTRO") or "jazzy",
         }
-
-
-def _extent(start: int, duration: int) -> dict[str, dict[str, int]]:
-    return {
-        "starting_time": {"nanoseconds_since_epoch": start},
-        "duration": {"nanoseconds": duration},
-    }
 
 
 def read_metadata(file: Path) -> BagMetadata:
@@ -105,17 +83,14 @@ def read_metadata(file: Path) -> BagMetadata:
                 f"here: convert the bag with ros2 bag convert of ROS 2 Jazzy"
             )
         return BagMetadata(
-            files=tuple(FileEntry(str(path)) for path in information["relative_file_paths"] or ()),
+            files=tuple(map(str, information["relative_file_paths"] or ())),
             topics=tuple(
                 _topic(item, file) for item in information["topics_with_message_count"] or ()
             ),
             start=int(information["starting_time"]["nanoseconds_since_epoch"]),
             duration=int(information["duration"]["nanoseconds"]),
             message_count=int(information["message_count"]),
-            storage=str(information["storage_identifier"]),
-            compression_format=str(information.get("compression_format") or ""),
             compression_mode=str(information.get("compression_mode") or "").upper(),
-            ros_distro=str(information.get("ros_distro") or ""),
             custom_data=dict(information.get("custom_data") or {}),
         )
     except OSError as error:

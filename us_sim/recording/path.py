@@ -16,9 +16,7 @@ array([-0.01 , -0.009])
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import BagError, TrackingError
+from us_sim.geometry.frame_chain import FrameChain
+from us_sim.geometry.pose import Pose
 from us_sim.recording.probe_path import ProbePath
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.resampling import Times, slerp
 from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.topic import BagTopic, QosProfile
@@ -39,9 +38,6 @@ from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 _TF = "tf2_msgs/msg/TFMessage"
-_NOWHERE = (math.nan,) * 7
-_LATE = 1_000_000_000  # ns that a stamp may be older than one before; more is another time
-_LONGEST_GAP = 10_000_000_000  # ns between two transforms that belong together, as tf2 keeps them
 
 _Found = tuple[str, Any, Any, Any]  # a body's name, header, position, orientation
 
@@ -137,85 +133,25 @@ def _each(bag: Bag, topic: BagTopic) -> Iterator[tuple[Row, _Found]]:
 
 
 def _chained(bag: Bag, topic: BagTopic, body: str, parent: str) -> Iterator[Row]:
-    """The poses of a frame of tf in one further up, all links of the way at one time.
-
-    They are made at the stamps of the link that moves least often, and the others interpolated
-    there; without a pose where one of them is not known then.
-    """
-    from scipy.spatial.transform import Rotation
-
-    links: dict[str, list[Row]] = {}
-    fixed: set[str] = set()
+    """The poses of a frame of tf in one further up, made as `FrameChain` makes them live."""
+    chain, is_empty = FrameChain(body, parent), True
     static = f"{topic.name}_static"
-    if any(each.name == static for each in bag.topics):
-        for row, (frame, *_) in _each(bag, bag.topic(static)):
-            links[frame] = [row]
-            fixed.add(frame)
-    for row, (frame, *_) in _each(bag, topic):
-        links[frame] = [row] if frame in fixed or frame not in links else [*links[frame], row]
-        fixed.discard(frame)
-    way: list[str] = []
-    while (frame := links[way[-1]][0].frame_id.lstrip("/") if way else body) != parent:
-        if frame not in links or frame in way:
-            way = []
-            break
-        way.append(frame)
-    moving = [frame for frame in way if frame not in fixed]
-    if not moving:
+    for name in [each.name for each in bag.topics if each.name == static] + [topic.name]:
+        for row, (frame, *_) in _each(bag, bag.topic(name)):
+            numbers = np.array(row.pose)
+            if not is_pose(numbers[None])[0]:
+                continue
+            above, pose = row.frame_id.lstrip("/"), Pose(numbers[:3], numbers[3:])
+            if name == static:
+                chain.fix(frame, above, pose)
+            elif made := chain.move(frame, above, row.stamp, pose):
+                stamp, found = made
+                is_empty = False
+                yield Row(row.log_time, stamp, parent, (*found.position, *found.orientation))
+    if is_empty:
         raise BagError(
             f"{bag.path} holds no way in {topic.name} from '{body}' up to '{parent}' that moves"
         )
-    tracks = {frame: _track(bag, frame, links[frame]) for frame in way}
-    slowest = min(moving, key=lambda frame: len(links[frame]))
-    stamps = np.unique([row.stamp for row in links[slowest]])
-    turn, place = Rotation.identity(len(stamps)), np.zeros((len(stamps), 3))
-    for frame in way:
-        poses = _at(tracks[frame], stamps, is_fixed=frame in fixed)
-        is_known = np.isfinite(poses).all(axis=1)
-        place[~is_known] = np.nan
-        poses[~is_known] = 0, 0, 0, 0, 0, 0, 1
-        link = Rotation.from_quat(poses[:, 3:])
-        turn, place = link * turn, link.apply(place) + poses[:, :3]
-    base = stamps[0]
-    seen = np.array([(row.stamp - base, row.log_time - base) for row in links[moving[0]]])
-    seen = seen[np.argsort(seen[:, 0], kind="stable")]
-    times = np.interp(stamps - base, *seen.T).round().astype(np.int64) + base
-    for time, stamp, at, q in zip(times, stamps, place, turn.as_quat(), strict=True):
-        pose = (*at.tolist(), *q.tolist()) if np.isfinite(at).all() else _NOWHERE
-        yield Row(int(time), int(stamp), parent, pose)
-
-
-def _track(bag: Bag, frame: str, rows: list[Row]) -> tuple[Times, NDArray[np.float64]]:
-    """The poses (K, 7) of a frame of tf by its stamps, each stamp once."""
-    if len({row.frame_id for row in rows}) > 1:
-        raise BagError(f"{bag.path} holds '{frame}' of tf in several frames: no way up is known")
-    stamps = np.array([row.stamp for row in rows], np.int64)
-    back = (np.maximum.accumulate(stamps) - stamps).max()
-    if back > _LATE:
-        raise BagError(
-            f"{bag.path}: stamps of '{frame}' in tf go back by {back / 1e9:.1f} s, so nobody knows "
-            f"which transforms go together: cut the recording there"
-        )
-    stamps, first = np.unique(stamps, return_index=True)
-    return stamps, np.array([row.pose for row in rows])[first]
-
-
-def _at(track: tuple[Times, NDArray[np.float64]], stamps: Times, *, is_fixed: bool) -> Any:
-    """Poses (M, 7) of a link at stamps; nan where there is none, or a neighbour is far."""
-    times, poses = track
-    usable = is_pose(poses)
-    if is_fixed:
-        return np.tile(poses[0] if usable[0] else _NOWHERE, (len(stamps), 1))
-    found = np.full((len(stamps), 7), np.nan)
-    after = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
-    before = np.clip(np.searchsorted(times, stamps, side="right") - 1, 0, None)
-    known = (times[before] <= stamps) & (stamps <= times[after])
-    known &= usable[before] & usable[after] & (times[after] - times[before] <= _LONGEST_GAP)
-    if usable.sum() > 1 and known.any():
-        found[known] = slerp(times[usable], poses[usable], stamps[known])
-    elif known.any():
-        found[known] = poses[usable]
-    return found
 
 
 _PATHS = "give a bag (.mcap, .db3) or a tracker recording of PLUS (.igs.mha, .igs.nrrd)"
@@ -254,12 +190,12 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
         single = Path(path).suffix.lower() in TRANSFORM_SUFFIXES
         remedy = "a single transform belongs in `registration` or `calibration`; " if single else ""
         raise BagError(f"{error}; {remedy}{_PATHS}") from None
-    read = _read(bag, topic or _only_body(bag, option))
-    if topic is None and len(read.frames) > 1:  # a hand and a device took turns
+    name, rows = _read(bag, topic or _only_body(bag, option))
+    if topic is None and len(_frames(rows)) > 1:  # a hand and a device took turns
         poses = [each.name for each in bag.topics if each.type_name == POSE_STAMPED]
-        of_probe = [name for name in poses if name.endswith("/probe/pose") and name != read.name]
-        read = _read(bag, of_probe[0]) if len(of_probe) == 1 else read
-    return _usable(bag, read)
+        of_probe = [each for each in poses if each.endswith("/probe/pose") and each != name]
+        name, rows = _read(bag, of_probe[0]) if len(of_probe) == 1 else (name, rows)
+    return _usable(bag, name, rows)
 
 
 def is_tracker_recording(path: str | Path) -> bool:
@@ -327,58 +263,46 @@ def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.isfinite(poses).all(axis=1) & has_orientation
 
 
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """All recorded poses of a body."""
-
-    name: str
-    frames: tuple[str, ...]  # in which they are
-    times: NDArray[np.int64]  # (K, 2) ns: log time and stamp
-    poses: NDArray[np.float64]  # (K, 7)
-
-
-def _read(bag: Bag, name: str) -> _Read:
+def _read(bag: Bag, name: str) -> tuple[str, list[Row]]:
+    """A body's whole name, and its recorded poses."""
     topic, colon, body = name.partition(":")
     name = bag.topic(topic).name + colon + body
-    rows = list(pose_rows(bag, name))
-    times = np.array([(row.log_time, row.stamp) for row in rows], np.int64)
-    return _Read(
-        name,
-        tuple(dict.fromkeys(row.frame_id for row in rows)),
-        times.reshape(-1, 2),
-        np.array([row.pose for row in rows], np.float64).reshape(-1, 7),
-    )
+    return name, list(pose_rows(bag, name))
 
 
-def _usable(bag: Bag, read: _Read) -> ProbePath:
+def _frames(rows: list[Row]) -> list[str]:
+    return list(dict.fromkeys(row.frame_id for row in rows))
+
+
+def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
     """The poses of one frame that can be used."""
-    count, poses = len(read.poses), read.poses
-    if not count:
-        raise BagError(f"{bag.path} holds no pose on {read.name}; {bag.note or 'it is silent'}")
-    if len(read.frames) > 1:
+    if not rows:
+        raise BagError(f"{bag.path} holds no pose on {name}; {bag.note or 'it is silent'}")
+    frames = _frames(rows)
+    if len(frames) > 1:
         raise BagError(
-            f"{bag.path} holds poses on {read.name} in the frames {', '.join(read.frames)}: a path "
-            f"has one frame"
+            f"{bag.path} holds poses on {name} in the frames {', '.join(frames)}: a path has one "
+            f"frame"
         )
+    poses = np.array([row.pose for row in rows], np.float64)
     usable = is_pose(poses)
-    rejected = count - int(usable.sum())
+    rejected = len(rows) - int(usable.sum())
     notes = [bag.note] if bag.note else []
     if rejected:
         notes.append(
-            f"{rejected} of the {count} poses on {read.name} are not finite"
-            + (", or not known all the way up," if read.name.count(":") > 1 else "")
-            + " or have no orientation and are left out, the first being number "
-            + str(int(np.argmin(usable)) + 1)
+            f"{rejected} of the {len(rows)} poses on {name} are not finite or have no orientation "
+            f"and are left out, the first being number {int(np.argmin(usable)) + 1}"
         )
-    if rejected == count:
+    if rejected == len(rows):
         raise BagError(f"{bag.path} holds no usable pose: {'; '.join(notes)}")
+    times = np.array([(row.log_time, row.stamp) for row in rows], np.int64)[usable]
     return ProbePath(
-        topic=read.name,
-        frame_id=read.frames[0],
-        stamps=read.times[usable, 1],
+        topic=name,
+        frame_id=frames[0],
+        stamps=times[:, 1],
         positions=poses[usable, :3],
         orientations=poses[usable, 3:],
-        log_times=read.times[usable, 0],
+        log_times=times[:, 0],
         rejected=rejected,
         note="; ".join(notes),
     )

@@ -7,17 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
 
 
 @dataclass(frozen=True, eq=False)
 class ProbePath:
-    """Poses in the order in which they were recorded; their stamps may go back.
-
-    Raises:
-        BagError: the arrays are not of K poses.
-    """
+    """Poses in the order in which they were recorded; their stamps may go back."""
 
     topic: str
     frame_id: str
@@ -33,14 +28,6 @@ class ProbePath:
     def __post_init__(self) -> None:
         if not len(self.log_times):
             object.__setattr__(self, "log_times", self.stamps)
-        count = len(self.stamps)
-        shapes = [(count,), (count, 3), (count, 4), (count,)]
-        arrays = [self.stamps, self.positions, self.orientations, self.log_times]
-        if [array.shape for array in arrays] != shapes:
-            raise BagError(
-                f"a path of {count} stamps needs as many positions (K, 3), orientations (K, 4) "
-                f"and log times, not {[array.shape for array in arrays[1:]]}"
-            )
 
     def __len__(self) -> int:
         return len(self.stamps)

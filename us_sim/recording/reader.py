@@ -15,10 +15,11 @@
 from __future__ import annotations
 
 import heapq
-from collections import Counter
+from collections import Counter, defaultdict, deque
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ class Bag:
         self.metadata = metadata
         self._storages = storages
         self._scratch = scratch  # kept alive with the files that it unpacked
-        self._decompress_messages = metadata is not None and metadata.compression_mode == "MESSAGE"
+        self._is_packed = metadata is not None and metadata.compression_mode == "MESSAGE"
         topics: dict[str, BagTopic] = {}
         for topic in (topic for storage in storages for topic in storage.topics):
             earlier = topics.get(topic.name)
@@ -91,25 +92,16 @@ class Bag:
         """The faults that were found when the bag was opened."""
         found = [fault for storage in self._storages for fault in storage.faults]
         if self.metadata is not None:
-            if missing := missing_files(self.path, self.metadata):
-                found.append(
-                    Fault(
-                        f"{self.path / 'metadata.yaml'} names {', '.join(missing)}, which "
-                        f"{'is' if len(missing) == 1 else 'are'} not there"
-                    )
+            if missing := ", ".join(missing_files(self.path, self.metadata)):
+                text = f"{self.path / 'metadata.yaml'} names files that are not there: {missing}"
+                found.append(Fault(text))
+            if (lost := self.metadata.message_count - self.message_count) > 0:
+                text = (
+                    f"{self.path} has {self.message_count} messages where its metadata.yaml says "
+                    f"{self.metadata.message_count}: {lost} were lost"
                 )
-            said, held = self.metadata.message_count, self.message_count
-            if said > held:
-                text = f"{self.path} has {held} messages where its metadata.yaml says {said}"
-                untold = max(said - held - sum(fault.messages for fault in found), 0)
-                found.append(Fault(f"{text}: {said - held} were lost", untold))
-        return found
-
-    def faults(self) -> list[Fault]:
-        """Everything that is wrong with the bag, for which all of it is read."""
-        found: list[Fault] = []
-        for _ in self.all_messages(found):
-            pass
+                untold = max(lost - sum(fault.messages for fault in found), 0)
+                found.append(Fault(text, untold))
         return found
 
     def all_messages(self, faults: list[Fault]) -> Iterator[BagMessage]:
@@ -188,7 +180,7 @@ class Bag:
             unpacked = self._unpacked(message)
             packed += unpacked is not message
             yield unpacked
-        if packed and damage is not None and not self._decompress_messages:
+        if packed and damage is not None and not self._is_packed:
             text = f"{packed} messages of {self.path} are each packed with zstd"
             damage.append(Fault(f"{text}, which no metadata.yaml says"))
 
@@ -201,18 +193,12 @@ class Bag:
             count: messages of each topic.
 
         Raises:
-            BagError: the bag has no such topic, or is damaged.
+            BagError: the bag has no such topic.
         """
-        names = {self.topic(name).name for name in topics}
-        found = [each for s in self._storages for each in s.latest(names, before, count)]
-        found.sort(key=lambda message: message.log_time)
-        left = Counter(dict.fromkeys(names, count))
-        last = []
-        for message in reversed(found):
-            left[message.topic] -= 1
-            if left[message.topic] >= 0:
-                last.append(self._unpacked(message))
-        return last[::-1]
+        last: dict[str, deque[BagMessage]] = defaultdict(lambda: deque(maxlen=count))
+        for message in takewhile(lambda each: each.log_time < before, self.messages(topics, [])):
+            last[message.topic].append(message)
+        return sorted(chain(*last.values()), key=lambda message: message.log_time)
 
     def _unpacked(self, message: BagMessage) -> BagMessage:
         """The message, decompressed where each one is compressed by itself.
@@ -221,12 +207,12 @@ class Bag:
         """
         is_frame = message.data.startswith(zstandard.FRAME_HEADER)
         is_cdr = self._topics[message.topic].encoding == "cdr"
-        if not (self._decompress_messages or (is_frame and is_cdr)):
+        if not (self._is_packed or (is_frame and is_cdr)):
             return message
         try:
             data = zstandard.decompress(message.data)
         except zstandard.ZstdError as error:
-            if self._decompress_messages:
+            if self._is_packed:
                 raise BagError(f"{self.path} is damaged: {error}") from None
             return message  # other bytes that begin so
         return message._replace(data=data)
@@ -246,8 +232,7 @@ class Bag:
         store = self.definitions(topic)
         try:
             return store.deserialize_cdr(message.data, topic.type_name)
-        except Exception as error:
-            # Generated decoders may raise anything when the bytes are wrong.
+        except Exception as error:  # generated decoders may raise anything for wrong bytes
             raise BagError(
                 f"{self.path} holds a message on {topic.name} at {message.log_time} ns that is no "
                 f"{topic.type_name}: {error}"

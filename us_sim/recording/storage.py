@@ -1,44 +1,35 @@
-"""The files of a bag and the readers of them: by their first bytes MCAP, SQLite, or zstd of either.
-
-SQLite is read here and not by rosbags' ``Sqlite3Reader``, which opens a file as immutable: of a
-recorder that was killed it leaves out all that is in the journal (``-wal``) beside the file.
-"""
+"""The files of a bag and the readers of them: by their first bytes MCAP, SQLite, or zstd."""
 
 from __future__ import annotations
 
 import os
 import re
 import shutil
-import sqlite3
 import tempfile
 import weakref
 from collections.abc import Collection, Iterator
-from contextlib import closing
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import zstandard
 from mcap.writer import MCAP0_MAGIC
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from us_sim.errors import BagError
 from us_sim.recording.mcap_storage import McapStorage
 from us_sim.recording.metadata import BagMetadata, read_metadata
-from us_sim.recording.salvage import unpacked_pieces
 from us_sim.recording.schemas import normalized_type
-from us_sim.recording.topic import (
-    BagAttachment,
-    BagMessage,
-    BagNote,
-    BagTopic,
-    Fault,
-    qos_from_yaml,
-)
+from us_sim.recording.topic import BagAttachment, BagMessage, BagNote, BagTopic, Fault, QosProfile
 
 _SQLITE_MAGIC = b"SQLite format 3\0"
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_NUMBERS = re.compile(r"^\d+_|_[\d_-]+(?=\.)")
+"""What tells the files of a bag apart: BAG_1.mcap, or 1_BAG_2026_06_24-10_00_00.mcap in Lyrical."""
 
 
-class SqliteFile:
-    """One SQLite file as a Storage; errors call it by the label.
+class SqliteStorage:
+    """One SQLite file as a Storage, by rosbags; errors call it by the label.
 
     Raises:
         BagError: the file is damaged, or without the tables of rosbag2.
@@ -48,157 +39,67 @@ class SqliteFile:
 
     def __init__(self, path: Path, label: str) -> None:
         self._label = label
-        self._uri, unread = _address(path)
-        (self.start, self.end, rows, last), *_ = self._rows(
-            "SELECT MIN(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
-            "MAX(timestamp) FILTER (WHERE typeof(timestamp) = 'integer'), "
-            "COUNT(*), MAX(id) FROM messages"
-        )
-        try:
-            with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                self.topics = tuple(_topics(database, self._label))
-        except (sqlite3.Error, UnicodeDecodeError, TypeError, AttributeError) as error:
-            raise self._damaged(error) from None
-        self.faults = [Fault(unread)] if unread else []
-        if last is not None and last > rows:  # rosbag2 numbers them from 1
+        self.faults: list[Fault] = []
+        journal = path.with_name(f"{path.name}-wal")
+        if os.path.isfile(journal) and journal.stat().st_size:
             text = (
-                f"{self._label} holds {rows} messages, and the last one has the number {last}: "
-                f"{last - rows} were lost"
+                f"{label} was not closed by its recorder, and what is in {journal.name} is not "
+                f"read: `sqlite3 {path} 'PRAGMA wal_checkpoint'` puts it into the file"
             )
-            self.faults.append(Fault(text, last - rows))
+            self.faults.append(Fault(text))
+        self._reader = Sqlite3Reader(path)
+        try:
+            self._reader.open()
+            self.topics = tuple(map(_topic, self._reader.connections))
+            about = self._reader.metadata
+            self.start = int(about.start_time) if about.message_count else None
+            self.end = int(about.end_time) - 1 if about.message_count else None
+        except Exception as error:  # rosbags' own, SQLite's, and what foreign texts lead to
+            raise self._damaged(error) from None
 
-    def attachments(
-        self,
-        damage: list[Fault] | None,  # noqa: ARG002
-    ) -> Iterator[BagAttachment]:
+    def attachments(self, _: list[Fault] | None) -> Iterator[BagAttachment]:
         """None: rosbag2 keeps no files in a database."""
         return iter(())
 
-    def notes(self, damage: list[Fault] | None) -> Iterator[BagNote]:  # noqa: ARG002
+    def notes(self, _: list[Fault] | None) -> Iterator[BagNote]:
         """None."""
         return iter(())
 
     def messages(
-        self,
-        topics: Collection[str],
-        damage: list[Fault] | None,  # noqa: ARG002 (what SQLite finds damaged ends it)
-        since: int | None = None,
+        self, topics: Collection[str], _: list[Fault] | None, since: int | None = None
     ) -> Iterator[BagMessage]:
         """The messages of these topics, since a log time (ns), in the order of their log times.
 
         Raises:
             BagError: the database is damaged.
         """
-        types = {topic.name: topic.type_name for topic in self.topics if topic.name in topics}
-        marks = ",".join("?" * len(types))
-        query = (
-            f"SELECT topics.name, timestamp, data {_JOINED} WHERE topics.name IN ({marks}) "
-            "AND timestamp >= ? ORDER BY timestamp, messages.id"
-        )
-        for name, time, data in self._rows(query, *types, -(2**63) if since is None else since):
-            yield self._message(name, types[name], time, data)
-
-    def latest(self, topics: Collection[str], before: int, count: int) -> list[BagMessage]:
-        """The last messages of each of these topics before a log time, ns.
-
-        Raises:
-            BagError: the database is damaged.
-        """
-        query = (
-            f"SELECT timestamp, data {_JOINED} WHERE topics.name = ? AND timestamp < ? "
-            "ORDER BY timestamp DESC, messages.id DESC LIMIT ?"
-        )
-        found = [
-            self._message(topic.name, topic.type_name, time, data)
-            for topic in self.topics
-            if topic.name in topics
-            for time, data in self._rows(query, topic.name, before, count)
-        ]
-        return found[::-1]
-
-    def _rows(self, query: str, *values: object) -> Iterator[tuple[Any, ...]]:
+        wanted = [each for each in self._reader.connections if each.topic in topics]
         try:
-            with closing(sqlite3.connect(self._uri, uri=True)) as database:
-                yield from database.execute(query, values)
-        except (sqlite3.Error, UnicodeDecodeError) as error:
+            for connection, time, data in self._reader.messages(wanted, since):
+                type_name = normalized_type(connection.msgtype)
+                yield BagMessage(connection.topic, type_name, int(time), int(time), bytes(data))
+        except Exception as error:
             raise self._damaged(error) from None
 
-    def _message(self, topic: str, type_name: str, time: object, data: object) -> BagMessage:
-        if not (isinstance(time, int) and isinstance(data, bytes)):  # SQLite has no checksums
-            raise self._damaged(f"a message on {topic} has the time {time!r:.20}, or no data")
-        return BagMessage(topic, type_name, time, time, data)
-
-    def _damaged(self, error: object) -> BagError:
-        return BagError(f"{self._label} is damaged, or no rosbag2 database: {error}")
+    def _damaged(self, error: Exception) -> BagError:
+        text = f"{self._label} is damaged, or no rosbag2 database: {error}"
+        return BagError("; ".join([text, *(fault.text for fault in self.faults)]))
 
 
-_JOINED = "FROM messages JOIN topics ON topics.id = messages.topic_id"
-
-
-def _address(path: Path) -> tuple[str, str]:
-    """The URI of a database, and a sentence on a part of it that cannot be read.
-
-    The last messages are in a journal beside the file (``-wal``) where the recorder was killed.
-    """
-    uri = f"{path.resolve().as_uri()}?mode=ro"
-    # Immutable, so that a bag on a read-only disk needs no lock file beside it.
-    unlocked = f"{uri}&immutable=1"
-    journal = path.with_name(f"{path.name}-wal")
-    try:
-        if not (os.path.isfile(journal) and journal.stat().st_size):
-            return unlocked, ""
-        with closing(sqlite3.connect(uri, uri=True)) as database:
-            database.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
-        return uri, ""
-    except (sqlite3.Error, OSError) as error:
-        return unlocked, (
-            f"the part of it in {journal.name} is not read ({error}): copy both files to a folder "
-            f"that can be written, and read them there"
-        )
-
-
-def _topics(database: sqlite3.Connection, label: str) -> Iterator[BagTopic]:
-    """Topics of a file of any schema version; its columns tell the version."""
-    columns = {row[1] for row in database.execute("PRAGMA table_info(topics)")}
-    qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
-    type_hash = "type_description_hash" if "type_description_hash" in columns else "''"
-    schemas: dict[str, str] = {}
-    if database.execute("PRAGMA table_info(message_definitions)").fetchone():
-        schemas = dict(
-            database.execute(
-                "SELECT topic_type, encoded_message_definition FROM message_definitions "
-                "WHERE encoding = 'ros2msg'"
-            )
-        )
-    rows = database.execute(
-        f"SELECT name, type, serialization_format, {qos}, {type_hash}, COUNT(messages.id) "
-        "FROM topics LEFT JOIN messages ON messages.topic_id = topics.id "
-        "GROUP BY topics.id ORDER BY topics.id"
+def _topic(connection: Any) -> BagTopic:
+    definition = connection.msgdef
+    return BagTopic(
+        name=connection.topic,
+        type_name=normalized_type(connection.msgtype),
+        message_count=connection.msgcount,
+        qos=tuple(map(QosProfile.of, connection.ext.offered_qos_profiles)),
+        type_hash=connection.digest or "",
+        encoding=connection.ext.serialization_format,
+        schema=definition.data if definition.format.name == "MSG" else None,
     )
-    for name, type_name, encoding, profiles, digest, count in rows:
-        yield BagTopic(
-            name=name,
-            type_name=normalized_type(type_name),
-            message_count=count,
-            qos=qos_from_yaml(profiles, f"{label}, {name}"),
-            type_hash=digest or "",
-            encoding=encoding,
-            schema=schemas.get(type_name),
-        )
 
 
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-_PART = re.compile(r"(?P<name>.*?)(?:_(?P<part>\d+))?(?P<kind>\.(?:mcap|db3)(?:\.zstd)?)")
-"""A file of a bag: FOLDER_0.mcap, FOLDER_1.mcap or session.mcap, session_1.mcap and so on."""
-_DATED_PART = re.compile(
-    r"(?P<part>\d+)_(?P<name>.+)_\d{4}(?:_\d\d){2}-\d\d(?:_\d\d){2}"
-    r"(?P<kind>\.(?:mcap|db3)(?:\.zstd)?)"
-)
-"""A file as the rosbag2 of ROS 2 Lyrical calls it: 0_FOLDER_2026_06_24-10_00_00.mcap."""
-
-
-Storage = McapStorage | SqliteFile
+Storage = McapStorage | SqliteStorage
 
 
 class NoBagError(BagError):
@@ -223,17 +124,19 @@ class Scratch:
         copy = Path(self._folder, file.name.removesuffix(".zstd"))
         try:
             with file.open("rb") as packed, copy.open("wb") as unpacked:
-                unpacked.writelines(unpacked_pieces(packed))
+                frames = zstandard.ZstdDecompressor()
+                with frames.stream_reader(packed, read_across_frames=True) as reader:
+                    shutil.copyfileobj(reader, unpacked, 1 << 20)
         except zstandard.ZstdError as error:
             raise BagError(f"{file} cannot be decompressed: {error}") from None
         return copy
 
 
 def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
-    """The files that a bag consists of, in their order, and its ``metadata.yaml`` if it has one.
+    """The files that a bag consists of, and its ``metadata.yaml`` if it has one.
 
     Raises:
-        BagError: there are none, some are missing, or several could be meant.
+        BagError: there are none, or several bags could be meant.
     """
     if os.path.isfile(path):
         return [path], None
@@ -241,19 +144,18 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
         raise BagError(f"there is no bag at {path}: give an .mcap or .db3 file, or a bag's folder")
     if os.path.isfile(path / "metadata.yaml"):
         metadata = read_metadata(path / "metadata.yaml")
-        found = [_listed_file(path, file.path) for file in metadata.files]
+        found = [_listed_file(path, file) for file in metadata.files]
         if metadata.files and not any(found):
-            names = ", ".join(file.path for file in metadata.files)
+            names = ", ".join(metadata.files)
             raise BagError(f"{path / 'metadata.yaml'} names {names}, which is not there")
         return [file for file in found if file is not None], metadata
     files = [file for file in sorted(path.iterdir()) if file.name.endswith(_SUFFIXES)]
     if not files:
         raise BagError(f"{path} holds no bag: neither metadata.yaml nor an .mcap or .db3 file")
-    parts = {file: _DATED_PART.fullmatch(file.name) or _PART.fullmatch(file.name) for file in files}
-    if len({(part["name"], part["kind"]) for part in parts.values() if part}) > 1:
+    if len({_NUMBERS.sub("", file.name) for file in files}) > 1:
         names = ", ".join(file.name for file in files)
         raise BagError(f"{path} holds several bags and no metadata.yaml: give one of {names}")
-    return sorted(files, key=lambda file: int(p["part"] or -1) if (p := parts[file]) else 0), None
+    return files, None
 
 
 def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
@@ -271,7 +173,7 @@ def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
     if start.startswith(MCAP0_MAGIC):
         return McapStorage(file, label)
     if start == _SQLITE_MAGIC:
-        return SqliteFile(file, label)
+        return SqliteStorage(file, label)
     if start.startswith(_ZSTD_MAGIC):
         copy = scratch.unpack(file)
         if not copy.stat().st_size:
@@ -284,7 +186,7 @@ def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
 
 def missing_files(folder: Path, metadata: BagMetadata) -> list[str]:
     """Return the names of the files that metadata.yaml lists and the folder lacks."""
-    return [file.path for file in metadata.files if _listed_file(folder, file.path) is None]
+    return [file for file in metadata.files if _listed_file(folder, file) is None]
 
 
 def _listed_file(folder: Path, listed: str) -> Path | None:

@@ -16,23 +16,12 @@ WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 
 @dataclass(frozen=True, eq=False)
 class WrenchRecord:
-    """Wrenches in the order in which they were recorded.
-
-    Raises:
-        BagError: the arrays are not of K wrenches.
-    """
+    """Wrenches in the order in which they were recorded."""
 
     topic: str
     frame_id: str
     stamps: NDArray[np.int64]  # (K,) ns since the epoch, of the messages' headers
     wrenches: NDArray[np.float64]  # (K, 6) force N and torque N m, frame frame_id; as recorded
-
-    def __post_init__(self) -> None:
-        if self.stamps.ndim != 1 or self.wrenches.shape != (len(self.stamps), 6):
-            raise BagError(
-                f"{len(self.stamps)} stamps need as many wrenches (K, 6), not an array of shape "
-                f"{self.wrenches.shape}"
-            )
 
     def __len__(self) -> int:
         return len(self.stamps)

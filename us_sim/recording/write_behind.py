@@ -14,7 +14,7 @@ from us_sim.recording.schemas import schema_text, type_hash
 from us_sim.recording.topic import LOST
 from us_sim.recording.writer import BagWriter
 
-_FLUSH = 0.5  # s, after which messages are handed to the operating system
+_FLUSH = 0.2  # s, after which messages are handed to the operating system
 _PAUSE = 0.05  # s, in which messages gather: to be woken for each costs whoever has them time
 _RETRY = 1.0  # s, between tries to write to a disk that was full
 _BATCH = 512 * 1024  # bytes that may wait where `put` waits for the disk
@@ -24,7 +24,7 @@ class WriteBehind:
     """A bag and the thread that writes it.
 
     While the disk is full, messages wait in the queue, and the disk is tried again every second.
-    Those that do not fit into the queue are counted in `losses` and noted in the bag.
+    Those that do not fit into the queue are counted in `losses`, and noted in the bag at its end.
 
     Args:
         bag: open, and used by nobody else from now on.
@@ -33,7 +33,6 @@ class WriteBehind:
     """
 
     def __init__(self, bag: BagWriter, max_cache_size: int) -> None:
-        self.problem = ""  # why nothing is written at present
         self.untold: deque[str] = deque(maxlen=100)  # sentences, for whoever tells a person
         self._bag = bag
         self._limit = max_cache_size
@@ -42,7 +41,7 @@ class WriteBehind:
         self._sequences: Counter[str] = Counter()  # all messages of a topic, also the lost ones
         self._lost: Counter[str] = Counter()
         self._lock = threading.Lock()  # of `_lost`
-        self._noted: Counter[str] = Counter()  # losses that the bag tells of
+        self._told = ""  # the sentence that was told last
         self._ending = threading.Event()
         self._has_given_up = False
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
@@ -52,6 +51,11 @@ class WriteBehind:
     def path(self) -> str:
         """The file that is written."""
         return str(self._bag.path)
+
+    @property
+    def problem(self) -> str:
+        """Why nothing is written at present; empty when something is."""
+        return self._bag.problem
 
     @property
     def losses(self) -> Counter[str]:
@@ -111,13 +115,11 @@ class WriteBehind:
         self._ending.set()
         self._queue.put(None)
         self._thread.join()
-        self._try(self._note_losses)
-        self._bag.custom_data["messages_lost"] = str(self.losses.total())
-        try:
-            self._bag.close()
-        finally:
-            for topic, count in self._bag.lost.items():
-                self.lose(topic, count)
+        if lost := self.losses:
+            note = {topic: str(count) for topic, count in lost.items()}
+            self._try(partial(self._bag.note, LOST, note))
+        self._bag.custom_data["messages_lost"] = str(lost.total())
+        self._bag.close()
 
     def _run(self) -> None:
         flush_at = time.monotonic() + _FLUSH
@@ -135,7 +137,6 @@ class WriteBehind:
             except queue.Empty:
                 pass
             if time.monotonic() >= flush_at:
-                self._try(self._note_losses)
                 self._try(self._bag.flush)
                 flush_at = time.monotonic() + _FLUSH
 
@@ -158,15 +159,7 @@ class WriteBehind:
             failure = str(error)
         except Exception as error:
             failure = f"{self.path} cannot be written: {error!r}"
-        told = failure or self._bag.problem
-        if told and told != self.problem:
+        told = failure or self.problem
+        if told and told != self._told:
             self.untold.append(told)
-        self.problem = self._bag.problem
-
-    def _note_losses(self) -> None:
-        """Note the losses since the last note."""
-        lost = self.losses
-        if lost != self._noted and not self._bag.problem:
-            new = lost - self._noted
-            self._noted = lost
-            self._bag.note(LOST, {topic: str(count) for topic, count in new.items()})
+        self._told = told

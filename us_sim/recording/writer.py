@@ -1,4 +1,4 @@
-"""Recording MCAP as rosbag2 does, so that nothing but the last second is lost to a crash.
+"""Recording MCAP as rosbag2 does, so that nothing but the last chunk is lost to a crash.
 
 >>> import tempfile
 >>> from us_sim.recording.writer import BagWriter
@@ -13,28 +13,25 @@ b'\\x89MCAP0\\r\\n'
 from __future__ import annotations
 
 import contextlib
-import os
+import tempfile
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from us_sim.errors import BagError
-from us_sim.recording.metadata import BagMetadata, FileEntry
+from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, schema_text
 from us_sim.recording.topic import BagTopic, QosProfile, as_yaml, qos_to_yaml
 from us_sim.settings.spelling import counted
 from us_sim.share import full_path
 
 _CHUNK_SIZE = 2 * 1024 * 1024  # bytes; the writer keeps an index of each chunk in memory
-_FLUSH = 10**9  # ns of log time after which everything is handed to the operating system
 _COMPRESSIONS = {"none": CompressionType.NONE, "zstd": CompressionType.ZSTD}
 
 
@@ -44,12 +41,18 @@ class PatientFile:
     Where a write fails the file is cut back to the last one that succeeded, so that it holds whole
     records at every moment. Each `flush` tries again.
 
+    Args:
+        path: of the file.
+        reserve: bytes of the disk that are kept free for `use_reserve`.
+
     Raises:
         OSError: the file exists or cannot be made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, reserve: int = 0) -> None:
         self.error: OSError | None = None  # why bytes wait
+        self._reserve = tempfile.TemporaryFile(dir=path.parent, buffering=0)  # noqa: SIM115
+        self._reserve.write(bytes(reserve))
         self._stream = path.open("xb", buffering=0)
         self._waiting: deque[bytes] = deque()
         self._size = 0  # bytes in the file
@@ -76,39 +79,30 @@ class PatientFile:
             self.error = None
         except OSError as error:
             self.error = error
-            self._cut(self._size)
+            with contextlib.suppress(OSError):
+                self._stream.truncate(self._size)
+                self._stream.seek(self._size)
 
-    def close(self, size: int | None = None) -> None:
-        """Close the file, cut to ``size`` bytes where that is given; what waits is lost."""
-        if size is not None:
-            self._cut(size)
-        self._waiting.clear()
+    def use_reserve(self) -> None:
+        """Write what waits where the disk had been kept free."""
+        self._reserve.close()
+        self.flush()
+
+    def close(self) -> None:
+        """Close the file; what waits is lost."""
+        self._reserve.close()
         with contextlib.suppress(OSError):
             self._stream.close()
-
-    def _cut(self, size: int) -> None:
-        with contextlib.suppress(OSError):
-            self._stream.truncate(size)
-            self._stream.seek(size)
-
-
-@dataclass
-class _Topic:
-    type_name: str
-    schema: str | None  # None where nobody knows it
-    qos: tuple[QosProfile, ...]
-    type_hash: str
-    channel: int = 0
 
 
 class BagWriter:
     """Writes one bag: an MCAP file, and when it is closed, its ``metadata.yaml``.
 
-    A message reaches the operating system at the latest when one comes that is a second younger,
-    or with :meth:`flush`, and then survives the end of the process.
+    A message reaches the operating system with its chunk or with :meth:`flush`, and then survives
+    the end of the process.
 
     Where the disk is full the file holds what fitted, :attr:`problem` says so, and what was
-    written since waits in memory for room. :attr:`lost` counts the messages that are gone.
+    written since waits in memory for room.
 
     Args:
         path: ``FILE.mcap``, with ``metadata.yaml`` in the same folder; or a new folder, in which
@@ -119,6 +113,7 @@ class BagWriter:
         further: where ``FILE.mcap`` exists, go on in ``FILE_1.mcap`` or the next that is free. No
             ``metadata.yaml`` is written then: it would have to speak for files that are not this
             writer's.
+        reserve: bytes of the disk that are kept free for the last chunk and the index.
 
     Raises:
         BagError: something is there already, or the file cannot be made.
@@ -132,26 +127,23 @@ class BagWriter:
         chunk_size: int = _CHUNK_SIZE,
         sidecar: bool = True,
         further: bool = False,
+        reserve: int = 0,
     ) -> None:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
         self.custom_data: dict[str, str] = {}  # free text for the metadata
-        self.lost: Counter[str] = Counter()  # messages that the file does not hold, by topic
-        self._counts: Counter[str] = Counter()  # messages by topic, of the chunk in progress too
+        self._counts: Counter[str] = Counter()  # messages by topic
         self._span: tuple[int, int] | None = None  # ns, of their log times
-        self._topics: dict[str, _Topic] = {}
+        self._topics: dict[str, BagTopic] = {}
+        self._channels: dict[str, int] = {}  # by topic
         self._schemas: dict[str, int] = {}  # by type
-        self._last_flush: int | None = None  # ns of log time
         self._is_closed = False
         try:
             self.path, self._metadata_file = _names(Path(path), sidecar, further)
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = PatientFile(self.path)
+            self._file = PatientFile(self.path, reserve)
         except (OSError, ValueError) as error:  # ValueError: a name that no file can have
             raise _cannot_be_made(path, error) from None
-        # What no full disk takes away any more: bytes, and the messages in them.
-        self._size = 0
-        self._entry, self._kept = FileEntry(self.path.name), self._counts.copy()
         stream: Any = self._file  # which has what a Writer asks of one
         self._writer = Writer(stream, chunk_size, _COMPRESSIONS[compression])
         self._writer.start("ros2", _library())
@@ -212,7 +204,8 @@ class BagWriter:
                 raise BagError(
                     f"topic {topic} is recorded as {known.type_name}: it cannot also be {type_name}"
                 )
-            known.qos = tuple(dict.fromkeys((*known.qos, *profiles)))
+            qualities = tuple(dict.fromkeys((*known.qos, *profiles)))
+            self._topics[topic] = replace(known, qos=qualities)
             return
         try:
             schema = schema_text(type_name) if schema is None else schema
@@ -221,27 +214,17 @@ class BagWriter:
         except BagError:
             if defined:
                 raise
-        self._topics[topic] = _Topic(type_name, schema, profiles, type_hash or "")
-        self._register(topic, self._topics[topic])
-
-    def _register(self, name: str, topic: _Topic) -> None:
-        encoding, text = ("", "") if topic.schema is None else ("ros2msg", topic.schema)
-        schema: dict[str, Any] = {"name": topic.type_name, "encoding": encoding}
-        schema["data"] = text.encode()
-        if topic.type_name not in self._schemas:
-            self._schemas[topic.type_name] = self._writer.register_schema(**schema)
-        channel: dict[str, Any] = {"topic": name, "message_encoding": "cdr"}
-        channel["schema_id"] = self._schemas[topic.type_name]
-        channel["metadata"] = {
-            "offered_qos_profiles": qos_to_yaml(topic.qos),
-            "topic_type_hash": topic.type_hash,
+        if type_name not in self._schemas:
+            encoding = "" if schema is None else "ros2msg"
+            content = (schema or "").encode()
+            self._schemas[type_name] = self._writer.register_schema(type_name, encoding, content)
+        about = {
+            "offered_qos_profiles": qos_to_yaml(profiles),
+            "topic_type_hash": type_hash or "",
         }
-        topic.channel = self._writer.register_channel(**channel)
-        # Twice, here and in the next chunk: one damaged chunk makes no others unreadable.
-        records = RecordBuilder()
-        Schema(id=channel["schema_id"], **schema).write(records)
-        Channel(id=topic.channel, **channel).write(records)
-        self._file.write(records.end())
+        schema_id = self._schemas[type_name]
+        self._channels[topic] = self._writer.register_channel(topic, "cdr", schema_id, about)
+        self._topics[topic] = BagTopic(topic, type_name, 0, profiles, type_hash or "")
 
     def write(
         self,
@@ -276,19 +259,11 @@ class BagWriter:
             )
         if self.problem:
             self.flush()
-        before, number = self._file.tell(), sequence & 0xFFFFFFFF
-        channel = self._topics[topic].channel
+        channel, number = self._channels[topic], sequence & 0xFFFFFFFF
         self._writer.add_message(channel, log_time_ns, bytes(cdr), publish_time_ns, number)
         self._counts[topic] += 1
         first, last = self._span or (log_time_ns, log_time_ns)
         self._span = min(first, log_time_ns), max(last, log_time_ns)
-        if self._file.tell() > before:  # a chunk has ended with this message
-            self._note_kept()
-        if self._last_flush is None:
-            self._last_flush = log_time_ns
-        elif log_time_ns - self._last_flush >= _FLUSH:
-            self._flush()
-            self._last_flush = log_time_ns
 
     def attach(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Put a file into the bag, such as the scene that is recorded.
@@ -314,13 +289,14 @@ class BagWriter:
         self.flush()
 
     def flush(self) -> None:
-        """Hand everything to the operating system.
+        """End the chunk in progress, and hand everything to the operating system.
 
         Raises:
             BagError: the bag is closed, or the disk is full.
         """
         self._require_open()
-        self._flush()
+        self._writer.flush()
+        self._file.flush()
         if self.problem:
             raise BagError(self.problem)
 
@@ -328,31 +304,25 @@ class BagWriter:
         """Write the index and ``metadata.yaml``; closing again does nothing.
 
         Raises:
-            BagError: the disk is full, with the number of messages that are lost; or the file was
-                removed or moved.
+            BagError: the disk is full; or the file was removed or moved.
         """
         if self._is_closed:
             return
-        told = []
-        self._flush()
         self._add_metadata()
         self._writer.finish()
-        self._file.flush()
-        if self._file.error is None:
-            self._note_kept()
+        self._file.use_reserve()
         self._is_closed = True
-        self._file.close(None if self._file.error is None else self._size)
-        self.lost = self._counts - self._kept
-        self._counts = self._kept
+        self._file.close()
+        told = []
         if self._file.error is not None:
             told.append(
-                f"{self._full()}; {counted(self.lost.total(), 'message')} and its index are "
-                f"missing, and `us-sim bag repair` makes an index where there is room"
+                f"{self._full()}; what came since and its index are missing, and `us-sim bag "
+                f"repair` makes an index where there is room"
             )
         if not self.path.exists():
             told.append(
                 f"{self.path} was removed or moved away while it was recorded, with "
-                f"{counted(self._counts.total(), 'message')}"
+                f"{counted(self.message_count, 'message')}"
             )
         elif self._metadata_file is not None:
             told += self._write_metadata_file(self._metadata_file)
@@ -387,36 +357,21 @@ class BagWriter:
         assert self._file.error is not None
         return f"{self.path} cannot be written ({self._file.error.strerror})"
 
-    def _flush(self) -> None:
-        """End the chunk in progress, and hand everything to the operating system."""
-        self._writer.flush()
-        self._file.flush()
-        self._note_kept()
-
-    def _note_kept(self) -> None:
-        if self._file.error is None:
-            self._size, self._kept = self._file.tell(), self._counts.copy()
-            if self._span is not None:
-                first, last = self._span
-                self._entry = FileEntry(self.path.name, first, last - first, self._kept.total())
-
     def _add_metadata(self) -> None:
         information = as_yaml(self._metadata().information())
         self._writer.add_metadata("rosbag2", {"serialized_metadata": information})
-        self._flush()
+        self._writer.flush()
 
     def _metadata(self) -> BagMetadata:
-        return BagMetadata(
-            files=(self._entry,),
-            topics=tuple(
-                BagTopic(name, known.type_name, self._kept[name], known.qos, known.type_hash)
-                for name, known in self._topics.items()
-            ),
-            start=self._entry.start,
-            duration=self._entry.duration,
-            message_count=self._entry.message_count,
-            ros_distro=os.environ.get("ROS_DISTRO") or "jazzy",
-            custom_data=self.custom_data,
+        topics = tuple(
+            replace(topic, message_count=self._counts[name]) for name, topic in self._topics.items()
+        )
+        metadata = BagMetadata((self.path.name,), topics, custom_data=self.custom_data)
+        if self._span is None:
+            return metadata
+        first, last = self._span
+        return replace(
+            metadata, start=first, duration=last - first, message_count=self.message_count
         )
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import time
-import zlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -19,14 +17,13 @@ from us_sim.recording.schemas import schema_text
 from us_sim.recording.topic import QosProfile
 
 QUEUE = 1000  # messages that may wait for the executor
-OVERLAP_S = 2.0  # in which publishers find a new subscription, before the old one is given up
 
 
 class RecordedTopic:
-    """Takes every message of a topic once, from every publisher there is or comes.
+    """Takes every message of a topic, from every publisher there is or comes.
 
-    Where a publisher comes that cannot serve the subscription, a weaker one takes its place. Both
-    are there for a while, and what comes by both is taken once.
+    Where a publisher comes that cannot serve the subscription, a weaker one takes its place; what
+    is sent before that was found is missing.
 
     Args:
         node: that subscribes.
@@ -52,17 +49,9 @@ class RecordedTopic:
         profiles = [QosProfile.of(profile) for profile in offered]
         self._offered = dict.fromkeys(profiles)
         self._adopted = _adopted(self._offered)
-        self._old: Subscription | None = None
-        self._old_until = 0.0  # s, monotonic
-        self._recent: dict[tuple[int, int], None] = {}
         self._publishers = len(profiles)
         self._sequence: int | None = None
         self._subscription = self._subscribed()
-
-    @property
-    def offered(self) -> list[QosProfile]:
-        """Qualities of service that its publishers have offered so far."""
-        return [*self._offered]
 
     @property
     def is_latched(self) -> bool:
@@ -74,26 +63,22 @@ class RecordedTopic:
         now = [QosProfile.of(profile) for profile in offered]
         if len(now) != self._publishers:
             self._publishers, self._sequence = len(now), None
-        if self._old is not None and time.monotonic() > self._old_until:
-            self._node.destroy_subscription(self._old)
-            self._old = None
         new = [profile for profile in dict.fromkeys(now) if profile not in self._offered]
         self._offered |= dict.fromkeys(new)
         adopted = _adopted(self._offered)
         if adopted != self._adopted:
-            if self._old is not None:
-                self._node.destroy_subscription(self._old)
-            self._adopted, self._old = adopted, self._subscription
-            self._old_until = time.monotonic() + OVERLAP_S
+            self.take_rest()
+            self._node.destroy_subscription(self._subscription)
+            self._adopted, self._sequence = adopted, None
             self._subscription = self._subscribed()
         return new
 
     def take_rest(self) -> None:
         """Take the messages that wait for the executor; also after ROS was shut down."""
-        for subscription in filter(None, (self._old, self._subscription)):
-            with subscription.handle:
-                while taken := subscription.handle.take_message(self._type, True):
-                    self._receive(*taken)
+        handle = self._subscription.handle
+        with handle:
+            while taken := handle.take_message(self._type, True):
+                self._receive(*taken)
 
     def _subscribed(self) -> Subscription:
         events = SubscriptionEventCallbacks(message_lost=self._count_lost)
@@ -112,13 +97,6 @@ class RecordedTopic:
         self.take_rest()
 
     def _receive(self, data: bytes, info: Mapping[str, Any]) -> None:
-        if self._old is not None or self.is_latched:
-            key = info["source_timestamp"], zlib.crc32(data)
-            if key in self._recent and key[0] > 0:
-                return
-            self._recent[key] = None
-            if len(self._recent) > QUEUE:
-                del self._recent[next(iter(self._recent))]
         self._count(info.get("publication_sequence_number"))
         self._take(self.name, data, info)
 

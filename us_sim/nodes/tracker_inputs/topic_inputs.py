@@ -11,13 +11,13 @@ from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool, Header
 
 from us_sim.errors import PoseError, SceneError
+from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
 from us_sim.nodes.qos import FOREIGN
 from us_sim.nodes.tf import TFMessage, require_tf
 from us_sim.nodes.tracker_inputs.device import Device, TrackerInput
 from us_sim.recording.decoding import transform_from
 from us_sim.settings.spelling import counted
-from us_sim.tracking.frame_chain import FrameChain
 from us_sim.tracking.haptic import HapticDevice
 from us_sim.tracking.measurement import PATIENT, Measurement
 from us_sim.tracking.mouse import SixDofMouse

@@ -1,7 +1,7 @@
 """A frame's pose in one further up a tree of frames, with every link taken at one time.
 
 >>> from us_sim.geometry.pose import Pose
->>> from us_sim.tracking.frame_chain import FrameChain
+>>> from us_sim.geometry.frame_chain import FrameChain
 >>> chain = FrameChain("tool", "world")
 >>> chain.move("base", "world", 0, Pose([0.0, 0.0, 0.0]))
 >>> chain.move("base", "world", 2_000_000_000, Pose([0.2, 0.0, 0.0]))

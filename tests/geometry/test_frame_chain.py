@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.frame_chain import FrameChain
 
 MS = 1_000_000  # ns
 
