@@ -140,12 +140,6 @@ def test_commands_on_files_do_their_work(python, tmp_path, small_scene):
 
 
 @pytest.mark.slow
-def test_the_time_to_publish_an_image_is_left_out(python):
-    program = "from us_sim.evaluation.processes import publishing_ms; print(publishing_ms(8))"
-    assert last_line(python("-c", program)) == "None"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

@@ -18,8 +18,6 @@ from us_sim.progress import Progress
 
 C = TypeVar("C")
 
-Tell = Callable[[float, str], None]  # takes how many s of a case are over, and the present activity
-
 
 def steps(
     description: str, work: Sequence[C], unit: str, name: Callable[[C], str] = str

@@ -131,17 +131,17 @@ EVALUATIONS = Choice(
     tissue=Option(f"{_EVALUATION}.tissue.report:TISSUE", _NOTHING),
     stability=Option(f"{_EVALUATION}.stability.report:STABILITY", _NOTHING),
     slice=Option(
-        f"{_EVALUATION}.slice.report:evaluate_slice",
+        f"{_EVALUATION}.slice.report:SLICE",
         f"{_EVALUATION}.settings:RecordedSweep",
     ),
     hand=Option(
-        f"{_EVALUATION}.hand.report:evaluate_hand",
+        f"{_EVALUATION}.hand.report:HAND",
         f"{_EVALUATION}.settings:HandSettings",
     ),
-    tracking=Option(f"{_EVALUATION}.tracking.report:evaluate_tracking", _NOTHING),
-    image=Option(f"{_EVALUATION}.image.report:evaluate_image", _NOTHING),
-    latency=Option(f"{_EVALUATION}.latency.report:evaluate_latency", _NOTHING),
-    viewer=Option(f"{_EVALUATION}.viewer.report:evaluate_viewer", _NOTHING),
+    tracking=Option(f"{_EVALUATION}.tracking.report:TRACKING", _NOTHING),
+    image=Option(f"{_EVALUATION}.image.report:IMAGE", _NOTHING),
+    latency=Option(f"{_EVALUATION}.latency.report:LATENCY", _NOTHING),
+    viewer=Option(f"{_EVALUATION}.viewer.report:VIEWER", _NOTHING),
     measured=Option(
         f"{_EVALUATION}.measured.report:MEASURED",
         f"{_EVALUATION}.settings:MeasuredData",

@@ -1,6 +1,5 @@
 """Images cut from the real liver volume beside the real frames, and made-up sweeps."""
 
-import csv
 import math
 
 import cv2
@@ -12,8 +11,8 @@ from us_sim.errors import VolumeError
 from us_sim.evaluation.slice.recorded import (
     LIVER_SWEEP,
     RecordedFan,
-    compare_with_recorded,
     normalised_cross_correlation,
+    recorded_rows,
 )
 from us_sim.slicing.cutting.resampling import sample_plane
 from us_sim.slicing.probe.plane import SlicePlane
@@ -35,24 +34,16 @@ def liver(shared_data):
 
 
 @pytest.mark.slow
-def test_real_frames_are_found_again_in_the_volume(liver, tmp_path):
-    found = compare_with_recorded(*liver, tmp_path, quick=True)
-    with (tmp_path / "recorded_frames.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row["frame"]) for row in rows] == list(range(0, 140, 10))
+def test_real_frames_are_found_again_in_the_volume(liver):
+    rows = list(recorded_rows(*liver, quick=True))
+    assert [row["frame"] for row in rows] == list(range(0, 140, 10))
     for row in rows:
-        assert float(row["ncc_raw"]) >= 0.8, row
-        assert float(row["ncc_smoothed"]) >= float(row["ncc_raw"]), row
-        assert float(row["coverage"]) >= 0.85, row
+        assert row["ncc_raw"] >= 0.8, row
+        assert row["ncc_smoothed"] >= row["ncc_raw"], row
+        assert row["coverage"] >= 0.85, row
         # The wrong way round must not reach it, or the number would say nothing.
-        assert float(row["ncc_mirrored"]) < 0.8, row
-        assert int(row["grey_difference_rigid"]) <= 1, row
-    assert np.abs(found.shifts).max() < 1e-3  # m, the volume's voxel
-    picture = cv2.imread(str(tmp_path / "recorded_frames.png"))
-    assert picture.shape[1] > picture.shape[0] > 500
-    text = found.markdown()
-    assert "Data: ImFusion GmbH, CC BY 4.0" in text
-    assert "14 of 14" in text
+        assert row["ncc_mirrored"] < 0.8, row
+        assert row["grey_difference_rigid"] <= 1, row
 
 
 def test_the_fan_is_where_the_real_frames_are_lit(liver):
@@ -117,30 +108,20 @@ def _made_up(tmp_path, columns=81, rows=60, shift=0.0, spacing=(1.0, 1.0)):
 
 
 def test_frames_cut_from_the_volume_correlate_fully(tmp_path):
-    found = compare_with_recorded(*_made_up(tmp_path), tmp_path / "out", quick=False, fan=SMALL)
-    assert [row.frame for row in found.rows] == [0, 1, 2]
-    assert found.lowest > 0.98  # but for the probe's pixels, which are not quite the frame's
-    np.testing.assert_array_equal(found.shifts, 0.0)
-
-
-@pytest.mark.slow
-def test_a_wrong_pose_shows_as_a_shift(tmp_path):
-    files = _made_up(tmp_path, shift=1.0)
-    found = compare_with_recorded(*files, tmp_path / "out", quick=False, fan=SMALL)
-    # The poses lie 1 mm too far along +x: the cut should move by -1 mm.
-    np.testing.assert_allclose(found.shifts, [[-1e-3, 0.0, 0.0]] * 3, atol=1e-9)
+    rows = list(recorded_rows(*_made_up(tmp_path), quick=False, fan=SMALL))
+    assert [row["frame"] for row in rows] == [0, 1, 2]
+    # But for the probe's pixels, which are not quite the frame's.
+    assert min(row["ncc_raw"] for row in rows) > 0.98
 
 
 @pytest.mark.parametrize(
     ("made", "fan", "message"),
     [
-        ({}, LIVER_SWEEP, "81 × 60 pixels do not hold the probe's fan"),
-        ({"shift": 500.0}, SMALL, "the volume covers nothing of frame 0"),
-        ({"spacing": (1.0, 0.9)}, SMALL, "pixels are not squares of one size"),
+        ({}, LIVER_SWEEP, "fan"),
+        ({"shift": 500.0}, SMALL, "covers nothing of frame 0"),
+        ({"spacing": (1.0, 0.9)}, SMALL, "not squares"),
     ],
 )
 def test_a_sweep_that_is_not_the_volumes_is_refused(tmp_path, made, fan, message):
-    files = _made_up(tmp_path, **made)
-    with pytest.raises(VolumeError, match=message) as refused:
-        compare_with_recorded(*files, tmp_path / "out", quick=False, fan=fan)
-    assert "\n" not in str(refused.value)
+    with pytest.raises(VolumeError, match=message):
+        list(recorded_rows(*_made_up(tmp_path, **made), quick=False, fan=fan))

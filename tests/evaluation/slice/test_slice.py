@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from us_sim.command.main import main
-from us_sim.evaluation.slice import measure as slice_vtk
 from us_sim.evaluation.slice import report as evaluation
 from us_sim.evaluation.slice.cases import (
     Case,
@@ -25,10 +24,11 @@ from us_sim.evaluation.slice.measure import (
 from us_sim.settings.registry import SLICERS
 from us_sim.volume.volume import Volume
 
-COLUMNS = (
-    "method,size,nodes,tets,threads,ms_median,ms_p99,coverage_mismatch_px,max_grey_difference,"
-    "mean_grey_difference,max_voxel_error"
-)
+COLUMNS = {
+    *("method", "size", "nodes", "tets", "threads", "ms_median", "ms_p99", "coverage_mismatch_px"),
+    *("max_grey_difference", "mean_grey_difference", "max_voxel_error", "deformation", "plane"),
+    *("cpu_ms_median", "images"),
+}
 SMALL = Case(48, (6, 5, 5), "pressed_12mm", "straight")
 
 
@@ -77,18 +77,17 @@ def test_vtk_finds_what_the_reference_finds(block):
     assert errors["coverage_mismatch_px"] <= 4  # it takes some pixels beside the surface along
     assert errors["max_voxel_error"] < 0.02
     assert errors["max_grey_difference"] <= 1
-    assert vtk.filter_ms > 0 < vtk.sampling_ms
 
 
 def test_errors_of_a_known_image_are_what_they_are_by_hand(block):
     _, frame, volume, exact = block
     image, rest = np.rint(exact.grey).astype(np.uint8), exact.rest.copy()
-    assert set(compare(volume, frame, exact, image, rest).values()) == {0}
+    assert list(compare(volume, frame, exact, image, rest).values())[:-1] == [0, 0, 0, 0]
     row, column = np.argwhere(exact.tissue & (image < 200))[100]
     image[row, column] += 7
     rest[row, column] += volume.index_to_patient[:3, :3] @ [0.03, 0.0, 0.04]
     errors = compare(volume, frame, exact, image, rest)
-    assert list(errors.values()) == [0, 7.0, *map(pytest.approx, (7 / image.size, 0.05))]
+    assert list(errors.values())[:-1] == [0, 7.0, *map(pytest.approx, (7 / image.size, 0.05))]
 
 
 def test_each_kind_of_wrong_coverage_is_counted(block):
@@ -106,37 +105,26 @@ def test_each_kind_of_wrong_coverage_is_counted(block):
         assert compare(volume, frame, exact, image, rest)["coverage_mismatch_px"] == wrong
 
 
-@pytest.fixture
-def small(monkeypatch):
-    """One small case, and nothing around it that takes long."""
-    for module in (evaluation, slice_vtk):
-        monkeypatch.setattr(module, "MAIN", SMALL)
-    monkeypatch.setattr(evaluation, "cases", lambda _: [SMALL, replace(SMALL, size=24)])
-    monkeypatch.setattr(evaluation, "_QUICK_SECONDS", (0.0, 0.0))
-    monkeypatch.setattr(evaluation, "peak_memory", lambda _: 512**3 + 10**8)
-    monkeypatch.setattr(evaluation, "publishing_ms", lambda _: 0.5)
-    monkeypatch.setattr(evaluation, "costs", lambda *_: ({}, {}, {}))
-    monkeypatch.setattr("us_sim.evaluation.slice.report.SHOWN", (SMALL,))
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("small")
-def test_rows_plots_and_report_are_written(tmp_path, capsys):
+def test_rows_plots_and_report_are_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "MAIN", SMALL)
+    monkeypatch.setattr(evaluation, "SHOWN", (SMALL,))
+    monkeypatch.setattr(evaluation, "cases", lambda _: [SMALL, replace(SMALL, size=24)])
+    monkeypatch.setattr(evaluation, "_seconds", lambda *_: 0.0)
     out = tmp_path / "slices"
     assert main(["evaluate", "slice", "--quick", "--out", str(out)]) == 0
     with (out / "slice.csv").open(encoding="utf-8") as file:
-        head, *rows = csv.reader(file)
-    assert ",".join(head).startswith(COLUMNS)
-    found = [dict(zip(head, row, strict=True)) for row in rows]
-    assert {row["method"] for row in found} == set(SLICING_METHODS)
-    for row in found:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) == COLUMNS
+    assert {row["method"] for row in rows} == set(SLICING_METHODS)
+    for row in rows:
         if row["method"] in SLICERS.names:
             assert row["coverage_mismatch_px"] == "0"
             assert float(row["max_grey_difference"]) <= 1
             assert float(row["max_voxel_error"]) < 0.1
     assert len(rows) == 2 * 7
     report = (out / "slice.md").read_text(encoding="utf-8")
+    assert "$" not in report
     for picture in re.findall(r"\]\((\S+\.png)\)", report):
         assert (out / picture).stat().st_size > 10_000
-    assert "| at most 300 MB" in report
-    assert slice_vtk.HOW_TO_GET not in report + capsys.readouterr().out
+    assert "Recorded frames" not in report

@@ -1,424 +1,253 @@
-"""`us-sim evaluate hand`: hand.csv, its pictures, and hand.md."""
+"""`us-sim evaluate hand`: how far the tissue of every method is behind a hand."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
-from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+import pandas as pd
 
-from us_sim.evaluation.hand.hand_motion import HASTES, KINDS, RATE
+from us_sim.evaluation.figures import draw_error_over_time, draw_lines
+from us_sim.evaluation.hand.hand_motion import KINDS, RATE
 from us_sim.evaluation.hand.measure import (
-    APPROACH,
     AWAY,
-    CONVERGED,
-    ENOUGH,
-    HELD,
     HOLD,
     MAIN_TISSUE,
-    OWN_EVERY,
     TISSUES,
-    TRUSTED,
-    Converged,
-    Motion,
-    Point,
-    measured_points,
+    Bench,
     motions,
-    select,
-)
-from us_sim.evaluation.report import (
-    ReportFolder,
-    Target,
-    failures,
-    key_beside,
-    markdown_table,
-    method_keys,
-    number,
-    panel_grid,
-    percentile,
-    picture,
-    plain,
-    target_table,
 )
 from us_sim.evaluation.settings import HandSettings
+from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
-from us_sim.progress import Progress
 
 JUDGED = "fem_nonlinear"  # the method that the targets are for
 
-_LOWEST = 1e-3  # mm; smaller errors are drawn there
-_HEAD = (
-    *("mm, p50", "p95", "p99", "worst", "to own balance: mm, p50", "worst"),
-    *("residual, p50", "p99", "> 0.01", "> 0.1", "> 1"),
-    *("inverted", "ms, p50", "p99", "worst"),
-)
-_LIVE = (
-    *("poses", "skipped", "mm, p50", "worst", "ms off", "latency ms, p50", "p99", "inverted"),
-    *("held: frames to 0.01", "to 0.001", "residual in the end", "inverted then"),
-)
+_BY_MOTION = {
+    "motion": "motion",
+    "method": "method",
+    "error_mm_p50": "mm, p50",
+    "error_mm_p99": "p99",
+    "error_mm_worst": "worst",
+    "own_error_mm_p50": "to own balance: mm, p50",
+    "residual_p50": "residual, p50",
+    "residual_over_0.01": "part > 0.01",
+    "residual_over_1": "part > 1",
+    "frames_inverted": "inverted",
+    "cpu_ms_p50": "ms, p50",
+    "cpu_ms_p99": "ms, p99",
+}
+_LIVE = {
+    "motion": "motion",
+    "method": "method",
+    "live_skipped": "part skipped",
+    "live_error_mm_p50": "mm, p50",
+    "live_error_mm_worst": "worst",
+    "live_away_ms": "ms off",
+    "live_latency_ms_p50": "latency ms, p50",
+    "live_latency_ms_p99": "p99",
+    "live_frames_inverted": "inverted",
+    "hold_frames_to_1e-2": "held: frames to 0.01",
+    "hold_frames_to_1e-3": "to 0.001",
+    "hold_residual": "residual in the end",
+    "hold_inverted": "inverted then",
+}
 
 
-def evaluate_hand(out: Path, quick: bool, settings: HandSettings | None = None) -> int:
-    """Write hand.csv, the plots and hand.md, as `us_sim.evaluation` says.
-
-    A quick run has fewer and shorter motions.
-    """
-    folder = ReportFolder("hand", out, quick)
-    planned = motions(quick, (settings or HandSettings()).seed)
-    answers: dict[Motion, Converged] = {}
-    runs = sum(len(motion.poses) for motion in planned) * (1 + len(TISSUE_METHODS))
-    with Progress("hand", runs, "poses") as progress, threadpool_limits(1):
-        points = list(measured_points(planned, answers, progress.update))
-        progress.update(runs)
-    folder.write_rows("hand", points)
-    table = target_table(targets(points))
-    free = [motion for motion in answers if motion.kind == "free"]
-    others = [motion for motion in answers if motion.kind != "free"]
-    main = [motion for motion in free if motion.tissue == MAIN_TISSUE]
-    rest = [motion for motion in (*free, *others) if motion not in main]
-    rest.sort(key=lambda motion: motion.tissue == MAIN_TISSUE)  # one of another tissue first
-    _plot_time(points, [*main, *rest][:3], answers, folder.picture("time"))
-    _plot_errors(points, list(answers) if folder.quick else free, folder.picture("error"))
-    _plot_faults(points, folder.picture("faults"))
-    _plot_hold(points, folder.picture("hold"))
-    hastes = "; ".join(
-        f"{name}: {1e3 * asked.speed:.0f} mm/s and {np.degrees(asked.turning):.0f}°/s"
-        for name, asked in HASTES.items()
-    )
-    return folder.finish(
-        table,
-        failures(points),
-        ("numpy", "scipy", "numba"),
-        hastes=hastes,
-        seeds=", ".join(dict.fromkeys(str(motion.seed) for motion in answers)),
-        rate=f"{RATE:.0f}",
-        judged=JUDGED,
-        targets=table,
-        motions=_by_motion(select(points, kind=None if folder.quick else "free")),
-        live=_live(select(points)),
-        hold=f"{HOLD}",
-        tissues="\n".join(f"- `{name}`: {tissue.words}" for name, tissue in TISSUES.items()),
-        kinds="\n".join(f"- {name}: {kind.words}" for name, kind in KINDS.items()),
-        answers=_answers(answers),
-        away=f"{AWAY:g}",
-        converged=f"{CONVERGED:g}",
-        trusted=f"{TRUSTED:g}",
-        held=f"{1e3 * HELD:g}",
-        few=f"{100 * (1 - ENOUGH):.0f}",
-        own_every=f"{OWN_EVERY}",
-        approach=f"{APPROACH:g}",
-    )
-
-
-def targets(points: Sequence[Point]) -> list[Target]:
-    """Limits for `JUDGED`, against the measured numbers."""
-    mine = select(points, method=JUDGED)
-    brisk = select(mine, tissue=MAIN_TISSUE, haste="brisk")
-    careful = select(mine, tissue=MAIN_TISSUE, haste="careful")
-    violent = select(mine, haste="violent")
-    where = f"brisk on the {MAIN_TISSUE}"
-
-    def most(
-        what: str, limit: float, some: Sequence[Point], values: _Values, percent: float, unit: str
-    ) -> Target:
-        found = _together(some, values)
-        return Target.at_most(what, limit, percentile(found[~np.isnan(found)], percent), unit)
-
-    def fraction(what: str, asked: float, some: Sequence[Point], limit: float) -> Target:
-        residual = _together(some, lambda p: p.frames.residual)
-        seen = 100 * float((residual <= limit).mean()) if len(residual) else np.nan
-        return Target.at_least(what, asked, seen, form=".4g")
-
-    def off(what: str, limit: float, unit: str, seen: float) -> Target:
-        """A measure of errors, where enough frames have one."""
-        known = float(np.isfinite(errors).mean()) if len(errors) else 1.0
-        if known < ENOUGH:
-            said = f"no converged answer for {100 * (1 - known):.0f} % of the frames"
-            return Target(what, f"at most {limit:g} {unit}", said)
-        return Target.at_most(what, limit, seen, unit)
-
-    def rest(what: str, limit: int, some: Sequence[Point], residual: float) -> Target:
-        """Frames after the probe has stopped until the residual is as small."""
-        found = np.array([p.held.frames_to(residual) for p in some])
-        never = int(np.isnan(found).sum())
-        if not never:
-            return Target.at_most(what, limit, found.max() if len(found) else np.nan, form="g")
-        return Target(what, f"at most {limit}", f"never in {never} of {len(found)} motions", False)
-
-    errors = _together(brisk, lambda p: p.live.frames.error)
-    live_error = percentile(errors[~np.isnan(errors)], 50)
-    away = max((p.live.away for p in brisk), default=np.nan)
-    came = sum(p.live.poses for p in brisk)
-    made = sum(len(p.live.frames.number) for p in brisk)
-    inverted = sum(
-        int((each.inverted > 0).sum()) for p in mine for each in (p.frames, p.live.frames)
-    )
-    inverted_at_rest = sum(p.held.inverted > 0 for p in mine)
-    return [
-        fraction(f"{where}: % of frames with a residual of at most 0.01", 99.0, brisk, 1e-2),
-        fraction(f"{where}: likewise 0.1", 100.0, brisk, 0.1),
-        most(f"{where}: ms a frame (processor), median", 8, brisk, _cpu, 50, "ms"),
-        most(f"{where}: likewise, 99th percentile", 33, brisk, _cpu, 99, "ms"),
-        most(f"{where}: mm to its own balance, median", 0.05, brisk, _own, 50, "mm"),
-        most(f"{where}: likewise, 99th percentile", 0.5, brisk, _own, 99, "mm"),
-        fraction(f"careful on the {MAIN_TISSUE}: % with at most 0.01", 99.9, careful, 1e-2),
-        off(f"live, {where}: mm to the converged answer, median", 0.05, "mm", live_error),
-        off(f"live, {where}: ms in which a node is over {AWAY:g} mm off, longest", 50, "ms", away),
-        most(
-            *(f"live, {where}: ms from a pose to its nodes, 99th percentile", 25, brisk),
-            *(lambda p: p.live.latency, 99, "ms"),
-        ),
-        Target.at_most(
-            f"live, {where}: % of poses skipped", 5, 100 * (1 - made / came) if came else np.nan
-        ),
-        Target.at_most(
-            "all motions: frames with inverted tetrahedra", 0, inverted if mine else np.nan
-        ),
-        most("violent: ms of the slowest frame", 50, violent, lambda p: p.frames.wall, 100, "ms"),
-        most(
-            "all motions: mm that a fixed node moves",
-            0,
-            mine,
-            lambda p: p.frames.slipped,
-            100,
-            "mm",
-        ),
-        rest("violent, then held: frames to a residual of 0.01, worst", 5, violent, 1e-2),
-        rest("all motions, then held: frames to a residual of 0.001, worst", 30, mine, 1e-3),
-        Target.at_most(
-            "all motions, then held: inverted in the end", 0, inverted_at_rest if mine else np.nan
-        ),
-    ]
-
-
-_Values = Callable[[Point], NDArray[np.float64]]
-
-
-def _cpu(point: Point) -> NDArray[np.float64]:
-    return point.frames.cpu
-
-
-def _own(point: Point) -> NDArray[np.float64]:
-    return point.frames.own
-
-
-def _together(points: Sequence[Point], values: Callable[[Point], NDArray]) -> NDArray:
-    return np.concatenate([values(p) for p in points]) if points else np.empty(0)
-
-
-def _plot_time(
-    points: Sequence[Point],
-    chosen: Sequence[Motion],
-    answers: Mapping[Motion, Converged],
-    file: Path,
-) -> None:
-    """A column a motion: the nodes' error over time, and the depth and speed of the hand."""
-    title = "How far the farthest node is off while a hand moves (every pose fed)"
-    with picture(file, 4.4 * len(chosen) + 1.4, 7.2, title) as figure:
-        panels = figure.subplots(
-            *(3, len(chosen)), squeeze=False, sharex="col", sharey="row", height_ratios=(2.4, 1, 1)
-        )
-        for (error, depth, speed), motion in zip(panels.T, chosen, strict=True):
-            error.set_title(str(motion), fontsize=11, loc="left")
-            for point in select(p for p in points if p.motion == motion):
-                time = (point.frames.number - motion.begins) / RATE
-                colour = TISSUE_METHODS[point.method].colour
-                shown = np.maximum(point.frames.error, _LOWEST)
-                error.plot(time, shown, color=colour, lw=1.3, label=point.method)
-                some = ~np.isnan(point.frames.own)
-                if some.any():
-                    own = np.maximum(point.frames.own[some], _LOWEST)
-                    label = f"{point.method}, to its own balance"
-                    error.plot(time[some], own, ".", color=colour, ms=5, label=label)
-            error.set_yscale("log")
-            _draw_motion(depth, speed, motion, answers[motion])
-            speed.set_xlabel("time, s")
-            speed.set_xlim(0, min(4.0, motion.duration))
-            for panel in (error, depth, speed):
-                plain(panel)
-        panels[0, 0].set_ylim(bottom=_LOWEST)
-        panels[0, 0].set_ylabel("error of the worst node, mm")
-        panels[1, 0].set_ylabel("depth, mm")
-        panels[2, 0].set_ylabel("speed", labelpad=8)
-        panels[1, 0].invert_yaxis()
-        for panel in panels[:, -1]:
-            key_beside(panel)
-
-
-def _draw_motion(depth: Axes, speed: Axes, motion: Motion, answer: Converged) -> None:
-    depths = np.array([pose.position[2] for pose in motion.poses[motion.begins :]])
-    time = np.arange(len(depths)) / RATE
-    depth.axhline(0.0, color="0.6", lw=1, label="skin")
-    depth.plot(time, 1e3 * depths, color="0.2", lw=1.3, label="middle of the probe's face")
-    touching = answer.pressed[motion.begins :].tolist()
-    look = {"color": "0.93", "zorder": 0, "label": "touching"}
-    depth.fill_between(time, *depth.get_ylim(), where=touching, **look)  # type: ignore[arg-type]
-    moved, turned = motion.speeds
-    speed.plot(time[1:], 1e3 * moved, color="0.2", lw=1.3, label="mm/s")
-    speed.plot(time[1:], np.degrees(turned), color="0.2", lw=1.0, ls="--", label="degrees/s")
-
-
-def _plot_errors(points: Sequence[Point], chosen: Sequence[Motion], file: Path) -> None:
-    """A panel a motion: error against processor time, the median and the 99th percentile."""
-    columns, rows = min(3, len(chosen)), -(-len(chosen) // 3)
-    title = "Error of the worst node against run time (full: median frame; hollow: 99th percentile)"
-    labels = ("processor time of a frame, ms", "error of the worst node, mm")
-    with picture(file, 4.2 * columns + 1.6, 3.6 * rows + 0.7, title) as figure:
-        panels = panel_grid(figure, map(str, chosen), *labels)
-        for panel, motion in zip(panels, chosen, strict=True):
-            for point in select(p for p in points if p.motion == motion):
-                frames, look = point.frames, TISSUE_METHODS[point.method]
-                if frames.compared >= ENOUGH:
-                    x = [float(np.percentile(frames.cpu, part)) for part in (50, 99)]
-                    y = [float(np.nanpercentile(frames.error, part)) for part in (50, 99)]
-                    y = [max(value, _LOWEST) for value in y]
-                    panel.plot(x, y, "-", color=look.colour, lw=1.2, alpha=0.7)
-                    panel.plot(x[0], y[0], look.mark, color=look.colour, ms=7)
-                    panel.plot(x[1], y[1], look.mark, mec=look.colour, mfc="white", ms=6)
-            panel.set(xscale="log", yscale="log")
-            panel.axvline(1e3 / RATE, color="0.6", lw=1, ls=":", zorder=0)
-            plain(panel)
-        key = method_keys(TISSUE_METHODS, lw=1.2)
-        key_beside(panels[columns - 1], [*key, _line("16.7 ms: 60 Hz", "0.6", ":")])
-
-
-def _plot_faults(points: Sequence[Point], file: Path) -> None:
-    """A panel a fault: in how many frames of a hundred a method has it, for each haste."""
-    faults: dict[str, Callable[[Point], NDArray[np.bool_]]] = {
-        "residual above 0.01": lambda p: p.frames.residual > 1e-2,
-        "residual above 0.1": lambda p: p.frames.residual > 0.1,
-        "residual above 1": lambda p: p.frames.residual > 1.0,
-        "tetrahedra inside out": lambda p: p.frames.inverted > 0,
-        "poses skipped at 60 Hz": lambda p: np.arange(p.live.poses) >= len(p.live.frames.number),
-    }
-    hastes = [haste for haste in HASTES if select(points, haste=haste)]
-    width = 0.8 / max(1, len(hastes))
-    title = "What goes wrong, in % of frames (all tissues and motions)"
-    with picture(file, 14.5, 4.2, title) as figure:
-        panels = figure.subplots(1, len(faults), sharey=True)
-        for panel, (name, faulty) in zip(panels, faults.items(), strict=True):
-            panel.set_title(name, fontsize=11, loc="left")
-            for place, haste in enumerate(hastes):
-                percent = []
-                for method in TISSUE_METHODS:
-                    found = _together(select(points, method=method, haste=haste), faulty)
-                    percent.append(100 * float(found.mean()) if len(found) else 0.0)
-                at = np.arange(len(percent)) + (place - 0.5 * (len(hastes) - 1)) * width
-                colour = dict(zip(HASTES, ("#9ecae1", "#3182bd", "#08306b"), strict=True))[haste]
-                asked = HASTES[haste]
-                label = f"{haste}: {1e3 * asked.speed:.0f} mm/s, {np.degrees(asked.turning):.0f}°/s"
-                bars = panel.barh(at, percent, 0.92 * width, color=colour, label=label)
-                panel.bar_label(bars, [f"{p:.3g}" for p in percent], padding=2, fontsize=7)
-            panel.set_xlim(0, 118)
-            plain(panel)
-            panel.set_xticks([0, 50, 100])
-        panels[0].set_yticks(range(len(TISSUE_METHODS)), list(TISSUE_METHODS))
-        panels[0].invert_yaxis()
-        panels[0].tick_params(axis="y", labelsize=10)
-        key_beside(panels[-1])
-
-
-def _plot_hold(points: Sequence[Point], file: Path) -> None:
-    """A panel a method: the residual after the probe has stopped, a line a motion."""
-    with picture(
-        file, 14.5, 4.2, "The probe is held still: does the tissue come to balance?"
-    ) as figure:
-        panels = figure.subplots(1, len(TISSUE_METHODS), sharex=True, sharey=True)
-        for panel, method in zip(panels, TISSUE_METHODS, strict=True):
-            panel.set_title(method, fontsize=11, loc="left")
-            for point in select(points, method=method):
-                shown = np.maximum(point.held.residual, 1e-9)
-                # A settled residual stays.
-                shown = np.append(shown, np.full(HOLD + 1 - len(shown), shown[-1]))
-                style = "--" if point.held.inverted > 0 else "-"
-                colour = TISSUES[point.motion.tissue].colour
-                panel.plot(shown, color=colour, lw=1.2, ls=style, alpha=0.8)
-            panel.axhline(1e-3, color="0.4", lw=1, ls=":")
-            panel.axvline(30, color="0.4", lw=1, ls=":")
-            panel.set(yscale="log", xlim=(0, HOLD), ylim=(1e-9, None))
-            plain(panel)
-            ticks = range(-9, 4, 2)
-            panel.set_yticks([10.0**n for n in ticks], [f"$10^{{{n}}}$" for n in ticks])
-            panel.set_xlabel("frames after it stopped")
-        panels[0].set_ylabel("residual")
-        names = dict.fromkeys(p.motion.tissue for p in points)
-        key = [_line(name, TISSUES[name].colour, "-") for name in names]
-        key += [_line("inside out at the end", "0.2", "--")]
-        key_beside(panels[-1], [*key, _line("asked: 0.001 in 30", "0.4", ":")])
-
-
-def _line(label: str, colour: str, style: str) -> Line2D:
-    return Line2D([], [], color=colour, ls=style, lw=1.3, label=label)
-
-
-def _by_motion(points: Sequence[Point]) -> str:
-    rows = []
-    for p in points:
-        values = p.values
-        told = p.frames.compared >= ENOUGH
-        errors = [values[f"error_mm_{part}"] for part in ("p50", "p95", "p99", "worst")]
-        numbers = [
-            *(errors if told else 4 * [np.nan]),
-            *(values[f"own_error_mm_{part}"] for part in ("p50", "worst")),
-            *(values[f"residual_{part}"] for part in ("p50", "p99")),
+def _pieces(quick: bool, settings: HandSettings | None = None) -> Mapping[str, Sequence[Piece]]:
+    bench = Bench()
+    return {
+        "hand": [
+            Piece(
+                {
+                    "tissue": motion.tissue,
+                    "kind": motion.kind,
+                    "haste": motion.haste,
+                    "seed": motion.seed,
+                    "method": method,
+                },
+                partial(bench.row, motion, method),
+            )
+            for motion in motions(quick, (settings or HandSettings()).seed)
+            for method in TISSUE_METHODS
         ]
-        rows.append(
-            (
-                *(str(p.motion), _name(p.method), *map(_number, numbers)),
-                *(_percent(values[f"residual_over_{limit}"]) for limit in ("0.01", "0.1", "1")),
-                f"{values['frames_inverted']}",
-                *(_number(values[f"cpu_ms_{part}"]) for part in ("p50", "p99", "worst")),
-            )
-        )
-    return markdown_table(("motion", "method", *_HEAD), rows)
+    }
 
 
-def _live(points: Sequence[Point]) -> str:
-    rows = []
-    for p in points:
-        values, told = p.values, p.live.frames.compared >= ENOUGH
-        errors = [values[f"live_{name}"] for name in ("error_mm_p50", "error_mm_worst", "away_ms")]
-        rows.append(
-            (
-                *(str(p.motion), _name(p.method), f"{p.live.poses}"),
-                _percent(values["live_skipped"]),
-                *(_number(error) if told else "" for error in errors),
-                *(_number(values[f"live_latency_ms_{part}"]) for part in ("p50", "p99")),
-                f"{values['live_frames_inverted']}",
-                *(number(p.held.frames_to(small), ".0f", "never") for small in (1e-2, 1e-3)),
-                _number(values["hold_residual"]),
-                "yes" if p.held.inverted else "",
-            )
-        )
-    return markdown_table(("motion", "method", *_LIVE), rows)
+def targets(table: pd.DataFrame) -> list[Target]:
+    """Limits for `JUDGED`, against the measured numbers."""
+    mine = with_motion(table[table["method"] == JUDGED])
+    arm = mine[mine["tissue"] == MAIN_TISSUE]
+    brisk, careful = arm[arm["haste"] == "brisk"], arm[arm["haste"] == "careful"]
+    violent = mine[mine["haste"] == "violent"]
+    where = f"brisk on the {MAIN_TISSUE}"
+    frames, live = _joined(brisk, "every"), _joined(brisk, "live")
 
+    def within(what: str, asked: float, some: pd.DataFrame, limit: float) -> Target:
+        percent = 100 * (some["residual"] <= limit).mean()
+        return Target.at_least(f"{what}: % of frames with a residual of at most {limit:g}", asked,
+                               percent, form=".4g")  # fmt: skip
 
-def _answers(answers: Mapping[Motion, Converged]) -> str:
-    rows = [
+    def rest(what: str, limit: int, some: pd.DataFrame, column: str) -> Target:
+        """Frames after the probe has stopped until the residual is small; NaN is never."""
+        worst = some[column].astype(float).fillna(np.inf).max()
+        if worst == np.inf:
+            return Target(what, f"at most {limit}", "never in some motion", False)
+        return Target.at_most(what, limit, worst, form="g")
+
+    limits: Sequence[tuple[str, float, float, str]] = (
+        (f"{where}: ms a frame (processor), median", 8, frames["cpu"].median(), "ms"),
+        (f"{where}: likewise, 99th percentile", 33, frames["cpu"].quantile(0.99), "ms"),
+        (f"{where}: mm to its own balance, median", 0.05, frames["own"].median(), "mm"),
+        (f"{where}: likewise, 99th percentile", 0.5, frames["own"].quantile(0.99), "mm"),
+        (f"live, {where}: mm to the converged answer, median", 0.05, live["error"].median(), "mm"),
         (
-            *(str(motion), f"{len(answer.residual)}"),
-            *map(_percent, ((answer.residual <= CONVERGED).mean(), answer.trusted.mean())),
-            *map(_number, (answer.residual.max(), answer.smallest.min())),
-            _number(1e3 * answer.slipped.max()),
-        )
-        for motion, answer in answers.items()
+            f"live, {where}: ms in which a node is over {AWAY:g} mm off, longest",
+            50,
+            brisk["live_away_ms"].max(),
+            "ms",
+        ),
+        (
+            f"live, {where}: ms from a pose to its nodes, 99th percentile",
+            25,
+            live["latency"].quantile(0.99),
+            "ms",
+        ),
+        (f"live, {where}: % of poses skipped", 5, 100 * brisk["live_skipped"].mean(), ""),
+        (
+            "all motions: frames with inverted tetrahedra",
+            0,
+            (mine["frames_inverted"] + mine["live_frames_inverted"]).sum(),
+            "",
+        ),
+        ("violent: ms of the slowest frame", 50, violent["wall_ms_worst"].max(), "ms"),
+        ("all motions: mm that a fixed node moves", 0, mine["fixed_nodes_moved_mm"].max(), "mm"),
+        ("all motions, then held: inverted in the end", 0, mine["hold_inverted"].sum(), ""),
+    )
+    return [
+        within(where, 99.0, frames, 1e-2),
+        within(where, 100.0, frames, 0.1),
+        within(f"careful on the {MAIN_TISSUE}", 99.9, _joined(careful, "every"), 1e-2),
+        *(Target.at_most(*limit) for limit in limits),
+        rest("violent, then held: frames to a residual of 0.01, worst", 5, violent,
+             "hold_frames_to_1e-2"),
+        rest("all motions, then held: frames to a residual of 0.001, worst", 30, mine,
+             "hold_frames_to_1e-3"),
+    ]  # fmt: skip
+
+
+def with_motion(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with the words of each row's motion."""
+    return table.assign(motion=table["tissue"] + ", " + table["kind"] + ", " + table["haste"])
+
+
+def _joined(table: pd.DataFrame, frames: str) -> pd.DataFrame:
+    """Every frame of some rows, with the row's motion and method."""
+    columns = ["residual", "cpu", "own", "error", "latency", "inverted", "s"]
+    if table.empty:
+        return pd.DataFrame(columns=columns, dtype=float)
+    return pd.concat(
+        [
+            row[frames].assign(motion=row["motion"], method=row["method"])
+            for _, row in table.iterrows()
+        ]
+    )
+
+
+def _report(table: pd.DataFrame) -> Report:
+    table = with_motion(table)
+    free = table[table["kind"] == "free"]
+    shown = list(dict.fromkeys([*free["motion"], *table["motion"]]))[:3]
+    frames = _joined(table, "every")
+    points = [
+        {"motion": row["motion"], "method": row["method"], "ms": row[f"cpu_ms_{part}"],
+         "mm": row[f"error_mm_{part}"], "median": part == "p50"}
+        for _, row in (free if len(free) else table).iterrows()
+        for part in ("p50", "p99")
+    ]  # fmt: skip
+    held = pd.DataFrame(
+        [
+            {"method": row["method"], "motion": row["motion"], "frame": k, "residual": residual}
+            for _, row in table.iterrows()
+            for k, residual in enumerate(row["hold"])
+        ]
+    )
+    arm = table[(table["tissue"] == MAIN_TISSUE) & (table["haste"] == "brisk")]
+    mine = arm[arm["method"] == JUDGED]
+    judged, live = _joined(mine, "every"), _joined(mine, "live")
+    inverted = frames.groupby("method", sort=False)["inverted"].apply(lambda n: (n > 0).mean())
+    linear = _joined(arm[arm["method"] == "fem"], "every")
+    take_home = [
+        f"In a brisk hand on the arm `{JUDGED}` is {judged['error'].median():.2g} mm off where it "
+        f"is worst (median frame; {judged['error'].quantile(0.99):.2g} mm at the 99th percentile), "
+        f"in {judged['cpu'].median():.2g} ms.",
+        f"Live, it is {live['error'].median():.2g} mm off, skips "
+        f"{100 * mine['live_skipped'].mean():.2g} % of the poses, and shows nodes "
+        f"{live['latency'].quantile(0.99):.2g} ms after their pose (99th percentile).",
+        f"`fem` needs {linear['cpu'].median():.2g} ms, and its linear strain is "
+        f"{linear['error'].median():.2g} mm off there.",
+        "Frames with tetrahedra inside out, all motions: "
+        + ", ".join(f"`{name}` {100 * part:.2g} %" for name, part in inverted.items())
+        + ".",
     ]
-    head = ("motion", "poses", f"residual ≤ {CONVERGED:g}", f"≤ {TRUSTED:g}", "largest residual")
-    return markdown_table((*head, "smallest volume ratio", "mm a fixed node moved"), rows)
+    faults = frames.assign(
+        **{f"residual > {limit:g}, %": 100.0 * (frames["residual"] > limit) for limit in (0.01, 1)},
+        **{"inside out, %": 100.0 * (frames["inverted"] > 0)},
+    )
+    places = {
+        "judged": JUDGED,
+        "time": draw_lines(
+            frames[frames["motion"].isin(shown)],
+            "s",
+            "error",
+            "How far the farthest node is off while a hand moves (every pose fed)",
+            panels="motion",
+            lines="method",
+            log="y",
+            floor=1e-3,
+            labels={"s": "time, s", "error": "error of the worst node, mm"},
+        ),
+        "error": draw_error_over_time(
+            pd.DataFrame(points),
+            "ms",
+            "mm",
+            "Error of the worst node over run time (full: median frame; hollow: 99th percentile)",
+            panels="motion",
+            lines="method",
+            filled="median",
+            floor=1e-3,
+            limits={"16.7 ms: 60 Hz": 1e3 / RATE},
+            labels={"ms": "processor time of a frame, ms", "mm": "error of the worst node, mm"},
+        ),
+        "motions": table[list(_BY_MOTION)].rename(columns=_BY_MOTION),
+        "faults": faults.groupby("method", sort=False)[list(faults.columns[-3:])]
+        .mean()
+        .reset_index(),
+        "hold_figure": draw_lines(
+            held,
+            "frame",
+            "residual",
+            "The probe is held still: does the tissue come to balance?",
+            panels="method",
+            lines="motion",
+            log="y",
+            floor=1e-9,
+            limits={"y:asked: 0.001 in 30": 1e-3},
+            labels={"frame": "frames after it stopped"},
+        ),
+        "live": table[list(_LIVE)].rename(columns=_LIVE),
+        "hold": str(HOLD),
+        "tissues": [f"`{name}`: {tissue.words}" for name, tissue in TISSUES.items()],
+        "kinds": [f"{name}: {kind.words}" for name, kind in KINDS.items()],
+    }
+    return Report(take_home, places, targets(table))
 
 
-def _name(method: str) -> str:
-    return f"**{method}**" if method == JUDGED else method
-
-
-def _number(value: Any) -> str:
-    return number(value, ".2g")
-
-
-def _percent(value: Any) -> str:
-    return f"{100 * value:.3g} %" if np.isfinite(value) else ""
+HAND = Subject(
+    "hand",
+    "A hand: error, residual and run time of every method",
+    _pieces,
+    _report,
+    hidden=("every", "live", "hold"),
+)

@@ -1,4 +1,4 @@
-"""Loss, enhancement, shadows, and echoes by the angle of the beam, against closed forms.
+"""Loss, shadows, and echoes by the angle of the beam, against closed forms.
 
 >>> from us_sim.evaluation.image.acoustics import STATES, corners
 >>> np.round(corners(STATES["rest"])[0] * 1e3, 3)  # mm, x and z of one
@@ -7,9 +7,9 @@ array([-6., 14.])
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,25 +18,13 @@ from us_sim.evaluation.image.measure import (
     GREY,
     LAYERS,
     PROBES,
-    Artefact,
-    Point,
     layered_volume,
     lost,
+    row_of,
     tilted,
     voxel_grid,
-    worst_percent,
-)
-from us_sim.evaluation.report import (
-    ReportFolder,
-    Target,
-    filled,
-    key_beside,
-    markdown_table,
-    picture,
-    plain,
 )
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.acoustics.media import crossing_loss
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
 from us_sim.slicing.acoustics.surface_echo import MIRROR, ROUGHNESS
 from us_sim.slicing.b_mode import BMode
@@ -47,6 +35,7 @@ from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
 Array = NDArray[np.float64]
+Row: TypeAlias = "dict[str, Any]"
 
 _LOW, _HIGH = (-6e-3, 14e-3), (5.2e-3, 18e-3)  # m, x and z of a block of bone
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)
@@ -71,50 +60,20 @@ def _acoustics(
     )
 
 
-class Attenuation(Artefact):
+def attenuation_rows(quick: bool) -> Iterator[Row]:
     """Images of layers of one grey, whose levels are the loss alone (Beer and Lambert)."""
-
-    name, title = "attenuation", "Loss along the beams"
-
-    def points(self, quick: bool) -> list[Point]:
-        volume = layered_volume()
-        found = []
-        for name, frequency in (("linear", 7e6), ("convex", 3.5e6), ("sector", 3e6)):
-            acoustics = _acoustics(frequency, 0.5, {layer.name: layer.tissue for layer in LAYERS})
-            probe = PROBES[name]
-            scanner = BMode(volume, probe, acoustics=acoustics)
-            for degrees in (0.0, 40.0) if quick else (0.0, 10.0, 20.0, 30.0, 40.0):
-                for direction in (False, True) if degrees else (False,):
-                    pose = tilted(degrees, elevational=direction)
-                    artefact = self.name + ("_elevational" if direction else "")
-                    image = scanner.image(pose)
-                    expected = _expected_levels(probe, pose, acoustics)
-                    found += _worst_depths(artefact, name, degrees, probe, image, expected)
-        return found
-
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        targets = []
-        for name in PROBES:
-            worst = worst_percent([p for p in points if p.probe == name])
-            what = f"loss in layers, {name} probe, tilted up to 40°: amplitude, worst depth"
-            targets.append(Target.at_most(what, 1.0, worst, "%"))
-        return targets
-
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        title = "Loss in layers: error of the amplitude at the worst depths"
-        with picture(folder.picture("attenuation"), 10.5, 3.8, title) as figure:
-            for panel, name in zip(figure.subplots(1, 3, sharey=True), PROBES, strict=True):
-                mine = [p for p in points if p.probe == name]
-                for key in dict.fromkeys((p.artefact, p.tilt_deg) for p in mine):
-                    some = [p for p in mine if (p.artefact, p.tilt_deg) == key]
-                    label = f"{key[1]:g}°" + (", out of plane" if key[0] != self.name else "")
-                    error = [p.error_percent for p in some]
-                    panel.plot([p.depth_mm for p in some], error, label=label)
-                panel.set(title=name, xlabel="depth, mm")
-                plain(panel)
-            figure.axes[0].set_ylabel("error, %")
-            key_beside(figure.axes[-1])
-        return filled("image", self.name, layers=", ".join(layer.name for layer in LAYERS))
+    volume = layered_volume()
+    for name, frequency in (("linear", 7e6), ("convex", 3.5e6), ("sector", 3e6)):
+        acoustics = _acoustics(frequency, 0.5, {layer.name: layer.tissue for layer in LAYERS})
+        probe = PROBES[name]
+        scanner = BMode(volume, probe, acoustics=acoustics)
+        for degrees in (0.0, 40.0) if quick else (0.0, 10.0, 20.0, 30.0, 40.0):
+            for direction in (False, True) if degrees else (False,):
+                pose = tilted(degrees, elevational=direction)
+                artefact = "attenuation" + ("_elevational" if direction else "")
+                image = scanner.image(pose)
+                expected = _expected_levels(probe, pose, acoustics)
+                yield from _worst_depths(artefact, name, degrees, probe, image, expected)
 
 
 def _expected_levels(probe: Probe, pose: Pose, acoustics: Acoustics) -> Array:
@@ -138,7 +97,7 @@ def _worst_depths(
     probe: Probe,
     image: NDArray[np.uint8],
     expected: Array,
-) -> list[Point]:
+) -> Iterator[Row]:
     """The depth with the greatest error in each twelfth of the depth."""
     grey = GREY + GREYS_PER_DECIBEL * expected
     usable = (grey > 4.0) & (grey < 250.0)  # between which a mean is not clipped
@@ -149,50 +108,11 @@ def _worst_depths(
     off = np.bincount(flat, shown, minlength=count) / np.maximum(number, 1)
     mean = np.bincount(flat, expected[usable], minlength=count) / np.maximum(number, 1)
     off[number < 32] = 0.0  # pixels of a mean
-    points = []
     for part in np.array_split(np.arange(count), 12):
         at = part[np.argmax(np.abs(off[part]))]
         depth = (at + 0.5) * probe.pixel_spacing[1]
-        row = (artefact, name, degrees, float(depth), float(mean[at]), float(mean[at] + off[at]))
-        points.append(Point.of(*row, "dB"))
-    return points
-
-
-class Enhancement(Artefact):
-    """A block of blood in muscle, which takes less of the sound."""
-
-    name, title = "enhancement", "Enhancement behind fluid"
-
-    def points(self, quick: bool) -> list[Point]:
-        del quick
-        frequency, muscle, fluid = 8e6, (0.57, 1.645e6), (0.14, 1.679e6)
-        volume = dataclasses.replace(_bone_volume(), label_names={1: "muscle", 2: "blood"})
-        tissues = {
-            name: TissueAcoustics(attenuation=attenuation, impedance=impedance)
-            for name, (attenuation, impedance) in (("muscle", muscle), ("blood", fluid))
-        }
-        scanner = BMode(volume, _PROBE, acoustics=_acoustics(frequency, 0.57, tissues))
-        found = []
-        for degrees in (0.0, 5.0, 10.0):
-            image = scanner.image(Pose(np.zeros(3), tilted(degrees).orientation))
-            behind = image[400:430, 250:262]  # of the middle beams
-            shown = float(behind.mean() - GREY) / GREYS_PER_DECIBEL
-            length = (_HIGH[1] - _LOW[1]) / np.cos(np.radians(degrees))
-            spared = 200.0 * (muscle[0] - fluid[0]) * frequency * 1e-6 * length
-            expected = spared - 2.0 * crossing_loss(muscle[1], fluid[1])
-            row = (self.name, "linear", degrees, 415 / 512 * _PROBE.depth, expected, shown)
-            found.append(Point.of(*row, "dB"))
-        return found
-
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        what = "behind 4 mm of blood in muscle: amplitude, worst tilt"
-        return [Target.at_most(what, 1.0, worst_percent(points), "%")]
-
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        del folder
-        rows = [(f"{p.tilt_deg:g}°", f"{p.expected:.2f}", f"{p.measured:.2f}") for p in points]
-        table = markdown_table(("tilt", "closed form, dB", "image, dB"), rows)
-        return filled("image", self.name, table=table)
+        shown_level = float(mean[at] + off[at])
+        yield row_of(artefact, name, degrees, float(depth), float(mean[at]), shown_level, "dB")
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,63 +163,33 @@ def _line_through(probe: Probe, pose: Pose, points: Array) -> Array:
     return 0.5 * (low + high)
 
 
-class Shadow(Artefact):
+def shadow_rows(quick: bool) -> Iterator[Row]:
     """A shadow of bone at rest, pressed, and as the probe slides: half of the amplitude is left."""
-
-    name, title = "shadow_edge", "The edge of a shadow"
-
-    def points(self, quick: bool) -> list[Point]:
-        found = []
-        volume = _bone_volume()
-        sides = zip(((-0.06, 0.06), (-0.015, 0.015), (-0.04, 0.08)), (9, 4, 8), strict=True)
-        carrier = box_mesh(*(uniform_planes(*side, n) for side, n in sides))
-        tissues = {
-            "muscle": TissueAcoustics(attenuation=0.57, impedance=1.645e6),
-            # Opaque: sound that bone lets through would move the place of half of the amplitude.
-            "bone": TissueAcoustics(attenuation=20.0, impedance=1e8),
-        }
-        probes: dict[str, tuple[Probe, float]] = {
-            "linear": (LinearProbe(aperture=0.04, depth=0.04), 8e6),
-            "convex": (ConvexProbe(radius=0.05, opening_angle=np.radians(50), depth=0.06), 4e6),
-            "sector": (SectorProbe(aperture=0.02, opening_angle=np.radians(70), depth=0.06), 3e6),
-        }
-        for name, (probe, frequency) in probes.items():
-            scanner = BMode(volume, probe, acoustics=_acoustics(frequency, 0.57, tissues))
-            scanner.carry(carrier.nodes, carrier.tetrahedra)
-            for degrees in (0.0, 15.0) if quick else (-20.0, -10.0, 0.0, 10.0, 20.0):
-                for state_name, state in STATES.items():
-                    pose = Pose(np.array([state.slid, 0.0, 0.0]), tilted(degrees).orientation)
-                    image = scanner.image(pose, carrier.nodes @ state.gradient.T)
-                    places = _line_through(probe, pose, corners(state))
-                    artefact = f"{self.name}_{state_name}"
-                    for part in (0.6, 0.75, 0.9):
-                        depth = part * probe.depth
-                        found += _edges(artefact, name, degrees, probe, image, places, depth)
-        return found
-
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        targets = []
-        for state in STATES:
-            mine = [p for p in points if p.artefact == f"{self.name}_{state}"]
-            off = max(abs(p.measured - p.expected) for p in mine)
-            what = f"shadow of bone, {state}: pixels from its geometric edge, worst of {len(mine)}"
-            targets.append(Target.at_most(what, 1.0, off))
-        return targets
-
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        title = "A shadow's edge: pixels from the geometric one"
-        with picture(folder.picture("shadow"), 10.5, 3.8, title) as figure:
-            for panel, name in zip(figure.subplots(1, 3, sharey=True), PROBES, strict=True):
-                for state, mark in zip(STATES, "osx", strict=True):
-                    of = (f"{self.name}_{state}", name)
-                    mine = [p for p in points if (p.artefact, p.probe) == of]
-                    off = [p.measured - p.expected for p in mine]
-                    panel.plot([p.tilt_deg for p in mine], off, mark, ms=4, label=state)
-                panel.set(title=name, xlabel="tilt, degrees", ylim=(-1.05, 1.05))
-                plain(panel)
-            figure.axes[0].set_ylabel("pixels")
-            key_beside(figure.axes[-1])
-        return filled("image", self.name)
+    volume = _bone_volume()
+    sides = zip(((-0.06, 0.06), (-0.015, 0.015), (-0.04, 0.08)), (9, 4, 8), strict=True)
+    carrier = box_mesh(*(uniform_planes(*side, n) for side, n in sides))
+    tissues = {
+        "muscle": TissueAcoustics(attenuation=0.57, impedance=1.645e6),
+        # Opaque: sound that bone lets through would move the place of half of the amplitude.
+        "bone": TissueAcoustics(attenuation=20.0, impedance=1e8),
+    }
+    probes: dict[str, tuple[Probe, float]] = {
+        "linear": (LinearProbe(aperture=0.04, depth=0.04), 8e6),
+        "convex": (ConvexProbe(radius=0.05, opening_angle=np.radians(50), depth=0.06), 4e6),
+        "sector": (SectorProbe(aperture=0.02, opening_angle=np.radians(70), depth=0.06), 3e6),
+    }
+    for name, (probe, frequency) in probes.items():
+        scanner = BMode(volume, probe, acoustics=_acoustics(frequency, 0.57, tissues))
+        scanner.carry(carrier.nodes, carrier.tetrahedra)
+        for degrees in (0.0, 15.0) if quick else (-20.0, -10.0, 0.0, 10.0, 20.0):
+            for state_name, state in STATES.items():
+                pose = Pose(np.array([state.slid, 0.0, 0.0]), tilted(degrees).orientation)
+                image = scanner.image(pose, carrier.nodes @ state.gradient.T)
+                places = _line_through(probe, pose, corners(state))
+                artefact = f"shadow_edge_{state_name}"
+                for part in (0.6, 0.75, 0.9):
+                    depth = part * probe.depth
+                    yield from _edges(artefact, name, degrees, probe, image, places, depth)
 
 
 def _edges(
@@ -310,7 +200,7 @@ def _edges(
     image: NDArray[np.uint8],
     places: Array,
     depth: float,
-) -> list[Point]:
+) -> Iterator[Row]:
     """Both edges of the shadow at a depth, in pixels from the middle beam, along the arc."""
     line, distance = probe.pixel_beams
     near = np.abs(distance - depth) < 1.5 * probe.pixel_spacing[1]
@@ -328,114 +218,84 @@ def _edges(
     if angle > 1e-6:
         length *= angle / (2 * np.sin(0.5 * angle))
     pixels = float(length / probe.pixel_spacing[0])
-    points = []
     for expected, sign in ((places.min(), 1), (places.max(), -1)):
         if not 0.08 < expected < 0.92:
             continue
         dark = np.flatnonzero(mean < 0.5)
         if not len(dark):
-            return [Point(artefact, name, degrees, 1e3 * depth, failure="there is no shadow")]
+            raise ArithmeticError(f"{artefact}, {name}, {degrees:g}°: there is no shadow")
         inner = dark[0] if sign > 0 else dark[-1]
         outer = inner - sign
         part = (mean[outer] - 0.5) / (mean[outer] - mean[inner])
         found = centre[outer] + part * (centre[inner] - centre[outer])
         row = (artefact, name, degrees, depth, pixels * (expected - 0.5), pixels * (found - 0.5))
-        points.append(Point.of(*row, "px"))
-    return points
+        yield row_of(*row, "px")
 
 
-class Surfaces(Artefact):
+def surface_rows(quick: bool) -> Iterator[Row]:
     """The echo of a flat border, by the angle between beam and normal, in the plane and out."""
-
-    name, title = "surface", "Surfaces by their angle"
-
-    def points(self, quick: bool) -> list[Point]:
-        border, above, below = 0.0152, 1.5e6, 1.8e6  # m along z, and Rayl
-        labels = np.ones(_BOX, dtype=np.uint8)
-        z = -0.03 + 0.2e-3 * (np.arange(labels.shape[2]) + 0.5)
-        labels[:, :, z > border] = 2
-        # Two tissues that scatter little, one below the other.
-        grey = np.full(labels.shape, 40, dtype=np.uint8)
-        volume = Volume(grey, _box_placed(), labels, {1: "above", 2: "below"})
-        media = {
-            "above": TissueAcoustics(attenuation=0.5, impedance=above),
-            "below": TissueAcoustics(attenuation=0.5, impedance=below),
-        }
-        acoustics = _acoustics(6e6, 0.5, media, surfaces=True, anisotropy=False)
-        scanner = BMode(volume, _PROBE, acoustics=acoustics)
-        ratio = (below - above) / (below + above)
-        found = []
-        for degrees in _ANGLES[::2] if quick else _ANGLES:
-            facing = np.exp(-(np.tan(np.radians(degrees)) ** 2) / (2 * ROUGHNESS**2))
-            expected = float(MIRROR + 20.0 * np.log10(ratio * facing))  # dB; 0 is the strongest
-            for elevational in (False, True):
-                pose = tilted(degrees, elevational=elevational)
-                shown = [
-                    scanner.image(Pose(np.array([0.0, y, 0.0]), pose.orientation)).max(axis=0)
-                    for y in np.arange(0.0, 8e-3, 0.5e-3)  # a voxel each, along the grain
-                ]
-                level = float(np.mean(shown)) / GREYS_PER_DECIBEL - ECHO_RANGE
-                name = self.name + ("_elevational" if elevational else "")
-                found.append(Point.of(name, "linear", degrees, border, expected, level, "dB"))
-        return found
-
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        worst = max(abs(p.measured - p.expected) for p in points)
-        return [Target.at_most("echo of a border by its angle: dB off, worst", 1.0, worst)]
-
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        _plot_angles(points, self.name, "Echo of a border", folder)
-        return filled("image", self.name, mirror=f"{MIRROR:g}", roughness=f"{ROUGHNESS:g}")
+    border, above, below = 0.0152, 1.5e6, 1.8e6  # m along z, and Rayl
+    labels = np.ones(_BOX, dtype=np.uint8)
+    z = -0.03 + 0.2e-3 * (np.arange(labels.shape[2]) + 0.5)
+    labels[:, :, z > border] = 2
+    # Two tissues that scatter little, one below the other.
+    grey = np.full(labels.shape, 40, dtype=np.uint8)
+    volume = Volume(grey, _box_placed(), labels, {1: "above", 2: "below"})
+    media = {
+        "above": TissueAcoustics(attenuation=0.5, impedance=above),
+        "below": TissueAcoustics(attenuation=0.5, impedance=below),
+    }
+    acoustics = _acoustics(6e6, 0.5, media, surfaces=True, anisotropy=False)
+    scanner = BMode(volume, _PROBE, acoustics=acoustics)
+    ratio = (below - above) / (below + above)
+    for degrees in _ANGLES[::2] if quick else _ANGLES:
+        facing = np.exp(-(np.tan(np.radians(degrees)) ** 2) / (2 * ROUGHNESS**2))
+        expected = float(MIRROR + 20.0 * np.log10(ratio * facing))  # dB; 0 is the strongest
+        for elevational in (False, True):
+            pose = tilted(degrees, elevational=elevational)
+            shown = [
+                scanner.image(Pose(np.array([0.0, y, 0.0]), pose.orientation)).max(axis=0)
+                for y in np.arange(0.0, 8e-3, 0.5e-3)  # a voxel each, along the grain
+            ]
+            level = float(np.mean(shown)) / GREYS_PER_DECIBEL - ECHO_RANGE
+            name = "surface" + ("_elevational" if elevational else "")
+            yield row_of(name, "linear", degrees, border, expected, level, "dB")
 
 
-class Fibres(Artefact):
+def fibre_rows(quick: bool) -> Iterator[Row]:
     """Echoes of muscle by the angle between beam and fibres, at rest and sheared."""
-
-    name, title = "anisotropy", "Fibres off the perpendicular"
-    shear = 0.15  # m along z a metre along y
-
-    def points(self, quick: bool) -> list[Point]:
-        grey = 150
-        muscle = TissueAcoustics(
-            attenuation=0.57,
-            impedance=1.645e6,
-            fibres=(0.0, 1.0, 0.0),
-            anisotropy=14.0,
-            half_angle=0.3,
-        )
-        labels = np.ones(_BOX, dtype=np.uint8)
-        acoustics = _acoustics(6e6, 0.57, {"muscle": muscle})
-        volume = Volume(np.full(_BOX, grey, np.uint8), _box_placed(), labels, {1: "muscle"})
-        scanner = BMode(volume, _PROBE, acoustics=acoustics)
-        sides = ((-0.05, 0.05), (-0.04, 0.04), (-0.03, 0.06))
-        carrier = box_mesh(*(uniform_planes(*side, 6) for side in sides))
-        scanner.carry(carrier.nodes, carrier.tetrahedra)
-        sheared = carrier.nodes.copy()
-        sheared[:, 2] += self.shear * sheared[:, 1]
-        found = []
-        for degrees in _ANGLES[::2] if quick else _ANGLES:
-            for name, nodes, lean in (
-                (self.name, carrier.nodes, 0.0),
-                (f"{self.name}_sheared", sheared, np.arctan(self.shear)),
-            ):
-                pose = Pose(np.zeros(3), tilted(degrees, elevational=True).orientation)
-                image = scanner.image(pose, nodes)[100:400, 100:400]
-                shown = float(image.mean() - grey) / GREYS_PER_DECIBEL
-                square = np.sin(np.radians(degrees) - lean) ** 2
-                half = np.sin(muscle.half_angle) ** 2
-                expected = -muscle.anisotropy * square / (square + half)
-                found.append(Point.of(name, "linear", degrees, 0.015, expected, shown, "dB"))
-        return found
-
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        worst = max(abs(p.measured - p.expected) for p in points)
-        return [Target.at_most("echo of fibres by their angle: dB off, worst", 0.1, worst)]
-
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        _plot_angles(points, self.name, "Echo of fibres", folder)
-        return filled("image", self.name, lean=f"{np.degrees(np.arctan(self.shear)):.1f}")
+    grey = 150
+    muscle = TissueAcoustics(
+        attenuation=0.57,
+        impedance=1.645e6,
+        fibres=(0.0, 1.0, 0.0),
+        anisotropy=14.0,
+        half_angle=0.3,
+    )
+    labels = np.ones(_BOX, dtype=np.uint8)
+    acoustics = _acoustics(6e6, 0.57, {"muscle": muscle})
+    volume = Volume(np.full(_BOX, grey, np.uint8), _box_placed(), labels, {1: "muscle"})
+    scanner = BMode(volume, _PROBE, acoustics=acoustics)
+    sides = ((-0.05, 0.05), (-0.04, 0.04), (-0.03, 0.06))
+    carrier = box_mesh(*(uniform_planes(*side, 6) for side in sides))
+    scanner.carry(carrier.nodes, carrier.tetrahedra)
+    sheared = carrier.nodes.copy()
+    sheared[:, 2] += SHEAR * sheared[:, 1]
+    for degrees in _ANGLES[::2] if quick else _ANGLES:
+        for name, nodes, lean in (
+            ("anisotropy", carrier.nodes, 0.0),
+            ("anisotropy_sheared", sheared, np.arctan(SHEAR)),
+        ):
+            pose = Pose(np.zeros(3), tilted(degrees, elevational=True).orientation)
+            image = scanner.image(pose, nodes)[100:400, 100:400]
+            shown = float(image.mean() - grey) / GREYS_PER_DECIBEL
+            square = np.sin(np.radians(degrees) - lean) ** 2
+            half = np.sin(muscle.half_angle) ** 2
+            expected = -muscle.anisotropy * square / (square + half)
+            yield row_of(name, "linear", degrees, 0.015, expected, shown, "dB")
 
 
+SHEAR = 0.15  # m along z a metre along y
 _ANGLES = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 _BOX = (200, 160, 450)  # voxels
 
@@ -444,18 +304,3 @@ def _box_placed() -> Array:
     placed = np.diag([0.5e-3, 0.5e-3, 0.2e-3, 1.0])
     placed[:3, 3] = (-0.05 + 0.25e-3, -0.04 + 0.25e-3, -0.03 + 0.1e-3)
     return placed
-
-
-def _plot_angles(points: Sequence[Point], name: str, title: str, folder: ReportFolder) -> None:
-    title += ", closed form (lines) and image (marks)"
-    with picture(folder.picture(name), 7.5, 3.8, title) as figure:
-        panel = figure.subplots()
-        artefacts = dict.fromkeys(p.artefact for p in points)
-        for colour, artefact in zip(("C0", "C1"), artefacts, strict=True):
-            mine = [p for p in points if p.artefact == artefact]
-            tilt = [p.tilt_deg for p in mine]
-            panel.plot(tilt, [p.expected for p in mine], "-", color=colour)
-            panel.plot(tilt, [p.measured for p in mine], "o", color=colour, label=artefact)
-        panel.set(xlabel="tilt, degrees", ylabel="dB")
-        plain(panel)
-        key_beside(panel)

@@ -8,15 +8,14 @@ aperture the loss in bone and gas, in steps of a tenth of a millimetre through t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.image.measure import Artefact, Point, tilted
-from us_sim.evaluation.report import ReportFolder, Target, filled, markdown_table
+from us_sim.evaluation.image.measure import row_of, tilted, time_row
 from us_sim.evaluation.timing import medians_in_turn
 from us_sim.geometry.pose import Pose
 from us_sim.kernels import njit
@@ -147,126 +146,77 @@ def _label(x, y, z, labels):
 _TILTS = (-20.0, -10.0, 0.0, 10.0, 20.0)
 
 
-class ArmTilts(Artefact):
-    """The whole of it, in an arm: the gain of every pixel against rays."""
-
-    name, title = "arm", "The arm at five tilts"
-
-    def __init__(self) -> None:
-        self._pictures: list[NDArray[np.uint8]] = []
-
-    def points(self, quick: bool) -> list[Point]:
-        scene = load_scene("upper_arm")
-        volume, side = volume_of(scene), 96 if quick else 320
-        deep: Any = probe_of(scene)
-        probe = dataclasses.replace(deep, depth=0.054).with_pixels(side, round(1.35 * side))
-        acoustics = scene.imaging.acoustics
-        all_of_it = BMode(volume, probe, Imaging(), acoustics)
-        bare = dataclasses.replace(acoustics, surfaces=False, noise=None)
-        without = BMode(volume, probe, Imaging(), bare)
-        sound = BeamAcoustics(volume, probe, bare)
-        # The probe turns about the bone, so that it stays in view.
-        bone, from_bone = np.array([12e-3, 0.0, 38e-3]), np.array([-6e-3, 0.0, -36e-3])  # m
-        found = []
-        self._pictures = []
-        for degrees in _TILTS[::2] if quick else _TILTS:
-            turned = tilted(degrees)
-            pose = Pose(bone + turned.rotation @ from_bone, turned.orientation)
-            frame = without.frame(pose)
-            slice_ = frame.slice(frame.plane)
-            shown = sound.gain_on_pixels(frame)
-            traced = _traced_gain(volume, probe, pose, acoustics)
-            usable = (slice_ > 0) & (traced > -40.0)
-            off = np.abs(shown - traced)[usable]
-            for name, percent in (("median", 50), ("p95", 95)):
-                value = float(np.percentile(off, percent))
-                row = (f"{self.name}_{name}", "linear", degrees, float("nan"), 0.0, value)
-                found.append(Point.of(*row, "dB"))
-            reference = np.clip(slice_ + 4.25 * traced, 0, 255) * (slice_ > 0)
-            column = (all_of_it.image(pose), without.image(pose), reference.astype(np.uint8))
-            self._pictures.append(np.vstack(column))
-        return found
-
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        targets = []
-        for name, limit in (("median", 0.2), ("p95", 3.0)):
-            worst = max(p.measured for p in points if p.artefact == f"{self.name}_{name}")
-            what = f"the arm at rest, gain against rays: dB off, {name}, worst tilt"
-            targets.append(Target.at_most(what, limit, worst))
-        return targets
-
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        cv2.imwrite(str(folder.picture("arm_tilts")), np.hstack(self._pictures))
-        tilts = ", ".join(f"{p.tilt_deg:g}°" for p in points if p.artefact.endswith("median"))
-        return filled("image", self.name, tilts=tilts)
-
-
-class RunTime(Artefact):
-    """Images of 512 × 512 of the pressed arm, in turn, so that all have the same disturbances."""
-
-    name, title = "run_time", "Run time"
-
-    def points(self, quick: bool) -> list[Point]:
-        scene = load_scene("upper_arm")
-        volume, probe = volume_of(scene), probe_of(scene).with_pixels(512, 512)
-        full = scene.imaging.acoustics
-        none = dataclasses.replace(full, surfaces=False, anisotropy=False, noise=None)
-        kinds: dict[str, Acoustics | None] = {
-            "slice": None,
-            "loss": none,
-            "loss_and_surfaces": dataclasses.replace(none, surfaces=True),
-            "loss_and_fibres": dataclasses.replace(none, anisotropy=True),
-            "all": full,
+def arm_rows(quick: bool) -> Iterator[dict[str, Any]]:
+    """The whole of it, in an arm: the gain of every pixel against rays; the images are hidden."""
+    scene = load_scene("upper_arm")
+    volume, side = volume_of(scene), 96 if quick else 320
+    deep: Any = probe_of(scene)
+    probe = dataclasses.replace(deep, depth=0.054).with_pixels(side, round(1.35 * side))
+    acoustics = scene.imaging.acoustics
+    all_of_it = BMode(volume, probe, Imaging(), acoustics)
+    bare = dataclasses.replace(acoustics, surfaces=False, noise=None)
+    without = BMode(volume, probe, Imaging(), bare)
+    sound = BeamAcoustics(volume, probe, bare)
+    # The probe turns about the bone, so that it stays in view.
+    bone, from_bone = np.array([12e-3, 0.0, 38e-3]), np.array([-6e-3, 0.0, -36e-3])  # m
+    for degrees in _TILTS[::2] if quick else _TILTS:
+        turned = tilted(degrees)
+        pose = Pose(bone + turned.rotation @ from_bone, turned.orientation)
+        frame = without.frame(pose)
+        slice_ = frame.slice(frame.plane)
+        shown = sound.gain_on_pixels(frame)
+        traced = _traced_gain(volume, probe, pose, acoustics)
+        usable = (slice_ > 0) & (traced > -40.0)
+        off = np.abs(shown - traced)[usable]
+        reference = np.clip(slice_ + 4.25 * traced, 0, 255) * (slice_ > 0)
+        images = {
+            "all artefacts": all_of_it.image(pose),
+            "loss, shadows, fibres": without.image(pose),
+            "by rays": reference.astype(np.uint8),
         }
-        sides = zip(((-0.036, 0.036), (-0.03, 0.03), (0.0, 0.054)), (32, 16, 16), strict=True)
-        mesh, press = box_mesh(*(uniform_planes(*side, n) for side, n in sides)), 8e-3  # m
-        x, y, z = mesh.nodes.T
-        nodes = mesh.nodes.copy()
-        nodes[:, 2] += press * np.exp(-(x**2 + y**2) / 0.02**2) * (1.0 - z / 0.054)
-        scanners = {}
-        for name, acoustics in kinds.items():
-            scanners[name] = BMode(volume, probe, Imaging(), acoustics)
-            scanners[name].prepare(probe, Imaging(), acoustics)
-            scanners[name].carry(mesh.nodes, mesh.tetrahedra)
+        for name, percent in (("median", 50), ("p95", 95)):
+            value = float(np.percentile(off, percent))
+            row = row_of(f"arm_{name}", "linear", degrees, float("nan"), 0.0, value, "dB")
+            yield {**row, "images": images}
 
-        def shown(scanner: BMode) -> Callable[[Pose], object]:
-            return lambda pose: scanner.image(pose, nodes)
 
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            medians = medians_in_turn(
-                {name: shown(scanner) for name, scanner in scanners.items()},
-                60 if quick else 300,
-                5,
-                prepare=lambda number: Pose(np.array([2e-4 * (number % 7), 0.0, press])),
-            )
-        finally:
-            cv2.setNumThreads(threads)
-        return [
-            Point(f"{self.name}_{name}", "linear", measured=ms, unit="ms", ms_median=ms)
-            for name, ms in medians.items()
-        ]
+def run_time_rows(quick: bool) -> Iterator[dict[str, Any]]:
+    """Images of 512 × 512 of the pressed arm, in turn, so that all have the same disturbances."""
+    scene = load_scene("upper_arm")
+    volume, probe = volume_of(scene), probe_of(scene).with_pixels(512, 512)
+    full = scene.imaging.acoustics
+    none = dataclasses.replace(full, surfaces=False, anisotropy=False, noise=None)
+    kinds: dict[str, Acoustics | None] = {
+        "slice": None,
+        "loss": none,
+        "loss_and_surfaces": dataclasses.replace(none, surfaces=True),
+        "loss_and_fibres": dataclasses.replace(none, anisotropy=True),
+        "all": full,
+    }
+    sides = zip(((-0.036, 0.036), (-0.03, 0.03), (0.0, 0.054)), (32, 16, 16), strict=True)
+    mesh, press = box_mesh(*(uniform_planes(*side, n) for side, n in sides)), 8e-3  # m
+    x, y, z = mesh.nodes.T
+    nodes = mesh.nodes.copy()
+    nodes[:, 2] += press * np.exp(-(x**2 + y**2) / 0.02**2) * (1.0 - z / 0.054)
+    scanners = {}
+    for name, acoustics in kinds.items():
+        scanners[name] = BMode(volume, probe, Imaging(), acoustics)
+        scanners[name].prepare(probe, Imaging(), acoustics)
+        scanners[name].carry(mesh.nodes, mesh.tetrahedra)
 
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        ms = {p.artefact.removeprefix(f"{self.name}_"): p.ms_median for p in points}
-        what = "ms an image of 512 × 512 with all acoustics, 34,875 tetrahedra, one core"
-        return [
-            Target.at_most(what, 1.5, ms["all"], form=".2f"),
-            Target.at_most(
-                "as many times what the slice alone takes", 1.67, ms["all"] / ms["slice"]
-            ),
-        ]
+    def shown(scanner: BMode) -> Callable[[Pose], object]:
+        return lambda pose: scanner.image(pose, nodes)
 
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        del folder
-        rows = [
-            (
-                p.artefact.removeprefix(f"{self.name}_").replace("_", " "),
-                f"{p.ms_median:.2f}",
-                f"{p.ms_median / points[0].ms_median:.2f}",
-            )
-            for p in points
-        ]
-        table = markdown_table(("with", "ms", "times the slice"), rows)
-        return filled("image", self.name, table=table)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        medians = medians_in_turn(
+            {name: shown(scanner) for name, scanner in scanners.items()},
+            60 if quick else 300,
+            5,
+            prepare=lambda number: Pose(np.array([2e-4 * (number % 7), 0.0, press])),
+        )
+    finally:
+        cv2.setNumThreads(threads)
+    for name, ms in medians.items():
+        yield {**time_row(f"run_time_{name}", ms), "measured": ms, "unit": "ms"}

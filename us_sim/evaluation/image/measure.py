@@ -1,9 +1,9 @@
-"""Rows of image.csv, the interface of artefacts, and layers of tissue with their known loss.
+"""Rows of image.csv, and layers of tissue with their known loss.
 
->>> from us_sim.evaluation.image.measure import Point, lost
->>> Point.of("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB").error_percent.__round__(2)
+>>> from us_sim.evaluation.image.measure import row_of, lost
+>>> round(row_of("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB")["error_percent"], 2)
 -1.14
->>> Point.of("strain", "linear", 0.0, 0.02, 0.04, 0.0404, "").error_percent.__round__(2)
+>>> round(row_of("strain", "linear", 0.0, 0.02, 0.04, 0.0404, "")["error_percent"], 2)
 1.0
 >>> down = np.array([0.0, 0.0, 1.0])
 >>> float(lost(np.zeros(3), down, np.array([0.01]), 5e6)[0].round(3))  # 1 cm of liver
@@ -12,15 +12,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import ReportFolder, Row, Target
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.acoustics.settings import TissueAcoustics
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
@@ -29,75 +27,49 @@ from us_sim.volume.volume import Volume
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Point(Row):
-    """One expected number, and the one that the image shows."""
+def row_of(
+    artefact: str,
+    probe: str,
+    tilt: float,
+    depth: float,
+    expected: float,
+    measured: float,
+    unit: str,
+    *,
+    of: float | None = None,
+    ms: float = float("nan"),
+) -> dict[str, Any]:
+    """Row of one expected number, and the one that the image shows.
 
-    artefact: str
-    probe: str
-    tilt_deg: float = float("nan")
-    depth_mm: float = float("nan")
-    expected: float = float("nan")
-    measured: float = float("nan")
-    unit: str = ""
-    error_percent: float = float("nan")
-    ms_median: float = float("nan")  # processor time of an image, where that was measured
-    failure: str = ""
-
-    @classmethod
-    def of(
-        cls,
-        artefact: str,
-        probe: str,
-        tilt: float,
-        depth: float,
-        expected: float,
-        measured: float,
-        unit: str,
-        *,
-        of: float | None = None,
-        ms: float = float("nan"),
-    ) -> Point:
-        """A row; the error of levels in dB is that of the amplitude.
-
-        Args:
-            tilt: degrees. depth: m.
-            of: whole of which the error is a fraction; None is the expected value, of pixels one.
-        """
-        if unit == "dB":
-            error = 100.0 * (10.0 ** ((measured - expected) / 20.0) - 1.0)
-        else:
-            whole = of or (1.0 if unit == "px" else abs(expected))
-            error = 100.0 * (measured - expected) / whole if whole else float("nan")
-        return cls(artefact, probe, tilt, 1e3 * depth, expected, measured, unit, error, ms)
-
-    @property
-    def title(self) -> str:
-        return f"{self.artefact}, {self.probe}, {self.tilt_deg:g}°"
+    Args:
+        artefact: a word, or several with underscores.
+        tilt: degrees. depth: m.
+        of: whole of which the error is a fraction; None is the expected value, of pixels one; the
+            error of levels in dB is that of the amplitude.
+        ms: processor time of an image, where that was measured.
+    """
+    if unit == "dB":
+        error = 100.0 * (10.0 ** ((measured - expected) / 20.0) - 1.0)
+    else:
+        whole = of or (1.0 if unit == "px" else abs(expected))
+        error = 100.0 * (measured - expected) / whole if whole else float("nan")
+    return {
+        "artefact": artefact,
+        "probe": probe,
+        "tilt_deg": tilt,
+        "depth_mm": 1e3 * depth,
+        "expected": expected,
+        "measured": measured,
+        "unit": unit,
+        "error_percent": error,
+        "ms_median": ms,
+    }
 
 
-class Artefact(ABC):
-    """An effect in images that is measured; `us_sim.evaluation.image.report` lists them."""
-
-    name: ClassVar[str]  # the first column of its rows: a word, or several with underscores
-    title: ClassVar[str]  # the heading of its part of the report
-
-    @abstractmethod
-    def points(self, quick: bool) -> list[Point]:
-        """The rows of image.csv."""
-
-    @abstractmethod
-    def targets(self, points: Sequence[Point]) -> list[Target]:
-        """Limits against its own rows."""
-
-    @abstractmethod
-    def report(self, points: Sequence[Point], folder: ReportFolder) -> str:
-        """Its part of the report, from its template; draws its pictures into the folder."""
-
-
-def worst_percent(points: Sequence[Point]) -> float:
-    """The greatest error."""
-    return max(abs(p.error_percent) for p in points)
+def time_row(artefact: str, ms: float, tilt: float = float("nan")) -> dict[str, Any]:
+    """Row of the median processor time of an image."""
+    nan = float("nan")
+    return row_of(artefact, "linear", tilt, nan, nan, nan, "", ms=ms)
 
 
 @dataclass(frozen=True)

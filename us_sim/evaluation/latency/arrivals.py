@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from us_sim.nodes.guarded_node import GuardedNode
 from us_sim.nodes.qos import EVERY
 
 HOPS = {
@@ -29,7 +30,7 @@ EYE = {"tissue/structures": MarkerArray, "ultrasound/image_annotated": Image}
 _HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
 
 
-class Arrivals(GuardedNode):
+class Arrivals(Node):  # type: ignore[misc]
     """Subscribes to topics without looking at more of their messages than the stamps.
 
     Args:
@@ -40,10 +41,10 @@ class Arrivals(GuardedNode):
         super().__init__("arrivals", **kwargs)
         self._heard: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
         for topic, kind in HOPS.items():
-            self.subscribe(kind, topic, self._noted(self._heard[topic]), EVERY, raw=True)
-        if viewer:
-            for topic, kind in EYE.items():
-                self.subscribe(kind, topic, lambda _: None, EVERY, raw=True)
+            note = partial(self._note, self._heard[topic])
+            self.create_subscription(kind, topic, note, EVERY, raw=True)
+        for topic, kind in EYE.items() if viewer else ():
+            self.create_subscription(kind, topic, lambda _: None, EVERY, raw=True)
 
     def heard(self, topic: str) -> Sequence[tuple[int, int]]:
         """Stamp and time of arrival of every message so far, ns."""
@@ -57,9 +58,6 @@ class Arrivals(GuardedNode):
         }
 
     @staticmethod
-    def _noted(heard: list[tuple[int, int]]) -> Callable[[bytes], None]:
-        def note(data: bytes) -> None:
-            seconds, nanoseconds = _HEADER.unpack_from(data)
-            heard.append((1_000_000_000 * seconds + nanoseconds, time.time_ns()))
-
-        return note
+    def _note(heard: list[tuple[int, int]], data: bytes) -> None:
+        seconds, nanoseconds = _HEADER.unpack_from(data)
+        heard.append((1_000_000_000 * seconds + nanoseconds, time.time_ns()))

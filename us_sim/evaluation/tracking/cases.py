@@ -52,12 +52,9 @@ CONDITIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A body of markers: how a report names and draws it, and how it is made."""
+    """A body of markers, its words in a report, and how it is made."""
 
-    name: str
     words: str
-    colour: str
-    mark: str  # of its points in a plot, as Matplotlib names it
     make: Callable[[], RigidBody]
     facing: tuple[float, float, float] | None = None  # as `front`; None: the first marker's normal
 
@@ -72,32 +69,27 @@ class Marker:
         return self.body.normals[0] if self.facing is None else np.array(self.facing)
 
 
-_ALL = (
-    Marker(
-        *(SINGLE, "one ArUco marker of 40 mm", "#D55E00", "D"),
-        lambda: RigidBody.single("4X4_50", 7, 0.04),
+MARKERS = {
+    SINGLE: Marker("one ArUco marker of 40 mm", lambda: RigidBody.single("4X4_50", 7, 0.04)),
+    "apriltag_40mm": Marker(
+        "one AprilTag of 40 mm", lambda: RigidBody.single("APRILTAG_36h11", 7, 0.04)
     ),
-    Marker(
-        *("apriltag_40mm", "one AprilTag of 40 mm", "#E69F00", "v"),
-        lambda: RigidBody.single("APRILTAG_36h11", 7, 0.04),
-    ),
-    Marker(
-        *("charuco_board", "ChArUco, 5 × 4 squares of 24 mm, markers of 18 mm", "#0072B2", "o"),
+    "charuco_board": Marker(
+        "ChArUco, 5 × 4 squares of 24 mm, markers of 18 mm",
         lambda: RigidBody.charuco("4X4_50", 5, 4, 0.024, 0.018),
     ),
-    Marker(
-        *("grid_board", "4 × 3 ArUco markers of 24 mm, 6 mm apart", "#009E73", "s"),
+    "grid_board": Marker(
+        "4 × 3 ArUco markers of 24 mm, 6 mm apart",
         lambda: RigidBody.grid("4X4_50", 4, 3, 0.024, 0.006),
     ),
-    Marker(
-        *(RIGID_BODY, "6 markers of 30 mm on three facets, 4 visible at 0°", "#CC79A7", "^"),
+    RIGID_BODY: Marker(
+        "6 markers of 30 mm on three facets, 4 visible at 0°",
         lambda: read_rigid_body(shared_path("config/markers/probe_grip.yaml")),
         # Between its middle facet and the one to the right: these two are seen, at 30° each.
         facing=(0.5, 0.0, math.sqrt(0.75)),
     ),
-)
-MARKERS = {marker.name: marker for marker in _ALL}
-"""By name, in the reports' order; colours are told apart in every common colour blindness."""
+}
+"""By name, in the report's order."""
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import Row
+from us_sim.evaluation.subject import Piece
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp, rotation_log
 from us_sim.settings.registry import FILTERS
@@ -29,80 +29,45 @@ from us_sim.tracking.settings import KalmanSettings, OneEuroSettings
 
 Array = NDArray[np.float64]
 
-FILTER_METHODS = {"none": ("0.3", "*"), "one_euro": ("#0072B2", "o"), "kalman": ("#D55E00", "s")}
-"""By name, the colour and the mark of its points in a plot."""
-
 _RATE = 60.0  # Hz
 _NOISE, _TURN_NOISE = 3e-4, 3.5e-3  # m and rad, standard deviation of a coordinate
 _MOVING, _REST = 8.0, 8.0  # s
 _SWAY = ((0.25, 0.035, 0.25), (0.9, 0.009, 0.12), (2.3, 0.0012, 0.015))
 """Hz, m and rad of the hand's sway along and about each axis: a slow slide, a rocking, a tremor."""
 
-_Path = Callable[[Array], Array]
-FilterTrial = tuple[str, Settings | None, str]  # a filter's name, its settings, and those in words
 
-
-@dataclass(frozen=True)
-class FilterPoint(Row):
-    """A row of filters.csv."""
-
-    decimals = 4
-
-    method: str
-    setting: str
-    default: bool
-    lag: float  # s
-    rotation_lag: float  # s
-    jitter: float  # m, at rest, root mean square over all three coordinates
-    rotation_jitter: float  # rad
-    moving_jitter: float  # m, without the lag
-    error: float  # m, root mean square to where the probe is at that moment
-    stated: float  # s, the lag that the filter itself states, in motion
-    seconds: float  # a pose
-
-    @property
-    def values(self) -> dict[str, object]:
-        return {
-            "filter": self.method,
-            "setting": self.setting,
-            "rate_hz": _RATE,
-            "noise_mm": 1e3 * _NOISE,
-            "noise_deg": round(float(np.degrees(_TURN_NOISE)), 3),
-            "lag_ms": round(1e3 * self.lag, 2),
-            "rotation_lag_ms": round(1e3 * self.rotation_lag, 2),
-            "jitter_mm": 1e3 * self.jitter,
-            "jitter_deg": float(np.degrees(self.rotation_jitter)),
-            "moving_jitter_mm": 1e3 * self.moving_jitter,
-            "error_mm": 1e3 * self.error,
-            "stated_lag_ms": round(1e3 * self.stated, 2),
-            "us_per_pose": round(1e6 * self.seconds, 1),
-        }
-
-
-def filter_trials(quick: bool) -> list[FilterTrial]:
+def filter_pieces(quick: bool) -> list[Piece]:
     """Every filter over its settings; all are to follow the same noisy path."""
+    return [
+        Piece({"filter": name, "setting": words}, partial(filter_row, name, settings))
+        for name, settings, words in _trials(quick)
+    ]
+
+
+def _trials(quick: bool) -> Iterator[tuple[str, Settings | None, str]]:
+    """Filters' names, settings, and these in words."""
     cutoffs = (0.5, 1.5, 6.0) if quick else (0.25, 0.5, 1.0, 1.5, 3.0, 6.0, 12.0)
     slopes = (180.0,) if quick else (0.0, 60.0, 180.0, 600.0)
     accelerations = (0.01, 0.05, 0.25) if quick else (0.003, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0)
-    tried: list[FilterTrial] = [("none", None, "")]
+    yield "none", None, ""
     for slope in slopes:
         for cutoff in cutoffs:
-            turning = slope * OneEuroSettings().rotation_speed_coefficient / 180.0
             one_euro = OneEuroSettings(
                 minimum_cutoff=cutoff,
                 speed_coefficient=slope,
                 rotation_minimum_cutoff=cutoff,
-                rotation_speed_coefficient=turning,
+                rotation_speed_coefficient=(
+                    slope * OneEuroSettings().rotation_speed_coefficient / 180.0
+                ),
             )
-            tried.append(("one_euro", one_euro, f"{cutoff:g} Hz + {slope:g} Hz per m/s"))
+            yield "one_euro", one_euro, f"{cutoff:g} Hz + {slope:g} Hz per m/s"
     for acceleration in accelerations:
         kalman = KalmanSettings(acceleration=acceleration, angular_acceleration=10 * acceleration)
-        tried.append(("kalman", kalman, f"{acceleration:g} m/s per root second"))
-    return tried
+        yield "kalman", kalman, f"{acceleration:g} m/s per root second"
 
 
-def delay(times: Array, values: Array, path: _Path) -> float:
-    """s by which values (K, d) at times (K,) are behind a path, by least squares.
+def delay(times: Array, values: Array, path: Callable[[Array], Array]) -> float:
+    """Seconds by which values (K, d) at times (K,) are behind a path, by least squares.
 
     The path is known at any time, so this is the peak of the correlation between grid points too.
     """
@@ -121,8 +86,8 @@ def delay(times: Array, values: Array, path: _Path) -> float:
     return best
 
 
-def filter_point(method: str, settings: Settings | None, words: str) -> FilterPoint:
-    """Row of a filter with some settings, named in words, on the noisy path."""
+def filter_row(method: str, settings: Settings | None) -> list[dict[str, Any]]:
+    """Row of a filter with some settings on the noisy path."""
     times = np.arange(round((_MOVING + _REST) * _RATE)) / _RATE
     random = np.random.default_rng(7)
     noise = random.normal(0.0, _NOISE, (len(times), 3))
@@ -147,19 +112,24 @@ def filter_point(method: str, settings: Settings | None, words: str) -> FilterPo
     moving = (times >= 1.0) & (times < _MOVING)
     rest = times >= _MOVING + 4.0
     lag = delay(times[moving], found[moving], _position)
-    return FilterPoint(
-        method,
-        words,
-        settings in (None, FILTERS.settings(method)()),
-        lag,
-        delay(times[moving], found_turns[moving], _rotation),
-        _root_mean_square(found[rest] - positions[rest]),
-        _root_mean_square(found_turns[rest] - turns[rest]),
-        _root_mean_square(found[moving] - _position(times[moving] - lag)),
-        _root_mean_square(found[moving] - positions[moving]),
-        float(np.median(np.array(stated)[moving])),
-        seconds,
-    )
+    late = found[moving] - _position(times[moving] - lag)
+    turned_rest = _root_mean_square(found_turns[rest] - turns[rest])
+    return [
+        {
+            "rate_hz": _RATE,
+            "noise_mm": 1e3 * _NOISE,
+            "noise_deg": float(np.degrees(_TURN_NOISE)),
+            "lag_ms": 1e3 * lag,
+            "rotation_lag_ms": 1e3 * delay(times[moving], found_turns[moving], _rotation),
+            "jitter_mm": 1e3 * _root_mean_square(found[rest] - positions[rest]),
+            "jitter_deg": float(np.degrees(turned_rest)),
+            "moving_jitter_mm": 1e3 * _root_mean_square(late),
+            "error_mm": 1e3 * _root_mean_square(found[moving] - positions[moving]),
+            "stated_lag_ms": 1e3 * float(np.median(np.array(stated)[moving])),
+            "us_per_pose": 1e6 * seconds,
+            "default": settings in (None, FILTERS.settings(method)()),
+        }
+    ]
 
 
 def _swayed(times: Array, what: int) -> Array:

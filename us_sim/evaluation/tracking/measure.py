@@ -1,27 +1,27 @@
 """A tracker's errors, failures and run time in one case, and small markers' corners.
 
->>> from us_sim.evaluation.tracking.measure import mirrored, small_marker_point
+>>> from us_sim.evaluation.tracking.measure import mirrored, small_marker_row
 >>> tilted = Pose([0.0, 0.0, 0.4], [np.sin(0.1), 0.0, 0.0, np.cos(0.1)])
 >>> mirrored(tilted, np.zeros(3), np.array([0.0, 0.0, 1.0])).orientation.round(4) + 0.0
 array([-0.0998,  0.    ,  0.    ,  0.995 ])
->>> point = small_marker_point("APRILTAG_36h11", 32.0, 4)
->>> point.views, point.kept == point.found_by_opencv > 0, point.median_px < 0.2
-(4, True, True)
+>>> (row,) = small_marker_row("APRILTAG_36h11", 32.0, 4)
+>>> row["kept"] == row["found_by_opencv"] > 0, row["median_px"] < 0.2
+(True, True)
 """
 
 from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from us_sim.evaluation.report import Row, percentile
-from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, SMALL, Case, Marker
+from us_sim.evaluation.report import percentile
+from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, Case, Marker
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import product, rotation_between, rotation_exp
 from us_sim.tracking.camera.body_pose import body_poses, rotation_angle
@@ -34,127 +34,25 @@ from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import CameraSettings
 
-
-@dataclass(frozen=True)
-class View:
-    """The tracker's result of one image."""
-
-    first: bool  # of a sequence: nothing was known before
-    ms: float  # wall clock
-    cpu_ms: float
-    detected: bool = False
-    flipped: bool = False
-    mm: float = np.nan  # of the body's middle
-    degrees: float = np.nan
-    used: int = 0  # markers
-    visible: int = 0  # markers that the camera sees at less than the usual limit of the angle
-    expected_mm: float = np.nan  # by the covariance, of the body's origin
-    square: float = np.nan  # of the error in its own standard deviations (Mahalanobis)
-
-    @property
-    def inside(self) -> bool:
-        """Whether the error is in the ellipsoid that should hold 95 % of them."""
-        return self.square < 12.5916  # chi-square of six degrees of freedom
+_INSIDE = 12.5916  # chi-square of six degrees of freedom, that 95 % of errors stay below
 
 
-@dataclass(frozen=True)
-class Point(Row):
-    """A row of tracking.csv."""
-
-    decimals = 4
-
-    case: Case
-    views: tuple[View, ...] = ()
-    detector_cpu_ms: float = np.nan  # one whole image
-    pose_cpu_ms: float = np.nan
-    failure: str = ""
-
-    @property
-    def values(self) -> dict[str, object]:
-        found = self.found
-        return {
-            "marker": self.case.marker,
-            "image_size": self.case.image_size,
-            "distance_m": self.case.distance,
-            "angle_deg": self.case.angle,
-            "condition": self.case.condition,
-            "views": len(self.views),
-            "detected": len(found),
-            "flipped": self.flipped,
-            "median_mm": self.error(50),
-            "p95_mm": self.error(95),
-            "median_deg": self.turned(50),
-            "p95_deg": self.turned(95),
-            "ms_median": percentile([view.ms for view in self.views], 50),
-            "ms_first": percentile([view.ms for view in self.views if view.first], 50),
-            "cpu_ms_median": self.cpu_ms,
-            "detector_cpu_ms": self.detector_cpu_ms,
-            "pose_cpu_ms": self.pose_cpu_ms,
-            "markers_used": _mean([view.used for view in found]),
-            "expected_mm": percentile([view.expected_mm for view in found], 50),
-            "within_95": _mean([view.inside for view in found]),
-            "failure": self.failure,
-        }
-
-    @property
-    def title(self) -> str:
-        return str(self.case)
-
-    @property
-    def found(self) -> list[View]:
-        """Views in which the body was found."""
-        return [view for view in self.views if view.detected]
-
-    @property
-    def flipped(self) -> int:
-        """Views in which a mirror image of the pose was taken for it."""
-        return sum(view.flipped for view in self.views)
-
-    @property
-    def cpu_ms(self) -> float:
-        """Processor time of an image, median."""
-        return percentile([view.cpu_ms for view in self.views], 50)
-
-    def error(self, percent: float) -> float:
-        """mm, percentile of the position's error."""
-        return percentile([view.mm for view in self.found], percent)
-
-    def turned(self, percent: float) -> float:
-        """Degrees, percentile of the rotation's error."""
-        return percentile([view.degrees for view in self.found], percent)
-
-
-def select(points: Sequence[Point], **case: object) -> list[Point]:
-    """Points whose case has these values, such as ``marker="aruco_40mm", distance=0.4``."""
-    wanted = case.items()
-    return [p for p in points if all(getattr(p.case, name) == value for name, value in wanted)]
-
-
-def views_of(points: Sequence[Point], **case: object) -> list[View]:
-    """All views of the points that `select` finds."""
-    return [view for point in select(points, **case) for view in point.views]
-
-
-class Bench:
+class Tracking:
     """Renders cases and tracks them; keeps the room of the last body."""
 
     def __init__(self) -> None:
         self._rooms: dict[tuple[str, str], RenderedView] = {}
 
-    def warm_up(self) -> None:
-        """Compile everything that is timed later."""
-        for name in MARKERS:
-            self.point(Case(name, SMALL, 0.4, 30.0), 1)
-
-    def point(self, case: Case, sequences: int) -> Point:
-        """Row of a case, from so many sequences of images."""
+    def row(self, case: Case, sequences: int) -> list[dict[str, Any]]:
+        """Row of a case, from so many sequences of images; its ``shots`` are a row a view."""
         seen, camera = MARKERS[case.marker], WEBCAMS[case.image_size]
         key = (case.marker, case.image_size)
-        if key not in self._rooms:
+        is_new = key not in self._rooms
+        if is_new:
             self._rooms = {key: RenderedView(camera, seen.body)}
         room = self._rooms[key]
         conditions, _ = CONDITIONS[case.condition]
-        views: list[View] = []
+        rows: list[dict[str, Any]] = []
         parts: list[tuple[float, float]] = []
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
@@ -165,26 +63,56 @@ class Bench:
                 for frame, pose in enumerate(case.sequence(number)):
                     # The hand and the light stay as they are through a sequence, not the noise.
                     image = room.render(pose, conditions, seed, case.motion(number), frame)
-                    views.append(_view(source, seen, frame, pose, image))
+                    if is_new:  # what is compiled now must not count
+                        CameraSource(camera, seen.body).measure(image, 0)
+                        _time_parts(camera, seen, image)
+                        is_new = False
+                    rows.append(_view(source, seen, frame, pose, image))
                     if frame == 0:
-                        parts.append(_parts(camera, seen, image))
+                        parts.append(_time_parts(camera, seen, image))
         finally:
             cv2.setNumThreads(threads)
-        detector = percentile([part[0] for part in parts], 50)
-        solver = percentile([part[1] for part in parts if np.isfinite(part[1])], 50)
-        return Point(case, tuple(views), detector, solver)
+        views = pd.DataFrame(rows)
+        found = views[views["detected"]]
+        detector, solver = np.array(parts).T
+        return [
+            {
+                "views": len(views),
+                "detected": len(found),
+                "flipped": int(found["flipped"].sum()),
+                "median_mm": found["mm"].median(),
+                "p95_mm": found["mm"].quantile(0.95),
+                "median_deg": found["degrees"].median(),
+                "p95_deg": found["degrees"].quantile(0.95),
+                "ms_median": views["ms"].median(),
+                "ms_first": views["ms"][views["first"]].median(),
+                "cpu_ms_median": views["cpu_ms"].median(),
+                "detector_cpu_ms": percentile(detector, 50),
+                "pose_cpu_ms": percentile(solver[np.isfinite(solver)], 50),
+                "markers_used": found["used"].mean(),
+                "expected_mm": found["expected_mm"].median(),
+                "within_95": found["inside"].mean(),
+                "shots": views,
+            }
+        ]
 
 
 def _view(
     source: CameraSource, seen: Marker, frame: int, true: Pose, image: NDArray[np.uint8]
-) -> View:
+) -> dict[str, Any]:
+    """What the tracker says of one image, and how far it is off."""
     begin, processor = time.perf_counter(), time.thread_time()
     measured = source.measure(image, round(frame * 1e9 / 30))
     processor, wall = time.thread_time() - processor, time.perf_counter() - begin
-    view = View(frame == 0, 1e3 * wall, 1e3 * processor, visible=visible(seen, true))
-    if measured is None:
-        return view
-    return replace(_compared(view, measured, seen, true), used=source.seen)
+    return {
+        "first": frame == 0,  # of a sequence: nothing was known before
+        "ms": 1e3 * wall,
+        "cpu_ms": 1e3 * processor,
+        "visible": visible(seen, true),
+        "detected": measured is not None,
+        "used": source.seen if measured else 0,
+        **_compared(measured, seen, true),
+    }
 
 
 def visible(seen: Marker, pose: Pose) -> int:
@@ -195,7 +123,11 @@ def visible(seen: Marker, pose: Pose) -> int:
     return int((cosines > np.cos(CameraSettings().view_angle_limit)).sum())
 
 
-def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> View:
+def _compared(measured: Measurement | None, seen: Marker, true: Pose) -> dict[str, Any]:
+    """Errors of the body's middle and turn, and what the covariance says of the origin's."""
+    if measured is None:
+        unknown = dict.fromkeys(("mm", "degrees", "expected_mm"), np.nan)
+        return {"flipped": False, **unknown, "inside": False}
     found = measured.pose
     middle = seen.body.centres.mean(axis=0)
     off = (found.apply(middle[None]) - true.apply(middle[None]))[0]
@@ -203,18 +135,16 @@ def _compared(view: View, measured: Measurement, seen: Marker, true: Pose) -> Vi
     other = rotation_angle(found, mirrored(true, middle, seen.front))
     turn = rotation_between(found.orientation, true.orientation)
     error = np.concatenate([true.position - found.position, turn])
-    square = np.nan
+    square = np.nan  # of the error in its own standard deviations (Mahalanobis)
     if measured.covariance is not None:
         square = float(error @ np.linalg.pinv(measured.covariance, hermitian=True) @ error)
-    return replace(
-        view,
-        detected=True,
-        flipped=bool(other < angle and angle > np.radians(5.0)),
-        mm=1e3 * float(np.linalg.norm(off)),
-        degrees=float(np.degrees(angle)),
-        expected_mm=1e3 * (measured.position_deviation or np.nan),
-        square=square,
-    )
+    return {
+        "flipped": bool(other < angle and angle > np.radians(5.0)),
+        "mm": 1e3 * float(np.linalg.norm(off)),
+        "degrees": float(np.degrees(angle)),
+        "expected_mm": 1e3 * (measured.position_deviation or np.nan),
+        "inside": square < _INSIDE,
+    }
 
 
 def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]) -> Pose:
@@ -232,8 +162,8 @@ def mirrored(pose: Pose, middle: NDArray[np.float64], front: NDArray[np.float64]
     return Pose.from_matrix(matrix)
 
 
-def _parts(camera: CameraModel, seen: Marker, image: NDArray[np.uint8]) -> tuple[float, float]:
-    """ms of processor time: finding markers in the whole image, and a pose from them."""
+def _time_parts(camera: CameraModel, seen: Marker, image: NDArray[np.uint8]) -> tuple[float, float]:
+    """Time (ms, processor) the search for markers in a whole image, and a pose from them."""
     detector = FiducialDetector(seen.body)
     begin = time.thread_time()
     detection = detector.detect(image)
@@ -245,10 +175,6 @@ def _parts(camera: CameraModel, seen: Marker, image: NDArray[np.uint8]) -> tuple
     return 1e3 * (between - begin), 1e3 * (time.thread_time() - between)
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")
-
-
 _CAMERA = CameraModel(
     200,
     160,
@@ -258,36 +184,16 @@ _CAMERA = CameraModel(
 _SIZE = 0.04  # m, of the marker
 
 
-@dataclass(frozen=True)
-class SmallMarkerPoint(Row):
-    """A row of small_markers.csv."""
+def small_marker_row(name: str, edge: float, views: int) -> list[dict[str, Any]]:
+    """Row of the dictionary's markers in so many views, tilted by up to 60° towards any side.
 
-    dictionary: str
-    edge_px: float  # of a marker that faces the camera
-    views: int
-    found_by_opencv: int
-    kept: int  # of those
-    median_px: float  # error of a kept marker's worst corner
-    p95_px: float
-    worst_px: float
-    opencv_p95_px: float  # the same of OpenCV's own corners, as it gives them
-
-
-def small_marker_trials(quick: bool) -> Iterator[tuple[str, float, int]]:
-    """Arguments of `small_marker_point`: dictionaries, edges in pixels, and views of each."""
-    for name in ("APRILTAG_36h11", "APRILTAG_25h9", "4X4_50"):
-        for edge in (14.0, 18.0, 24.0, 32.0, 44.0):
-            yield name, edge, 40 if quick else 200
-
-
-def small_marker_point(name: str, edge: float, views: int) -> SmallMarkerPoint:
-    """Markers of the dictionary ``name`` in so many views, tilted by up to 60° towards any side.
-
-    The ``edge`` of a marker that faces the camera is in pixels.
+    The ``edge`` of a marker that faces the camera is in pixels; errors are of a marker's worst
+    corner.
     """
     random = np.random.default_rng([zlib.crc32(name.encode()), round(10 * edge)])
     plain = cv2.aruco.ArucoDetector(dictionary(name), cv2.aruco.DetectorParameters())
-    found, ours, theirs = 0, [], []
+    ours: list[float] = []
+    theirs: list[float] = []
     for number in range(views):
         body = RigidBody.single(name, int(random.integers(0, 30)), _SIZE)
         pose = _pose(random, edge)
@@ -299,17 +205,22 @@ def small_marker_point(name: str, edge: float, views: int) -> SmallMarkerPoint:
         seen = [] if ids is None else np.asarray(ids).ravel().tolist()
         if body.ids[0] not in seen:
             continue
-        found += 1
         true = _CAMERA.project(pose.apply(square(_SIZE)))
         theirs.append(_error(np.reshape(corners[seen.index(body.ids[0])], (4, 2)), true))
         detection = FiducialDetector(body).detect(image)
         if len(detection.ids):
             ours.append(_error(detection.corners[0], true))
-    median, most, worst = np.percentile(ours, [50, 95, 100]) if ours else 3 * [np.nan]
-    by_opencv = float(np.percentile(theirs, 95)) if theirs else np.nan
-    return SmallMarkerPoint(
-        name, edge, views, found, len(ours), float(median), float(most), float(worst), by_opencv
-    )
+    return [
+        {
+            "views": views,
+            "found_by_opencv": len(theirs),
+            "kept": len(ours),
+            "median_px": percentile(ours, 50),
+            "p95_px": percentile(ours, 95),
+            "worst_px": percentile(ours, 100),
+            "opencv_p95_px": percentile(theirs, 95),
+        }
+    ]
 
 
 def _pose(random: np.random.Generator, edge: float) -> Pose:

@@ -1,141 +1,109 @@
-"""`us-sim evaluate viewer`: viewer.csv, its pictures, and viewer.md."""
+"""`us-sim evaluate viewer`: what a page costs the simulator, and how soon it shows an image."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
+import pandas as pd
 
-from us_sim.evaluation.latency.measure import live_cases
-from us_sim.evaluation.report import (
-    ReportFolder,
-    Target,
-    failures,
-    key_beside,
-    markdown_table,
-    number,
-    picture,
-    plain,
-    plain_bars,
-    target_table,
-)
-from us_sim.evaluation.viewer.measure import Point, cases, run_case
+from us_sim.evaluation.figures import draw_lines
+from us_sim.evaluation.subject import Piece, Report, Subject, Target
+from us_sim.evaluation.viewer.measure import cases, run_case
+from us_sim.run.live import prepare_volume
+from us_sim.run.processes import prepare_ros
+from us_sim.scene.reading import load_scene
 
-_HEAD = (
-    *("", "s", "images/s made", "poses skipped %", "age ms p50", "p99", "images/s shown"),
-    *("delay ms median", "p99", "start s", "opened s", "viewer cores", "browser cores"),
-)
-
-
-def evaluate_viewer(out: Path, quick: bool) -> int:
-    """Write viewer.csv, the plots and viewer.md, as `us_sim.evaluation` says."""
-    folder = ReportFolder("viewer", out, quick)
-    points = live_cases(folder, cases(quick), run_case, Point)
-    table = target_table(targets(points))
-    _plot_rates(points, folder.picture("rates"))
-    longest = max(points, key=lambda point: (bool(point.usage), point.case.seconds))
-    _plot_memory(longest, folder.picture("memory"))
-    return folder.finish(
-        table,
-        failures(points),
-        ("nicegui", "playwright"),
-        targets=table,
-        rows=markdown_table(_HEAD, [_cells(point) for point in points]),
-        longest=str(longest.case),
-    )
+SHOWN = {
+    "case": "",
+    "seconds": "s",
+    "images_a_second_made": "images/s made",
+    "poses_skipped_percent": "poses skipped %",
+    "image_age_ms_p50": "age ms p50",
+    "image_age_ms_p99": "p99",
+    "images_a_second_shown": "images/s shown",
+    "delay_ms_median": "delay ms median",
+    "delay_ms_p99": "delay p99",
+    "start_s": "start s",
+    "page_opened_s": "opened s",
+    "cores_viewer": "viewer cores",
+    "cores_browser": "browser cores",
+}
 
 
-def targets(points: Sequence[Point]) -> list[Target]:
-    """Limits against the measured numbers."""
-    by_name = {point.title: point for point in points}  # of two of one name the longer, last one
-
-    def seen(name: str, value: Callable[[Point], float]) -> float:
-        point = by_name.get(name)
-        return np.nan if point is None or point.failure else float(value(point))
-
-    without = seen("no viewer, path", lambda p: p.made)
-    taking = seen("1 page that takes, path", lambda p: p.made)
-    browser, hand = "1 browser, path", "1 browser, hand"
-    taker = "1 page that takes, hand"
-
-    def delays(words: str, name: str) -> list[Target]:
-        """Median and 99th percentile."""
-        median, p99 = seen(name, lambda p: p.delay_median), seen(name, lambda p: p.delay_p99)
-        return [
-            Target.at_most(f"{words}, median", 60, median, "ms"),
-            Target.at_most(f"{words}, 99th percentile", 120, p99, "ms"),
+def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
+    prepare_ros(network=False)
+    prepare_volume(load_scene("upper_arm"))
+    return {
+        "viewer": [
+            Piece({"case": str(case), "seconds": case.seconds}, partial(run_case, case))
+            for case in cases(quick)
         ]
+    }
 
-    def growth(name: str) -> Target:
-        what = f"growth of the {name} after the first minute"
-        return Target.under(what, 1, seen(browser, lambda p: p.growth(name)), "MB/min")
 
-    return [
-        Target.at_least("images a second in a browser, path", 25, seen(browser, lambda p: p.shown)),
-        Target.at_least("images a second in a browser, hand", 25, seen(hand, lambda p: p.shown)),
-        *delays("browser: ms from the mouse to the image", hand),
-        *delays("page that takes: ms from a command to its image", taker),
-        Target.at_most(
-            "images a second that the simulator loses to a page that takes",
-            *(10, 100.0 * (1.0 - taking / without), "%"),
+def report_of(table: pd.DataFrame) -> Report:
+    """What the table says of the page."""
+
+    def seen(name: str, column: str) -> float:
+        """Of two cases of one name that of the longer, last one."""
+        rows = table[table["case"] == name]
+        return float(rows[column].iloc[-1]) if len(rows) else np.nan
+
+    browser, hand = "1 browser, path", "1 browser, hand"
+    shown = "images_a_second_shown"
+    mouse = [seen(hand, f"delay_ms_{part}") for part in ("median", "p99")]
+    without = seen("no viewer, path", "images_a_second_made")
+    lost = 100.0 * (1.0 - seen(browser, "images_a_second_made") / without)
+    targets = [
+        Target.at_least("images a second in a browser, path", 25, seen(browser, shown)),
+        Target.at_least("images a second in a browser, hand", 25, seen(hand, shown)),
+        Target.at_most("browser: ms from the mouse to the image, median", 60, mouse[0], "ms"),
+        Target.at_most("browser: likewise, 99th percentile", 120, mouse[1], "ms"),
+        Target.at_most("images a second that the simulator loses to a page", 10, lost, "%"),
+        Target.at_most("s from opening a page to its image", 4, seen(hand, "page_opened_s")),
+        *(
+            Target.at_most(
+                f"growth of the {name} after the first minute",
+                1,
+                seen(browser, f"growth_mb_a_minute_{name}"),
+                "MB/min",
+            )
+            for name in ("viewer", "browser")
         ),
-        Target.at_most(
-            "from `us-sim view` to the first image in a page",
-            *(4, seen(taker, lambda p: p.started), "s"),
-        ),
-        growth("viewer"),
-        growth("browser"),
     ]
+    take_home = [
+        f"The page in a browser shows {seen(browser, shown):.3g} images a second of a path, "
+        f"{seen(hand, shown):.3g} while the mouse drags the probe.",
+        f"From the mouse to the image it takes {mouse[0]:.3g} ms, {mouse[1]:.3g} at the 99th "
+        f"percentile.",
+        f"A page costs the simulator {lost:.2g} % of its images; the viewer keeps "
+        f"{seen(browser, 'cores_viewer'):.2g} cores busy, the browser "
+        f"{seen(browser, 'cores_browser'):.2g}.",
+        f"From `us-sim view` to the first image it takes {seen(hand, 'start_s'):.2g} s.",
+    ]
+    longest = table.loc[table["seconds"].idxmax()]
+    places = {
+        "rows": table[list(SHOWN)].rename(columns=SHOWN),
+        "longest": str(longest["case"]),
+        "memory": draw_lines(
+            pd.DataFrame(longest["memory"], columns=["process", "s", "MB"]),
+            "s",
+            "MB",
+            f"Memory: {longest['case']}, {longest['seconds']:g} s",
+            lines="process",
+            labels={"s": "time, s", "MB": "memory, MB"},
+        ),
+    }
+    return Report(take_home, places, targets)
 
 
-def _plot_rates(points: Sequence[Point], file: Path) -> None:
-    """Two bars a case: images made and shown; and beside them how long a page waits for them."""
-    shown = [point for point in points if not point.failure]
-    height = 1.8 + 0.42 * max(1, len(shown))
-    with picture(file, 11, height, "What a page costs, and what it gets") as figure:
-        rates, delays = figure.subplots(1, 2, sharey=True)
-        places = np.arange(len(shown))
-        rates.barh(places - 0.19, [p.made for p in shown], 0.36, color="#08519c", label="made")
-        in_page = {"color": "#6baed6", "label": "in the page"}
-        rates.barh(places + 0.19, [p.shown for p in shown], 0.36, **in_page)
-        rates.set_yticks(places, [f"{p.case}, {p.case.seconds:g} s" for p in shown])
-        rates.invert_yaxis()
-        rates.set_xlabel("images a second")
-        graph = [(p.age(50), p.age(99)) for p in shown]
-        page = [(p.delay_median, p.delay_p99) for p in shown]
-        for spans, beside, colour, name in (
-            (graph, -0.19, "#08519c", "pose to image, in the graph"),
-            (page, 0.19, "#6baed6", "pointer, or command, to image in the page"),
-        ):
-            median, p99 = np.array(spans).reshape(-1, 2).T
-            delays.barh(places + beside, median, 0.36, color=colour, label=name)
-            delays.plot(p99, places + beside, "o", color="#d62728", ms=4)
-        delays.set_xlabel("ms: bars median, dots 99th percentile")
-        for panel in (rates, delays):
-            plain_bars(panel)
-            above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
-            panel.legend(fontsize=8, frameon=False, **above)
-
-
-def _plot_memory(point: Point, file: Path) -> None:
-    """Memory of every process of the longest case."""
-    with picture(file, 10, 4.2, f"{point.case}, {point.case.seconds:g} s") as figure:
-        panel = figure.subplots()
-        for name, use in point.usage.items():
-            panel.plot(use.times, [1e-6 * each.memory for each in use.uses], label=name)
-        panel.set(xlabel="time, s", ylabel="memory, MB")
-        panel.set_ylim(bottom=0)
-        plain(panel)
-        key_beside(panel)
-
-
-def _cells(point: Point) -> list[str]:
-    numbers = (
-        *((point.case.seconds, "g"), (point.made, ".1f"), (point.skipped, ".1f")),
-        *((point.age(50), ".1f"), (point.age(99), ".1f"), (point.shown, ".1f")),
-        *((point.delay_median, ".0f"), (point.delay_p99, ".0f"), (point.started, ".1f")),
-        *((point.opened, ".1f"), (point.cores("viewer"), ".2f")),
-        (point.cores("browser"), ".2f"),
-    )
-    return [str(point.case), *(number(value, form) for value, form in numbers)]
+VIEWER = Subject(
+    "viewer",
+    "The viewer: what it costs, and how soon a page shows what one does",
+    _pieces,
+    report_of,
+    hidden=("memory",),
+    libraries=("nicegui", "playwright"),
+)
