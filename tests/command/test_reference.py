@@ -34,7 +34,8 @@ def test_every_parameter_of_every_node_is_on_it():
         told |= {f"strain.{key}" for key in keys_in(sections["strain"])}
         told |= keys_in(sections["imaging"]) | keys_in(sections["probe.geometry.linear"])
         for name in SOLVERS:
-            told |= {f"{name}.{key}" for key in keys_in(sections[f"tissue.settings.{name}"])}
+            if section := sections.get(f"tissue.settings.{name}"):
+                told |= {f"{name}.{key}" for key in keys_in(section)}
         for name in ("one_euro", "kalman"):
             told |= {f"{name}.{key}" for key in keys_in(sections[f"tracker.filter.{name}"])}
         told |= {f"membrane.{key}" for key in keys_in(sections["skin"])}

@@ -59,11 +59,8 @@ def versions() -> str:
         f"byte order {sys.byteorder}",
         f"us_sim_code {code_checksum()}",
     ]
-    packages = {
-        str(each.metadata["Name"]): str(each.version)
-        for each in distributions()
-        if each.metadata["Name"]
-    }
+    read = (each.metadata for each in distributions())  # which is parsed at each access
+    packages = {str(each["Name"]): str(each["Version"]) for each in read if each["Name"]}
     return "\n".join([*lines, *(f"{n} {v}" for n, v in sorted(packages.items()))]) + "\n"
 
 

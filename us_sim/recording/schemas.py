@@ -60,7 +60,10 @@ def type_hash(type_name: str) -> str:
     Raises:
         BagError: the type is not known.
     """
-    return definitions(type_name, schema_text(type_name)).hash_rihs01(type_name)
+    store = jazzy_definitions()
+    if type_name not in store.fielddefs or os.environ.get("ROS_DISTRO", "jazzy") != "jazzy":
+        store = definitions(type_name, schema_text(type_name))
+    return store.hash_rihs01(type_name)
 
 
 @cache
