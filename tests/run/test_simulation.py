@@ -154,7 +154,7 @@ def test_what_turns_out_not_to_work_is_taken_back(running):
 def test_a_scene_s_own_recording_is_played_to_its_tracker_and_held_at_its_end():
     scene = load_scene("upper_arm_path")
     plan = plan_of(Request(scene))
-    played = plan.processes[-1].all_parameters
+    played = plan.processes[-1].parameters
     assert (plan.nodes[-1], played["path"], played["stay"]) == ("path_player", PATH, True)
     assert plan_of(Request(scene, by_hand=True)).nodes == plan.nodes[:-1]
     without = replace(scene, tracker=replace(scene.tracker, file=None))
