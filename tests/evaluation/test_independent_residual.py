@@ -28,6 +28,7 @@ from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_nonlinear import FemNonlinear
 
+pytestmark = pytest.mark.slow
 RANDOM = np.random.default_rng(2)
 
 

@@ -58,6 +58,7 @@ def press():
     return Press(times, poses, felt + TARE)
 
 
+@pytest.mark.slow
 def test_moduli_are_found_within_their_intervals(press):
     noise = 0.01 * np.repeat(np.abs(press.wrenches).reshape(-1, 2, 3).max(axis=(0, 2)), 3)
     errors = np.random.default_rng(1).normal(size=press.wrenches.shape) * noise

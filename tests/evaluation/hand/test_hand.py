@@ -129,6 +129,7 @@ def test_live_the_newest_pose_wins(monkeypatch):
     assert set(row["live"]["error"]) == {0.0}
 
 
+@pytest.mark.slow
 def test_the_converged_answer_does_not_depend_on_the_way():
     straight = [Pose(position=[0.0, 0.0, 0.008])]
     around = [Pose(position=[x, 0.0, z]) for x, z in ((0.004, 0.004), (0.002, 0.01))] + straight

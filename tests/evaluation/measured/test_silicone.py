@@ -72,6 +72,7 @@ def test_the_law_falls_less_behind_where_silicones_stiffen(compressions):
     assert errors["66 %, slip, stiffening, s from 60 %"] < 8
 
 
+@pytest.mark.slow
 def test_a_small_compression_of_a_cylinder_that_sticks_is_that_of_other_elements():
     skfem = pytest.importorskip("skfem")
     helpers = pytest.importorskip("skfem.helpers")

@@ -107,6 +107,7 @@ def _made_up(tmp_path, columns=81, rows=60, shift=0.0, spacing=(1.0, 1.0)):
     return tmp_path / "volume.mha", path
 
 
+@pytest.mark.slow
 def test_frames_cut_from_the_volume_correlate_fully(tmp_path):
     rows = list(recorded_rows(*_made_up(tmp_path), quick=False, fan=SMALL))
     assert [row["frame"] for row in rows] == [0, 1, 2]

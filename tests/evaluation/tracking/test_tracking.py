@@ -18,6 +18,7 @@ ASKED = [
 ]
 
 
+@pytest.mark.slow
 def test_the_rigid_body_is_tracked_as_well_as_asked():
     (row,) = Tracking().row(Case(RIGID_BODY, "640x480", 0.4, 0.0), 4)
     assert row["detected"] == row["views"] == 20

@@ -349,7 +349,7 @@ def test_points_enter_through_the_plane_that_touches_where_their_way_goes_in(
     gap, found = probe.entered(last, pose, pose.apply(there[None]))
     found = pose.rotation.T @ found[0]
     off = 1e-6 / (cosine * collider.offset_box[3])  # angle, of a micrometre before the shape
-    np.testing.assert_allclose(found, normal, atol=3 * off)
+    np.testing.assert_allclose(found, normal, atol=5 * off)
     assert gap[0] == pytest.approx(normal @ (there - on_way(root)), abs=0.15 * off + 1e-6)
     # The whole shape is behind the plane.
     along = np.linalg.svd(found[None])[2][1:]

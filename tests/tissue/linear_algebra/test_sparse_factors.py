@@ -79,6 +79,7 @@ def test_springs_add_their_stiffness():
     )
 
 
+@pytest.mark.slow
 def test_where_local_corrections_stall_it_takes_few_iterations():
     nodes = (9, 5, 9)
     mesh = block_mesh(nodes)
