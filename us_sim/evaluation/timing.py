@@ -1,4 +1,4 @@
-"""Progress through pieces of work, times of functions in turn, and frames until a tissue settles.
+"""Times of functions in turn, and frames until a tissue settles.
 
 >>> from us_sim.evaluation.timing import frames_until
 >>> frames_until([1.0, 1e-4, 0.5, 9e-4, 1e-6], 1e-3), frames_until([1.0], 1e-3)
@@ -8,26 +8,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.progress import Progress
-
 C = TypeVar("C")
-
-
-def steps(
-    description: str, work: Sequence[C], unit: str, name: Callable[[C], str] = str
-) -> Iterator[C]:
-    """The pieces of work one after another; a bar shows the name of the present one."""
-    with Progress(description, len(work), unit) as progress:
-        for done, piece in enumerate(work):
-            progress.update(done, name(piece))
-            yield piece
-        progress.update(len(work))
 
 
 def medians_in_turn(
