@@ -66,6 +66,7 @@ def press_options(parser: argparse.ArgumentParser) -> None:
 
 def _press(args: argparse.Namespace) -> int:
     from us_sim.geometry.pose import Pose
+    from us_sim.progress import late_progress
     from us_sim.scene.building import label_fractions_of, tissue_model_of, volume_of
     from us_sim.scene.reading import load_scene
     from us_sim.tissue.press import press_to_force
@@ -82,9 +83,16 @@ def _press(args: argparse.Namespace) -> int:
     chosen: Any = section.settings.get(name)
     solver = create_solver(name, model, chosen)
     start = Pose(np.array([*settings.at, 0.0]))
+    show = late_progress(f"pressing with {settings.force:g} N")
     curve = press_to_force(
-        solver, settings.force, start, step=settings.step, deepest=settings.deepest
+        solver,
+        settings.force,
+        start,
+        step=settings.step,
+        deepest=settings.deepest,
+        progress=show,
     )
+    show(1.0, f"{1e3 * curve[-1].depth:.2f} mm deep")
     fractions, names = label_fractions_of(model.mesh, volume), volume.label_names
     table = _table(model.mesh, curve, fractions, {0: "tissue"} | dict(names))
     with settings.out.open("w", newline="", encoding="utf-8") as file:

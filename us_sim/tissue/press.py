@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,7 @@ def press_to_force(
     step: float = 1e-3,
     deepest: float = 0.1,
     tolerance: float = 1e-3,
+    progress: Callable[[float, str], None] | None = None,
 ) -> list[Press]:
     """Press a probe along its axis until the tissue pushes back with a force.
 
@@ -54,6 +56,7 @@ def press_to_force(
         step: m, between the poses on the way.
         deepest: m, from the start, to which it is pressed at most.
         tolerance: of the force, relative.
+        progress: takes the part of the force that is reached, and the force in words.
 
     Returns:
         The presses on the way, the last one of the force.
@@ -74,7 +77,11 @@ def press_to_force(
                 f"{solver.name} finds no balance {1e3 * depth:.1f} mm deep, of residual "
                 f"{found.residual:.1g}; it reaches {-found.force[2]:.3g} N: press less, or use fem"
             )
-        return Press(depth, 0.0 - float(found.force[2]), pose, found)  # no minus nothing
+        made = Press(depth, 0.0 - float(found.force[2]), pose, found)  # no minus nothing
+        if progress is not None:
+            done = min(max(made.force / force, 0.0), 0.99)
+            progress(done, f"{made.force:.3g} N, {1e3 * depth:.2f} mm deep")
+        return made
 
     curve = [press(0.0)]
     while curve[-1].force < force:
