@@ -73,6 +73,7 @@ def test_moduli_are_found_within_their_intervals(press):
     np.testing.assert_allclose(found.offset, TARE, atol=4 * noise.max())
 
 
+@pytest.mark.slow
 def test_what_no_force_tells_is_refused_by_name(press):
     def with_bone(moduli):
         made = constants(moduli)

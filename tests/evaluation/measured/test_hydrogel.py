@@ -27,6 +27,7 @@ def _length(vectors):
     return np.sqrt((vectors**2).sum(axis=1).mean())
 
 
+@pytest.mark.slow
 def test_beads_of_a_large_homogeneous_deformation_are_predicted_exactly():
     random = np.random.default_rng(3)
     slope = np.array([[0.35, 0.2, 0.0], [-0.1, -0.3, 0.25], [0.05, 0.0, 0.15]])

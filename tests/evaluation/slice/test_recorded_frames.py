@@ -115,6 +115,7 @@ def test_frames_cut_from_the_volume_correlate_fully(tmp_path):
     assert min(row["ncc_raw"] for row in rows) > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "fan", "message"),
     [

@@ -91,6 +91,7 @@ def test_every_method_passes_and_its_residual_is_that_of_independent_equations(m
     assert trial.residual_reported == pytest.approx(trial.residual_checked, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_solver_that_understates_its_residual_is_caught():
     trial = tried(Lying)
     assert trial.finite
@@ -111,6 +112,7 @@ class LyingOfSurfaces(FemNonlinear):
         return replace(deformation, residual=deformation.residual / 100)
 
 
+@pytest.mark.slow
 def test_a_solver_that_understates_what_the_surface_leaves_is_caught():
     trial, model = Trial(), model_of(CASE)
     checked = equations_of("fem_nonlinear", CASE, model)
@@ -224,6 +226,7 @@ def test_residuals_agree_within_a_factor_of_two_or_both_are_negligible(
     assert agrees(reported, checked, rounding, least) is true
 
 
+@pytest.mark.slow
 def test_a_free_tissue_of_springs_keeps_its_shape():
     trial = try_case("msds", StabilityCase("free", support="nothing", depth=0.1))
     assert not trial.fault
