@@ -109,7 +109,7 @@ def prepare_process() -> None:
         from setproctitle import setproctitle
 
         setproctitle(name)
-    gc.disable()  # until the node is made: a fifth of what it takes to import and load everything
+    gc.disable()  # until the node is made, which leaves little garbage
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:

@@ -186,8 +186,8 @@ class TissueDeformer(SceneNode):
     once in lockstep; what cannot be made is said and set back. With ``compare_with`` another method
     runs on the same poses, and diagnostics say how far its nodes are from those published. Once a
     second they estimate how far the frame's nodes are from the continuum's
-    (``discretisation_error_percent``) and the force from its (``force_error_percent``), where the
-    method can.
+    (``discretisation_error_percent``) and, while no pose comes, the force from its
+    (``force_error_percent``), where the method can.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -314,7 +314,7 @@ class TissueDeformer(SceneNode):
                 self._publish(deformation, pose, last.header.stamp)
             else:
                 self._describe(deformation)
-        self._estimate()
+        self._estimate(has_time=True)
 
     def _is_wanted(self, stamp: TimeMessage) -> bool:
         """Whether somebody subscribes to what a frame yields."""
@@ -375,15 +375,18 @@ class TissueDeformer(SceneNode):
             "difference_rms_mm": f"{1e3 * apart.rms:.4g}",
         }
 
-    def _estimate(self) -> None:
-        """Estimate the error of the first frame after a report."""
+    def _estimate(self, *, has_time: bool = False) -> None:
+        """Estimate the error of the first frame after a report.
+
+        Args:
+            has_time: whether no pose waits: the force's error takes as long as a frame.
+        """
         if self._is_estimate_due:
             self._is_estimate_due = False
             solver = self._tissue.solver
-            found = {
-                "discretisation_error_percent": solver.discretisation_error(),
-                "force_error_percent": solver.force_error(),
-            }
+            found = {"discretisation_error_percent": solver.discretisation_error()}
+            if has_time:
+                found["force_error_percent"] = solver.force_error()
             self._estimated = {
                 name: f"{100 * error:.2g}" for name, error in found.items() if error is not None
             }
