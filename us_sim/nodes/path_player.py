@@ -211,6 +211,7 @@ class PathPlayer(GuardedNode):
 
     def _end(self) -> None:
         self._playback.finish()
+        self.health.report()  # or the last second of the path would seem not to be played
         self.get_logger().info("the path is at its end")
         if not self._settings.stay:
             self.finished.set_result(None)
