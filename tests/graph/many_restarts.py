@@ -108,10 +108,11 @@ class Listener:
         self._context.try_shutdown()
 
 
-def nodes_of(parent):
-    """The process of each node that a process has started, which bears the node's name."""
-    from us_sim.nodes.settings import NODES
+FORKS = "us_sim nodes"  # the title of the process that forks them
 
+
+def children_of(parent):
+    """The processes that a process has started, by title."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -119,21 +120,34 @@ def nodes_of(parent):
             title = (folder / "cmdline").read_bytes().partition(b"\0")[0].decode()
         except OSError:
             continue
-        if int(fields[1]) == parent and fields[0] != "Z" and title in NODES:
+        if int(fields[1]) == parent and fields[0] != "Z":
             found[title] = int(folder.name)
     return found
 
 
-def restart(listener, node, number):
-    """End a node and wait until all is as before: it reports, and images come at their rate."""
+def nodes_of(run):
+    """The process of each node that a simulation has started, which bears the node's name."""
+    from us_sim.nodes.settings import NODES
+
+    own = children_of(run)
+    all_of_it = {**own, **children_of(own[FORKS])} if FORKS in own else own
+    return {title: pid for title, pid in all_of_it.items() if title in NODES}
+
+
+def restart(listener, node, number, pid):
+    """End a process and wait until all is as before: nodes report, images come at their rate.
+
+    What forks nodes ends with all of them.
+    """
     before = listener.pids
+    ended = before.keys() if node == FORKS else {node}
     rate = listener.usual_rate
     began = time.monotonic()
-    os.kill(before[node], number)
+    os.kill(pid, number)
     back = full = None
     while back is None or full is None:
         listener.spin(0.1)
-        if back is None and listener.pids[node] != before[node]:
+        if back is None and all(listener.pids[each] != before[each] for each in ended):
             back = time.monotonic() - began
         # What was on its way when the node ended does not make a window full.
         full = listener.full_since(began + 0.1, rate)
@@ -142,7 +156,7 @@ def restart(listener, node, number):
     makes_images = node not in ("session_recorder", "skin_deformer")
     seconds = full - began if makes_images else back
     now = listener.pids
-    others = tuple(n for n in before if n != node and now[n] != before[n])
+    others = tuple(n for n in before if n not in ended and now[n] != before[n])
     return Restart(node, number, seconds, others)
 
 
@@ -179,8 +193,10 @@ def main():
         while len(done) < asked.count and time.monotonic() < ends:
             listener.spin(1.0 + chance.random())
             listener.wait_for_full_rate()
-            node = chance.choice(sorted(nodes_of(run.pid)))
-            done.append(restart(listener, node, chance.choice(SIGNALS)))
+            own = nodes_of(run.pid) | {FORKS: children_of(run.pid)[FORKS]}
+            node = chance.choice(sorted(own))
+            number = signal.SIGKILL if node == FORKS else chance.choice(SIGNALS)
+            done.append(restart(listener, node, number, own[node]))
             print(len(done), node, done[-1].number.name, f"{done[-1].seconds:.2f} s", flush=True)
             assert not done[-1].others, done[-1]
             for file in sorted(folder.glob("*.mcap"), key=lambda f: f.stat().st_mtime)[:-2]:

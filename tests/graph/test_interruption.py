@@ -42,9 +42,11 @@ def test_ctrl_c(played_scene, tmp_path, images):
             time.sleep(0.02)  # what runs needs this core
         demo.send_signal(signal.SIGINT)
         demo.wait(10)
+        deadline = time.monotonic() + 2
+        while processes_in(tmp_path):  # what forked the nodes ends by itself
+            assert time.monotonic() < deadline
     finally:
         demo.kill()
-    assert processes_in(tmp_path) == []
     assert demo.returncode == 130
     assert b"Traceback" not in demo.stderr.read()
     assert message_count(recording, IMAGES) >= images

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from many_restarts import nodes_of
+from many_restarts import FORKS, children_of, nodes_of
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
@@ -121,18 +121,34 @@ def test_of_two_simulations_at_once_one_is_refused(played_scene, tmp_path):
             run.kill()
 
 
-class Deaf(NodeProcess):
-    """A process that does not end when it is told to."""
+def test_where_nodes_are_forked_ends_they_end_and_are_back(played_scene, tmp_path):
+    run = started("run", played_scene, "--duration", "100", cwd=tmp_path)
+    try:
+        wait_until(lambda: len(nodes_of(run.pid)) == 4, run)
+        before, server = nodes_of(run.pid), children_of(run.pid)[FORKS]
+        os.kill(server, signal.SIGKILL)
+        wait_until(lambda: len({*nodes_of(run.pid).values()} - {*before.values()}) == 4, run)
+        assert not any(Path(f"/proc/{pid}").exists() for pid in before.values())
+        run.send_signal(signal.SIGINT)
+        said = run.communicate(timeout=60)[1]
+    finally:
+        run.kill()
+    for node in before:
+        assert f"{node} was told to end by a signal" in said
 
-    def command(self) -> list[str]:
-        code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
-        return [sys.executable, "-c", code + "print('deaf', flush=True); time.sleep(100)"]
+
+def main(_):
+    """A node that does not end when it is told to."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    print("deaf", flush=True)
+    time.sleep(100)
 
 
 def test_a_recorder_that_does_not_end_is_killed_and_that_is_told(monkeypatch):
     monkeypatch.setattr("us_sim.run.processes.RECORDER_STOP_S", 0.2)
+    monkeypatch.setattr("us_sim.run.processes.module_of", lambda _: __name__)
     group = ProcessGroup()
-    group.start([Deaf("session_recorder")])
+    group.start([NodeProcess("session_recorder")])
     deadline = time.monotonic() + 30
     while group.last_words("session_recorder") != "deaf":
         assert time.monotonic() < deadline

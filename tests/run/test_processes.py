@@ -71,6 +71,14 @@ def runs(pid):
         return False
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nodes are not forked")
+def test_what_forks_nodes_has_one_thread_and_no_rclpy():
+    program = "import us_sim.run.preloaded, os, sys; "
+    program += "print(len(os.listdir('/proc/self/task')), 'rclpy' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.stdout.split() == ["1", "False"], ended.stderr
+
+
 STARTS = """
 import time
 from us_sim.run.background import Background

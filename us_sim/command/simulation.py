@@ -24,6 +24,7 @@ from us_sim.command.options import (
     viewer,
 )
 from us_sim.errors import BagError, UsSimError
+from us_sim.run.forked import begin_fork_server
 from us_sim.run.watch import SupervisionSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -56,6 +57,7 @@ def demo_options(demo: argparse.ArgumentParser) -> None:
 
 
 def _demo(args: argparse.Namespace) -> int:
+    begin_fork_server()
     from us_sim.run.live import demo
 
     return demo(
@@ -92,6 +94,8 @@ def run_options(run: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     asked = read_settings(args, RunSettings)
     parameters = node_parameters(args.param)
+    if not args.dry_run:
+        begin_fork_server()
     from us_sim.run.live import dry_run, run
     from us_sim.run.plan import Request
     from us_sim.scene.reading import check_files, load_scene
@@ -208,6 +212,8 @@ def _view(args: argparse.Namespace) -> int:
         "network": args.network,
         "supervision": read_settings(args, SupervisionSettings),
     }
+    if not args.attach:
+        begin_fork_server()
     from us_sim.run.live import run, view_running
 
     if args.attach:

@@ -100,11 +100,8 @@ def ros_refusal(error: Exception) -> UsSimError:
     return UsSimError(sentence)
 
 
-def prepare_process() -> None:
-    """Where this process is a node, bear its name, require rclpy, and end at once on Ctrl-C."""
-    name = node_name(sys.orig_argv)
-    if not name:
-        return
+def prepare_process(name: str) -> None:
+    """Bear the node's name, require rclpy, and end at once on Ctrl-C."""
     with contextlib.suppress(ImportError):  # a node works without a name in `ps`
         from setproctitle import setproctitle
 
@@ -139,4 +136,5 @@ def node_name(command: list[str]) -> str:
     return ""
 
 
-prepare_process()  # before the imports that take a second
+if _name := node_name(sys.orig_argv):  # this process is a node
+    prepare_process(_name)  # before the imports that take a second

@@ -96,8 +96,13 @@ _ENDINGS = (signal.SIGINT, signal.SIGTERM)
 _told_to_end = threading.Event()
 """An exception of a handler is lost where it meets a destructor or a compiler's callback."""
 
-_is_spun = threading.Event()
+_signals_wait = threading.Event()
 """From then on a signal waits for the callback's end: no message or solver is left halfway."""
+
+
+def let_signals_wait() -> None:
+    """Have a signal to end wait until the node is made, which must not take long from here."""
+    _signals_wait.set()
 
 
 def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
@@ -123,7 +128,7 @@ def run_node(create: Callable[[], Node], args: list[str] | None = None) -> int:
         gc.freeze()  # what a node is made of stays; to look through it takes a tenth of a second
         gc.enable()
         inspect.getframeinfo(sys._getframe())  # as rclpy does with each log; the first takes 40 ms
-        _is_spun.set()
+        _signals_wait.set()
         executor = create_executor(node)
         if priority := getattr(node, "realtime_priority", 0):
             node.health.scheduling = go_first(priority)
@@ -204,7 +209,7 @@ def _interrupt_once(*_: object) -> None:
     for number in _ENDINGS:
         signal.signal(number, lambda *_: None)
     _told_to_end.set()
-    if _is_spun.is_set():
+    if _signals_wait.is_set():
         return
     sys.unraisablehook = lambda _: None  # a compiler's callback has nobody to pass this on to
     raise KeyboardInterrupt

@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import Group, LiveSettings
-from us_sim.nodes.process import let_receivers_go_first, run_node
+from us_sim.nodes.process import let_receivers_go_first, let_signals_wait, run_node
 from us_sim.nodes.sessions.attachments import session_attachments
 from us_sim.nodes.sessions.recorded_topic import RecordedTopic, message_type
 from us_sim.nodes.sessions.triggers import offer
@@ -257,6 +257,7 @@ def main(args: list[str] | None = None) -> int:
     give_back_large_buffers()
 
     def create() -> SessionRecorder:
+        let_signals_wait()  # a file that is begun gets its end
         node = SessionRecorder()
         let_receivers_go_first()
         return node

@@ -18,7 +18,8 @@ from tqdm import tqdm
 from us_sim.errors import UsSimError, memory_limit, printable
 from us_sim.nodes import ENDS_WITH_INPUT, INTERRUPTED, require_rclpy
 from us_sim.nodes.settings import RECORDER, VIEWER
-from us_sim.run.plan import NodeProcess
+from us_sim.run.forked import ForkedNode
+from us_sim.run.plan import NodeProcess, module_of
 from us_sim.run.shared_memory import remove_abandoned_segments
 
 LIFELINE, _OTHER_END = os.pipe()
@@ -61,16 +62,24 @@ class RunningNode:
 
     def __init__(self, node: NodeProcess, show: Callable[[str, str], None]) -> None:
         self.node = node
-        self.process = subprocess.Popen(
-            node.command(),
-            stdin=LIFELINE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            env=child_environment() | node.secrets,
-            start_new_session=True,  # so that Ctrl-C is for this process alone
-        )
+        environment = child_environment() | node.secrets
+        self.process: subprocess.Popen[str] | ForkedNode
+        # The viewer shares little, and shall be there first; elsewhere forks are not safe.
+        if node.node == VIEWER or sys.platform != "linux":
+            self.process = subprocess.Popen(
+                node.command(),
+                stdin=LIFELINE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+                env=environment,
+                start_new_session=True,  # so that Ctrl-C is for this process alone
+            )
+        else:
+            self.process = ForkedNode(
+                node.node, module_of(node.node), node.arguments(), environment
+            )
         self.complaint = ""  # why it cannot work
         self.last_words = ""
         self.is_noted = False  # that it has ended
@@ -176,6 +185,8 @@ class ProcessGroup:
                     process.wait(max(deadline - time.monotonic(), 0.0))
                 except subprocess.TimeoutExpired:
                     process.kill()
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(STOP_S)
                     killed.append(node)
         for node in nodes:
             self._running[node].is_noted = True

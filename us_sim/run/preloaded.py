@@ -1,0 +1,41 @@
+"""Import what node processes share, in the process that forks them; never rclpy."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import signal
+
+from us_sim.run.forked import end_with_parent
+
+_SHARED = (
+    "us_sim.nodes.messages",
+    "us_sim.nodes.settings",
+    "us_sim.scene.case_tissue",
+    "us_sim.skin.membrane",
+    "us_sim.slicing.b_mode",
+    "us_sim.tissue.live_tissue",
+    "us_sim.tissue.solvers.fem_nonlinear",
+)
+
+
+def preload() -> None:
+    """Import it, as a process that ends with the one that started it."""
+    end_with_parent(signal.SIGKILL)
+    with contextlib.suppress(ImportError):  # it works without a name in `ps`
+        from setproctitle import setproctitle
+
+        setproctitle("us_sim nodes")
+    for name in _SHARED:
+        importlib.import_module(name)
+    import numpy as np
+
+    from us_sim.geometry.triangles import vertex_normals
+
+    # With the first kernel that is loaded numba reads its tables of functions, for 0.7 s.
+    vertex_normals(np.eye(3), np.array([[0, 1, 2]]))
+    gc.freeze()
+
+
+preload()
