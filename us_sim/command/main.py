@@ -61,11 +61,6 @@ _COMMANDS = (
         "reference",
         "topics, node parameters and scene settings, with ranges and defaults",
     ),
-    (
-        "compile",
-        "measuring",
-        "compile all numerical kernels now, so that no first run waits for it",
-    ),
 )
 """Each command, the module in which NAME_options adds its options, and its help."""
 

@@ -1,4 +1,4 @@
-"""The commands `evaluate`, `calibrate`, `print-marker` and `compile`."""
+"""The commands `evaluate`, `calibrate` and `print-marker`."""
 
 from __future__ import annotations
 
@@ -77,13 +77,3 @@ def _print_marker(args: argparse.Namespace) -> int:
     count = counted(len(pages), "sheet")
     print(f"{args.out}: {pages[0].foot}; {count} of {asked.paper}, to be printed at 100 %")
     return 0
-
-
-def compile_options(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(command=_compile)
-
-
-def _compile(_: argparse.Namespace) -> int:
-    from us_sim.run.compilation import compile_kernels
-
-    return compile_kernels()

@@ -35,12 +35,6 @@ if TYPE_CHECKING:
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
-    demo.add_argument(
-        "--source",
-        choices=("path", "camera"),
-        help="poses as they were recorded, or tracked in a camera video that is rendered of them; "
-        "default: camera where the scene's tracker is one",
-    )
     add_path_option(
         demo, "play this probe path, such as hand.mcap, a brisk hand; default: the scene's own"
     )
@@ -50,8 +44,7 @@ def demo_options(demo: argparse.ArgumentParser) -> None:
         default=Path("us_sim_demo"),
         help="folder to write to; default: %(default)s",
     )
-    default = "; default: upper_arm, or upper_arm_camera with --source camera"
-    add_running_options(demo, default)
+    add_running_options(demo, "; default: upper_arm")
     add_view_option(demo)
     demo.set_defaults(command=_demo)
 
@@ -61,13 +54,12 @@ def _demo(args: argparse.Namespace) -> int:
     from us_sim.run.live import demo
 
     return demo(
-        scene_name(args, "upper_arm_camera" if args.source == "camera" else "upper_arm"),
+        scene_name(args, "upper_arm"),
         args.volume,
         args.out,
         node_parameters(args.param),
         network=args.network,
         supervision=read_settings(args, SupervisionSettings),
-        source=args.source,
         path=args.path,
         topic=args.topic,
         view=viewed(args),

@@ -6,7 +6,6 @@ import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
@@ -33,10 +32,6 @@ from us_sim.scene.scene import Scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import full_path
 from us_sim.viewer.access import is_loopback
-
-if TYPE_CHECKING:
-    from us_sim.run.camera_video import PathVideo
-
 
 SETTLE_S = 1.2  # after the path's end: for the last images and each node's last report
 
@@ -235,7 +230,6 @@ def demo(
     *,
     network: bool,
     supervision: SupervisionSettings,
-    source: str | None = None,
     path: Path | None = None,
     topic: str | None = None,
     view: ViewerSettings | None = None,
@@ -249,8 +243,6 @@ def demo(
         parameters: given by a person, by node.
         network: talk beyond this host.
         supervision: when a node hangs, and how often it is started again.
-        source: "camera" shows the scene's camera a rendered video of the path, "path" plays it;
-            None is the one that the scene's tracker asks for.
         path: bag or recording that is played in place of the scene's own path.
         topic: of the body in it whose poses are played.
         view: address of the page that shows the simulation; None is no page.
@@ -275,17 +267,13 @@ def demo(
     recording = out / "session.mcap"
     if recording.exists():
         raise UsSimError(f"{recording} exists already; choose another folder with --out")
-    source = source or ("camera" if scene.tracker.source.name == "camera" else "path")
-    if source == "path":
-        path_of(scene, file, topic)  # before anything is made for what cannot be played
+    path_of(scene, file, topic)  # before anything is made for what cannot be played
     out.mkdir(parents=True, exist_ok=True)
-    video = _prepared_video(scene, file, topic) if source == "camera" else None
-    played = file if video is None else None
-    request = Request(scene, parameters, recording, played, topic, video=video, view=view)
+    request = Request(scene, parameters, recording, file, topic, view=view)
     started = time.monotonic()
     outcome = _simulate(request, out / "nodes.log", supervision)
     try:
-        _report(scene, out, outcome, time.monotonic() - started, video)
+        _report(scene, out, outcome, time.monotonic() - started)
     except UsSimError as error:
         lost = outcome.sentence()
         if not lost:
@@ -376,24 +364,12 @@ def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = N
         keep_tissue(scene, volume)
 
 
-def _prepared_video(scene: Scene, file: Path, topic: str | None) -> PathVideo:
-    from us_sim.recording.path import read_path
-    from us_sim.run.camera_video import path_video
-
-    show = late_progress("rendering the video")
-    return path_video(
-        scene, read_path(file, topic, option="--topic"), lambda done, total: show(done / total, "")
-    )
-
-
 def _require_nothing_lost(outcome: Outcome) -> None:
     if lost := outcome.sentence():
         raise UsSimError(lost)
 
 
-def _report(
-    scene: Scene, out: Path, outcome: Outcome, wall: float, video: PathVideo | None
-) -> None:
+def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
     from us_sim.run.contact_sheet import contact_sheet
     from us_sim.run.session_summary import read_session, write_summary
 
@@ -403,11 +379,6 @@ def _report(
         summary = session.summary(areas)
         summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
         summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
-        tracked = None
-        if video is not None:
-            from us_sim.run.session_summary import tracked_path
-
-            summary["tracked_path"], tracked = tracked_path(session, video)
         bar.update(50, "drawing the contact sheet")
         contact_sheet(session, scene, areas, out / "contact_sheet.png")
         bar.update(100)
@@ -415,14 +386,11 @@ def _report(
     latency = summary["latency_ms"]
     image, recorder = latency["/ultrasound/image"], latency["end_to_end"]
     print(
-        f"{summary['poses_in']} {'poses' if video is None else 'camera images'} in, "
-        f"{summary['images_out']} images out, "
+        f"{summary['poses_in']} poses in, {summary['images_out']} images out, "
         f"{summary['dropped']} dropped, {summary['images_per_second']:.1f} images/s, "
         f"pose to image p50 {image['p50']:.1f} ms, p99 {image['p99']:.1f} ms; "
         f"to the recorder {recorder['p50']:.1f} ms, {recorder['p99']:.1f} ms"
     )
-    if tracked is not None:
-        print(tracked)
     for vessel in areas.area if areas is not None else ():
         changes = {
             moment: "not in the image" if change is None else format(change, form)

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
@@ -27,9 +27,6 @@ from us_sim.settings.setting import rules_of
 from us_sim.settings.viewer import TOKEN, ViewerSettings
 from us_sim.share import full_path
 from us_sim.viewer.server import require_free
-
-if TYPE_CHECKING:
-    from us_sim.run.camera_video import PathVideo
 
 Parameters = dict[str, dict[str, str]]  # parameters given by a person: YAML texts by node and name
 
@@ -98,7 +95,6 @@ class Request:
     topic: str | None = None  # of the body in it whose poses are played
     everything: bool = False  # the bag's topics are published in place of the scene's nodes
     playing: Mapping[str, object] = field(default_factory=dict)  # parameters of the player
-    video: PathVideo | None = None  # to show the scene's camera in place of a path
     view: ViewerSettings | None = None  # address of the page that shows it; None is no page
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
@@ -123,7 +119,7 @@ class Plan:
     """The processes of a live run, and how long it lasts."""
 
     processes: list[NodeProcess]
-    poses: int | None = None  # or images, in the path or video that is played to its end
+    poses: int | None = None  # or images, in the path that is played to its end
     duration: float | None = None  # s
     player: str = "path_player"  # node that plays them
     loops: bool = False  # it begins again at its end
@@ -197,26 +193,13 @@ def plan_of(request: Request) -> Plan:
         settings = {"file": str(full_path(request.record)), **scene_settings(scene)}
         if request.path is not None:
             settings["path"] = played
-        if request.video is not None:
-            settings["exclude"] = ["camera/image_raw"]  # the video is there already
         processes.append(NodeProcess(RECORDER, settings | recorder))
-    driver = taken("camera_driver") if request.video is not None else {}
     is_played = request.by_hand or request.path is not None
     processes += simulation_nodes(scene, parameters, played=is_played)
     for process in processes:
         if process.node == RECORDER:
             process.parameters["parameters"] = parameters_file(processes)
     awaited = recorder_of(processes)
-    if request.video is not None:
-        video = request.video
-        settings = {
-            "source": str(video.file),
-            "camera_info": str(video.camera_info),
-            **_awaited(["camera/camera_info", *scene.ready_topics], awaited),
-        }
-        processes.append(NodeProcess("camera_driver", settings | driver))
-        loops = bool(driver.get("loop"))
-        return Plan(processes, len(video.poses), request.duration, "camera_driver", loops)
     if request.path is None:
         return Plan(processes, duration=request.duration)
     path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
@@ -235,7 +218,7 @@ def _with_path_of_tracker(request: Request) -> Request:
         SceneError: the scene names no recording.
     """
     tracker = request.scene.tracker
-    if tracker.source.name != "path" or request.by_hand or request.path or request.video:
+    if tracker.source.name != "path" or request.by_hand or request.path:
         return request
     if tracker.file is None:
         raise SceneError(

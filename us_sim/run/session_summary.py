@@ -1,4 +1,4 @@
-"""A recorded session measured: counts, latency, lumen areas, and the error of a tracked path."""
+"""A recorded session measured: counts, latency and lumen areas."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import rotation_between
 from us_sim.nodes.topics import published_counts
 from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.run.camera_video import PathVideo
 from us_sim.run.session_tables import SECOND, read_times
 from us_sim.scene.building import scanner_of, volume_of
 from us_sim.scene.scene import Scene
@@ -27,10 +25,8 @@ from us_sim.scoring.lumen import LumenAreas, LumenMeter, lumens_of
 from us_sim.slicing.b_mode import BMode
 
 IMAGE, POSE, NODES = "/ultrasound/image", "/probe/pose", "/tissue/nodes"
-CAMERA_INFO = "/camera/camera_info"
-"""Comes with each image of a camera, and has its stamp."""
-PLAYED = ("/tracker/pose", CAMERA_INFO)  # what comes in, of a path and of a camera
-STAMPED = (*PLAYED, POSE, NODES, "/skin/nodes", IMAGE)
+PLAYED = "/tracker/pose"
+STAMPED = (PLAYED, POSE, NODES, "/skin/nodes", IMAGE)
 OTHERS = ("/tissue/rest", "/tissue/tetrahedra", "/diagnostics")
 
 
@@ -122,7 +118,7 @@ class Session:
         stamps = self.stamps(IMAGE)
         if not stamps:
             raise BagError(f"the session holds no image on {IMAGE}")
-        poses = max(len(self.stamps(topic)) for topic in PLAYED)
+        poses = len(self.stamps(PLAYED))
         seconds = (stamps[-1] - stamps[0]) / SECOND
         latency = {t: _percentiles(self.times[t], "sent") for t in STAMPED[1:] if t in self.times}
         latency["end_to_end"] = _percentiles(self.times[IMAGE], "logged")
@@ -202,36 +198,3 @@ def read_session(file: Path, *further: Path) -> Session:
 def write_summary(summary: dict[str, Any], file: Path) -> None:
     """The summary as indented JSON."""
     file.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-
-
-def tracked_path(session: Session, video: PathVideo) -> tuple[dict[str, Any], str]:
-    """Hold ``probe/pose`` against where the probe was in the image of the same stamp.
-
-    Returns:
-        Numbers of images, and errors of the probe's face, as one JSON-like mapping; and a sentence.
-
-    Raises:
-        BagError: the session has no image of the camera or no pose of the probe.
-    """
-    stamps = pd.Series(sorted(session.stamps(CAMERA_INFO)), dtype="int64")
-    # The driver begins when all listen, so the last image is recorded for certain; each of the
-    # others is so many periods before it as its stamp says.
-    before = ((stamps.max() - stamps) / SECOND * video.rate).round().astype(int)
-    errors = []
-    for stamp, number in zip(stamps, len(video.poses) - 1 - before, strict=True):
-        if stamp in session.poses and number >= 0:
-            pose, true = session.poses[stamp], video.poses[number]
-            turn = np.linalg.norm(rotation_between(pose.orientation, true.orientation))
-            off = np.linalg.norm(pose.position - true.position)
-            errors.append((1e3 * off, np.degrees(turn)))
-    if not errors:
-        raise BagError(f"no pose of the probe has the stamp of an image on {CAMERA_INFO}")
-    parts = pd.DataFrame(errors, columns=["mm", "deg"]).quantile([0.5, 0.95, 1.0]).round(4)
-    parts.index = ["median", "p95", "max"]
-    mm, degrees = parts["mm"].to_dict(), parts["deg"].to_dict()
-    counts = {"images": len(video.poses), "shown": len(stamps), "tracked": len(errors)}
-    return counts | {"error_mm": mm, "error_deg": degrees}, (
-        f"tracked in {len(errors)} of {len(video.poses)} images, from the true path: "
-        f"median {mm['median']:.3f} mm and {degrees['median']:.3f}°, "
-        f"95 % within {mm['p95']:.3f} mm and {degrees['p95']:.3f}°"
-    )
