@@ -17,7 +17,7 @@ class RemoteControl:
         from rclpy.node import Node
         from rclpy.parameter_client import AsyncParameterClient
         from rclpy.qos import DurabilityPolicy, QoSProfile
-        from sensor_msgs.msg import CompressedImage, Image
+        from sensor_msgs.msg import Image
 
         self._context = Context()
         rclpy.init(args=[], context=self._context)
@@ -30,12 +30,10 @@ class RemoteControl:
         self.images = 0
         self.size = None
         self.scenes = {}
-        self.thumbnails = {}
         self.node.create_subscription(DiagnosticArray, "diagnostics", self._take, 100)
         self.node.create_subscription(Image, "ultrasound/image", self._imaged, 10)
         kept = QoSProfile(depth=200, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(DiagnosticArray, "session/scenes", self._listed, kept)
-        self.node.create_subscription(CompressedImage, "session/thumbnails", self._pictured, kept)
 
     def set(self, of="session_control", /, **values):
         """Set them together; the reason where that is refused."""
@@ -104,9 +102,6 @@ class RemoteControl:
 
     def _listed(self, message):
         self.scenes = {status.name: status for status in message.status}
-
-    def _pictured(self, message):
-        self.thumbnails[message.header.frame_id] = bytes(message.data)
 
 
 def started(*words, cwd):

@@ -4,8 +4,6 @@ import os
 import signal
 import sys
 
-import cv2
-import numpy as np
 import pytest
 from many_restarts import nodes_of
 from remote_control import RemoteControl, started
@@ -98,12 +96,8 @@ def test_scenes_recordings_and_replays_are_changed_while_it_runs(
     assert control.set(replay="", scene=str(small_scene)) == ""
     control.until(lambda: control.state == "running" and control.report()["scene"] == "small")
 
-    control.until(lambda: "small" in control.scenes and control.thumbnails)
+    control.until(lambda: "small" in control.scenes)
     listed = control.scenes["upper_arm"]
     assert listed.message.startswith("Procedural upper arm")
-    picture = cv2.imdecode(
-        np.frombuffer(next(iter(control.thumbnails.values())), np.uint8), cv2.IMREAD_GRAYSCALE
-    )
-    assert picture.shape == (180, 240)
     assert run.poll() is None
     assert os.path.exists(tmp_path / "session.mcap")

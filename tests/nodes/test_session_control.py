@@ -83,14 +83,11 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     bench.spin_until(lambda: control.count_subscribers("session/scenes"))
     arm = ListedScene("arm", "/arm.yaml", description="An arm.", structures=("vein", "artery"))
     control.tell_scenes([arm, ListedScene("leg", "/leg.yaml", problem="volume: is missing")])
-    control.tell_thumbnail("/arm.yaml", b"jpeg")
     control.tell_bags({"a.mcap": "/a.mcap"})
     values = {"scene": "arm", "replay_rate": "0.5", "replay_loop": "true", "fraction": "0.40"}
     values["record_note"] = "it lies beside another"
     control.tell("starting: 2 of 5 nodes", values, "nothing came")
-    bench.spin_until(
-        lambda: board.state.scene == "arm" and board.bags and "/arm.yaml" in board.thumbnails
-    )
+    bench.spin_until(lambda: board.state.scene == "arm" and board.bags)
     bench.spin_until(lambda: board.scenes)
     assert [(each.description, each.problem) for each in board.scenes] == [
         ("An arm.", ""),
@@ -111,17 +108,6 @@ def test_pages_follow_and_ask_and_hear_why_not(bench):
     assert simulation.taken[-1][1].record == "b.mcap"
     board.unwatch()
     bench.spin_until(lambda: not control.count_subscribers("session/scenes"))
-
-
-def test_a_page_that_opens_later_has_the_picture_of_every_scene(bench):
-    control, _ = controlled(bench)
-    pictures = {f"/{scene}.yaml": scene.encode() for scene in ("arm", "leg", "liver")}
-    for scene, picture in pictures.items():
-        control.tell_thumbnail(scene, picture)
-    page = bench.add(GuardedNode("page", context=bench.context))
-    session = ViewerSession(page, Posted(page))
-    session.watch()
-    bench.spin_until(lambda: dict(session.thumbnails) == pictures)
 
 
 def report(name, **values):

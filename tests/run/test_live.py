@@ -37,7 +37,7 @@ def fail(*_):
 
 
 def test_a_taken_port_is_said_before_the_volume_is_made(small_scene, taken, monkeypatch):
-    monkeypatch.setattr(live, "prepare_volume", fail)
+    monkeypatch.setattr(live, "prepare_scene", fail)
     scene, view = load_scene(small_scene), ViewerSettings(port=taken)
     request = Request(scene, view=view)
     with pytest.raises(UsSimError, match=f"port {taken} of 127.0.0.1 is taken: choose another"):

@@ -81,13 +81,13 @@ def test_what_forks_nodes_has_one_thread_and_no_rclpy():
 
 STARTS = """
 import time
-from us_sim.run.background import Background
 from us_sim.run.plan import NodeProcess
+from us_sim.run.preparation import Preparation
 from us_sim.run.processes import ProcessGroup
 group = ProcessGroup()
 group.start([NodeProcess("scorer")])
-work = Background("list", nice=1)
-print(group.pids["scorer"], work.process.pid, flush=True)
+work = Preparation("upper_arm", None)
+print(group.pids["scorer"], work._process.pid, flush=True)
 while not group.last_words("scorer"):
     time.sleep(0.05)
 time.sleep(60)

@@ -1,5 +1,6 @@
 """A running simulation follows its control, here without any process."""
 
+import os
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,9 +9,10 @@ import pytest
 
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.settings import SessionControlSettings
+from us_sim.recording.writer import BagWriter
 from us_sim.run.losses import Recordings
 from us_sim.run.plan import Request, plan_of
-from us_sim.run.simulation import Simulation
+from us_sim.run.simulation import Simulation, bags_in_reach
 from us_sim.scene.reading import load_scene
 from us_sim.share import shared_path
 
@@ -54,6 +56,12 @@ class Control:
 
     def tell_player(self, node, values):
         self.to_player.append((node, values))
+
+    def tell_bags(self, bags):
+        self.bags = bags
+
+    def tell_scenes(self, scenes):
+        self.scenes = scenes
 
 
 @pytest.fixture
@@ -160,3 +168,30 @@ def test_a_scene_s_own_recording_is_played_to_its_tracker_and_held_at_its_end():
     without = replace(scene, tracker=replace(scene.tracker, file=None))
     with pytest.raises(UsSimError, match="tracker"):
         plan_of(Request(without))
+
+
+def test_all_scenes_are_listed_once_that_which_runs_first(running, small_scene):
+    simulation, _, control = running
+    for _ in range(40):
+        simulation.update()
+    assert control.scenes[0].origin == str(small_scene)
+    assert len({scene.origin for scene in control.scenes}) == len(control.scenes) > 5
+
+
+@pytest.mark.parametrize("recordings", ["work/rec", "rec"])
+def test_every_recording_of_a_folder_is_offered_once_the_newest_first(
+    tmp_path, monkeypatch, recordings
+):
+    (tmp_path / "work" / "split").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "work")
+    folder = tmp_path / recordings
+    folder.mkdir()
+    BagWriter(folder / "t1.mcap").close()
+    BagWriter(folder / "t2.mcap", sidecar=False).close()
+    BagWriter(tmp_path / "work" / "split" / "a.mcap").close()
+    for age, name in enumerate(["work/split", f"{recordings}/t1.mcap", f"{recordings}/t2.mcap"]):
+        os.utime(tmp_path / name, (age, age))
+    offered = bags_in_reach(str(folder))
+    own = [name for name, file in offered.items() if str(tmp_path) in file]
+    assert [name for name in own if name != "rec"] == ["rec/t2.mcap", "rec/t1.mcap", "split"]
+    assert len(offered) == len({*offered.values()})

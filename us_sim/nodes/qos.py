@@ -16,9 +16,6 @@ EVERY = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Topics published once, for later subscribers too."""
 
-CATALOGUE = QoSProfile(depth=200, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Likewise, where each message is about another thing."""
-
 FOREIGN = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Input from drivers, many of which publish best effort. A tracker's filter wants every pose, so
 some may wait while the process does not get a processor."""

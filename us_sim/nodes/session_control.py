@@ -11,12 +11,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from sensor_msgs.msg import CompressedImage
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.parameters import changed, declared, parameters_with
-from us_sim.nodes.qos import CATALOGUE
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.scene.listing import ListedScene
 
@@ -57,7 +55,6 @@ class SessionControl(GuardedNode):
         self._untold: dict[str, dict[str, Any]] = {}  # parameters for a node that plays
         self.health = Health(self, "")
         self._scenes = self.latched(DiagnosticArray, "session/scenes")
-        self._thumbnails = self.stream(CompressedImage, "session/thumbnails", CATALOGUE)
         self._bags = self.latched(DiagnosticArray, "session/bags")
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._take)
@@ -117,13 +114,6 @@ class SessionControl(GuardedNode):
             status.values = [KeyValue(key=key, value=value) for key, value in about.items()]
             message.status.append(status)
         self._scenes.publish(message)
-
-    def tell_thumbnail(self, origin: str, jpeg: bytes) -> None:
-        """Publish the view of the probe in a scene."""
-        message = CompressedImage(format="jpeg", data=jpeg)
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.header.frame_id = origin
-        self._thumbnails.publish(message)
 
     def tell_bags(self, bags: Mapping[str, str]) -> None:
         """Publish which bags can be played: files by name."""

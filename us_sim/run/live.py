@@ -9,7 +9,7 @@ from pathlib import Path
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
-from us_sim.progress import Progress, late_progress
+from us_sim.progress import Progress
 from us_sim.run.losses import IMAGER, IMAGES, Outcome
 from us_sim.run.monitored import Monitored, alone_on_domain, domain
 from us_sim.run.plan import (
@@ -21,12 +21,13 @@ from us_sim.run.plan import (
     require_new,
     viewer_process,
 )
+from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import ProcessGroup, prepare_ros
 from us_sim.run.ros_arguments import ros_arguments
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import Supervisor, say
 from us_sim.run.watch import SupervisionSettings
-from us_sim.scene.building import path_of, volume_of
+from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
 from us_sim.settings.viewer import ViewerSettings
@@ -218,7 +219,7 @@ def run(
 
 def _simulate(request: Request, log: Path | None, supervision: SupervisionSettings) -> Outcome:
     plan = plan_of(request).with_free_port()
-    prepare_volume(request.scene, request.path, plan.topic)
+    prepare_scene(request.scene, request.path, plan.topic)
     return follow(plan, log, supervision, request)
 
 
@@ -336,32 +337,6 @@ def play(
     plan = Plan([process], poses, player=process.node, loops=player.loop)
     _require_nothing_lost(follow(plan, None, SupervisionSettings()))
     return 0
-
-
-def prepare_volume(scene: Scene, path: Path | None = None, topic: str | None = None) -> None:
-    """Make a phantom that is not in the cache yet, in view of the person who waits.
-
-    The tissue of a case is made too, and kept in the case. Of a phantom that is there nothing is
-    read, unless a path is played: its nodes do that, and notice damage.
-
-    Raises:
-        SceneError: no image along the path that will be played shows any of the volume.
-    """
-    phantom = scene.volume.phantom
-    if path is None and phantom is not None:
-        from us_sim.volume.phantom.phantom import is_phantom_kept
-
-        if is_phantom_kept(phantom, scene.volume.seed, scene.volume.voxel_size):
-            return
-    volume = volume_of(scene, late_progress(f"making {scene.volume.name}"))
-    if path is not None:
-        from us_sim.scene.placement import check_path_in_volume
-
-        check_path_in_volume(scene, path, volume, topic)
-    if scene.volume.case is not None:
-        from us_sim.scene.case_tissue import keep_tissue
-
-        keep_tissue(scene, volume)
 
 
 def _require_nothing_lost(outcome: Outcome) -> None:

@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER
 from us_sim.progress import Progress
-from us_sim.run.live import prepare_volume
 from us_sim.run.monitored import ros_context
 from us_sim.run.plan import (
     NodeProcess,
@@ -27,6 +26,7 @@ from us_sim.run.plan import (
     scene_settings,
     simulation_nodes,
 )
+from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import prepare_ros
 from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
@@ -78,7 +78,7 @@ def render_scene(
         raise UsSimError(f"--out {out}: is not empty; choose another folder")
     out.mkdir(parents=True, exist_ok=True)
     topic = path_of(scene, path, topic).topic
-    prepare_volume(scene, path, topic)
+    prepare_scene(scene, path, topic)
     folders = truth_folders(scene, out) if truth else {}
     with Progress("rendering", len(path_of(scene, path, topic)), "images") as bar:
         count = render(

@@ -184,7 +184,7 @@ def plan_of(request: Request) -> Plan:
     played = "" if request.path is None else str(full_path(request.path))
     settings: dict[str, object]
     if request.path is not None and request.everything:
-        running = ["diagnostics", "session/scenes", "session/thumbnails", "session/bags"]
+        running = ["diagnostics", "session/scenes", "session/bags"]
         running += [f"/{name}" for name in running]  # of a session without namespace
         settings = {"path": played, "exclude": running, **request.playing}
         processes.append(NodeProcess("session_player", settings))

@@ -6,24 +6,25 @@ import contextlib
 import time
 from collections.abc import Collection
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
-from us_sim.run.background import Background, bags_in_reach
 from us_sim.run.monitored import Monitored
 from us_sim.run.plan import Request, plan_of, require_new
+from us_sim.run.preparation import Preparation
 from us_sim.run.supervision import Supervisor, say
 from us_sim.scene.building import path_of
-from us_sim.scene.listing import ListedScene
+from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
-from us_sim.share import find_bag, full_path
+from us_sim.share import find_bag, full_path, shared_roots
 
-CATALOGUE_AFTER_S = 3.0
-"""From all nodes ready until scenes are listed: the first picture goes before."""
 _BAGS_EVERY_S = 2.0
+_BAGS = (".mcap", ".db3", ".zstd")
+_MOST_BAGS = 500  # the newest
 _RECORDING_EVERY_S = 1.0
 _OF_SCENE = {"scene", "volume"}
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
@@ -45,11 +46,9 @@ class Simulation:
         self._request = request
         self._settled: Request | None = None  # the last with which all nodes were ready
         self._supervisor, self._monitor = supervisor, monitor
-        self._making: Background | None = None
-        self._made = (0.0, "")  # fraction, and of what
-        self._asked: tuple[str, str | None] = ("", None)  # scene and volume that are being made
-        self._catalogue: Background | None = None
-        self._ready_since: float | None = None
+        self._preparation: Preparation | None = None
+        self._unlisted = chain([listed_scene(request.scene.origin)], listed_scenes())
+        self._listed: dict[str, ListedScene] = {}  # by what loads it
         self._bags_at = self._recording_at = 0.0
         self._recording: dict[str, str] = {}  # how far it is
         self._bags: dict[str, str] = {}
@@ -73,16 +72,15 @@ class Simulation:
             self._go_back(str(error))
         if not self._supervisor.waiting:
             self._settled = self._request
-            self._ready_since = self._ready_since or time.monotonic()
-        self._follow_making()
-        self._publish_catalogue()
+            self._list_scenes()
+            self._list_bags()
+        self._follow_preparation()
         self._report()
 
     def close(self) -> None:
-        """End all work in the background."""
-        for process in (self._making, self._catalogue):
-            if process is not None:
-                process.end()
+        """End what is being prepared."""
+        if self._preparation is not None:
+            self._preparation.end()
 
     def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         """Raise UsSimError where the parameters ask for something impossible."""
@@ -115,7 +113,8 @@ class Simulation:
         """Begin to do as the parameters say."""
         self._problem = ""
         if _OF_SCENE & set(named):
-            self._make(wanted.scene, wanted.volume)
+            self.close()
+            self._preparation = Preparation(wanted.scene, wanted.volume)
             return
         request = replace(
             self._request,
@@ -146,40 +145,23 @@ class Simulation:
         if values and wanted.replay:
             self._control.tell_player(self._supervisor.plan.player, values)
 
-    def _make(self, name: str, volume: str | None) -> None:
-        if self._making is not None:
-            self._making.end()
-        self._asked, self._made = (name, volume), (0.0, "reading the scene")
-        self._making = Background("make", name, *filter(None, [volume]), nice=2)
-
-    def _follow_making(self) -> None:
-        making = self._making
-        if making is None:
+    def _follow_preparation(self) -> None:
+        preparation = self._preparation
+        if preparation is None or not preparation.has_ended():
             return
-        has_ended = making.has_ended  # before what it has said, so that nothing is missed
-        refused = f"{self._asked[0]}: what makes it ended without a word"
-        for said in making.said():
-            if "fraction" in said:
-                self._made = float(said["fraction"]), str(said["text"])
-            else:
-                has_ended, refused = True, str(said.get("refused", ""))
-        if has_ended:
-            self._making = None
-            making.end()
-            self._begin(refused)
-
-    def _begin(self, refused: str) -> None:
-        name, volume = self._asked
-        if not refused:
+        preparation.end()
+        self._preparation = None
+        refusal = preparation.refusal
+        if not refusal:
             try:
-                scene = load_scene(name, volume=volume)
+                scene = load_scene(preparation.name, volume=preparation.volume)
                 anew = set(self._supervisor.plan.nodes) - {VIEWER}
                 self._change(self._request.with_scene(scene), anew)
                 say(f"loading {scene.name}")
             except UsSimError as error:
-                refused = str(error)
-        if refused:
-            self._problem = f"{refused}; {self._request.scene.name} goes on"
+                refusal = str(error)
+        if refusal:
+            self._problem = f"{refusal}; {self._request.scene.name} goes on"
             say(self._problem)
         self._control.show(self._shown())
 
@@ -203,34 +185,34 @@ class Simulation:
         self._supervisor.change(plan_of(before))
         self._control.show(self._shown())
 
-    def _publish_catalogue(self) -> None:
-        now = time.monotonic()
-        if self._ready_since is None or now - self._ready_since < CATALOGUE_AFTER_S:
+    def _list_scenes(self) -> None:
+        """Read one scene more; publish the list once all are read."""
+        for scene in self._unlisted:
+            self._listed.setdefault(scene.origin, scene)
             return
-        if now - self._bags_at > _BAGS_EVERY_S:
-            view = self._request.view
-            self._bags_at, bags = now, bags_in_reach(view.recordings if view else None)
-            if bags != self._bags:
-                self._bags = bags
-                self._control.tell_bags(bags)
-        if self._catalogue is None:
-            origin = self._request.scene.origin
-            self._catalogue = Background("list", origin, nice=19)
-        for said in self._catalogue.said():
-            if "scenes" in said:
-                self._control.tell_scenes([*map(ListedScene.from_json, said["scenes"])])
-            else:
-                with contextlib.suppress(OSError):  # the cache was emptied meanwhile
-                    self._control.tell_thumbnail(said["thumbnail"], Path(said["file"]).read_bytes())
+        if self._listed:
+            self._control.tell_scenes([*self._listed.values()])
+            self._listed.clear()
+
+    def _list_bags(self) -> None:
+        now = time.monotonic()
+        if now - self._bags_at < _BAGS_EVERY_S:
+            return
+        view = self._request.view
+        self._bags_at, bags = now, bags_in_reach(view.recordings if view else None)
+        if bags != self._bags:
+            self._bags = bags
+            self._control.tell_bags(bags)
 
     def _report(self) -> None:
         request, waiting = self._request, self._supervisor.waiting
         count = len(self._supervisor.plan.nodes)
         state, fraction = "running", 1.0
-        if self._making is not None:
-            fraction, what = self._made
-            name = Path(self._asked[0].rpartition(":")[2]).stem  # of a file, or `case:NAME`
-            state = f"loading {name}: {what}"
+        preparation = self._preparation
+        if preparation is not None:
+            fraction = preparation.fraction
+            name = Path(preparation.name.rpartition(":")[2]).stem  # of a file, or `case:NAME`
+            state = f"loading {name}: {preparation.step}"
         elif waiting:
             fraction = (count - len(waiting)) / max(count, 1)
             state = f"starting: {count - len(waiting)} of {count} nodes"
@@ -246,7 +228,7 @@ class Simulation:
             "scene": request.scene.name,
             "origin": request.scene.origin,
             "volume": request.scene.volume.name,
-            "loading": self._asked[0] if self._making is not None else "",
+            "loading": preparation.name if preparation is not None else "",
             "fraction": f"{fraction:.2f}",
             "record": str(record or ""),
             "record_note": reports.get(RECORDER, {}).get("note", "") if record else "",
@@ -287,3 +269,34 @@ def _volume_of(scene: Scene) -> str | None:
         with contextlib.suppress(SceneError):  # it has none of its own
             own = load_scene(scene.origin).volume.file
     return scene.volume.file if scene.volume.file != own else None
+
+
+def bags_in_reach(recordings: str | None = None) -> dict[str, str]:
+    """Return bags that can be replayed: files by names, the newest first, installed ones last.
+
+    A bag of several files is one with its folder; each of these files is a bag of its own, too.
+
+    Args:
+        recordings: folder to which pages record, wherever that is.
+    """
+    here = Path.cwd()
+    own = [(here, here), (here / "bags", here)]
+    if recordings:
+        own.append((full_path(recordings), full_path(recordings).parent))
+    bags: dict[str, str] = {}
+    for places in (own, [(root / "bags", root / "bags") for root in shared_roots()]):
+        found: dict[Path, Path] = {}  # the folder that a bag is named from
+        for folder, base in places:
+            found |= {each: base for each in folder.glob("*") if each.suffix in _BAGS}
+            found |= {each.parent: base for each in folder.glob("*/metadata.yaml")}
+        for file in sorted(found, key=_changed_at, reverse=True)[:_MOST_BAGS]:
+            if str(file) not in bags.values():
+                bags.setdefault(file.relative_to(found[file]).as_posix(), str(file))
+    return bags
+
+
+def _changed_at(file: Path) -> float:
+    try:
+        return file.stat().st_mtime
+    except OSError:  # taken away meanwhile
+        return 0.0

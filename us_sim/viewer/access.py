@@ -36,7 +36,7 @@ _POLICY = (
     "script-src 'self' 'nonce-{number}' 'unsafe-eval'",
     # Vue and Quasar write style attributes, and the page's template has style elements.
     "style-src 'self' 'unsafe-inline'",
-    "img-src 'self' data: blob:",  # thumbnails, and pictures that the page itself has made
+    "img-src 'self' data: blob:",  # pictures that the page itself has made
     "media-src 'self' blob:",
     "font-src 'self'",
     "connect-src 'self'{sockets}",

@@ -20,10 +20,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from sensor_msgs.msg import CompressedImage
 
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
-from us_sim.nodes.qos import CATALOGUE, LATCHED, STREAM
+from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.status import Watched
 
@@ -102,7 +101,6 @@ class SessionBoard(Watched):
         self.folder, self._is_own = folder, is_own
         self.state = SessionState()
         self.scenes: tuple[ListedScene, ...] = ()  # another object whenever it changes
-        self.thumbnails: dict[str, bytes] = {}  # JPEG of the image of a scene, by origins
         self.bags: Mapping[str, str] = {}  # files that can be played, by name
 
     def ask(self, **values: object) -> Future[str]:
@@ -164,7 +162,6 @@ class ViewerSession(SessionBoard):
             node,
             (DiagnosticArray, "diagnostics", self._hear, STREAM, False),
             (DiagnosticArray, "session/scenes", self._take_scenes, LATCHED, False),
-            (CompressedImage, "session/thumbnails", self._take_thumbnail, CATALOGUE, False),
             (DiagnosticArray, "session/bags", self._take_bags, LATCHED, False),
         )
         self._timer = node.create_timer(_EVERY_S, self._check)
@@ -187,9 +184,6 @@ class ViewerSession(SessionBoard):
 
     def _take_scenes(self, message: DiagnosticArray) -> None:
         self.scenes = tuple(map(_scene_of, message.status))
-
-    def _take_thumbnail(self, message: CompressedImage) -> None:
-        self.thumbnails[message.header.frame_id] = bytes(message.data)
 
     def _take_bags(self, message: DiagnosticArray) -> None:
         self.bags = {shown(status.name): status.hardware_id for status in message.status}

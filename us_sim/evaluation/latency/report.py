@@ -11,7 +11,7 @@ import pandas as pd
 from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.latency.measure import BUSY, DEMO, LIVE, Case, cases, run_case
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
-from us_sim.run.live import prepare_volume
+from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import prepare_ros
 from us_sim.scene.reading import load_scene
 
@@ -36,7 +36,7 @@ _SHOWN = {
 
 def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     prepare_ros(network=False)
-    prepare_volume(load_scene("upper_arm"))
+    prepare_scene(load_scene("upper_arm"))
     return {"latency": [Piece(case.columns, partial(run_case, case)) for case in cases(quick)]}
 
 

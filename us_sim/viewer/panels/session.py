@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import time
 from collections.abc import Awaitable, Callable
 from datetime import datetime
@@ -27,7 +26,6 @@ class _Cases:
     def __init__(self, simulator: Simulator) -> None:
         self._board = simulator.session
         self._shown: tuple[object, ...] = ()
-        self._pictures: dict[str, ui.image] = {}
         with WhileShown(self._board.watch, self._board.unwatch, EVERY_S, self._refresh):
             self._state = ui.label().classes("us-session-state").props('role="status"')
             self._bar = ui.linear_progress(0.0, show_value=False, color="primary")
@@ -47,14 +45,9 @@ class _Cases:
         if shown != self._shown:
             self._shown = shown
             self._draw(state)
-        for origin, picture in self._pictures.items():
-            jpeg = board.thumbnails.get(origin)
-            if jpeg is not None and not picture.source:
-                picture.set_source(f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}")
 
     def _draw(self, state: SessionState) -> None:
         self._list.clear()
-        self._pictures.clear()
         cases = [each for each in self._board.scenes if each.kind == "case"]
         scenes = [each for each in self._board.scenes if each.kind != "case"]
         with self._list:
@@ -81,17 +74,13 @@ class _Cases:
         with ui.card().classes("us-case") as card:
             if is_loaded:
                 card.classes("us-case-loaded")
-            with ui.row().classes("us-case-row"):
-                picture = ui.image().classes("us-case-picture").props('fit="contain" no-spinner')
-                picture.props["alt"] = f"{scene.name}: what the probe sees"
-                self._pictures[scene.origin] = picture
-                with ui.column().classes("us-case-text"):
-                    ui.label(scene.name.replace("_", " ")).classes("us-case-name")
-                    for text in (scene.region, scene.description, ", ".join(scene.structures)):
-                        if text:
-                            ui.label(text).classes("us-quiet")
-                    if scene.problem:
-                        ui.label(scene.problem).classes("us-session-problem")
+            with ui.column().classes("us-case-text"):
+                ui.label(scene.name.replace("_", " ")).classes("us-case-name")
+                for text in (scene.region, scene.description, ", ".join(scene.structures)):
+                    if text:
+                        ui.label(text).classes("us-quiet")
+                if scene.problem:
+                    ui.label(scene.problem).classes("us-session-problem")
             with ui.row().classes("us-case-foot"):
                 ui.label("loaded" if is_loaded else "").classes("us-accent")
                 button = ui.button(
