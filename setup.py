@@ -110,11 +110,9 @@ setup(
         "meshes": ["meshio>=5.3"],
         "ray": [GYMNASIUM, "ray>=2.40", UPATH],
         "space_mouse": ["hidapi>=0.14"],
-        "surfaces": ["fast-simplification>=0.1.7"],
         "viewer": ["nicegui>=3.6,<4"],
         "test": [
             "axe-playwright-python>=0.1.4",
-            "fast-simplification>=0.1.7",
             GYMNASIUM,
             "hypothesis>=6.100",
             "meshio>=5.3",

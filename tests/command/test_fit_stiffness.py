@@ -92,7 +92,6 @@ def test_a_case_gets_the_moduli_of_its_press(tmp_path, capsys):
     assert "has these moduli now" in capsys.readouterr().out
     changed = read_case(case)
     assert changed.settings.material_of("tissue").young_modulus == pytest.approx(11e3, rel=0.03)
-    assert changed.steps[-1].settings["moduli"]["tissue"]["factor"] < 1.1
     scene = load_scene(out)
     assert scene.volume.case == str(case)
     assert scene.tissue is not None

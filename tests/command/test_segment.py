@@ -58,7 +58,7 @@ def contents(folder):
 
 
 @pytest.mark.slow
-def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
+def test_seeds_make_labels_surfaces_and_a_picture(case, seeds, capsys):
     assert main(["segment", str(case), "--seeds", seeds]) == 0
     said = capsys.readouterr().out
     opened = read_case(case)
@@ -73,10 +73,6 @@ def test_seeds_make_labels_surfaces_picture_and_provenance(case, seeds, capsys):
     assert not (case / "tissue.npz").exists()
     assert opened.settings.structures["vein"].material == "artery"
     assert opened.settings.fixed == ("bottom",)
-    found, surfaced = opened.steps
-    assert found.settings["vein"]["method"] == "growing"
-    assert found.counts["voxels of vein"] == 240
-    assert surfaced.counts["triangles of vein"] > 100
     labels = read_labels(case / "labels.nrrd", volume)
     assert labels.names == {1: "vein", 2: "body"}
 
@@ -91,9 +87,7 @@ def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, 
     assert document["structures"] == {"brachial vein": {"label": 6, "colour": [0.125, 0.25, 0.5]}}
     for path, content in contents(case).items():
         assert b"doe" not in content, path
-    assert (
-        main(["segment", str(case), "--decimation", "0.5"]) == 0
-    )  # surfaces of the labels that are there
+    assert main(["segment", str(case)]) == 0  # surfaces of the labels that are there
     assert [path.name for path in (case / "surfaces").iterdir()] == ["brachial vein.stl"]
 
 

@@ -76,7 +76,10 @@ def _fit(args: argparse.Namespace) -> int:
     _draw(settings.out.with_suffix(".png"), found)
     print(f"{settings.out}: a scene with these moduli; its .png: how they fit")
     if args.into_case and scene.volume.case:
-        _write_into_case(scene.volume.case, args.session, found, settings)
+        from us_sim.volume.cases.writing import write_constants_into
+
+        write_constants_into(scene.volume.case, _constants(found))
+        print(f"{scene.volume.case}: has these moduli now")
     return 0
 
 
@@ -152,19 +155,3 @@ def _draw(file: Path, found: StiffnessFit) -> None:
         panel.set(xlabel="time (s)", ylabel=label, title="measured (dots) and modelled (lines)")
         panel.legend()
     figure.savefig(file)
-
-
-def _write_into_case(
-    case: str, session: Path, found: StiffnessFit, settings: StiffnessSettings
-) -> None:
-    """Write the fitted moduli into a case, with how they were found."""
-    from us_sim.volume.cases.provenance import Source, Step
-    from us_sim.volume.cases.writing import write_constants_into
-
-    constants = _constants(found)
-    fitted = {name: {**constants[name], "factor": found.factors[name]} for name in constants}
-    sources = (Source.of(session, "recorded press"),) if session.is_file() else ()
-    said = {"kept": list(settings.keep), "moduli": fitted}
-    step = Step("fitted stiffness to a press", said, {"poses": len(found.depths)}, sources)
-    write_constants_into(case, constants, step)
-    print(f"{case}: has these moduli now")

@@ -13,16 +13,13 @@ from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
-from us_sim.volume.cases.provenance import Source, Step, add_step
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
 from us_sim.volume.reconstruction.reconstruction import (
-    Plan,
     Prediction,
     Progress,
-    Reconstruction,
     Rest,
     leave_one_out,
     plan,
@@ -145,7 +142,6 @@ def reconstruct_sweep(
             scanned = () if planned.rest else scanner.poses
             case = CaseSettings(name=settings.out.name, probe=scanner.probe, scanned=scanned)
             write_case_settings(folder, case)
-            add_step(folder, _step(settings, planned, made, prediction))
             draw_slices(folder / picture.name, made.volume, made.covered, size)
     sentences = [
         f"{settings.out}: {size} ({100.0 * made.covered.mean():.0f} % covered, {made.filled} of "
@@ -173,35 +169,6 @@ def reconstruct_sweep(
         probe = scanner.probe and f"those of a {scanner.probe.geometry} array"
         sentences.append(f"its images are {probe or 'of a probe whose shape is guessed'}")
     return "; ".join([*sentences, f"slices in {picture}"])
-
-
-def _step(
-    settings: SweepSettings, planned: Plan, made: Reconstruction, prediction: Prediction | None
-) -> Step:
-    """The entry in the provenance, without names of files."""
-    sources = [Source.of(settings.sweep, "tracked sequence")]
-    if settings.calibration is not None:
-        sources.append(Source.of(settings.calibration, "probe calibration"))
-    counts: dict[str, int | float] = {
-        "frames": made.frames,
-        "frames left out": sum(planned.sweep.left_out.values()),
-        "voxels hit": made.hit,
-        "voxels filled": made.filled,
-    }
-    if prediction is not None:
-        counts["frames predicted"] = len(prediction.frames)
-        middle, worst = _correlations(prediction)
-        counts |= {"correlation median": round(middle, 4), "correlation worst": round(worst, 4)}
-    said = {
-        "spacing": planned.grid.spacing,
-        "method": planned.compounding.method,
-        "compounding": planned.compounding.compounding,
-        "hole_radius": planned.hole_radius,
-        "time_offset": settings.time_offset,
-        "pressure undone": planned.rest is not None,
-        "pixels used": int(planned.used.sum()),
-    }
-    return Step("reconstructed", said, counts, tuple(sources))
 
 
 def _correlations(prediction: Prediction) -> tuple[float, float]:

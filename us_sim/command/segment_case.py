@@ -13,11 +13,9 @@ from pathlib import Path
 
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.choice import Chosen
-from us_sim.settings.reading import document_of
 from us_sim.settings.spelling import aligned
 from us_sim.share import shared_roots
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, VOLUME, read_case
-from us_sim.volume.cases.provenance import Source, Step, add_step
 from us_sim.volume.cases.settings import RESERVED, CaseSettings, CaseStructure
 from us_sim.volume.cases.writing import changed_case, write_case_settings
 from us_sim.volume.files.labels import read_labels
@@ -31,20 +29,17 @@ from us_sim.volume.segmentation.settings import (
 )
 from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.structure_names import anatomical_colour
-from us_sim.volume.surfaces.settings import SurfaceSettings
 from us_sim.volume.surfaces.stl_file import write_stl
 from us_sim.volume.surfaces.structure_surface import StructureSurface, structure_surface
 from us_sim.volume.volume import LabelMap, Volume
 
 PICTURE = "segmentation.png"
-_HEADING = ("structure", "volume", "triangles", "area", "parts", "handles", "volume kept")
+_HEADING = ("structure", "volume", "triangles", "area", "parts", "volume kept")
 
 Progress = Callable[[float, str], None]
 
 
-def segment_as_asked(
-    asked: SegmentRequest, surfaces: SurfaceSettings, progress: Progress = lambda *_: None
-) -> str:
+def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None) -> str:
     """Segment a case; return the result in lines for a person.
 
     Raises:
@@ -58,13 +53,13 @@ def segment_as_asked(
     case = read_case(asked.case)
     progress(0.0, "reading")
     volume = case.volume() if _keeps_labels(asked) else read_volume(case.folder / VOLUME)
-    labels, step = _labels(asked, volume, progress)
+    labels = _labels(asked, volume, progress)
     volume, remarks = labels.on(volume), list(labels.remarks)
     settings = _with_structures(case.settings, labels, remarks)
     made = []
     for number, (label, name) in enumerate(sorted(labels.names.items())):
         progress(0.8 + 0.1 * number / len(labels.names), f"surface of {name}")
-        made.append(structure_surface(volume, label, surfaces))
+        made.append(structure_surface(volume, label))
     with changed_case(asked.case) as folder:
         if not _keeps_labels(asked):
             write_labels(folder / LABELS, volume, labels.colours)
@@ -77,9 +72,6 @@ def segment_as_asked(
         for one in made:
             write_stl(folder / SURFACES / f"{one.name}.stl", one.surface)
         draw_segmentation(volume, labels, folder / PICTURE)
-        triangles = {f"triangles of {one.name}": len(one.surface.triangles) for one in made}
-        add_step(folder, step)
-        add_step(folder, Step("surfaces made", document_of(surfaces), triangles))
     progress(1.0, "")
     rows = [_HEADING, *(_cells(one) for one in made)]
     notes = (f"note: {remark}" for remark in remarks)
@@ -90,10 +82,10 @@ def _keeps_labels(asked: SegmentRequest) -> bool:
     return asked.labels is None and asked.seeds is None and asked.vessels is None
 
 
-def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> tuple[LabelMap, Step]:
-    """The labels that are asked for, and their entry in the provenance."""
+def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelMap:
+    """The labels that are asked for."""
     if asked.labels is not None:
-        labels = read_labels(
+        return read_labels(
             asked.labels,
             volume,
             resample=asked.resample,
@@ -101,9 +93,6 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> tuple[
             names=asked.given_names(),
             taken=RESERVED,
         )
-        sources = (Source.of(asked.labels, "labels"),)
-        settings = {"resample": asked.resample}
-        return labels, Step("labels taken from a file", settings, _counts(labels), sources)
     if asked.seeds is not None:
         seeds = read_seeds(_seeds_file(asked.seeds))
     elif asked.vessels is not None:
@@ -114,11 +103,8 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> tuple[
             raise VolumeError(
                 f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark"
             )
-        return LabelMap(volume.labels, names), Step("labels kept")
-    labels = segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
-    # Without the description of the seeds, which is free text.
-    said = {name: document_of(one) for name, one in seeds.structures.items()}
-    return labels, Step("segmented", said, _counts(labels))
+        return LabelMap(volume.labels, names)
+    return segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
 
 
 def _seeds_file(path: Path) -> Path:
@@ -131,10 +117,6 @@ def _seeds_file(path: Path) -> Path:
         names = ", ".join(sorted(installed))
         raise VolumeError(f"--seeds {path}: there is no such file; installed are {names}")
     return installed[path.stem]
-
-
-def _counts(labels: LabelMap) -> dict[str, int]:
-    return {f"voxels of {name}": count for name, count in labels.voxels.items()}
 
 
 def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str]) -> CaseSettings:
@@ -169,6 +151,5 @@ def _cells(one: StructureSurface) -> tuple[str, ...]:
         str(len(surface.triangles)),
         f"{surface.area * 1e4:.2f} cm²",
         str(surface.parts),
-        str(surface.genus),
         f"{100 * one.volume_kept:.2f} %",
     )

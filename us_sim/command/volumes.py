@@ -101,21 +101,16 @@ def _reconstruct(args: argparse.Namespace) -> int:
 
 def segment_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.volume.segmentation.settings import SegmentRequest
-    from us_sim.volume.surfaces.settings import SurfaceSettings
 
     add_setting_options(parser, SegmentRequest)
-    add_setting_options(parser, SurfaceSettings)
     parser.set_defaults(command=_segment)
 
 
 def _segment(args: argparse.Namespace) -> int:
     from us_sim.command.segment_case import segment_as_asked
     from us_sim.volume.segmentation.settings import SegmentRequest
-    from us_sim.volume.surfaces.settings import SurfaceSettings
 
-    asked = read_settings(args, SegmentRequest)
-    surfaces = read_settings(args, SurfaceSettings)
-    print(segment_as_asked(asked, surfaces, late_progress("segment")))
+    print(segment_as_asked(read_settings(args, SegmentRequest), late_progress("segment")))
     return 0
 
 

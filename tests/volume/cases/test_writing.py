@@ -1,13 +1,9 @@
-"""A case is made whole or not at all, moduli alone change, and its history has a form."""
-
-import subprocess
-import time
+"""A case is made whole or not at all, and moduli alone change."""
 
 import pytest
 
 from us_sim.errors import CaseError, MaterialError, VolumeError
 from us_sim.volume.cases.case import read_case
-from us_sim.volume.cases.provenance import Source, Step, add_step
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import (
     changed_case,
@@ -62,45 +58,11 @@ def test_a_change_takes_the_place_of_the_case_only_when_all_of_it_is_right(make_
     assert sorted(folder.parent.iterdir()) == [folder]
 
 
-def test_steps_are_kept_in_order_with_what_went_in(make_case):
-    folder = make_case()
-    started = time.time()
-    with changed_case(folder) as partial:
-        source = Source.of(partial / "volume.nrrd", "volume")
-        add_step(partial, Step("imported", {"spacing": 5e-4, "method": "linear"}, {}, (source,)))
-        add_step(partial, Step("segmented", {"seeds": [[1.0, 2.0]]}, {"voxels": 12}))
-    imported, segmented = read_case(folder).steps
-    # As sha256sum has it of the same bytes.
-    digest = subprocess.run(
-        ["sha256sum", folder / "volume.nrrd"], capture_output=True, text=True, check=True
-    ).stdout.split()[0]
-    assert imported.sources == (Source("volume", digest),)
-    assert imported.settings == {"spacing": 5e-4, "method": "linear"}
-    assert segmented.counts == {"voxels": 12}
-    text = (folder / "provenance.yaml").read_text()
-    assert str(folder) not in text
-    assert time.strftime("%Y", time.localtime(started)) not in text  # nor when
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["steps: 3", "steps: [{what: made}]", "a: ["],
-)
-def test_a_provenance_that_is_none_is_refused(make_case, text):
-    folder = make_case()
-    (folder / "provenance.yaml").write_text(text)
-    with pytest.raises(CaseError, match=r"provenance\.yaml"):
-        assert read_case(folder).steps
-
-
-STEP = Step("fitted stiffness to a press", {"confidence": 0.95}, {"poses": 48})
-
-
 def test_constants_change_and_nothing_else(make_case):
     folder = make_case()
     before = read_case(folder).settings
     constants = {"young_modulus": 9876.0, "lumen_pressure": 400.0}
-    write_constants_into(folder, {"vein": {"young_modulus": 2345.0}, "tissue": constants}, STEP)
+    write_constants_into(folder, {"vein": {"young_modulus": 2345.0}, "tissue": constants})
     case = read_case(folder)
     assert case.settings.material_of("vein").young_modulus == 2345.0
     assert case.settings.material_of("tissue").young_modulus == 9876.0
@@ -109,8 +71,6 @@ def test_constants_change_and_nothing_else(make_case):
         was, now = before.material_of(name), case.settings.material_of(name)
         assert (now.poisson_ratio, now.density) == (was.poisson_ratio, was.density)
     assert case.settings.structures["vein"].label == before.structures["vein"].label
-    assert case.steps[-1].what == STEP.what
-    assert case.steps[-1].counts == {"poses": 48}
 
 
 @pytest.mark.parametrize(
@@ -124,6 +84,5 @@ def test_what_cannot_be_written_leaves_the_case_as_it_was(make_case, constants, 
     folder = make_case()
     before = (folder / "case.yaml").read_bytes()
     with pytest.raises(error, match=sentence):
-        write_constants_into(folder, constants, STEP)
+        write_constants_into(folder, constants)
     assert (folder / "case.yaml").read_bytes() == before
-    assert read_case(folder).steps == ()

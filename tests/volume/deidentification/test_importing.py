@@ -43,9 +43,6 @@ def test_a_volume_becomes_a_case_that_can_be_opened(volume, tmp_path, capsys):
     assert "30 × 24 × 5 voxels of 0.5 × 0.25 × 2 mm" in capsys.readouterr().out
     case = read_case(tmp_path / "arm")
     assert case.settings.name == "arm"
-    (step,) = case.steps
-    assert step.what == "imported"
-    assert step.counts["elements dropped"] > 10
     np.testing.assert_array_equal(case.volume().intensities, VOXELS)
     np.testing.assert_allclose(case.placement()[0], read_volume(volume).index_to_patient, atol=1e-9)
 

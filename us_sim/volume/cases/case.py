@@ -1,8 +1,8 @@
 """A case: a folder with everything that is needed to scan and press on one body part.
 
 ``case.yaml`` says what it is (`us_sim.volume.cases.settings`), ``volume.nrrd`` holds its grey
-values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/``, ``tissue.npz`` and
-``provenance.yaml`` may be there. All names are these: a case names no files of its own choice.
+values and ``labels.nrrd`` on the same grid what each voxel is; ``surfaces/`` and ``tissue.npz``
+may be there. All names are these: a case names no files of its own choice.
 
 Folders of cases are those in the environment variable US_SIM_CASES, or the folder ``cases`` in the
 user's data folder. A case is named by its folder in one of them, or by its path.
@@ -27,7 +27,6 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.registry import PROBES
 from us_sim.settings.spelling import aligned, unknown
 from us_sim.settings.text_files import read_yaml
-from us_sim.volume.cases.provenance import Step, read_steps
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.files.readers import open_image, read_placement, read_volume
 from us_sim.volume.volume import Volume
@@ -45,15 +44,6 @@ class Case:
 
     folder: Path
     settings: CaseSettings
-
-    @property
-    def steps(self) -> tuple[Step, ...]:
-        """How it was made.
-
-        Raises:
-            CaseError: the file cannot be read.
-        """
-        return read_steps(self.folder)
 
     @property
     def has_labels(self) -> bool:

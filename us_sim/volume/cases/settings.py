@@ -117,8 +117,7 @@ class CaseSettings(Settings):
     )
     slide: float | None = setting(
         Quantity("length", -0.05, 0.05),
-        "how far it slides along the probe's y, and rocks with it; not given: 8 mm, or as far as "
-        "something was scanned beside a proposed start",
+        "how far it slides along the probe's y, and rocks with it; not given: 8 mm",
         default=None,
     )
 

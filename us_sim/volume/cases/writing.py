@@ -21,7 +21,6 @@ from us_sim.settings.reading import document_of
 from us_sim.settings.spelling import unknown
 from us_sim.volume.cases.case import CASE, read_case
 from us_sim.volume.cases.proposal import with_proposal
-from us_sim.volume.cases.provenance import Step, add_step
 from us_sim.volume.cases.settings import AROUND, CaseSettings, check_name
 from us_sim.volume.partial_file import partial_file
 
@@ -78,14 +77,13 @@ def write_case_settings(folder: Path, settings: CaseSettings) -> None:
 
 
 def write_constants_into(
-    folder: str | os.PathLike[str], constants: Mapping[str, Mapping[str, float]], step: Step
+    folder: str | os.PathLike[str], constants: Mapping[str, Mapping[str, float]]
 ) -> None:
-    """Write constants of materials into a case, and how they were found.
+    """Write constants of materials into a case.
 
     Args:
         folder: of the case.
         constants: such as ``young_modulus`` (Pa), by structure, `AROUND` for tissue outside of all.
-        step: that found them.
 
     Raises:
         CaseError: there is no such case or structure, or it cannot be written.
@@ -104,7 +102,6 @@ def write_constants_into(
     settings = dataclasses.replace(settings, around=around, structures=structures)
     with changed_case(folder) as partial:
         write_case_settings(partial, settings)
-        add_step(partial, step)
 
 
 def _finish(folder: Path, partial: Path) -> None:

@@ -126,27 +126,13 @@ class Import:
         if out.name.lower().endswith(_VOLUMES):
             write_volume(out, volume, source.kept)
             return
-        from us_sim.volume.cases.provenance import Step, add_step
         from us_sim.volume.cases.settings import CaseSettings
         from us_sim.volume.cases.writing import new_case, write_case_settings
 
-        said = {
-            "kind": source.kind,
-            "values kept": sorted(source.kept),
-            "crop": settings.crop,
-            "whole image": settings.keep_whole_image,
-            "converted": list(source.conversions),
-        }
-        counts = {
-            "files": len(self.paths),
-            "elements dropped": sum(source.dropped.values()),
-            "regions kept": len(self.parts),
-        }
         with new_case(out) as folder:
             write_volume(folder / "volume.nrrd", volume, source.kept)
             del volume  # it is read again at the end, to propose where to start
             write_case_settings(folder, CaseSettings(name=settings.name or out.name))
-            add_step(folder, Step("imported", {k: v for k, v in said.items() if v}, counts))
 
 
 def look_at(

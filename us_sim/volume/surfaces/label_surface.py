@@ -58,44 +58,27 @@ def label_surface(
     mask, start = _voxels_of(volume, label, within)
     steps = np.maximum(1.0, spacing / np.linalg.norm(volume.index_to_patient[:3, :3], axis=0))
     pad = np.ceil(_PADDING * steps).astype(int)
-    field = np.pad(mask.astype(np.float32), [(p, p) for p in pad])
-    ndimage.gaussian_filter(field, _SMOOTHING * steps, output=field, mode="constant", truncate=3.0)
+    stairs = np.pad(mask.astype(np.float32), [(p, p) for p in pad])
+    field = ndimage.gaussian_filter(stairs, _SMOOTHING * steps, mode="constant", truncate=3.0)
     if (steps > 1.0).any():
         shape = tuple(np.ceil(np.array(field.shape) / steps).astype(int))
         field = ndimage.affine_transform(field, np.diag(steps), output_shape=shape, order=1)
+    elif field.max() <= _LEVELS[0]:
+        field = stairs  # so thin that smoothing would leave nothing of it
     if field.max() <= _LEVELS[0]:
         raise VolumeError(
             f"{_numbered(volume, label)} is too thin for a surface {spacing * 1e3:.2g} mm fine: "
             f"allow more triangles"
         )
+    if field is stairs:
+        vertices, triangles = marching_cubes(field, _STAIRS_LEVEL, gradient_direction="ascent")[:2]
+        return _placed(volume, vertices.astype(np.float64) - pad + start, triangles)
     wanted = np.count_nonzero(mask) / steps.prod()
     one, other = (abs(ClosedSurface(*marching_cubes(field, level)[:2]).volume) for level in _LEVELS)
     level = _LEVELS[0] + (wanted - one) / (other - one) * (_LEVELS[1] - _LEVELS[0])
     level = float(np.clip(level, 0.2, _LEVELS[0]))
     vertices, triangles = marching_cubes(field, level, gradient_direction="ascent")[:2]
     return _placed(volume, vertices.astype(np.float64) * steps - pad + start, triangles)
-
-
-def voxel_surface(volume: Volume, label: int) -> tuple[ClosedSurface, float]:
-    """The closed surface around all voxels of a label, half a voxel beyond their centres, stairs
-    and all.
-
-    A structure that leaves the volume ends there in a flat cap.
-
-    Returns:
-        The surface in ``patient``, and the volume of the label's voxels in m³.
-
-    Raises:
-        VolumeError: the volume has no labels, or none of its voxels has this one.
-    """
-    from skimage.measure import marching_cubes
-
-    block, start = _voxels_of(volume, label)
-    mask = np.pad(block.astype(np.float32), 1)
-    vertices, triangles = marching_cubes(mask, _STAIRS_LEVEL, gradient_direction="ascent")[:2]
-    placed, triangles = _placed(volume, vertices.astype(np.float64) + (start - 1), triangles)
-    voxel = abs(float(np.linalg.det(volume.index_to_patient[:3, :3])))
-    return ClosedSurface(placed, triangles), voxel * float(np.count_nonzero(block))
 
 
 def spacing_for(
