@@ -107,7 +107,7 @@ class Case:
         """
         placement, shape = self.placement()
         labels = open_image(self.folder / LABELS)
-        if labels.voxels.type.itemsize != 1:
+        if labels.type.itemsize != 1:
             raise CaseError(
                 f"{self.folder / LABELS}: its labels are not 8-bit numbers: use 0 to 255, saved "
                 f"as unsigned char"

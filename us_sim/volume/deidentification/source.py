@@ -25,8 +25,9 @@ from us_sim.volume.files.dicom.header import DicomFile, groups_of, items, number
 from us_sim.volume.files.dicom.pixels import ImageFormat
 from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
 from us_sim.volume.files.dicom.planes import frame_times, is_cartesian
-from us_sim.volume.files.readers import grey_voxels, open_image
+from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.segments import holds_segments, no_grey_values
+from us_sim.volume.files.stored_image import grey_voxels
 
 Progress = Callable[[float, str], None]
 Keep = NDArray[np.bool_] | None

@@ -104,9 +104,9 @@ def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
     """Read stored values (layer, i, j, k), whole numbers from 0 on."""
     if image.volumes > 1:
         raise VolumeError(f"{path}: holds {image.volumes} volumes; give one of labels")
-    stored = np.stack(list(image.slices()))
-    layers = (stored if image.components > 1 else stored[..., None]).transpose(3, 2, 1, 0)
-    is_whole = layers.dtype.kind != "f" or all((plane == np.rint(plane)).all() for plane in stored)
+    stored = image.read()
+    layers = stored if image.components > 1 else stored[None]
+    is_whole = layers.dtype.kind != "f" or bool((layers == np.rint(layers)).all())
     if not is_whole or not (least := layers.min()) >= 0:
         has = f"go down to {least:g}" if is_whole else "have fractions"
         raise VolumeError(f"{path}: its values {has}; labels are whole numbers from 0 on")

@@ -1,15 +1,15 @@
-"""Headers of MetaImage files (itk.org/Wiki/MetaIO/Documentation).
+"""MetaImage files (itk.org/Wiki/MetaIO/Documentation).
 
-SimpleITK does not read them here, as it would take wrong images and scales in silence: of packed
-data that are damaged, or shorter or longer than said, it makes an image of what was in memory; a
-spacing that is missing is 1 mm to it, a negative one is turned, and units are left out. Of a
-sequence its time grows with the square of the frames.
+SimpleITK does not read them here: of packed data that are damaged, or shorter than said, it makes
+an image of what was in memory; a spacing that is missing is 1 mm to it, units are left out, and of
+a sequence its time grows with the square of the frames.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
-from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
-from us_sim.volume.files.stored_image import StoredImage, StoredVoxels
+from us_sim.volume.files.stored_image import StoredImage, StoredNumbers
 
 _TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2",
@@ -44,32 +44,30 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int]:
     )
 
 
-def metaimage_voxels(path: Path, fields: Mapping[str, str], header_bytes: int) -> StoredVoxels:
+def metaimage_numbers(path: Path, fields: Mapping[str, str], header_bytes: int) -> StoredNumbers:
     """Describe the numbers behind a header."""
-    fields = {"ElementNumberOfChannels": "1", "NDims": "", "DimSize": "", **fields}
-    channels = _sizes(path, fields, "ElementNumberOfChannels", 1)
-    size = _sizes(path, fields, "DimSize", *_sizes(path, fields, "NDims", 1))
+    channels = int(_numbers(path, fields, 1, "ElementNumberOfChannels", default="1")[0])
+    count = len(fields.get("DimSize", "").split())
+    size = tuple(map(int, _numbers(path, fields, count, "DimSize")))
     element, name = fields.get("ElementType", ""), fields["ElementDataFile"]
-    skip = fields.get("HeaderSize", "0")
-    is_packed = _is_true(fields.get("CompressedData", ""))
     is_binary = _is_true(fields.get("BinaryData", "True"))
     is_list = name.upper().startswith("LIST") or "%" in name
-    is_skip = skip.isdecimal() or (skip == "-1" and not is_packed)
-    if element not in _TYPES or not is_binary or is_list or not is_skip:
+    if element not in _TYPES or not is_binary or is_list or min((channels, *size), default=0) < 1:
         raise VolumeError(
-            f"{path}: its ElementType is {element!r}, its ElementDataFile {name!r}, its HeaderSize "
-            f"{skip!r}; save it as one .mha file of binary numbers"
+            f"{path}: its ElementType is {element!r}, its DimSize {fields.get('DimSize', '')!r}, "
+            f"its ElementDataFile {name!r}; save it as one .mha file of binary numbers"
         )
     data = path if name.upper() == "LOCAL" else path.parent / name
     order = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", ""))
-    return StoredVoxels(
-        (*channels, *size) if channels != (1,) else size,
+    is_packed = _is_true(fields.get("CompressedData", ""))
+    return StoredNumbers(
+        (channels, *size) if channels > 1 else size,
         np.dtype(f"{'>' if _is_true(order) else '<'}{_TYPES[element]}"),
         data,
         path,
         header_bytes if data == path else 0,
-        int(skip),
-        "packed" if is_packed else "raw",
+        int(_numbers(path, fields, 1, "HeaderSize", default="0")[0]),
+        partial(zlib.decompress, wbits=32 + zlib.MAX_WBITS) if is_packed else None,
     )
 
 
@@ -79,54 +77,45 @@ def metaimage_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     ``given`` is the spacing (3,) in mm of a file that does not state it.
     """
     fields, header_bytes = metaimage_header(path)
-    voxels = metaimage_voxels(path, fields, header_bytes)
+    numbers = metaimage_numbers(path, fields, header_bytes)
     count = len(fields["DimSize"].split())
 
     def placement() -> NDArray[np.float64]:
         """(4, 4) m of the first three axes; the matrix has one axis after another."""
         unit = millimetres(path, fields.get("DistanceUnits", "mm"))
-        spacing = _numbers(path, fields, ("ElementSpacing", "ElementSize"), count)
-        origin = _numbers(path, fields, ("Offset", "Position", "Origin"), count)
-        matrix = _numbers(path, fields, ("TransformMatrix", "Rotation", "Orientation"), count**2)
-        axes = np.eye(count) if matrix is None else matrix.reshape(count, count).T
-        return checked_placement(
-            path,
-            None if spacing is None else unit * spacing[:3],
-            axes[:3, :3],
-            np.zeros(3) if origin is None else unit * origin[:3],
-            given,
+        spacing, origin, axes = (
+            _numbers(path, fields, length, *keys, default=default)
+            for length, keys, default in (
+                (count, ("ElementSpacing", "ElementSize"), "nan " * count),
+                (count, ("Offset", "Position", "Origin"), "0 " * count),
+                (count**2, ("TransformMatrix", "Rotation", "Orientation"), _unit_matrix(count)),
+            )
         )
+        stated = None if np.isnan(spacing).all() else unit * spacing[:3]
+        direction = axes.reshape(count, count).T[:3, :3]
+        return checked_placement(path, stated, direction, unit * origin[:3], given)
 
-    components = voxels.size[0] if len(voxels.size) > count else 1
-    return StoredImage(voxels, components, placement)
+    components = numbers.size[0] if len(numbers.size) > count else 1
+    return StoredImage(path, numbers.size, numbers.type, components, placement, numbers.read)
+
+
+def _unit_matrix(count: int) -> str:
+    return " ".join(f"{one:g}" for one in np.eye(count).ravel())
 
 
 def _numbers(
-    path: Path, fields: Mapping[str, str], keys: tuple[str, ...], count: int
-) -> NDArray[np.float64] | None:
-    """Read the finite numbers of the first field that is there."""
-    key = next((key for key in keys if key in fields), None)
-    if key is None:
-        return None
-    with suppress(ValueError):
-        numbers = np.array([float(word) for word in fields[key].split()])
-        if len(numbers) == count and np.isfinite(numbers).all():
-            return numbers
-    raise _refused(path, key, fields[key], f"{count} finite numbers belong")
-
-
-def _sizes(path: Path, fields: Mapping[str, str], key: str, count: int) -> tuple[int, ...]:
-    """Read so many whole numbers above zero of a field."""
-    words = fields[key].split()
-    if len(words) != count or not all(word.isdecimal() and int(word) for word in words):
-        raise _refused(path, key, fields[key], f"{count} whole numbers above zero belong")
-    return tuple(map(int, words))
-
-
-def _refused(path: Path, key: str, value: str, why: str) -> VolumeError:
-    return VolumeError(
-        f"{path}: cannot be read as an image: its {key} is {value[:80]!r} where {why}"
-    )
+    path: Path, fields: Mapping[str, str], count: int, *keys: str, default: str = ""
+) -> NDArray[np.float64]:
+    """Read the numbers of the first field that is there."""
+    key = next((key for key in keys if key in fields), keys[0])
+    text = fields.get(key, default)
+    try:
+        return np.array([float(word) for word in text.split()]).reshape(count)
+    except ValueError:
+        raise VolumeError(
+            f"{path}: cannot be read as an image: its {key} is {text[:80]!r} where {count or 3} "
+            f"numbers belong"
+        ) from None
 
 
 def _is_true(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""Headers of NIfTI files of both versions, in one file or in two, read by nibabel."""
+"""NIfTI files of both versions, in one file or in two, read by nibabel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, is_right_angled
-from us_sim.volume.files.stored_image import StoredImage, StoredVoxels
+from us_sim.volume.files.stored_image import StoredImage
 
 _TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # NIfTI's x goes to the right, its y to the front
 _OF_TWO_SIZES = 1e-2  # by which the sizes of voxels may differ that a header states twice
@@ -22,44 +22,40 @@ def nifti_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
 
     ``given`` is the spacing (3,) in mm of a file that does not state it.
     """
-    image = _opened(path)
-    kind = image.get_data_dtype()
-    components = len(kind) if kind.fields else 1  # bytes of a voxel's colour
-    if kind.kind not in "iufV" or kind.itemsize > 8:
-        raise VolumeError(f"{path}: holds {kind} numbers; save it as whole or floating-point ones")
-    size = tuple(int(length) for length in image.shape)
-    while len(size) > 3 and size[-1] == 1:
-        size = size[:-1]
-    file = Path(image.file_map["image"].filename)
-    voxels = StoredVoxels(
-        (components, *size) if components > 1 else size,
-        np.dtype(np.uint8) if components > 1 else kind,
-        file,
-        path,
-        skip=int(image.dataobj.offset),
-        encoding="packed" if file.suffix == ".gz" else "raw",
-    )
-    scaling = float(image.dataobj.slope), float(image.dataobj.inter)
-    return StoredImage(voxels, components, lambda: _placement(path, image, given), scaling)
-
-
-def _opened(path: Path) -> Any:
-    """Open an image without its voxels."""
     import nibabel  # which takes half a second
 
+    faults = (
+        nibabel.filebasedimages.ImageFileError,
+        nibabel.spatialimages.HeaderDataError,
+        *(OSError, EOFError, zlib.error, ValueError, OverflowError),
+    )
     try:
-        image = nibabel.load(path)
+        image: Any = nibabel.load(path)
         if not isinstance(image, nibabel.Nifti1Pair):  # type: ignore[attr-defined]
             raise ValueError("Analyze 7.5, which does not say which side is left; save it as NIfTI")
         if image.header["qform_code"] > 0:
             image.get_qform()  # raises where its quaternion is none
-        return image
-    except (nibabel.filebasedimages.ImageFileError, nibabel.spatialimages.HeaderDataError,
-            OSError, EOFError, zlib.error, ValueError, OverflowError) as error:  # fmt: skip
+    except faults as error:
         raise VolumeError(
             f"{path}: cannot be read as an image: {' '.join(str(error).split())}; give an MHA, "
             f"NRRD or NIfTI volume"
         ) from error
+    kind = image.get_data_dtype()
+    if kind.kind not in "iuf":
+        raise VolumeError(f"{path}: holds {kind} numbers; save it as whole or floating-point ones")
+    size = tuple(int(length) for length in image.shape)
+    while len(size) > 3 and size[-1] == 1:
+        size = size[:-1]
+
+    def read() -> NDArray[Any]:
+        try:
+            return np.asanyarray(image.dataobj).reshape(size, order="F")
+        except faults as error:
+            raise VolumeError(
+                f"{path}: its image data are broken or cut ({error}); copy it again"
+            ) from error
+
+    return StoredImage(path, size, kind, 1, lambda: _placement(path, image, given), read)
 
 
 def _placement(path: Path, image: Any, given: ArrayLike | None) -> NDArray[np.float64]:

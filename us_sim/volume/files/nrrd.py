@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from us_sim.errors import VolumeError
 from us_sim.volume.files.placement import checked_placement, millimetres
-from us_sim.volume.files.stored_image import Encoding, StoredImage, StoredVoxels
+from us_sim.volume.files.stored_image import StoredImage, StoredNumbers
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"longlong": "i8", "ulonglong": "u8", "float": "f4", "double": "f8"}
-_ENCODINGS: dict[str, Encoding] = {"raw": "raw", "gzip": "packed", "gz": "packed"}
-_ENCODINGS |= {"bzip2": "bzip2", "bz2": "bzip2"}
+_UNPACK = {"raw": None, "gzip": gzip.decompress, "gz": gzip.decompress}
+_UNPACK |= {"bzip2": bz2.decompress, "bz2": bz2.decompress}
 _TO_LPS = {
     "left-posterior-superior": (1, 1, 1),
     "right-anterior-superior": (-1, -1, 1),
@@ -43,30 +45,29 @@ def nrrd_header(path: Path) -> tuple[dict[str, Any], int]:
         ) from error
 
 
-def nrrd_voxels(path: Path, fields: Mapping[str, Any], start: int) -> StoredVoxels:
-    """Describe the numbers behind a header that ends at byte ``start``."""
+def nrrd_numbers(path: Path, fields: Mapping[str, Any], start: int) -> StoredNumbers:
+    """Describe the numbers behind a header that ends at byte ``start``.
+
+    They are not read by pynrrd, which takes the first of several members of gzip, as IGSIO writes.
+    """
     size = tuple(int(length) for length in fields.get("sizes", ()))
-    if len(size) != fields.get("dimension") or min(size, default=0) < 1:
-        raise VolumeError(
-            f"{path}: cannot be read as an image: its sizes are {' '.join(map(str, size))!r} where "
-            f"as many whole numbers above zero belong as its dimension says"
-        )
     kind, encoding = fields.get("type", ""), fields.get("encoding", "").lower()
     name = kind.lower().removeprefix("signed ").replace("unsigned ", "u").removesuffix(" int")
     name = name.removesuffix("_t").replace(" ", "")
     name = _TYPES.get(name, name if re.fullmatch("u?int(8|16|32|64)", name) else "")
-    skip = fields.get("byte skip", fields.get("byteskip", 0))
     data = fields.get("data file", fields.get("datafile", path.name))
-    is_odd = {"line skip", "lineskip"} & fields.keys() or (skip < 0 and encoding != "raw")
-    if not name or encoding not in _ENCODINGS or is_odd or data.startswith("LIST") or "%" in data:
+    is_odd = {"line skip", "lineskip"} & fields.keys() or min(size, default=0) < 1
+    if not name or encoding not in _UNPACK or is_odd or data.startswith("LIST") or "%" in data:
         raise VolumeError(
-            f"{path}: holds voxels of type {kind!r} in the encoding {encoding!r}, or in several "
-            f"files, or behind lines; save it as one .nrrd of numbers: raw, gzip or bzip2"
+            f"{path}: cannot be read as an image: it holds {kind!r} in the encoding {encoding!r} "
+            f"and sizes {' '.join(map(str, size))!r}, or in several files, or behind lines; save "
+            f"it as one .nrrd of numbers: raw, gzip or bzip2"
         )
     number = np.dtype(name).newbyteorder(">" if fields.get("endian") == "big" else "<")
     file = path.parent / data
     start = start if file == path else 0
-    return StoredVoxels(size, number, file, path, start, skip, _ENCODINGS[encoding])
+    skip = fields.get("byte skip", fields.get("byteskip", 0))
+    return StoredNumbers(size, number, file, path, start, skip, _UNPACK[encoding])
 
 
 def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
@@ -75,10 +76,10 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     ``given`` is the spacing (3,) in mm of a file that does not state it.
     """
     fields, start = nrrd_header(path)
-    voxels = nrrd_voxels(path, fields, start)
-    count = len(voxels.size)
+    numbers = nrrd_numbers(path, fields, start)
+    count = len(numbers.size)
     for key in (_DIRECTIONS, "kinds", "spacings", "units", "axis mins"):
-        if len(entries := fields.get(key, voxels.size)) != count:
+        if len(entries := fields.get(key, numbers.size)) != count:
             raise VolumeError(
                 f"{path}: its {key} has {len(entries)} entries where the image has {count} axes"
             )
@@ -91,9 +92,12 @@ def nrrd_image(path: Path, given: ArrayLike | None = None) -> StoredImage:
     first = axes[0]
     remark = "the file names no anatomical space: left-posterior-superior is assumed"
     return StoredImage(
-        voxels,
-        voxels.size[0] if first else 1,
+        path,
+        numbers.size,
+        numbers.type,
+        numbers.size[0] if first else 1,
         lambda: _placement(path, fields, axes, given),
+        numbers.read,
         texts={key: value for key, value in fields.items() if isinstance(value, str)},
         remarks=() if "space" in fields else (remark,),
     )

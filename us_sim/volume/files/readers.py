@@ -27,11 +27,7 @@ from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
 from us_sim.volume.files.metaimage import metaimage_header, metaimage_image
 from us_sim.volume.files.nifti import nifti_image
 from us_sim.volume.files.nrrd import nrrd_header, nrrd_image
-from us_sim.volume.files.stored_image import (
-    GreyLevels,
-    StoredImage,
-    volume_of_slices,
-)
+from us_sim.volume.files.stored_image import StoredImage, grey_voxels
 from us_sim.volume.volume import Volume
 
 _READERS = {"mha": metaimage_image, "mhd": metaimage_image, "nrrd": nrrd_image, "nhdr": nrrd_image}
@@ -73,9 +69,7 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
         from us_sim.volume.files.dicom.placed_images import placed_images
 
         return placed_images(files).placement
-    image, placement = _placed(path)
-    image.voxels.check_bytes()
-    return placement
+    return _placed(path)[1]
 
 
 def open_image(
@@ -103,20 +97,6 @@ def open_image(
     image = _READERS[ending](path, spacing)
     image.check(layers=layers)
     return image
-
-
-def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
-    """Read the grey values (i, j, k) of one of an image's volumes; say how they came about."""
-    path = image.voxels.header
-    if not 1 <= volume <= image.volumes:
-        raise VolumeError(f"{path}: holds {image.volumes} volumes; number {volume} is none of them")
-    levels, said = GreyLevels(), list(image.remarks)
-    if image.voxels.type != np.uint8 or image.scaling != (1.0, 0.0):
-        levels = GreyLevels.over(path, image.slices(volume))
-        said += levels.described(8 * image.voxels.type.itemsize)
-    if image.volumes > 1:
-        said.append(f"volume {volume} of {image.volumes}")
-    return volume_of_slices(map(levels, image.slices(volume)), image.shape[2]), tuple(said)
 
 
 def is_sequence(kinds: Iterable[str], keys: Iterable[str]) -> bool:

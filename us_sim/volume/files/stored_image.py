@@ -1,20 +1,13 @@
-"""Images in files: their numbers as a header says that they are stored, read piece by piece.
-
-The headers are read by each format's library. The numbers of all formats are read here, since a
-volume of 512³ shall not be in memory twice, and its bytes are compared with the header once.
-"""
+"""Images in files: their numbers, read when they are asked for, and as grey values."""
 
 from __future__ import annotations
 
-import bz2
-import io
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,121 +16,65 @@ from us_sim.errors import VolumeError
 
 LARGEST_VOLUME = 1 << 29  # numbers in the largest image that is read: 1024 × 1024 × 512
 
-_STEP = 1 << 20
-
-Encoding = Literal["raw", "packed", "bzip2"]
-"""As they are; by zlib or gzip; by bzip2."""
-
 
 @dataclass(frozen=True)
-class StoredVoxels:
-    """Numbers as a header says that they are stored."""
+class StoredNumbers:
+    """Numbers in a MetaImage or NRRD file, or in the file that its header names."""
 
-    size: tuple[int, ...]  # numbers along each axis, those of one voxel included, fastest first
+    size: tuple[int, ...]  # along each axis, those of one voxel included, fastest first
     type: np.dtype[Any]  # of a number, in the file's byte order
     file: Path
-    header: Path  # the file with the header, which errors name
+    header: Path  # which errors name
     start: int = 0  # byte of the file at which they, or the packed bytes, begin
     skip: int = 0  # bytes before them, after unpacking; -1 of raw ones: they end the file
-    encoding: Encoding = "raw"
+    unpack: Callable[[bytes], bytes] | None = None  # None: they are there as they are
 
-    @property
-    def expected(self) -> int:
-        """Bytes that the header says there are."""
-        return math.prod(self.size) * self.type.itemsize
+    def read(self) -> NDArray[Any]:
+        """Read all numbers, with axes as in `size`; those of a raw file are mapped.
 
-    def check_bytes(self) -> None:
-        """Compare the bytes of raw numbers with the header; packed ones are compared as read."""
+        Raises:
+            VolumeError: the file is not there, is damaged, or holds fewer or more bytes than its
+                header says, or does not fit into memory.
+        """
         if not self.file.is_file():
             raise VolumeError(f"{self.header}: belongs to {self.file.name}, which is not there")
-        if self.encoding == "raw":
-            there = self.file.stat().st_size - self.start - max(self.skip, 0)
-            self._check_length(min(there, self.expected) if self.skip < 0 else there)
-
-    def pieces(self, size: int, wanted: Iterable[int] | None = None) -> Iterator[NDArray[Any]]:
-        """Yield arrays of ``size`` numbers each, such as the slices of a volume.
-
-        Args:
-            size: numbers of a piece.
-            wanted: which pieces, ascending from 0; all without it, and then there must be no more.
-        """
-        self.check_bytes()
-        step, at = size * self.type.itemsize, 0
-        with self._stream() as stream:
-            for number in range(self.expected // step) if wanted is None else wanted:
-                if self.encoding == "raw":
-                    stream.seek(number * step - at, io.SEEK_CUR)
-                    at = number * step
-                while at < number * step and (passed := stream.read(step)):
-                    at += len(passed)
-                data = stream.read(step)
-                at += len(data)
-                if len(data) != step:
-                    self._check_length(at)
-                yield np.frombuffer(data, self.type)
-            if wanted is None:
-                self._check_length(at + len(stream.read(1)))
-
-    @contextmanager
-    def _stream(self) -> Iterator[Any]:
-        """Open the bytes after unpacking, from those on that are skipped."""
+        expected = math.prod(self.size) * self.type.itemsize
+        if self.unpack is None:
+            start = self.start + self.skip
+            if self.skip < 0:
+                start = max(self.file.stat().st_size - expected, self.start)
+            self._check_length(self.file.stat().st_size - start, expected)
+            return np.memmap(self.file, self.type, "r", start, self.size, "F")
+        check_memory(2 * expected, f"{self.header}: unpacking it")
         try:
-            with self.file.open("rb") as file:
-                file.seek(self.start)
-                stream: Any = file
-                if self.encoding == "packed":
-                    stream = io.BufferedReader(_Inflated(file))
-                elif self.encoding == "bzip2":
-                    stream = bz2.BZ2File(file)
-                if self.skip < 0:
-                    file.seek(-self.expected, io.SEEK_END)
-                stream.read(max(self.skip, 0))
-                yield stream
+            data = self.unpack(self.file.read_bytes()[self.start :])[self.skip :]
         except (zlib.error, EOFError, OSError) as error:
-            if isinstance(error, OSError) and error.errno is not None:
-                raise  # the file cannot be read at all
             raise VolumeError(
                 f"{self.header}: its image data are broken or cut ({error}); copy it again"
             ) from error
+        self._check_length(len(data), expected)
+        return np.frombuffer(data, self.type).reshape(self.size, order="F")
 
-    def _check_length(self, there: int) -> None:
-        if there != self.expected:
-            more = " or more" if self.encoding != "raw" and there > self.expected else ""
+    def _check_length(self, there: int, expected: int) -> None:
+        if there != expected:
             raise VolumeError(
-                f"{self.header}: holds {max(there, 0)}{more} bytes of image data where its header "
-                f"says {self.expected}; copy or export it again"
+                f"{self.header}: holds {max(there, 0)} bytes of image data where its header says "
+                f"{expected}; copy or export it again"
             )
 
 
-class _Inflated(io.RawIOBase):
-    """The plain bytes of a zlib or gzip stream in a file.
+def check_memory(needed: float, purpose: str, advice: str = "end other programs") -> None:
+    """Refuse a purpose that takes more bytes than the free memory has.
 
-    MetaImage packs by zlib, for which the standard library has no file; IGSIO writes gzip in
-    several members, of which pynrrd reads the first.
+    Raises:
+        VolumeError: it does.
     """
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any, /) -> int:
-        piece = b""
-        while not piece:
-            done = self._inflate.eof
-            packed = self._inflate.unused_data if done else self._inflate.unconsumed_tail
-            packed = packed or self._file.read(_STEP)
-            if done and not packed:
-                return 0
-            if done:  # the next member
-                self._inflate = zlib.decompressobj(32 + zlib.MAX_WBITS)
-            piece = self._inflate.decompress(packed, len(buffer))
-            if not (packed or piece or self._inflate.eof):
-                raise EOFError("its compression ends too early")
-        buffer[: len(piece)] = piece
-        return len(piece)
+    free = free_memory()
+    if needed > free:
+        raise VolumeError(
+            f"{purpose} takes {needed / 1e9:.3g} GB of memory where {free / 1e9:.3g} GB are free: "
+            f"{advice}"
+        )
 
 
 def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
@@ -146,13 +83,14 @@ def check_claim(path: Path, size: tuple[int, ...], value: int) -> None:
     Raises:
         VolumeError: it is larger than `LARGEST_VOLUME`, or than the memory that is free.
     """
-    count = math.prod(size)
-    needed, free = count * (value + 1), free_memory()  # as they are stored, and as grey values
-    if count > LARGEST_VOLUME or needed > free:
+    count, shown = math.prod(size), " × ".join(map(str, size))
+    if count > LARGEST_VOLUME:
         raise VolumeError(
-            f"{path}: says it holds {' × '.join(map(str, size))} numbers, {needed / 1e9:.3g} GB of "
-            f"memory; {LARGEST_VOLUME} numbers and {free / 1e9:.3g} GB are possible: cut out a part"
+            f"{path}: says it holds {shown} numbers where {LARGEST_VOLUME} are possible: cut out a "
+            f"part"
         )
+    # As they are stored, and as grey values.
+    check_memory(count * (value + 1), f"{path}: an image of {shown} numbers", "cut out a part")
 
 
 def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
@@ -190,17 +128,19 @@ def free_memory() -> float:
 class StoredImage:
     """An image in a MetaImage, NRRD or NIfTI file, as its header says."""
 
-    voxels: StoredVoxels
+    path: Path
+    size: tuple[int, ...]  # along each axis, fastest first, the numbers of a voxel included
+    type: np.dtype[Any]  # of a number
     components: int  # numbers of a voxel; where there are several they are the first axis
     placement: Callable[[], NDArray[np.float64]]  # (4, 4) m, from indices; raises VolumeError
-    scaling: tuple[float, float] = (1.0, 0.0)  # slope and offset of the stored numbers
+    read: Callable[[], NDArray[Any]]  # all numbers, with axes as in `size`; raises VolumeError
     texts: Mapping[str, str] = field(default_factory=dict)  # further keys and values
     remarks: tuple[str, ...] = ()  # on what the header leaves open, a sentence each
 
     @property
     def axes(self) -> tuple[int, ...]:
         """Voxels along each axis."""
-        return self.voxels.size[self.components > 1 :]
+        return self.size[self.components > 1 :]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -218,27 +158,18 @@ class StoredImage:
 
         With ``layers`` a voxel may have several numbers, as in segmentations of 3D Slicer.
         """
-        path, axes = self.voxels.header, self.axes
+        axes = self.axes
         if len(axes) not in (3, 4) or min(axes[:3]) < 2:
             raise VolumeError(
-                f"{path}: is {len(axes)}-dimensional, {' × '.join(map(str, axes))}; a volume has "
-                f"three dimensions and two voxels or more along each axis"
+                f"{self.path}: is {len(axes)}-dimensional, {' × '.join(map(str, axes))}; a volume "
+                f"has three dimensions and two voxels or more along each axis"
             )
         if self.components != 1 and not layers:
             raise VolumeError(
-                f"{path}: holds {self.components} numbers per voxel; convert it to one grey value"
+                f"{self.path}: holds {self.components} numbers per voxel; convert it to one grey "
+                f"value"
             )
-        check_claim(path, (*self.shape, self.components), self.voxels.type.itemsize)
-
-    def slices(self, volume: int = 1) -> Iterator[NDArray[Any]]:
-        """Yield the slices (j, i) of one of the volumes, or (j, i, component), scaled."""
-        i, j, k = self.shape
-        slope, offset = self.scaling
-        wanted = range(k * (volume - 1), k * volume) if self.volumes > 1 else None
-        form = (j, i, self.components) if self.components > 1 else (j, i)
-        for numbers in self.voxels.pieces(i * j * self.components, wanted):
-            image = numbers.reshape(form)
-            yield image if self.scaling == (1.0, 0.0) else image * slope + offset
+        check_claim(self.path, (*self.shape, self.components), self.type.itemsize)
 
 
 @dataclass(frozen=True)
@@ -291,17 +222,25 @@ class GreyLevels:
         return said
 
 
-def file_order(voxels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(k, j, i) C-contiguous, the order of files, of a part (i, j, k) of a volume.
+def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+    """Read the grey values (i, j, k) of one of an image's volumes; say how they came about."""
+    if not 1 <= volume <= image.volumes:
+        raise VolumeError(
+            f"{image.path}: holds {image.volumes} volumes; number {volume} is none of them"
+        )
+    said = list(image.remarks)
+    stored = image.read().reshape((*image.shape, image.volumes), order="F")[..., volume - 1]
 
-    OpenCV turns a plane in blocks that fit the cache, in a tenth of NumPy's time.
-    """
-    import cv2  # which a node that plays poses alone does not need
+    def slices() -> Iterator[NDArray[Any]]:
+        return (stored[:, :, k].T for k in range(stored.shape[2]))
 
-    made = np.empty(voxels.shape[::-1], np.uint8)
-    for j in range(voxels.shape[1]):
-        made[:, j, :] = cv2.transpose(voxels[:, j, :])
-    return made
+    levels = GreyLevels()
+    if stored.dtype != np.uint8:
+        levels = GreyLevels.over(image.path, slices())
+        said += levels.described(8 * image.type.itemsize)
+    if image.volumes > 1:
+        said.append(f"volume {volume} of {image.volumes}")
+    return volume_of_slices(map(levels, slices()), stored.shape[2]), tuple(said)
 
 
 def volume_of_slices(
@@ -311,12 +250,14 @@ def volume_of_slices(
 ) -> NDArray[np.uint8]:
     """A volume (i, j, k) of slices (j, i), of which a few are in memory at a time.
 
+    OpenCV turns a plane in blocks that fit the cache, in a tenth of NumPy's time.
+
     Args:
         slices: in order; the first is read before memory is taken for all.
         count: how many come.
         progress: told the fraction that is there.
     """
-    import cv2
+    import cv2  # which a node that plays poses alone does not need
 
     voxels: NDArray[np.uint8] | None = None
     slab: list[NDArray[np.uint8]] = []

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.stored_image import LARGEST_VOLUME, free_memory
+from us_sim.volume.files.stored_image import LARGEST_VOLUME
 from us_sim.volume.reconstruction.settings import ImagePart
 
 
@@ -75,20 +75,6 @@ def proposed_spacing(points: NDArray[np.float64], pixel: float) -> float:
     size = np.maximum(np.ptp(points, axis=0), pixel)
     needed = (math.prod(size) / (1 << 27)) ** (1 / 3)
     return pixel if needed <= pixel else math.ceil(1e5 * needed * 1.01) / 1e5
-
-
-def check_memory(needed: float, purpose: str) -> None:
-    """Refuse a purpose that takes more bytes than the free memory has.
-
-    Raises:
-        VolumeError: it does.
-    """
-    free = free_memory()
-    if needed > free:
-        raise VolumeError(
-            f"{purpose} takes {needed / 1e9:.2f} GB of memory where {free / 1e9:.2f} GB are free: "
-            f"give a larger --spacing, or end other programs"
-        )
 
 
 def image_mask(part: ImagePart, columns: int, rows: int) -> NDArray[np.bool_]:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.kernels import njit
-from us_sim.volume.reconstruction.grid import Grid, check_memory
+from us_sim.volume.files.stored_image import check_memory
+from us_sim.volume.reconstruction.grid import Grid
 
 _VOXEL_BYTES = 10  # of memory while images are inserted: sum, weight, grey, coverage
 _MEAN, _MAX, _COUNT, _COLLECT = range(4)

@@ -26,14 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.files.metaimage import metaimage_voxels
-from us_sim.volume.files.nrrd import nrrd_voxels
+from us_sim.volume.files.metaimage import metaimage_numbers
+from us_sim.volume.files.nrrd import nrrd_numbers
 from us_sim.volume.files.readers import is_sequence, sequence_header
-from us_sim.volume.files.stored_image import (
-    GreyLevels,
-    StoredVoxels,
-    check_claim,
-)
+from us_sim.volume.files.stored_image import GreyLevels, StoredNumbers
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
     frame_fields,
@@ -54,37 +50,36 @@ NO_FIELDS = "no field in the header"  # why frames cannot be used
 class StoredImages:
     """Images, grey or red, green and blue; other numbers than bytes are spread over all frames."""
 
-    voxels: StoredVoxels
+    numbers: StoredNumbers
     columns: int  # as they are stored
     rows: int
     channels: int  # 1 or 3
     orientation: str
 
     def read(self, wanted: Iterable[int]) -> Iterator[NDArray[np.uint8]]:
-        """Grey images (rows, columns) turned to ``MF``, one in memory at a time, of frames whose
-        numbers ascend.
-        """
+        """Yield grey images (rows, columns) of some frames, turned to ``MF``."""
         import cv2  # which a node that plays poses alone does not need
 
-        levels = self._levels
-        for numbers in self.voxels.pieces(self._size, wanted):
-            image = levels(numbers)
+        for number in wanted:
+            image = self._levels(self._stored[..., number].T)
             if self.channels > 1:
-                colours = image.reshape(self.rows, self.columns, self.channels)
-                image = np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-            image = image.reshape(self.rows, self.columns)
+                image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
             yield np.ascontiguousarray(turned(image, self.orientation))
 
-    @property
-    def _size(self) -> int:
-        return self.columns * self.rows * self.channels
+    @cached_property
+    def _stored(self) -> NDArray[Any]:
+        """(columns, rows, frames), or (channels, columns, rows, frames), as they are."""
+        each = (self.channels, self.columns, self.rows)[self.channels == 1 :]
+        return self.numbers.read().reshape((*each, -1), order="F")
 
     @cached_property
     def _levels(self) -> GreyLevels:
-        if self.voxels.type == np.uint8:
+        if self.numbers.type == np.uint8:
             return GreyLevels()
-        images = (each.reshape(self.rows, -1) for each in self.voxels.pieces(self._size))
-        return GreyLevels.over(self.voxels.header, images)
+        frames = (self._stored[..., n] for n in range(self._stored.shape[-1]))
+        return GreyLevels.over(
+            self.numbers.header, (each.T.reshape(self.rows, -1) for each in frames)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +107,9 @@ class TrackedSequence:
         return self._stored
 
     def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
-        """The images (rows, columns) in grey, turned to ``MF``, one in memory at a time.
-
-        Args:
-            which: indices into `numbers`; they come in ascending order. All without it.
-        """
+        """The images (rows, columns) in grey, turned to ``MF``; of these indices into `numbers`."""
         indices = range(len(self)) if which is None else which
-        return self.require_images().read(sorted({int(self.numbers[i]) for i in indices}))
+        return self.require_images().read(int(self.numbers[i]) for i in indices)
 
     def faults(self, transforms: FrameTransforms | None, *, images: bool) -> list[str]:
         """(K,) why each frame cannot be used, given what is needed of it, or an empty text."""
@@ -210,11 +201,9 @@ def _stored_images(
     elif kind not in ("BRIGHTNESS", "RGB_COLOR"):
         problem = f"its images are {kind}, no B-mode: give the logarithm of their envelopes"
     else:
-        check_claim(path, (columns, rows, channels), 1)
-        read = nrrd_voxels if path.name.lower().endswith((".nrrd", ".nhdr")) else metaimage_voxels
-        voxels = read(path, keys, start)
-        voxels.check_bytes()
-        return StoredImages(voxels, columns, rows, channels, code)
+        is_nrrd = path.name.lower().endswith((".nrrd", ".nhdr"))
+        read = nrrd_numbers if is_nrrd else metaimage_numbers
+        return StoredImages(read(path, keys, start), columns, rows, channels, code)
     raise VolumeError(f"{path}: {problem}")
 
 

@@ -41,11 +41,8 @@ class Sweep:
     sequence: TrackedSequence
 
     def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
-        """The images (rows, columns), ascending, one in memory at a time.
-
-        They are all, or those at these indices into `numbers`.
-        """
-        numbers = self.numbers if which is None else self.numbers[sorted(set(which))]
+        """The images (rows, columns): all, or those at these indices into `numbers`."""
+        numbers = self.numbers if which is None else self.numbers[list(which)]
         return self.sequence.require_images().read(int(number) for number in numbers)
 
 

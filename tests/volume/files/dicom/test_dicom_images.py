@@ -109,7 +109,7 @@ MPEG = "1.2.840.10008.1.2.4.102"
         (
             ExplicitVRLittleEndian,
             {"NumberOfFrames": 60000, "Rows": 60000, "Columns": 60000},
-            "GB of memory",
+            "are possible",
         ),
         (ExplicitVRLittleEndian, {"PhotometricInterpretation": "PALETTE COLOR"}, "table of col"),
         (JPEG2000Lossless, {"Rows": 13}, "decoded"),
