@@ -337,7 +337,11 @@ def test_a_further_file_is_begun_only_where_that_is_asked_for(bench, tmp_path):
     file.write_bytes(b"precious")
     with pytest.raises(BagError, match="exists already"):
         bench.make(SessionRecorder, file=str(file))
+    os.utime(file, times=(time.time() - 7.3,) * 2)
     recorder = bench.make(SessionRecorder, file=str(file), if_exists="further")
+    note = recorder.health.values["note"]
+    assert "session_1.mcap" in note
+    assert "7." in note
     end(bench, recorder)
     assert file.read_bytes() == b"precious"
     assert not read_bag(tmp_path / "session_1.mcap").note

@@ -90,16 +90,25 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder"}
     simulation.update()
     assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
+    assert control.told[-1][1]["record_state"] == "starting"
     assert control.told[-1][1]["record_note"] == ""
     supervisor.recordings.begin(supervisor.plan.processes[0])
     (tmp_path / "a.mcap").write_bytes(bytes(1000))
     (tmp_path / "a_1.mcap").write_bytes(bytes(500))
     simulation._recording_at = 0.0
-    simulation._monitor.node.reports["session_recorder"] = {"note": "it lies beside another"}
+    simulation._monitor.node.reports["session_recorder"] = {
+        "state": "recording",
+        "note": "it lies beside another",
+    }
     simulation.update()
     told = control.told[-1][1]
+    assert told["record_state"] == "recording"
     assert told["record_note"] == "it lies beside another"
     assert (told["record_bytes"], told["record_seconds"]) == ("1500", "0")
+    supervisor.waiting = ["session_recorder"]  # it was started again
+    simulation.update()
+    assert control.told[-1][1]["record_state"] == "starting"
+    supervisor.waiting = []
     assert 0 < float(told["record_room_bytes"]) <= shutil.disk_usage(tmp_path).total
     ask(simulation, control, replay=PATH, replay_rate=0.5)
     assert set(supervisor.plan.nodes) == nodes | {"session_recorder", "path_player"}

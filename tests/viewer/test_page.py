@@ -49,6 +49,26 @@ def test_pixels_are_drawn_as_they_were_sent(page: Any, simulator: Simulator) -> 
     assert box["width"] / box["height"] == pytest.approx(512 / 300, rel=1e-3)
 
 
+@pytest.mark.parametrize(("force", "words"), [({}, "no image"), ({"force_age": 0.7}, "no tissue")])
+def test_nothing_is_said_to_be_at_rest_that_says_nothing(
+    page: Any, simulator: Simulator, force: dict[str, float], words: str
+) -> None:
+    image, _ = feeds_of(simulator)
+    hand, probe = Feed("hand", rate=None), Feed("probe", rate=None)
+    simulator.add(hand, probe)
+    place = {"stamp": "1", "position": [0, 0, 0], "quaternion": [0, 0, 0, 1], **force}
+    probe.offer(lambda sequence: Packet("probe", sequence, place, b""))
+    hand.offer(lambda sequence: Packet("hand", sequence, {"is_resting": True}, b""))
+    page.goto(page.address)
+
+    def is_at_rest() -> bool:
+        offer(image, np.zeros((3, 4), np.uint8))
+        return bool(page.locator("#readout").inner_text() == "at rest")
+
+    until(is_at_rest, "images come")
+    page.wait_for_function(f"document.querySelector('#readout').textContent === '{words}'")
+
+
 def test_a_page_finds_the_viewer_again(page: Any, simulator: Simulator) -> None:
     image, _ = feeds_of(simulator)
     page.goto(page.address)

@@ -75,14 +75,19 @@ def test_a_session_is_recorded_and_replayed(page, session):
     file.fill("nowhere.mcap")
     page.get_by_role("button", name="Record", exact=True).click()
     page.get_by_text("there is no such file").wait_for()
-    board.state = dataclasses.replace(RUNNING, record="/home/a/mine.mcap")
+    board.state = dataclasses.replace(
+        RUNNING, record="/home/a/mine.mcap", record_state="starting", record_room_bytes=9e9
+    )
+    page.get_by_text("starting: /home/a/mine.mcap", exact=True).wait_for()
+    page.get_by_text("recorder starting: mine.mcap").wait_for()
+    assert not page.get_by_text("recording to").is_visible()
+    writing = dataclasses.replace(board.state, record_state="recording", record_room_bytes=0)
+    board.state = writing
     page.get_by_text("recording to /home/a/mine.mcap").wait_for()
     page.get_by_text("recording mine.mcap").wait_for()
     note = "metadata.yaml in this folder belongs to another recording"
     assert not page.get_by_text(note).is_visible()
-    board.state = dataclasses.replace(
-        RUNNING, record="/home/a/mine.mcap", record_note=f"{note}, so …"
-    )
+    board.state = dataclasses.replace(writing, record_note=f"{note}, so …")
     page.get_by_text(note).wait_for()
     until(lambda: file.input_value() == "mine.mcap", "the field names what is written", 30.0)
     page.get_by_role("button", name="Stop", exact=True).click()
@@ -112,6 +117,22 @@ def test_a_session_is_recorded_and_replayed(page, session):
     assert asked[-1]["replay_time"] == pytest.approx(6.0, abs=0.5)
     page.get_by_role("button", name="Play or pause").click()
     until(lambda: asked[-1] == {"replay_paused": True}, "it is paused", 30.0)
+
+
+def test_a_replay_that_starts_is_paused_when_it_is_ready(page, session):
+    board, asked = session
+    board.state = dataclasses.replace(RUNNING, replay="/a.mcap", replay_state="starting")
+    opened(page, "Session")
+    page.get_by_text("s, starting").wait_for()
+    play = page.get_by_role("button", name="Play or pause")
+    play.get_by_text("pause").wait_for()
+    play.click()
+    until(lambda: asked == [{"replay_paused": True}], "it is to be paused", 30.0)
+    board.state = dataclasses.replace(board.state, replay_paused=True, replay_state="waiting")
+    page.get_by_text("paused when it is ready").wait_for()
+    play.get_by_text("play_arrow").wait_for()
+    play.click()
+    until(lambda: asked[-1] == {"replay_paused": False}, "it is to be played", 30.0)
 
 
 @pytest.mark.parametrize("typed", ["/data/other.mcap", "hand.mcap"])

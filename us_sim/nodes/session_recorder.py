@@ -7,6 +7,7 @@ import ctypes
 import functools
 import os
 import sys
+import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -121,24 +122,32 @@ class SessionRecorder(GuardedNode):
 
     def _begin(self) -> None:
         settings = self._settings
+        goes_on = settings.if_exists == "further"
         taken = os.path.exists(Path(settings.file).parent / "metadata.yaml")
         taken = taken and settings.file.endswith(".mcap")
-        if taken and settings.if_exists != "further":
-            self.get_logger().info(_WITHOUT_METADATA)
+        if taken and not goes_on:
+            self._note(_WITHOUT_METADATA)
         compression: Any = settings.compression
         bag = BagWriter(
             settings.file,
             compression=compression,
             sidecar=not taken,
-            further=settings.if_exists == "further",
+            further=goes_on,
             reserve=_RESERVE,
         )
+        if goes_on and (gap := _gap_before(bag.path, Path(settings.file).stem)):
+            self._note(f"it goes on in {bag.path.name}: {gap:.1f} s before that are not recorded")
         self._bag = WriteBehind(bag, settings.max_cache_size)
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
             self._bag.attach(name, media_type, data, now)
         self._tell_state()
         self.get_logger().info(f"recording to {bag.path}")
+
+    def _note(self, sentence: str) -> None:
+        """Say what is to be known of the file, also in diagnostics."""
+        self.health.values["note"] = sentence
+        self.get_logger().info(sentence)
 
     def _discover(self) -> None:
         has_time = bool(self.get_clock().now().nanoseconds)  # simulated time has begun
@@ -232,6 +241,13 @@ class SessionRecorder(GuardedNode):
             self.health.state = "stopped"
         else:
             self.health.state = "paused" if self._settings.paused else "recording"
+
+
+def _gap_before(file: Path, stem: str) -> float:
+    """Return s since the files before this one, whose names begin so, were written; 0 without."""
+    before = [each for each in file.parent.glob("*.mcap") if each.name.startswith(stem)]
+    written = [each.stat().st_mtime for each in before if each != file]
+    return time.time() - max(written) if written else 0.0
 
 
 def _load_types() -> None:

@@ -221,6 +221,8 @@ class Simulation:
         if request.path:
             player = reports.get(self._supervisor.plan.player, {})
         record = full_path(request.record) if request.record else None
+        # What a recorder said that has ended is no more so.
+        recorder = {} if RECORDER in waiting else reports.get(RECORDER, {})
         if time.monotonic() - self._recording_at > _RECORDING_EVERY_S:
             self._recording_at = time.monotonic()
             self._recording = self._supervisor.recordings.progress(record) if record else {}
@@ -231,7 +233,8 @@ class Simulation:
             "loading": preparation.name if preparation is not None else "",
             "fraction": f"{fraction:.2f}",
             "record": str(record or ""),
-            "record_note": reports.get(RECORDER, {}).get("note", "") if record else "",
+            "record_state": recorder.get("state", "starting") if record else "",
+            "record_note": recorder.get("note", "") if record else "",
             **(self._recording if record else {}),
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",

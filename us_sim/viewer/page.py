@@ -217,13 +217,15 @@ def words_of(state: SessionState) -> tuple[str, str]:
     >>> words_of(SessionState(is_there=True, scene="upper_arm", state="starting", fraction=0.4))
     ('upper arm', 'starting, 40 %')
     >>> replay = {"replay": "/home/a/press.mcap", "replay_state": "finished"}
-    >>> words_of(SessionState(is_there=True, scene="upper_arm", record="/home/a/b.mcap", **replay))
+    >>> record = {"record": "/home/a/b.mcap", "record_state": "recording"}
+    >>> words_of(SessionState(is_there=True, scene="upper_arm", **record, **replay))
     ('upper arm', 'recording b.mcap · replay of press.mcap: finished')
     """
     name = state.scene.replace("_", " ")
     if state.is_busy:
         return name, f"{state.state}, {100 * state.fraction:.0f} %"
-    parts = [f"recording {PurePath(state.record).name}"] if state.record else []
+    begun = "recording" if state.is_recording else f"recorder {state.record_state}:"
+    parts = [f"{begun} {PurePath(state.record).name}"] if state.record else []
     if state.replay:
         parts.append(f"replay of {PurePath(state.replay).name}: {state.replay_state}")
     return name, " · ".join(filter(None, parts))

@@ -40,6 +40,7 @@ class SessionState:
     fraction: float = 1.0  # of loading or starting that is done
     problem: str = ""  # why the last thing that was asked for came to nothing
     record: str = ""  # file that is recorded to, with its folder
+    record_state: str = ""  # of its recorder: starting, recording, paused
     record_note: str = ""  # what is to be known of that file
     record_seconds: float = 0.0  # since when
     record_bytes: float = 0.0  # its size so far
@@ -49,6 +50,7 @@ class SessionState:
     replay_state: str = ""
     replay_rate: float = 1.0  # speed factor
     replay_loop: bool = False
+    replay_paused: bool = False  # as it was asked for, also before it begins
     position: float = 0.0  # s, in the replay
     duration: float = 0.0  # s
 
@@ -56,6 +58,22 @@ class SessionState:
     def is_busy(self) -> bool:
         """Whether a scene is being loaded, or nodes are starting."""
         return self.fraction < 1.0
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether the recorder says that it writes."""
+        return bool(self.record) and self.record_state == "recording"
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether a replay does not play yet."""
+        return bool(self.replay) and self.replay_state in ("starting", "waiting")
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether the replay goes on, or will as soon as it is ready."""
+        is_awaited = self.is_starting and not self.replay_paused
+        return is_awaited or self.replay_state == "playing"
 
     @classmethod
     def of(cls, status: DiagnosticStatus) -> SessionState:

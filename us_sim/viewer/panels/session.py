@@ -213,8 +213,9 @@ class _Session:
         self._file.set_enabled(not state.record)
         self._record.set_enabled(not state.record and state.replay_as == "path")
         self._stop.set_enabled(bool(state.record))
-        told, is_short = recorded(state)
-        self._recorded.set_text(f"recording to {state.record}{told}" if state.record else "")
+        told, is_short = recorded(state) if state.is_recording else ("", False)
+        begun = "recording to" if state.is_recording else f"{state.record_state}:"
+        self._recorded.set_text(f"{begun} {state.record}{told}" if state.record else "")
         self._recorded.classes(**{"add" if is_short else "remove": "us-wrong"})
         self._note.set_text(state.record_note)
         self._note.set_visibility(bool(state.record_note))
@@ -228,7 +229,7 @@ class _Session:
     def _follow(self, state: SessionState) -> None:
         """Show the replay as it is, also if it was changed elsewhere."""
         plays = bool(state.replay)
-        is_running = plays and state.replay_state == "playing"
+        is_running = plays and state.is_playing
         self._play.set_icon("pause" if is_running else "play_arrow")
         for control in (self._close, self._time):
             control.set_enabled(plays)
@@ -243,7 +244,8 @@ class _Session:
             self._sought = None
         if self._sought is None:
             self._time.set_value(min(state.position, state.duration) if plays else 0.0)
-        told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}"
+        held = ", paused when it is ready" if state.is_starting and state.replay_paused else ""
+        told = f"{state.position:.1f} of {state.duration:.1f} s, {state.replay_state}{held}"
         self._where.set_text(told if plays else "nothing is replayed")
         if not is_settled:
             return
@@ -283,7 +285,7 @@ class _Session:
             if state.replay_state == "finished":
                 await self._ask(replay_time=0.0, replay_paused=False)
             else:
-                await self._ask(replay_paused=state.replay_state == "playing")
+                await self._ask(replay_paused=state.is_playing)
         elif not chosen:
             ui.notify("choose a recording or a path first", type="info")
         else:
