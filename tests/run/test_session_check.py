@@ -13,14 +13,14 @@ from us_sim.recording.schemas import stamped
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import QosProfile
 from us_sim.recording.writer import BagWriter
-from us_sim.run.session_check import check, report
+from us_sim.run.session_check import check
 
 IMAGE = "/ultrasound/image"
 
 
 def findings(file):
     found = check(read_bag(file))
-    return found, [(each.kind, each.text) for each in found.findings if each.matters]
+    return found, [(each.kind, each.text) for each in found.findings]
 
 
 def of(messages, topic):
@@ -122,7 +122,7 @@ def shorten(messages):
 @pytest.mark.parametrize(
     ("change", "kinds", "told"),
     [
-        (remove("/probe/wrench", slice(30, 37)), "loss", "7 messages.* first after 0.485 s"),
+        (remove("/probe/wrench", slice(30, 37)), "loss", "lacks 7 messages"),
         (remove(IMAGE, slice(60, None)), "gap", "longest of 0.997 s at 0.986 s, while poses"),
         (remove(IMAGE, slice(None)), "gap", "1 gap, .* while poses came"),
         (list.clear, "index", "holds no message"),
@@ -160,20 +160,19 @@ def number_anew(messages):
 
 
 @pytest.mark.parametrize(
-    ("change", "said", "latency", "missing"),
+    ("change", "latency", "missing"),
     [
-        (later(86_400, 2, 3), "no latency is told", "-", 0),
-        (later(86_400, 3), "no latency is told", "-", 0),
-        (number_together, "", "1.00", None),
-        (number_anew, "", "1.00", 0),
+        (later(86_400, 2, 3), "-", 0),
+        (later(86_400, 3), "-", 0),
+        (number_together, "1.00", None),
+        (number_anew, "1.00", 0),
     ],
 )
-def test_what_is_only_unusual_is_whole(tmp_path, change, said, latency, missing):
+def test_what_is_only_unusual_is_whole(tmp_path, change, latency, missing):
     messages = press()
     change(messages)
     found = check(read_bag(write(tmp_path / "s.mcap", messages)))
-    assert found.is_whole
-    assert said in report(found)
+    assert not found.findings
     assert found.rows[1][2:5] == ("60.0", "0.02", latency)
     assert {each.missing for each in found.topics} == {missing}
 
@@ -241,7 +240,7 @@ def test_a_folder_that_holds_more_than_its_metadata_says(tmp_path):
     yaml.write_text(yaml.read_text().replace("message_count: 480", "message_count: 400", 1))
     ((kind, text),) = findings(tmp_path / "bag")[1]
     assert kind == "index"
-    assert "holds 480 messages where its metadata.yaml says 400" in text
+    assert "has 480 messages where its metadata.yaml says 400" in text
 
 
 def test_latched_messages_have_no_age_and_no_rate(tmp_path):

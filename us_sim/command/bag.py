@@ -92,7 +92,7 @@ def _check(args: argparse.Namespace) -> int:
 
     found = check(read_bag(args.file), late_progress(f"bag check {args.file.name}"))
     print(report(found))
-    return int(not found.is_whole)
+    return int(bool(found.findings))
 
 
 def _diff(args: argparse.Namespace) -> int:

@@ -95,10 +95,11 @@ class Bag:
             if missing := ", ".join(missing_files(self.path, self.metadata)):
                 text = f"{self.path / 'metadata.yaml'} names files that are not there: {missing}"
                 found.append(Fault(text))
-            if (lost := self.metadata.message_count - self.message_count) > 0:
+            if lost := self.metadata.message_count - self.message_count:
                 text = (
                     f"{self.path} has {self.message_count} messages where its metadata.yaml says "
-                    f"{self.metadata.message_count}: {lost} were lost"
+                    f"{self.metadata.message_count}: "
+                    f"{f'{lost} were lost' if lost > 0 else 'more were written since'}"
                 )
                 untold = max(lost - sum(fault.messages for fault in found), 0)
                 found.append(Fault(text, untold))
