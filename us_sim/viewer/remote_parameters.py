@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any
 
@@ -32,6 +32,38 @@ ABSENT = "is not running"
 ASKED = "is being asked for its parameters"
 SILENT = "does not answer what its parameters are"
 THERE = ""
+
+
+def answered(sentence: str) -> Future[str]:
+    """Return a future that holds the sentence already."""
+    told: Future[str] = Future()
+    told.set_result(sentence)
+    return told
+
+
+def set_together(client: AsyncParameterClient, parameters: Sequence[RosParameter]) -> Future[str]:
+    """Set all of these parameters, or none; the future holds why not, or nothing."""
+    name = client.remote_node_name.rpartition("/")[2]
+    if not client.services_are_ready():
+        return answered(f"{name} offers no parameters at present")
+    told: Future[str] = Future()
+
+    def on_answer(answer: Any) -> None:
+        result = answer.result().result
+        if not told.done():  # somebody waits still
+            told.set_result("" if result.successful else result.reason or f"{name} refuses it")
+
+    client.set_parameters_atomically(parameters).add_done_callback(on_answer)
+    return told
+
+
+async def in_time(told: Future[str], name: str) -> str:
+    """Await what a node says, or say that it says nothing."""
+    try:
+        return await asyncio.wait_for(asyncio.wrap_future(told), ANSWER_S)
+    except TimeoutError:
+        return f"{name} did not answer within {ANSWER_S:g} s"
+
 
 Door = Callable[..., "Future[str]"]
 """Sets parameters, given by name; the future holds why not, or nothing."""
@@ -86,23 +118,17 @@ class NodeParameters:
             return await self._send(parameter, parameter.raw_of(value))
         except SettingsError as error:
             return str(error)
-        except TimeoutError:
-            return f"{self.name} did not answer within {ANSWER_S:g} s"
 
     async def _send(self, parameter: Parameter, raw: Any) -> str:
         name = parameter.name
         if self._door is not None:
-            return await asyncio.wrap_future(self._door(**{name: raw}))
-        if self._client is None or not self._client.services_are_ready():
-            return f"{self.name} offers no parameters at present"
-        wanted = RosParameter(name, parameter.kind.value, raw)
-        async with asyncio.timeout(ANSWER_S):
-            results = (await _answer(self._client.set_parameters([wanted]))).results
-        if not results or not results[0].successful:
-            return (results and results[0].reason) or f"{self.name} refuses it"
-        if self.parameters.get(name) is parameter:  # nothing newer has come meanwhile
+            return await in_time(self._door(**{name: raw}), self.name)
+        assert self._client is not None  # which has told of the parameter
+        told = set_together(self._client, [RosParameter(name, parameter.kind.value, raw)])
+        refused = await in_time(told, self.name)
+        if not refused and self.parameters.get(name) is parameter:  # nothing newer has come
             self.parameters = {**self.parameters, name: parameter.with_raw(raw)}
-        return ""
+        return refused
 
     async def _follow(self, client: AsyncParameterClient) -> None:
         """Read the parameters, again whenever they are another process's, and follow changes."""

@@ -24,6 +24,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from us_sim.nodes.guarded_node import GuardedNode, Subscriptions, shown
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.scene.listing import ListedScene
+from us_sim.viewer.remote_parameters import answered, set_together
 from us_sim.viewer.status import Watched
 
 NOT_THERE = "us-sim does not run this simulation, so nothing can be loaded or recorded from here"
@@ -129,9 +130,7 @@ class SessionBoard(Watched):
             if self.folder and file:
                 values["record"] = str(PurePath(self.folder, str(file)))
             return self._send_to_control(values)
-        refused: Future[str] = Future()
-        refused.set_result(refusal or NOT_THERE)
-        return refused
+        return answered(refusal or NOT_THERE)
 
     def _refusal(self, values: Mapping[str, object]) -> str:
         """Why pages of other computers may not ask for this; "" where they may."""
@@ -153,7 +152,6 @@ CONTROL = "session_control"
 _EVERY_S = 0.5
 SILENT_S = 3.0
 """Without a word, after which nobody answers for the simulation: it says something every second."""
-ANSWER_S = 10.0  # for it to answer, which it may do late while it reads a scene
 
 
 class ViewerSession(SessionBoard):
@@ -174,7 +172,7 @@ class ViewerSession(SessionBoard):
         is_own: bool = True,
     ) -> None:
         super().__init__(lambda: post(self._listen), self._send, folder, is_own=is_own)
-        self._node, self._post = node, post
+        self._node = node
         self._name = f"{node.get_namespace().rstrip('/')}/{CONTROL}"
         self._subscriptions = Subscriptions(
             node,
@@ -186,7 +184,6 @@ class ViewerSession(SessionBoard):
         self._timer.cancel()
         self._client: AsyncParameterClient | None = None
         self._heard = 0.0
-        self._asked: list[tuple[Future[str], float]] = []  # and when that was
 
     def _listen(self) -> None:
         if self.is_watched and self._client is None:
@@ -208,36 +205,13 @@ class ViewerSession(SessionBoard):
 
     def _check(self) -> None:
         """Notice when nobody answers for the simulation any more."""
-        now = time.monotonic()
-        if self.state.is_there and now - self._heard > SILENT_S:
+        if self.state.is_there and time.monotonic() - self._heard > SILENT_S:
             self.state = SessionState()
-        for told, asked in self._asked:
-            if not told.done() and now - asked > ANSWER_S:
-                told.set_result(f"{CONTROL} has not answered for {ANSWER_S:g} s")
-        self._asked = [(told, asked) for told, asked in self._asked if not told.done()]
 
     def _send(self, values: Mapping[str, object]) -> Future[str]:
-        told: Future[str] = Future()
-        self._post(lambda: self._ask(values, told))
-        return told
-
-    def _ask(self, values: Mapping[str, object], told: Future[str]) -> None:
-        if self._client is None or not self._client.services_are_ready():
-            told.set_result(NOT_THERE)
-            return
-        self._asked.append((told, time.monotonic()))
-        parameters = [Parameter(name, value=value) for name, value in values.items()]
-        answer = self._client.set_parameters_atomically(parameters)
-        answer.add_done_callback(lambda done: _tell(told, done))
-
-
-def _tell(told: Future[str], answer: Any) -> None:
-    if told.done():
-        return
-    try:
-        told.set_result(answer.result().result.reason)
-    except Exception as error:  # whatever the middleware raises
-        told.set_result(f"{CONTROL} cannot be asked: {error}")
+        if self._client is None:
+            return answered(NOT_THERE)
+        return set_together(self._client, [Parameter(n, value=v) for n, v in values.items()])
 
 
 def _scene_of(status: DiagnosticStatus) -> ListedScene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from datetime import datetime
@@ -13,7 +12,8 @@ from nicegui import ui
 
 from us_sim.scene.listing import ListedScene
 from us_sim.viewer.panels.controls import WhileShown
-from us_sim.viewer.session import NOT_THERE, SessionState
+from us_sim.viewer.remote_parameters import in_time
+from us_sim.viewer.session import CONTROL, NOT_THERE, SessionState
 from us_sim.viewer.stream import Simulator
 
 AGAIN = "Ends the scene that runs, and starts it anew, without what was set in it"
@@ -94,7 +94,7 @@ class _Cases:
         state = self._board.state
         if state.record and not await self._is_sure(scene, state.record):
             return
-        refused = await asyncio.wrap_future(self._board.ask(scene=scene.origin))
+        refused = await in_time(self._board.ask(scene=scene.origin), CONTROL)
         if refused:
             ui.notify(refused, type="warning", multi_line=True)
 
@@ -319,7 +319,7 @@ class _Session:
         """Ask for it; whether that was taken."""
         self._asking += 1
         try:
-            refused = await asyncio.wrap_future(self._board.ask(**values))
+            refused = await in_time(self._board.ask(**values), CONTROL)
         finally:
             self._asking -= 1
             self._answered = time.monotonic()
