@@ -1,8 +1,8 @@
-"""Exponential, logarithm, adjoint and interpolation by their axioms, and against SciPy."""
+"""Exponential, adjoint and interpolation by their axioms, and against SciPy."""
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -38,21 +38,6 @@ def hat(twist):
 @given(twists)
 def test_exp_is_the_matrix_exponential(twist):
     np.testing.assert_allclose(se3.exp(twist).matrix, expm(hat(twist)), atol=1e-12)
-
-
-@quick
-@given(twists)
-@example(np.array([0.1, 0.2, 0.3, np.pi, 0.0, 0.0]))
-def test_exp_undoes_log(twist):
-    pose = se3.exp(twist)
-    again = se3.exp(se3.log(pose))
-    np.testing.assert_allclose(again.matrix, pose.matrix, atol=1e-12)
-
-
-@quick
-@given(twists.filter(lambda t: np.linalg.norm(t[3:]) < np.pi - 1e-4))
-def test_log_undoes_exp(twist):
-    np.testing.assert_allclose(se3.log(se3.exp(twist)), twist, atol=1e-11)
 
 
 @quick
@@ -116,4 +101,6 @@ def test_interpolation_takes_the_shorter_way_whatever_the_quaternions_sign():
     turned = se3.exp(np.array([0.0, 0, 0, 0, 0, np.radians(80)]))
     flipped = Pose(turned.position, -turned.orientation)
     half = se3.interpolate(Pose(), flipped, 0.5)
-    np.testing.assert_allclose(np.degrees(se3.log(half)[3:]), [0, 0, 40], atol=1e-12)
+    np.testing.assert_allclose(
+        np.degrees(se3.rotation_log(half.orientation)), [0, 0, 40], atol=1e-12
+    )

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from us_sim.geometry.se3 import log
+from us_sim.geometry.se3 import rotation_log
 from us_sim.tracking.robot import Robot, RobotSettings
 
 RATE = 250.0  # steps a second, many within a delay
@@ -77,7 +77,9 @@ def test_no_command_takes_the_arm_beyond_its_limits(commands):
         assert -settings.lift <= z <= settings.press
         angle = 2 * math.acos(min(abs(pose.orientation[3]), 1.0))
         assert angle <= settings.lean + 1e-9
-        moved = log(before.inverse() @ pose) / min(passed, 0.1)
+        step = before.inverse() @ pose
+        turn = rotation_log(step.orientation)
+        moved = np.concatenate([step.position, turn]) / min(passed, 0.1)
         assert np.linalg.norm(moved[:3]) <= settings.speed * (1 + 1e-6)
         assert np.linalg.norm(moved[3:]) <= settings.angular_speed * (1 + 1e-6)
         before, velocity = pose, moved

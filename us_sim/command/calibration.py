@@ -236,7 +236,7 @@ def _read(photo: Path) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-_TABLES = {".csv", ".txt", ".xml"}
+_TABLES = {".csv", ".txt"}
 
 
 def calibrate_tip(settings: PivotSettings, _: Progress | None = None) -> str:

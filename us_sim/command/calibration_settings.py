@@ -82,9 +82,7 @@ class PivotSettings(CalibrationSettings):
 class LandmarkSettings(CalibrationSettings):
     """Where the tracker or the probe is, from points touched."""
 
-    known: Path = setting(
-        description="landmarks in the patient's frame: CSV name,x,y,z or Plus' XML"
-    )
+    known: Path = setting(description="landmarks in the patient's frame: CSV name,x,y,z")
     measured: Path = setting(
         description="the same as the tracker measured them: CSV, or a recording of the stylus that "
         "touched them in the file's order"

@@ -111,15 +111,22 @@ class Pose:
 
     def __matmul__(self, other: Pose) -> Pose:
         """The transform that does ``other`` first, then this."""
-        x1, y1, z1, w1 = self.orientation
-        x2, y2, z2, w2 = other.orientation
-        product = [
+        turn = product(self.orientation, other.orientation)
+        return Pose(self.rotation @ other.position + self.position, turn)
+
+
+def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternion (4,) x, y, z, w that rotates by the second, then by the first."""
+    x1, y1, z1, w1 = first.tolist()
+    x2, y2, z2, w2 = second.tolist()
+    return np.array(
+        [
             w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
             w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
             w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
             w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
         ]
-        return Pose(self.rotation @ other.position + self.position, np.array(product))
+    )
 
 
 def same_pose(a: Pose | None, b: Pose | None) -> bool:

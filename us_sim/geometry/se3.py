@@ -1,16 +1,16 @@
-"""Rigid motions as vectors: exponential, logarithm, adjoint and interpolation on SE(3).
+"""Rigid motions as vectors: exponential, adjoint and interpolation on SE(3).
 
 A twist is (6,): translation (m), then rotation (rad), the order of a measurement's covariance.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, sin, sqrt, tan
+from math import atan2, cos, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, product
 
 _SMALL = 1e-3  # rad: below it series to the fourth order are exact to rounding
 
@@ -19,12 +19,6 @@ def exp(twist: NDArray[np.float64]) -> Pose:
     """The motion of a twist (6,) m, rad, done for one unit of time (Barfoot 2017, 7.86)."""
     rotation = twist[3:]
     return Pose(left_jacobian(rotation) @ twist[:3], rotation_exp(rotation))
-
-
-def log(pose: Pose) -> NDArray[np.float64]:
-    """The twist (6,) m, rad, of at most half a turn whose exponential is the pose."""
-    rotation = rotation_log(pose.orientation)
-    return np.concatenate([_inverse_left_jacobian(rotation) @ pose.position, rotation])
 
 
 def adjoint(pose: Pose) -> NDArray[np.float64]:
@@ -72,20 +66,6 @@ def rotation_between(
     return rotation_log(product(second, np.array([-x, -y, -z, w])))
 
 
-def product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternion (4,) x, y, z, w that rotates by the second, then by the first."""
-    x1, y1, z1, w1 = first.tolist()
-    x2, y2, z2, w2 = second.tolist()
-    return np.array(
-        [
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-        ]
-    )
-
-
 def left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) J: exp(v + d) is exp(J d) exp(v) to the first order in d (Barfoot 2017, 7.37)."""
     x, y, z = vector.tolist()
@@ -110,16 +90,3 @@ def cross_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) matrix that takes any u to vector × u."""
     x, y, z = vector.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def _inverse_left_jacobian(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) inverse of the left Jacobian, by half angles so that half a turn is no exception."""
-    square = float(vector @ vector)
-    angle = sqrt(square)
-    if angle < _SMALL:
-        second = 1.0 / 12.0 + square / 720.0
-    else:
-        second = (1.0 - 0.5 * angle / tan(0.5 * angle)) / square
-    cross = cross_matrix(vector)
-    matrix: NDArray[np.float64] = np.eye(3) - 0.5 * cross + second * (cross @ cross)
-    return matrix

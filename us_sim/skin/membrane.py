@@ -36,7 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.collider import Collider
-from us_sim.geometry.collider_distance import offset_box_distance, signed_distance
+from us_sim.geometry.collider_distance import (
+    offset_box_distance,
+    rotate,
+    rotate_back,
+    signed_distance,
+)
 from us_sim.geometry.pose import Pose, same_pose
 from us_sim.geometry.triangles import TriangleParts, part_size, vertex_normals
 from us_sim.kernels import njit
@@ -73,37 +78,6 @@ def spring_forces(force, x, rest, edges, natural_length, rest_tension, stiffness
         force[j, 0] -= fx
         force[j, 1] -= fy
         force[j, 2] -= fz
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def spring_energy(x, v, rest, edges, natural_length, rest_tension, stiffness, anchor, mass):
-    """J, energy of motion, anchors and springs, less that of the springs at rest."""
-    total = 0.0
-    for i in range(len(x)):
-        for a in range(3):
-            total += 0.5 * mass[i] * v[i, a] ** 2 + 0.5 * anchor * (x[i, a] - rest[i, a]) ** 2
-    for e in range(len(edges)):
-        i = edges[e, 0]
-        j = edges[e, 1]
-        length = 0.0
-        at_rest = 0.0
-        work = 0.0
-        for a in range(3):
-            length += (x[j, a] - x[i, a]) ** 2
-            at_rest += (rest[j, a] - rest[i, a]) ** 2
-            work += rest_tension[e, a] * (x[j, a] - x[i, a] - rest[j, a] + rest[i, a])
-        stored = _stored(np.sqrt(length), natural_length[e])
-        total += stiffness * (stored - _stored(np.sqrt(at_rest), natural_length[e]) - work)
-    return total
-
-
-@njit(inline="always", error_model="numpy")
-def _stored(length, natural_length):
-    if length >= SHORTEST * natural_length:
-        return 0.5 * (length - natural_length) ** 2
-    slope = 1.0 / SHORTEST - 1.0
-    at_shortest = 0.5 * ((1.0 - SHORTEST) * natural_length) ** 2
-    return at_shortest + 0.5 * slope * ((SHORTEST * natural_length) ** 2 - length**2)
 
 
 class PartArrays(NamedTuple):
@@ -191,18 +165,10 @@ def _place(start, end, fraction):
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _distance(box, r, a, b, c):
     """Distance (m) and the collider's normal at a place (a, b, c) m from the probe's origin."""
-    distance, lx, ly, lz = offset_box_distance(
-        box,
-        r[0, 0] * a + r[1, 0] * b + r[2, 0] * c,
-        r[0, 1] * a + r[1, 1] * b + r[2, 1] * c,
-        r[0, 2] * a + r[1, 2] * b + r[2, 2] * c,
-    )
-    return (
-        distance,
-        r[0, 0] * lx + r[0, 1] * ly + r[0, 2] * lz,
-        r[1, 0] * lx + r[1, 1] * ly + r[1, 2] * lz,
-        r[2, 0] * lx + r[2, 1] * ly + r[2, 2] * lz,
-    )
+    x, y, z = rotate_back(r, a, b, c)
+    distance, nx, ny, nz = offset_box_distance(box, x, y, z)
+    nx, ny, nz = rotate(r, nx, ny, nz)
+    return distance, nx, ny, nz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -344,22 +310,11 @@ class SkinMembrane:
             TriangleSurface(np.eye(3), np.array([[0, 1, 2]], dtype=np.int32)), self._collider
         )
         small.deform(Pose())
-        small.energy()
 
     @property
     def velocity(self) -> NDArray[np.float64]:
         """(N, 3) m/s, of the vertices at the end of the latest frame."""
         return self._velocity.copy()
-
-    def energy(self) -> float:
-        """J, of the springs, the anchors and the motion; 0 at rest."""
-        return float(
-            spring_energy(
-                *(self._vertices, self._velocity, self.surface.vertices, self._edges),
-                *(self._natural_length, self._rest_tension, self._stiffness, self._anchor),
-                self.mass,
-            )
-        )
 
     def deform(self, pose: Pose | None) -> SkinDeformation:
         """The skin one frame later, with the probe moved to ``pose``, or away where it is None.

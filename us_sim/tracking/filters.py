@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import cross_matrix, left_jacobian, product, rotation_between, rotation_exp
+from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.se3 import cross_matrix, left_jacobian, rotation_between, rotation_exp
 from us_sim.settings.registry import FILTERS
 from us_sim.settings.setting import Settings
 from us_sim.tracking.measurement import Measurement

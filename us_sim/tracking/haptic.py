@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry import se3
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, product
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import HapticSettings
 
@@ -186,6 +186,8 @@ _STORED = 2.0
 """Energy returned to the handle at most, over what the model says the tissue has stored, so that
 energy that was lost meanwhile does not come back as a kick."""
 
+_JUMP, _ROTATION_JUMP = 0.01, 0.3  # m and rad: the handle moves no farther between two poses
+_REACH, _ROTATION_REACH = 0.02, 0.5  # m and rad from a model's pose, beyond which it says nothing
 _DAMPING = 10.0  # N s/m, the strongest damping by which energy returned in excess is taken back
 
 
@@ -312,9 +314,9 @@ class HapticRendering:
             if self._poses:
                 motion = _motion(self._poses[-1], pose)
                 distance, turn = _lengths(motion)
-                if distance > self._settings.jump:
+                if distance > _JUMP:
                     doubt = f"the handle has jumped by {1e3 * distance:.1f} mm"
-                elif turn > self._settings.rotation_jump:
+                elif turn > _ROTATION_JUMP:
                     doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
                 else:
                     self._motion = self._motion + motion
@@ -376,9 +378,9 @@ class HapticRendering:
     def _far(self, moved: NDArray[np.float64]) -> str:
         """A doubt about a model made at a displacement (6,) m, rad, or an empty text."""
         distance, turn = _lengths(moved)
-        if distance > self._settings.model_reach:
+        if distance > _REACH:
             return f"the probe is {1e3 * distance:.1f} mm from where the contact is known"
-        if turn > self._settings.model_rotation_reach:
+        if turn > _ROTATION_REACH:
             return f"the probe is turned {math.degrees(turn):.0f}° from where the contact is known"
         return ""
 
@@ -499,12 +501,12 @@ class HapticDevice:
         if not held and self._held is not None and self._last is not None:
             x, y, z, w = self._last.orientation
             self._offset = self._held.position - self._scale * self._last.position
-            self._regrip = se3.product(np.array([-x, -y, -z, w]), self._held.orientation)
+            self._regrip = product(np.array([-x, -y, -z, w]), self._held.orientation)
             self._held = None
         self.is_held = held
 
     def _body(self, pose: Pose) -> Pose:
-        turned = se3.product(pose.orientation, self._regrip)
+        turned = product(pose.orientation, self._regrip)
         return Pose(self._scale * pose.position + self._offset, turned)
 
     def probe_moved(self, probe: Pose, before: Pose, now: Pose) -> NDArray[np.float64]:

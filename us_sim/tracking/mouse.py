@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.geometry import se3
-from us_sim.geometry.pose import Pose
+from us_sim.geometry.pose import Pose, product
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import SixDofMouseSettings
 
@@ -139,7 +139,7 @@ class SixDofMouse:
         turn = se3.rotation_exp(twist[3:])
         if self._settings.frame == "probe":
             return pose @ Pose(twist[:3], turn)
-        return Pose(pose.position + twist[:3], se3.product(turn, pose.orientation))
+        return Pose(pose.position + twist[:3], product(turn, pose.orientation))
 
     def _within(self, pose: Pose) -> Pose:
         """The pose, in the workspace."""

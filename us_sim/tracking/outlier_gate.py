@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from enum import Enum
-from math import degrees, exp, sqrt
+from math import degrees, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import GateSettings
 
 _DIAGONAL = np.diag_indices(6)
+_LIMIT = 38.26  # of chi-square with six degrees of freedom: one right pose in a million is more
 
 
 class Verdict(Enum):
@@ -52,7 +53,6 @@ class OutlierGate:
 
     def __init__(self, settings: GateSettings) -> None:
         self._settings = settings
-        self._limit = _chi_square_limit(settings.confidence)
         self.reset()
 
     def reset(self) -> None:
@@ -98,15 +98,15 @@ class OutlierGate:
         difference = np.concatenate([pose.position - before.pose.position, turn])
         covariance = before.covariance + measurement.covariance
         speeds = [settings.maximum_speed] * 3 + [settings.maximum_angular_speed] * 3
-        covariance[_DIAGONAL] += np.square(speeds) * (2.0 * step * step / self._limit)
+        covariance[_DIAGONAL] += np.square(speeds) * (2.0 * step * step / _LIMIT)
         distance = float(difference @ np.linalg.solve(covariance, difference))
-        if 0.0 <= distance <= self._limit:
+        if 0.0 <= distance <= _LIMIT:
             return ""
         return (
             f"the pose is {1e3 * _norm(difference[:3]):.1f} mm and "
             f"{degrees(_norm(difference[3:])):.1f}° from the one before: "
             f"Mahalanobis distance {sqrt(max(distance, 0.0)):.1f}, the limit is "
-            f"{sqrt(self._limit):.1f}"
+            f"{sqrt(_LIMIT):.1f}"
         )
 
     def _time_to_move(self, before: Measurement, measurement: Measurement) -> float:
@@ -139,17 +139,3 @@ class OutlierGate:
 
 def _norm(vector: NDArray[np.float64]) -> float:
     return sqrt(float(vector @ vector))
-
-
-def _chi_square_limit(confidence: float) -> float:
-    """The quantile of chi-square with six degrees of freedom at a confidence.
-
-    The probability above x is exp(-y) (1 + y + y² / 2), y = x / 2 (Abramowitz and Stegun, 26.4.21).
-    SciPy has the quantile too, but takes half a second to import.
-    """
-    low, high = 0.0, 100.0
-    for _ in range(60):
-        y = 0.5 * (low + high)
-        above = exp(-y) * (1.0 + y + 0.5 * y * y)
-        low, high = (y, high) if above > 1.0 - confidence else (low, y)
-    return low + high

@@ -27,8 +27,8 @@ from collections import Counter, deque
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import adjoint, product
+from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.se3 import adjoint
 from us_sim.tracking.filters import PoseFilter
 from us_sim.tracking.measurement import Measurement, TrackingClock, TrackingState
 from us_sim.tracking.outlier_gate import OutlierGate, Verdict

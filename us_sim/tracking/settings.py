@@ -159,11 +159,6 @@ class GateSettings(Settings):
         "turn between two poses that is allowed beside what the angular speed allows",
         default=math.radians(5),
     )
-    confidence: float = setting(
-        Quantity("number", 0.5, 1 - 1e-12),
-        "fraction of right poses with a covariance that are believed",
-        default=0.999999,
-    )
     accept_after: int = setting(
         Quantity("number", 2, 10_000),
         "so many refused poses in a row that agree with each other are the new place",
@@ -221,26 +216,6 @@ class HapticSettings(Settings):
         Quantity("time", 5e-3, 5.0),
         "age of the model of the contact from which on the wrench is zero",
         default=0.3,
-    )
-    jump: float = setting(
-        Quantity("length", 1e-4, 1.0),
-        "movement of the handle between two poses, beyond which the wrench is zero",
-        default=0.01,
-    )
-    rotation_jump: float = setting(
-        Quantity("angle", 1e-3, 3.0),
-        "turn of the handle between two poses, beyond which the wrench is zero",
-        default=0.3,
-    )
-    model_reach: float = setting(
-        Quantity("length", 1e-4, 1.0),
-        "distance of the probe from where the contact is known, beyond which the wrench is zero",
-        default=0.02,
-    )
-    model_rotation_reach: float = setting(
-        Quantity("angle", 1e-3, 3.0),
-        "turn of the probe from where the contact is known, beyond which the wrench is zero",
-        default=0.5,
     )
 
 

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import MeshError, PoseError
-from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import product, rotation_exp
+from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.se3 import rotation_exp
 
 _STEP = 1e-3
 """m: a way over the surface is walked in steps of this, each along the tangent where it begins."""

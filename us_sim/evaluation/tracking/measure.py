@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from us_sim.evaluation.report import percentile
 from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, Case, Marker
-from us_sim.geometry.pose import Pose
-from us_sim.geometry.se3 import product, rotation_between, rotation_exp
+from us_sim.geometry.pose import Pose, product
+from us_sim.geometry.se3 import rotation_between, rotation_exp
 from us_sim.tracking.camera.body_pose import body_poses, rotation_angle
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector
 from us_sim.tracking.camera.markers import dictionary, square

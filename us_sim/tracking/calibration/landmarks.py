@@ -1,8 +1,8 @@
-"""Point registration by landmarks, and their files: CSV with a header, and Plus' phantoms (XML).
+"""Point registration by landmarks, and their files: CSV with a header.
 
-Horn (1987), Closed-form solution of absolute orientation, by singular values as Arun (1987) and
-Umeyama (1991) do, without scale. FRE is the fiducial, TRE the target registration error
-(Fitzpatrick 1998); the latter is measured by leaving each landmark out once.
+Horn (1987), Closed-form solution of absolute orientation, by singular values. FRE is the fiducial,
+TRE the target registration error (Fitzpatrick 1998); the latter is measured by leaving each
+landmark out once.
 
 >>> from us_sim.tracking.calibration.landmarks import register_landmarks
 >>> phantom = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
@@ -13,21 +13,20 @@ array([0.5, 0.5, 0.5])
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
+from us_sim.geometry.se3 import cross_matrix
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.text_files import read_bytes, read_text
 
 Array = NDArray[np.float64]
 
@@ -122,12 +121,8 @@ def _check_fit(
 
 def _fit(measured: Array, known: Array) -> Pose:
     from_middle, to_middle = measured.mean(axis=0), known.mean(axis=0)
-    left, _, right = np.linalg.svd((known - to_middle).T @ (measured - from_middle))
-    proper = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
-    matrix = np.eye(4)
-    matrix[:3, :3] = left @ proper @ right
-    matrix[:3, 3] = to_middle - matrix[:3, :3] @ from_middle
-    return Pose.from_matrix(matrix)
+    turn, _ = Rotation.align_vectors(known - to_middle, measured - from_middle)
+    return Pose(to_middle - turn.apply(from_middle), turn.as_quat())
 
 
 def _leave_one_out(measured: Array, known: Array) -> Array:
@@ -148,85 +143,50 @@ def _deviations(known: Array, origin: Array, residuals: Array) -> Array:
     count = len(known)
     # A rotation w about the landmarks' middle moves a landmark by w × (landmark - middle).
     middle = known.mean(axis=0)
-    inertia = sum(_cross(point).T @ _cross(point) for point in known - middle)
+    inertia = sum(cross_matrix(point).T @ cross_matrix(point) for point in known - middle)
     variance = float((residuals**2).sum()) / (3 * count - 6)
     rotation = variance * np.linalg.inv(np.asarray(inertia))
-    lever = _cross(origin - middle)
+    lever = cross_matrix(origin - middle)
     position = variance / count * np.eye(3) + lever @ rotation @ lever.T
     return np.sqrt(np.concatenate([np.diag(position), np.diag(rotation)]))
-
-
-def _cross(vector: Array) -> Array:
-    """(3, 3) matrix whose product is the cross product with a vector."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 _LENGTH = Quantity("length")
 
 
 def read_landmarks(path: str | Path) -> dict[str, Array]:
-    """Points (3,) m by name, in the file's order.
+    """Read points (3,) m by name, in the file's order.
 
     Args:
-        path: a CSV with the columns name, x, y, z (metres, or with a unit: 12 mm), or a Plus
-            configuration with the Landmark elements of a phantom.
+        path: a CSV with the columns name, x, y, z (metres, or with a unit: 12 mm).
 
     Raises:
         CalibrationError: the file cannot be read, names a landmark twice or has none.
     """
     path = Path(path)
+    try:
+        table = pd.read_csv(path, dtype=str, skipinitialspace=True, encoding="utf-8-sig")
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, ValueError) as error:
+        raise CalibrationError(f"{path}: is no CSV: {error}") from error
+    table = table.rename(columns=str.strip).fillna("")
+    missing = [name for name in ("name", *"xyz") if name not in table]
+    if missing:
+        raise CalibrationError(
+            f"{path}: has no column {missing[0]}; its first line must be name,x,y,z"
+        )
     named: dict[str, Array] = {}
-    for name, point in _phantom(path) if path.suffix.lower() == ".xml" else _table(path):
+    for row in table.to_dict("records"):
+        name = row["name"].strip()
         if not name:
             raise CalibrationError(f"{path}: a landmark has no name; name all of them")
         if name in named:
             raise CalibrationError(f"{path}: landmark {name} is there twice; name each only once")
-        named[name] = point
+        try:
+            named[name] = np.array([_LENGTH.parse(row[axis]) for axis in "xyz"])
+        except ValueError as error:
+            raise CalibrationError(f"{path}: landmark {name}: {error}") from error
     if not named:
         raise CalibrationError(f"{path}: holds no landmark")
     return named
-
-
-def _table(path: Path) -> Iterator[tuple[str, Array]]:
-    """Names and points (3,) m of a CSV."""
-    try:
-        reader = csv.DictReader(io.StringIO(read_text(path, "utf-8-sig")), skipinitialspace=True)
-        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
-        missing = [name for name in ("name", *"xyz") if name not in reader.fieldnames]
-        if missing:
-            raise CalibrationError(
-                f"{path}: has no column {missing[0]}; its first line must be name,x,y,z"
-            )
-        for row in reader:
-            try:
-                point = np.array([_LENGTH.parse(row[axis] or "") for axis in "xyz"])
-            except ValueError as error:
-                raise CalibrationError(f"{path}: line {reader.line_num}: {error}") from error
-            yield (row["name"] or "").strip(), point
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise CalibrationError(f"{path}: is no CSV: {error}") from error
-
-
-def _phantom(path: Path) -> Iterator[tuple[str, Array]]:
-    """Names and points (3,) m of a configuration of Plus, which has them in mm."""
-    try:
-        root = ElementTree.fromstring(read_bytes(path))
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
-    except ElementTree.ParseError as error:
-        raise CalibrationError(f"{path}: is not XML: {error}") from error
-    for element in root.iter("Landmark"):
-        name, text = element.get("Name", ""), element.get("Position", "")
-        try:
-            x, y, z = map(float, text.split())
-        except ValueError:
-            x = y = z = math.nan
-        point = 1e-3 * np.array([x, y, z])
-        if not np.isfinite(point).all():
-            raise CalibrationError(
-                f"{path}: landmark {name}: Position must be 3 numbers in millimetres, not {text!r}"
-            )
-        yield name, point

@@ -91,9 +91,8 @@ def _swing(rotations: Array) -> float:
 _FEWEST = 10  # poses
 _SMALLEST_SWING = math.radians(5.0)  # of the direction that moves least, root mean square
 _LARGEST_RMS = 5e-3  # m, above which the tip did not stay in one place
-_TRIALS = 300
-_SAMPLE = 4  # poses a trial: two leave the tip free along their common axis
-_JUDGES = 1000  # poses that tell a trial's worth
+_ROUNDS = 30
+_EXACT = 1e-14  # m², a distance that counts as none
 _MEDIAN_SQUARE = 2.366  # median of chi-square with three degrees of freedom
 _LARGEST_SQUARE = 16.27  # its 99.9th percentile
 
@@ -118,8 +117,8 @@ class PivotCalibration:
 def calibrate_pivot(poses: Sequence[Pose]) -> PivotCalibration:
     """The tip that stays in one place, from poses of the body in the device's frame.
 
-    Up to about 40 % of the poses may be wrong (the tip slipped, the tracker saw a reflection):
-    a least median of squares start (Rousseeuw 1984) leaves them out.
+    A third of the poses may be wrong (the tip slipped, the tracker saw a reflection): a start by
+    the least sum of distances leaves them out.
 
     Raises:
         CalibrationError: there are too few poses, they turn about one axis only, or the tip did
@@ -165,34 +164,31 @@ def _check_swing(rotations: Array) -> float:
     return swing
 
 
-def _least_squares(rotations: Array, positions: Array) -> tuple[Array, Array, float]:
+def _least_squares(
+    rotations: Array, positions: Array, weights: Array | float = 1.0
+) -> tuple[Array, Array, float]:
     """Tip and fixed point (6,), their covariance (6, 6), and the root mean square distance."""
     count = len(rotations)
-    rows = np.empty((count, 3, 6))
-    rows[:, :, :3] = rotations
-    rows[:, :, 3:] = -np.eye(3)
-    matrix = rows.reshape(-1, 6)
-    solution = np.asarray(np.linalg.lstsq(matrix, -positions.ravel(), rcond=None)[0], np.float64)
-    squares = float(((matrix @ solution + positions.ravel()) ** 2).sum())
+    rows = np.concatenate([rotations, np.tile(-np.eye(3), (count, 1, 1))], axis=2)
+    scale = np.sqrt(np.broadcast_to(weights, count))
+    matrix = (rows * scale[:, None, None]).reshape(-1, 6)
+    right = -(positions * scale[:, None]).ravel()
+    solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], np.float64)
+    squares = float(((matrix @ solution - right) ** 2).sum())
     covariance = np.linalg.inv(matrix.T @ matrix) * squares / (3 * count - 6)
     return solution, covariance, math.sqrt(squares / count)
 
 
 def _consistent(rotations: Array, positions: Array) -> NDArray[np.bool_]:
-    """(K,) which poses agree with most others on a fixed point."""
-    rng = np.random.default_rng(0)  # the same poses, the same answer
-    # Every so many poses judge as well as all, in less memory.
-    judges = slice(None, None, -(-len(rotations) // _JUDGES))
-    chosen = rng.random((_TRIALS, len(rotations))).argpartition(_SAMPLE, axis=1)[:, :_SAMPLE]
-    means = rotations[chosen].mean(axis=1)
-    lengths = np.linalg.svd(means, compute_uv=False)[:, 0]
-    wide = lengths < 1.0 - _SMALLEST_SWING**2 / 8
-    solutions = _solve(means[wide], rotations[chosen[wide]], positions[chosen[wide]])
-    tips = np.einsum("kij,tj->tki", rotations[judges], solutions[:, :3]) + positions[judges]
-    medians = np.median(((tips - solutions[:, None, 3:]) ** 2).sum(axis=2), axis=1)
-    if not len(medians):
-        return np.ones(len(rotations), dtype=np.bool_)
-    squares = _squared_distances(rotations, positions, solutions[int(medians.argmin())])
+    """(K,) which poses agree with most others on a fixed point.
+
+    The least sum of distances, by weights of their inverses (Weiszfeld 1937), is the start.
+    """
+    weights = np.ones(len(rotations))
+    for _ in range(_ROUNDS):
+        solution = _least_squares(rotations, positions, weights)[0]
+        squares = _squared_distances(rotations, positions, solution)
+        weights = 1.0 / np.sqrt(squares + _EXACT)
     inliers = _near(squares)
     for _ in range(10):
         solution = _least_squares(rotations[inliers], positions[inliers])[0]
@@ -201,20 +197,6 @@ def _consistent(rotations: Array, positions: Array) -> NDArray[np.bool_]:
             break
         inliers = again
     return inliers
-
-
-def _solve(means: Array, rotations: Array, positions: Array) -> Array:
-    """(T, 6) tip and fixed point of T samples: rotations (T, S, 3, 3), positions (T, S, 3).
-
-    By the normal equations without the fixed point c = mean(R) t + mean(p):
-    (I - mean(R)ᵀ mean(R)) t = mean(R)ᵀ mean(p) - mean(Rᵀ p).
-    """
-    middles = positions.mean(axis=1)
-    turned = np.einsum("tsji,tsj->ti", rotations, positions) / rotations.shape[1]
-    right = np.einsum("tji,tj->ti", means, middles) - turned
-    left = np.eye(3) - means.transpose(0, 2, 1) @ means
-    tips = np.linalg.solve(left, right[..., None])
-    return np.concatenate([tips, means @ tips + middles[..., None]], axis=1)[..., 0]
 
 
 def _squared_distances(rotations: Array, positions: Array, solution: Array) -> Array:

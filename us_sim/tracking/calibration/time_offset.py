@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
+from scipy.stats import siegelslopes
 
 from us_sim.errors import CalibrationError
 
@@ -32,7 +33,6 @@ _ENOUGH_COLUMNS = 150
 _FAINTEST = 0.3  # of the brightest columns' brightness, that still shows the line
 _LEAST_CONTRAST = 20.0  # grey levels of the line above the image's median
 _REACH = 4  # rows on each side of the brightest that make the line's middle
-_TRIALS = 150
 _FEWEST_FRAMES = 0.5  # of all, that must show the line
 
 
@@ -88,8 +88,8 @@ def signal_of_images(
 def line_row(image: NDArray[np.uint8]) -> float:
     """The row (pixels, to a part of one) where a bright line crosses the image's middle column.
 
-    The brightest place of every column, and the line through most of them (least median of
-    squares, Rousseeuw 1984). nan where there is no line.
+    The brightest place of every column, and the line of repeated medians through them (Siegel
+    1982). nan where there is no line.
     """
     smooth = cv2.GaussianBlur(image, (1, 5), 0).astype(np.float64)
     peaks = smooth.argmax(axis=0)
@@ -104,22 +104,7 @@ def line_row(image: NDArray[np.uint8]) -> float:
     weights = image[around, lit].astype(np.float64)
     rows = (weights * around).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
     middle = 0.5 * (image.shape[1] - 1)
-    return _line_through_most(lit - middle, rows)
-
-
-def _line_through_most(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """The height at x = 0 of the line that most points lie on."""
-    rng = np.random.default_rng(0)  # the same image, the same row
-    first, second = rng.integers(len(x), size=(2, _TRIALS))
-    apart = np.abs(x[first] - x[second]) > 0.1 * np.ptp(x)
-    first, second = first[apart], second[apart]
-    slopes = (y[second] - y[first]) / (x[second] - x[first])
-    heights = y[first] - slopes * x[first]
-    errors = np.abs(y - slopes[:, None] * x - heights[:, None])
-    medians = np.median(errors, axis=1)
-    best = int(medians.argmin())
-    near = errors[best] <= max(4.0 * float(medians[best]), 0.5)
-    return float(np.polynomial.polynomial.polyfit(x[near], y[near], 1)[0])
+    return float(siegelslopes(rows, lit - middle).intercept)
 
 
 def _ascending(
