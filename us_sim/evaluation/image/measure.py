@@ -3,8 +3,6 @@
 >>> from us_sim.evaluation.image.measure import row_of, lost
 >>> round(row_of("attenuation", "linear", 20.0, 0.01, -6.0, -6.1, "dB")["error_percent"], 2)
 -1.14
->>> round(row_of("strain", "linear", 0.0, 0.02, 0.04, 0.0404, "")["error_percent"], 2)
-1.0
 >>> down = np.array([0.0, 0.0, 1.0])
 >>> float(lost(np.zeros(3), down, np.array([0.01]), 5e6)[0].round(3))  # 1 cm of liver
 -4.5
@@ -35,23 +33,18 @@ def row_of(
     expected: float,
     measured: float,
     unit: str,
-    *,
-    of: float | None = None,
-    ms: float = float("nan"),
 ) -> dict[str, Any]:
     """Row of one expected number, and the one that the image shows.
 
     Args:
         artefact: a word, or several with underscores.
         tilt: degrees. depth: m.
-        of: whole of which the error is a fraction; None is the expected value, of pixels one; the
-            error of levels in dB is that of the amplitude.
-        ms: processor time of an image, where that was measured.
+        unit: the error of levels in dB is that of the amplitude, of pixels in hundredths of one.
     """
     if unit == "dB":
         error = 100.0 * (10.0 ** ((measured - expected) / 20.0) - 1.0)
     else:
-        whole = of or (1.0 if unit == "px" else abs(expected))
+        whole = 1.0 if unit == "px" else abs(expected)
         error = 100.0 * (measured - expected) / whole if whole else float("nan")
     return {
         "artefact": artefact,
@@ -62,14 +55,7 @@ def row_of(
         "measured": measured,
         "unit": unit,
         "error_percent": error,
-        "ms_median": ms,
     }
-
-
-def time_row(artefact: str, ms: float, tilt: float = float("nan")) -> dict[str, Any]:
-    """Row of the median processor time of an image."""
-    nan = float("nan")
-    return row_of(artefact, "linear", tilt, nan, nan, nan, "", ms=ms)
 
 
 @dataclass(frozen=True)
