@@ -13,8 +13,8 @@ from launch_ros.actions import Node
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER
-from us_sim.run.monitored import alone_on_domain
-from us_sim.run.plan import Request, enclave_of, plan_of, require_new
+from us_sim.run.domain import alone_on_domain, enclave_of
+from us_sim.run.plan import Request, plan_of, require_new
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import find_bag

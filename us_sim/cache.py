@@ -1,8 +1,8 @@
 """Arrays kept in the user's cache folder, memory-mapped and shared by processes.
 
-An entry is a folder of .npy files and a description with their checksums. It is written beside its
-place and renamed there, so it is whole or absent; a lock lets one process make it while others
-wait; and what is damaged all the same is noticed and made again.
+An entry is a folder of .npy files and a description. It is written beside its place and renamed
+there, so it is whole or absent; a lock lets one process make it while others wait; and what cannot
+be read all the same is made again.
 
 >>> import os, tempfile
 >>> import numpy as np
@@ -23,7 +23,6 @@ import logging
 import os
 import shutil
 import tempfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +47,7 @@ _logger = logging.getLogger(__name__)
 class Form(Generic[Thing]):
     """How a thing is laid down as arrays and facts, and made from them again."""
 
-    description: str  # file name of the facts and checksums
+    description: str  # file name of the facts
     pack: Callable[[Thing], tuple[dict[str, NDArray], dict[str, Any]]]  # arrays, facts for JSON
     unpack: Callable[[dict[str, NDArray], dict[str, Any]], Thing]
 
@@ -114,14 +113,10 @@ def _load(entry: Path, form: Form[Thing], *, warn: bool = False) -> Thing | None
         return None
     try:
         facts = json.loads((entry / form.description).read_text(encoding="utf-8"))
-        arrays = {}
-        for name, checksum in facts["crc32"].items():
-            path = entry / f"{name}.npy"
-            if zlib.crc32(np.ascontiguousarray(np.load(path, mmap_mode="r"))) != checksum:
-                raise ValueError(f"the checksum of {name} is wrong")
-            # Mapped anew, so that only what is used takes memory; and a plain array over the map,
-            # since a subclass would slow kernels and surprise callers.
-            arrays[name] = np.asarray(np.load(path, mmap_mode="r"))
+        # Mapped, so that only what is used takes memory; and a plain array over the map, since a
+        # subclass would slow and surprise callers.
+        files = sorted(entry.glob("*.npy"))
+        arrays = {file.stem: np.asarray(np.load(file, mmap_mode="r")) for file in files}
         return form.unpack(arrays, facts)
     except _DAMAGE as error:
         if warn:
@@ -136,11 +131,9 @@ def _store(entry: Path, form: Form[Thing], thing: Thing) -> None:
     partial = Path(tempfile.mkdtemp(prefix=f"{entry.name}.partial-", dir=entry.parent))
     try:
         arrays, facts = form.pack(thing)
-        checksums = {}
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
-            checksums[name] = zlib.crc32(np.ascontiguousarray(array))
-        description = json.dumps({**facts, "crc32": checksums}, indent=1)
+        description = json.dumps(facts, indent=1)
         (partial / form.description).write_text(description, encoding="utf-8")
         if entry.is_dir():
             shutil.rmtree(entry)

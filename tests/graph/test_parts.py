@@ -42,8 +42,7 @@ def run_and_list_modules(scene: Path, tmp_path: Path) -> tuple[dict[str, set[str
     for file in modules.glob("*.json"):
         program, names = json.loads(file.read_text())
         by_node[Path(program).stem] = set(names)
-    for program in ("__main__", "background"):  # the command's own
-        by_node.pop(program, None)
+    by_node.pop("__main__", None)  # the command's own
     return by_node, {topic.name for topic in read_bag(recording).topics}
 
 

@@ -10,7 +10,7 @@ from us_sim.errors import UsSimError
 from us_sim.run import live
 from us_sim.run.live import _status
 from us_sim.run.plan import Plan, Request, viewer_process
-from us_sim.run.watch import SupervisionSettings
+from us_sim.run.supervision import SupervisionSettings
 from us_sim.scene.reading import load_scene
 from us_sim.settings.viewer import ViewerSettings
 

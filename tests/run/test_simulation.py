@@ -10,9 +10,9 @@ import pytest
 from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes.settings import SessionControlSettings
 from us_sim.recording.writer import BagWriter
-from us_sim.run.losses import Recordings
 from us_sim.run.plan import Request, plan_of
 from us_sim.run.simulation import Simulation, bags_in_reach
+from us_sim.run.supervision import Recordings
 from us_sim.scene.reading import load_scene
 from us_sim.share import shared_path
 
@@ -72,8 +72,7 @@ def running(small_scene):
     monitor = SimpleNamespace(control=made, node=SimpleNamespace(reports={}))
     simulation = Simulation(request, supervisor, monitor)
     simulation.update()
-    yield simulation, supervisor, control
-    simulation.close()
+    return simulation, supervisor, control
 
 
 def ask(simulation, control, **values):

@@ -1,15 +1,25 @@
 """The supervisor restarts nodes that end, here without any process."""
 
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from us_sim.errors import UsSimError
+from us_sim.errors import SettingsError, UsSimError
 from us_sim.nodes import INTERRUPTED
+from us_sim.recording.writer import BagWriter
 from us_sim.run.plan import NodeProcess, Plan, Request, plan_of
-from us_sim.run.supervision import Supervisor
-from us_sim.run.watch import SupervisionSettings
+from us_sim.run.supervision import (
+    START_S,
+    Loss,
+    Outcome,
+    SupervisionSettings,
+    Supervisor,
+    files_of,
+    going_on,
+    images_in,
+)
 from us_sim.scene.reading import load_scene
 from us_sim.share import find_bag
 
@@ -19,6 +29,7 @@ class Group:
 
     def __init__(self):
         self.pids = {}
+        self.running = set()
         self.started = []
         self.ended = {}
         self.ended_by_us = []
@@ -28,13 +39,14 @@ class Group:
         for process in processes:
             self.started.append(process)
             self.pids[process.node] = len(self.started)
+            self.running.add(process.node)
 
     def take_ended(self):
         ended, self.ended = self.ended, {}
         return ended
 
     def is_running(self, node):
-        return node in self.pids
+        return node in self.running
 
     def last_words(self, node):
         return f"{node} was here"
@@ -43,8 +55,7 @@ class Group:
         return UsSimError(f"{node} cannot work ({status})")
 
     def end(self, nodes):
-        for node in nodes:
-            del self.pids[node]
+        self.running -= {*nodes}
         self.ended_by_us += nodes
         return self.killed
 
@@ -60,7 +71,7 @@ class Monitor:
         self.told = []
         self.silent = set()
         self.node = SimpleNamespace(
-            reports={}, messages={}, heard={}, tell_lost=self.told.append, count=lambda *_: 7
+            reports={}, messages={}, heard=Counter(), tell_lost=self.told.append, count=lambda *_: 7
         )
         self.node.rejected = lambda node, kind: self.problems.get((node, kind), 0)
         self.problems = {}
@@ -68,10 +79,9 @@ class Monitor:
         self.node.resolve_topic_name = lambda topic: f"/{topic}"
 
     def spin(self, _=0.1):
-        for node, pid in self.group.pids.items():
-            if node not in self.silent:
-                self.node.heard[node, pid] = self.node.heard.get((node, pid), 0) + 1
-                self.node.reports.setdefault(node, {})["pid"] = str(pid)
+        for node in self.group.running - self.silent:
+            self.node.heard[node, self.group.pids[node]] += 1
+            self.node.reports.setdefault(node, {})["pid"] = str(self.group.pids[node])
 
 
 @pytest.fixture
@@ -260,3 +270,138 @@ def test_a_player_waits_for_the_recorder_to_record_what_it_is_to_record(tmp_path
         player = plan_of(asked).processes[-1]
         assert player.node == "path_player"
         assert set(player.parameters["await_recorded"]) - {""} == expected
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that the test moves, before the supervisor is made."""
+    now = SimpleNamespace(s=0.0)
+    monkeypatch.setattr("us_sim.run.supervision.time.monotonic", lambda: now.s)
+    return now
+
+
+def pass_time(supervisor, clock, seconds, step=0.1):
+    """Look again and again until something is lost; return after how long, and that."""
+    before, until = len(supervisor.losses), clock.s + seconds
+    while clock.s < until and len(supervisor.losses) == before:
+        clock.s += step
+        supervisor.update()
+    return clock.s, [loss.what for loss in supervisor.losses[before:]]
+
+
+def test_a_node_that_reports_never_hangs(clock, session):
+    assert pass_time(session[0], clock, 1000.0, step=0.5)[1] == []
+
+
+def test_a_silent_one_hangs_and_is_started_again(clock, session):
+    supervisor, group, monitor = session
+    supervisor.update()
+    monitor.silent = {"slice_interpolator"}
+    when, lost = pass_time(supervisor, clock, 100.0)
+    assert when == pytest.approx(30.0, abs=0.25)
+    assert lost == ["has not reported for 30 s"]
+    assert group.ended_by_us == ["slice_interpolator"]
+    # The process that takes its place may compile for long.
+    assert pass_time(supervisor, clock, START_S - 1.0, step=0.5)[1] == []
+
+
+def test_one_that_never_reports_ends_all(clock, session):
+    supervisor, _, monitor = session
+    monitor.silent = {"slice_interpolator"}
+    with pytest.raises(UsSimError, match="did not start"):
+        pass_time(supervisor, clock, START_S + 1.0, step=0.5)
+
+
+def test_time_in_which_nobody_looked_is_no_silence(clock, session):
+    supervisor, _, monitor = session
+    supervisor.update()
+    monitor.silent = {"slice_interpolator"}
+    assert pass_time(supervisor, clock, 15 * 3600.0, step=3600.0)[1] == []  # a laptop was closed
+    assert pass_time(supervisor, clock, 30.0)[1]
+
+
+@pytest.mark.parametrize("wrong", [{"restarts": -1}, {"silence": "1 s"}])
+def test_supervision_that_cannot_be_is_refused(wrong):
+    with pytest.raises(SettingsError, match="is outside"):
+        SupervisionSettings(**wrong)
+
+
+def test_a_player_goes_on_where_its_path_would_be():
+    player = NodeProcess("path_player", {"path": "a.mcap"})
+    again = going_on(player, {"played": "120", "begun": "1700000000.250000000"})
+    assert again.parameters == {"path": "a.mcap", "begun": 1700000000.25}
+    assert going_on(player, {"state": "waiting"}) is player
+    assert going_on(player, {"begun": "soon"}) is player
+
+
+def test_a_viewer_goes_on_where_pages_look_for_it():
+    viewer = NodeProcess("viewer", {"host": "127.0.0.1", "port": 0})
+    assert going_on(viewer, {"port": "41234"}).parameters["port"] == 41234
+    assert going_on(viewer, {"port": "any"}).parameters["port"] == 0
+
+
+def test_others_start_as_they_did():
+    tissue = NodeProcess("tissue_deformer", {"scene": "upper_arm", "solver": "msds"})
+    assert going_on(tissue, {"state": "ready"}) is tissue
+
+
+def outcome(losses=(), files=(), **counts):
+    counts = {"made": 600, "recorded": 600, "poses": 600} | counts
+    return Outcome(1.0, list(losses), list(files), **counts)
+
+
+@pytest.fixture
+def files(tmp_path):
+    return [tmp_path / "session.mcap", tmp_path / "session_1.mcap"]
+
+
+def test_nothing_lost_is_nothing_said(files):
+    assert outcome().sentence() == ""
+    assert outcome(files=files[:1]).sentence() == ""
+    # Poses that a live simulation skips are no loss of the recording's.
+    assert outcome(files=files[:1], made=590, recorded=591).sentence() == ""
+    assert outcome(made=590, recorded=0).sentence() == ""  # nothing was recorded
+
+
+def test_images_that_are_not_in_the_recording_are_said(files):
+    lacking = outcome(files=files[:1], recorded=64, made=440, poses=None)
+    assert lacking.sentence() == (
+        "64 images were recorded of 440 that were made; the recording is in session.mcap"
+    )
+
+
+def test_the_summary_has_all_of_it(files):
+    loss = Loss("a", "ended with status 3", 1.23, last_words="out of memory", back_after_s=2.0)
+    told = outcome([loss], files, recorded=590).summary()
+    assert told["images_made"] == 600
+    assert told["images_recorded"] == 590
+    assert told["files"] == ["session.mcap", "session_1.mcap"]
+    (node,) = told["nodes"]
+    assert node.pop("time")[:2] == "20"
+    assert node == {
+        "node": "a",
+        "what": "ended with status 3",
+        "at_s": 1.23,
+        "last_words": "out of memory",
+        "back_after_s": 2.0,
+        "given_up": "",
+    }
+
+
+def test_the_files_of_a_recording_are_found_in_their_order(tmp_path):
+    names = ["a.mcap", "a_1.mcap", "a_2.mcap", "a_2_1.mcap", "a_10.mcap"]
+    for name in (*names, "ab.mcap", "a_b.mcap", "a_1.db3", "b_1.mcap"):
+        (tmp_path / name).touch()
+    assert [file.name for file in files_of(tmp_path / "a.mcap")] == names
+    assert files_of(tmp_path / "none.mcap") == []
+
+
+def test_images_are_counted_in_all_files_and_a_broken_one_has_none(files, tmp_path):
+    for count, file in enumerate(files, start=3):
+        with BagWriter(file, sidecar=False) as writer:
+            writer.add_topic("/ultrasound/image", "std_msgs/msg/Empty")
+            for stamp in range(count):
+                writer.write("/ultrasound/image", bytes(5), stamp)
+    empty = tmp_path / "empty.mcap"
+    empty.touch()
+    assert images_in([*files, empty], "/ultrasound/image") == 3 + 4

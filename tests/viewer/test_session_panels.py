@@ -47,10 +47,8 @@ def test_a_case_is_loaded_and_a_recording_is_not_ended_unasked(page, session):
     assert page.get_by_role("button", name="Load sweep").is_disabled()
     page.get_by_role("button", name="Load liver").click()
     until(lambda: asked == [{"scene": "case:/liver"}], "it is asked for", 30.0)
-    board.state = dataclasses.replace(
-        RUNNING, state="loading liver: reading the volume", fraction=0.4
-    )
-    page.get_by_text("upper arm: loading liver: reading the volume, 40 %").wait_for()
+    board.state = dataclasses.replace(RUNNING, state="starting: 2 of 5 nodes", fraction=0.4)
+    page.get_by_text("upper arm: starting: 2 of 5 nodes, 40 %").wait_for()
     until(
         page.get_by_role("button", name="Load liver").is_disabled,
         "nothing else can be loaded meanwhile",

@@ -83,7 +83,7 @@ def main(args: Sequence[str] | None = None) -> int:
     before = {number: signal.signal(number, interrupt) for number in _ENDINGS}
     said, sys.stderr = sys.stderr, cast(TextIO, _Lasting(sys.stderr))
     try:
-        from us_sim.run.ros_arguments import take_ros_arguments
+        from us_sim.run.domain import take_ros_arguments
 
         parsed = _parser().parse_args(take_ros_arguments(sys.argv[1:] if args is None else args))
         return int(parsed.command(parsed) or 0)

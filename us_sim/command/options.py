@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 from us_sim.errors import UsSimError
-from us_sim.run.watch import SupervisionSettings
 from us_sim.settings.setting import Settings, kinds_of, rules_of
 from us_sim.settings.spelling import unknown
 from us_sim.share import find_bag
@@ -195,6 +194,8 @@ def add_network_option(parser: argparse.ArgumentParser) -> None:
 
 def add_running_options(parser: argparse.ArgumentParser, default: str = "") -> None:
     """Those of a scene, of the supervision of its nodes, and of the network."""
+    from us_sim.run.supervision import SupervisionSettings
+
     add_scene_options(parser, default)
     add_setting_options(parser, SupervisionSettings)
     add_network_option(parser)

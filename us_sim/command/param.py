@@ -47,7 +47,7 @@ def _run(command: Callable[[_Asker, argparse.Namespace], int], args: argparse.Na
     from us_sim.run.processes import prepare_ros
 
     prepare_ros(network=args.network)
-    from us_sim.run.monitored import ros_context
+    from us_sim.run.domain import ros_context
 
     context = ros_context()
     try:

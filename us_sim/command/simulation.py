@@ -7,7 +7,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from us_sim.command.options import (
     add_network_option,
@@ -25,13 +25,13 @@ from us_sim.command.options import (
 )
 from us_sim.errors import BagError, UsSimError
 from us_sim.run.forked import begin_fork_server
-from us_sim.run.watch import SupervisionSettings
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag
 
 if TYPE_CHECKING:
-    from us_sim.run.plan import Parameters
+    from us_sim.run.plan import Request
+    from us_sim.run.supervision import SupervisionSettings
 
 
 def demo_options(demo: argparse.ArgumentParser) -> None:
@@ -53,17 +53,24 @@ def _demo(args: argparse.Namespace) -> int:
     begin_fork_server()
     from us_sim.run.live import demo
 
-    return demo(
-        scene_name(args, "upper_arm"),
-        args.volume,
-        args.out,
-        node_parameters(args.param),
-        network=args.network,
-        supervision=read_settings(args, SupervisionSettings),
-        path=args.path,
-        topic=args.topic,
-        view=viewed(args),
-    )
+    request = _request(args, "upper_arm", view=viewed(args))
+    return demo(request, args.out, network=args.network, supervision=_supervision(args))
+
+
+def _request(args: argparse.Namespace, default: str | None = None, **more: Any) -> Request:
+    """Return the scene that is asked for, what is played in it, and more of a request."""
+    parameters = node_parameters(args.param)
+    from us_sim.run.plan import Request
+    from us_sim.scene.reading import load_scene
+
+    scene = load_scene(scene_name(args, default), volume=args.volume)
+    return Request(scene, parameters, path=args.path, topic=args.topic, **more)
+
+
+def _supervision(args: argparse.Namespace) -> SupervisionSettings:
+    from us_sim.run.supervision import SupervisionSettings
+
+    return read_settings(args, SupervisionSettings)
 
 
 @dataclass(frozen=True)
@@ -85,26 +92,15 @@ def run_options(run: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     asked = read_settings(args, RunSettings)
-    parameters = node_parameters(args.param)
     if not args.dry_run:
         begin_fork_server()
     from us_sim.run.live import dry_run, run
-    from us_sim.run.plan import Request
-    from us_sim.scene.reading import check_files, load_scene
+    from us_sim.scene.reading import check_files
 
-    request = Request(
-        load_scene(scene_name(args), volume=args.volume),
-        parameters,
-        record=asked.record,
-        path=args.path,
-        topic=args.topic,
-        duration=asked.duration,
-        view=viewed(args),
-    )
-    scene = request.scene
+    request = _request(args, record=asked.record, duration=asked.duration, view=viewed(args))
     if not args.dry_run:
-        supervision = read_settings(args, SupervisionSettings)
-        return run(request, network=args.network, supervision=supervision)
+        return run(request, network=args.network, supervision=_supervision(args))
+    scene = request.scene
     checked = check_files(scene)
     path = args.path or (Path(scene.path) if scene.path else None)
     if path is not None and not scene.volume.phantom:
@@ -137,39 +133,33 @@ def render_options(render: argparse.ArgumentParser) -> None:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from us_sim.run.lockstep import render_scene
-    from us_sim.scene.reading import load_scene
+    from us_sim.run.lockstep import render
 
-    parameters = node_parameters(args.param)
     if args.session is not None:
-        return _render_session(args, parameters)
-    scene = load_scene(scene_name(args), volume=args.volume)
-    return render_scene(scene, args.path, args.out, parameters, topic=args.topic, truth=args.truth)
+        return _render_session(args)
+    return render(_request(args), args.out, truth=args.truth)
 
 
-def _render_session(args: argparse.Namespace, parameters: Parameters) -> int:
+def _render_session(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
     from us_sim.recording.reader import read_bag
-    from us_sim.run.lockstep import render_scene
+    from us_sim.run.lockstep import render
     from us_sim.run.resimulation import resimulation
     from us_sim.run.session_diff import diff, table
 
+    parameters = node_parameters(args.param)
     if any(each is not None for each in (args.scene, args.case, args.path, args.topic)):
         raise UsSimError(
             f"--session {args.session}: the scene and the path are those of the recording; leave "
             f"out the scene, --case, --path and --topic"
         )
     with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
-        again = resimulation(args.session, Path(folder), args.volume)
-        for note in again.notes:
+        again, note = resimulation(args.session, Path(folder), args.volume)
+        if note:
             print(note, file=sys.stderr)
         for node, values in parameters.items():
             again.parameters.setdefault(node, {}).update(values)
-        render_scene(
-            *(again.scene, again.path, args.out, again.parameters),
-            topic=again.topic,
-            truth=args.truth,
-        )
+        render(again, args.out, truth=args.truth)
     made = args.out / "session.mcap"
     try:
         print(table(diff(read_bag(args.session), read_bag(made), late_progress("comparing"))))
@@ -199,11 +189,7 @@ def view_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(args: argparse.Namespace) -> int:
-    parameters = node_parameters(args.param)
-    following = {
-        "network": args.network,
-        "supervision": read_settings(args, SupervisionSettings),
-    }
+    supervision = _supervision(args)
     if not args.attach:
         begin_fork_server()
     from us_sim.run.live import run, view_running
@@ -215,24 +201,19 @@ def _view(args: argparse.Namespace) -> int:
                 "--attach shows what runs already: leave out the scene, --case, --volume, --path, "
                 "--record and --tracker, or leave out --attach"
             )
-        return view_running(viewer(args), parameters, **following)
+        parameters = node_parameters(args.param)
+        return view_running(viewer(args), parameters, network=args.network, supervision=supervision)
     if args.loop and args.path is None:
         raise UsSimError("--loop plays a path again and again: name one with --path")
-    from us_sim.run.plan import Request
-    from us_sim.scene.reading import load_scene
-
-    asked = read_settings(args, RunSettings, ("record",))
-    request = Request(
-        load_scene(scene_name(args, "upper_arm"), volume=args.volume),
-        parameters,
-        record=asked.record,
-        path=args.path,
-        topic=args.topic,
+    request = _request(
+        args,
+        "upper_arm",
+        record=read_settings(args, RunSettings, ("record",)).record,
         view=viewer(args),
         by_hand=not args.tracker,
         playing={"stay": True, "loop": args.loop} if args.path is not None else {},
     )
-    return run(request, **following)
+    return run(request, network=args.network, supervision=supervision)
 
 
 _OF_THE_PLAYER = ("rate", "loop", "time")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
 from us_sim.progress import Progress
-from us_sim.run.losses import IMAGER, IMAGES, Outcome
-from us_sim.run.monitored import Monitored, alone_on_domain, domain
+from us_sim.run.domain import alone_on_domain, domain, ros_arguments
 from us_sim.run.plan import (
     NodeProcess,
     Parameters,
@@ -23,12 +23,16 @@ from us_sim.run.plan import (
 )
 from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import ProcessGroup, prepare_ros
-from us_sim.run.ros_arguments import ros_arguments
 from us_sim.run.simulation import Simulation
-from us_sim.run.supervision import Supervisor, say
-from us_sim.run.watch import SupervisionSettings
-from us_sim.scene.building import path_of
-from us_sim.scene.reading import load_scene
+from us_sim.run.supervision import (
+    IMAGER,
+    IMAGES,
+    Monitored,
+    Outcome,
+    SupervisionSettings,
+    Supervisor,
+    say,
+)
 from us_sim.scene.scene import Scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import full_path
@@ -83,13 +87,11 @@ def follow(
                     say(lost)
             raise
         finally:
-            if simulation is not None:
-                simulation.close()
             (group.stop if supervisor is None else supervisor.end)()
         return supervisor.outcome(startup)
 
 
-_LONG_START_S = 15.0  # longer than a start takes whose kernels are all kept
+_LONG_START_S = 15.0  # longer than a start takes that compiles nothing
 
 
 def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
@@ -220,33 +222,19 @@ def run(
 def _simulate(request: Request, log: Path | None, supervision: SupervisionSettings) -> Outcome:
     plan = plan_of(request).with_free_port()
     prepare_scene(request.scene, request.path, plan.topic)
+    if log is not None:
+        log.parent.mkdir(parents=True, exist_ok=True)
     return follow(plan, log, supervision, request)
 
 
-def demo(
-    name: str,
-    volume: Path | None,
-    out: Path,
-    parameters: Parameters,
-    *,
-    network: bool,
-    supervision: SupervisionSettings,
-    path: Path | None = None,
-    topic: str | None = None,
-    view: ViewerSettings | None = None,
-) -> int:
+def demo(request: Request, out: Path, *, network: bool, supervision: SupervisionSettings) -> int:
     """Replay a path through a scene's nodes; recording, contact sheet and summary in ``out``.
 
     Args:
-        name: of the scene, or its file.
-        volume: in place of the scene's.
+        request: the scene, and what is played and shown.
         out: folder to write to.
-        parameters: given by a person, by node.
         network: talk beyond this host.
         supervision: when a node hangs, and how often it is started again.
-        path: bag or recording that is played in place of the scene's own path.
-        topic: of the body in it whose poses are played.
-        view: address of the page that shows the simulation; None is no page.
 
     Raises:
         UsSimError: bad input, ``out`` already holds a session, or something was lost: a node ended
@@ -258,19 +246,10 @@ def demo(
             "--ros-args: the demo's report is of topics under their usual names: use `us-sim run "
             "--record FILE` where they have others"
         )
-    scene = load_scene(name, volume=volume)
-    file = path or (Path(scene.path) if scene.path is not None else None)
-    if file is None:
-        raise UsSimError(
-            f"{scene.origin}: path: is missing, and the demo needs one to play; give one with "
-            f"--path"
-        )
-    recording = out / "session.mcap"
+    recording, scene = out / "session.mcap", request.scene
     if recording.exists():
         raise UsSimError(f"{recording} exists already; choose another folder with --out")
-    path_of(scene, file, topic)  # before anything is made for what cannot be played
-    out.mkdir(parents=True, exist_ok=True)
-    request = Request(scene, parameters, recording, file, topic, view=view)
+    request = replace(request.with_path(), record=recording)
     started = time.monotonic()
     outcome = _simulate(request, out / "nodes.log", supervision)
     try:

@@ -20,7 +20,7 @@ import yaml
 
 from us_sim.errors import SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
-from us_sim.run.ros_arguments import namespace, ros_arguments
+from us_sim.run.domain import enclave_of, namespace, ros_arguments
 from us_sim.scene.building import path_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
@@ -36,25 +36,13 @@ def module_of(node: str) -> str:
     return "us_sim.viewer.viewer" if node == "viewer" else f"us_sim.nodes.{node}"
 
 
-def enclave_of(node: str) -> str:
-    """Where ROS 2's security finds a node's keys."""
-    return f"/us_sim/{node}"
-
-
 @dataclass(frozen=True)
 class NodeProcess:
-    """One node and its parameters.
-
-    Raises:
-        UsSimError: a parameter is no UTF-8, as a file's name may be.
-    """
+    """One node and its parameters."""
 
     node: str
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
-
-    def __post_init__(self) -> None:
-        require_texts(self.parameters)
 
     def command(self) -> list[str]:
         """The command line that runs it, in ROS 2 and without."""
@@ -66,22 +54,6 @@ class NodeProcess:
         for name, value in self.parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments
-
-
-def require_texts(parameters: Mapping[str, object]) -> None:
-    """Raise UsSimError for a text that is no UTF-8, as a file's name may be.
-
-    >>> require_texts({"file": "Übung 1.mcap", "loop": True, "topics": ["a", "b"]})
-    """
-    for name, value in parameters.items():
-        for each in value if isinstance(value, list | tuple) else [value]:
-            try:
-                str(each).encode()
-            except UnicodeEncodeError:
-                raise UsSimError(
-                    f"{name}: {each!r} is no text in UTF-8, which a parameter of a ROS node must "
-                    f"be: rename the file, or use a locale with UTF-8"
-                ) from None
 
 
 @dataclass(frozen=True)
@@ -99,6 +71,18 @@ class Request:
     by_hand: bool = False  # poses come on `tracker/pose`, whatever the scene's tracker is
     duration: float | None = None  # s, after which all ends
     is_changed: bool = False  # while it ran: parameters may be of nodes that do not run now
+
+    def with_path(self) -> Request:
+        """Return the same with the scene's own path, where no other is to be played.
+
+        Raises:
+            SceneError: it has none.
+        """
+        if self.path is not None:
+            return self
+        if self.scene.path is None:
+            raise SceneError(f"{self.scene.origin}: path: is missing; name a bag with --path")
+        return replace(self, path=Path(self.scene.path))
 
     def with_scene(self, scene: Scene) -> Request:
         """Another scene, in which nothing is recorded or played yet.

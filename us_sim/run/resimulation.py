@@ -12,7 +12,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from us_sim.errors import BagError
@@ -21,7 +21,7 @@ from us_sim.recording.path import write_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.repair import extract, versions
 from us_sim.recording.topic import BagAttachment
-from us_sim.run.plan import Parameters, simulation_nodes
+from us_sim.run.plan import Parameters, Request, simulation_nodes
 from us_sim.scene.building import path_of
 from us_sim.scene.reading import load_scene
 from us_sim.scene.scene import Scene
@@ -34,22 +34,10 @@ _COMPUTING = (
     *("opencv-python-headless", "opencv-python", "SimpleITK", "pydicom"),
 )
 """Entries of `versions.txt` that can change an image."""
-POSES = "poses.mcap"
 
 
-@dataclass(frozen=True)
-class Resimulation:
-    """Everything that `us-sim render` needs to repeat a session."""
-
-    scene: Scene
-    path: Path  # poses of the session alone
-    topic: str  # of them
-    parameters: Parameters
-    notes: list[str]  # sentences on what may make images differ
-
-
-def resimulation(session: Path, folder: Path, volume: Path | None = None) -> Resimulation:
-    """Prepare a session to be simulated again.
+def resimulation(session: Path, folder: Path, volume: Path | None = None) -> tuple[Request, str]:
+    """Return what simulates a session again, and a sentence on what may make images differ.
 
     Args:
         session: its recording.
@@ -61,60 +49,40 @@ def resimulation(session: Path, folder: Path, volume: Path | None = None) -> Res
         BagError: the session has no scene or poses, or a file of the scene is missing or another.
         UsSimError: a file cannot be read or written.
     """
-    attached = read_bag(session).attachments()
-    if "scene.yaml" not in attached:
-        raise BagError(
-            f"{session} has no scene attached, so it cannot be simulated from itself: name the "
-            f"scene, and play it with `us-sim render SCENE --path {session}`"
-        )
-    scene = scene_within(session, attached, folder / "attached", volume)
-    path = path_of(scene, session)
-    write_path(folder / POSES, path, sidecar=False)
+    bag = read_bag(session)
+    scene = _unpack_scene(bag, folder / "attached", volume)
+    path, poses = path_of(scene, session), folder / "poses.mcap"
+    write_path(poses, path, sidecar=False)
+    attached = bag.attachments()
     parameters = _parameters(session, attached, scene)
     if path.topic.endswith("/probe/pose"):  # the filter has had its say
         parameters.setdefault("probe_tracker", {})["filter"] = "none"
-    return Resimulation(
-        replace(scene, path=str(folder / POSES)),
-        folder / POSES,
-        path.topic,
-        parameters,
-        [*_other_versions(session, attached)],
-    )
+    scene = replace(scene, path=str(poses))
+    request = Request(scene, parameters, path=poses, topic=path.topic)
+    return request, _other_versions(session, attached)
 
 
 @contextlib.contextmanager
 def scene_of(bag: Bag) -> Iterator[Scene]:
-    """The scene that is attached to a session, as long as its files are unpacked.
+    """Unpack the scene that is attached to a session, for a while.
 
     Raises:
         BagError, UsSimError: as of `resimulation`.
     """
+    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
+        yield _unpack_scene(bag, Path(folder, "attached"))
+
+
+def _unpack_scene(bag: Bag, folder: Path, volume: Path | None = None) -> Scene:
+    """Read the scene that is attached, after its files were unpacked into a new folder."""
     attached = bag.attachments()
     if "scene.yaml" not in attached:
-        raise BagError(f"{bag.path} has no scene attached, so nobody knows where vessels are")
-    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
-        yield scene_within(bag.path, attached, Path(folder, "attached"))
-
-
-def scene_within(
-    session: Path,
-    attached: Mapping[str, BagAttachment],
-    folder: Path,
-    volume: Path | None = None,
-) -> Scene:
-    """The scene that is attached to a session, of files that are as they were.
-
-    Args:
-        session: its recording.
-        attached: to it, a scene among them.
-        folder: gets the attached files; new or empty.
-        volume: where the scene's volume is now.
-
-    Raises:
-        BagError, UsSimError: as of `resimulation`.
-    """
-    _require_files(session, attached, volume)
-    extract(session, folder)
+        raise BagError(
+            f"{bag.path} has no scene attached: name the scene, and play it with "
+            f"`us-sim render SCENE --path {bag.path}`"
+        )
+    _require_files(bag.path, attached, volume)
+    extract(bag.path, folder)
     return load_scene(folder / "scene.yaml", volume=volume)
 
 
@@ -133,8 +101,8 @@ def _require_files(
         now = {checksum(part) for part in parts_of(volume)}
         if not now <= set(recorded.values()):
             raise BagError(
-                f"--volume {volume} is not the volume that {session} was recorded with (SHA-256 "
-                f"{_short(now)} is none of those in its files.txt): name that one"
+                f"--volume {volume} is not the volume that {session} was recorded with: its "
+                f"SHA-256 is none of those in files.txt of the recording; name that one"
             )
         held |= now
     for path, digest in recorded.items():
@@ -153,12 +121,8 @@ def _require_files(
             )
 
 
-def _short(digests: set[str]) -> str:
-    return ", ".join(f"{digest[:12]}…" for digest in sorted(digests)[:3])
-
-
 def _parameters(session: Path, attached: Mapping[str, BagAttachment], scene: Scene) -> Parameters:
-    """The recorded parameters of the nodes that run again."""
+    """Return the recorded parameters of the nodes that run again."""
     try:
         document = load_yaml(_text(attached, "parameters.yaml")) or {}
         return {
@@ -176,8 +140,8 @@ def _parameters(session: Path, attached: Mapping[str, BagAttachment], scene: Sce
         ) from None
 
 
-def _other_versions(session: Path, attached: Mapping[str, BagAttachment]) -> Iterator[str]:
-    """A sentence if something that computes is of another version now."""
+def _other_versions(session: Path, attached: Mapping[str, BagAttachment]) -> str:
+    """Return a sentence on versions that are others than those of the session; empty if none."""
 
     def by_name(text: str) -> dict[str, str]:
         lines = (line.rpartition(" ") for line in text.splitlines())
@@ -185,12 +149,10 @@ def _other_versions(session: Path, attached: Mapping[str, BagAttachment]) -> Ite
 
     then, now = by_name(_text(attached, "versions.txt")), by_name(versions())
     if not any(name in then for name in _COMPUTING):
-        yield f"{session} does not say with which versions it was made, so images may differ"
-        return
+        return f"{session} does not say with which versions it was made, so images may differ"
     other = [
         f"{name} {then.get(name, 'none')[:12]} (now {now.get(name, 'none')[:12]})"
         for name in _COMPUTING
         if then.get(name) != now.get(name)
     ]
-    if other:
-        yield f"{session} was made with {', '.join(other)}: images may differ"
+    return f"{session} was made with {', '.join(other)}: images may differ" if other else ""

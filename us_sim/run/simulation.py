@@ -12,13 +12,11 @@ from typing import Any
 
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
-from us_sim.run.monitored import Monitored
 from us_sim.run.plan import Request, plan_of, require_new
-from us_sim.run.preparation import Preparation
-from us_sim.run.supervision import Supervisor, say
+from us_sim.run.supervision import Monitored, Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
-from us_sim.scene.reading import load_scene
+from us_sim.scene.reading import check_files, load_scene
 from us_sim.scene.scene import Scene
 from us_sim.share import find_bag, full_path, shared_roots
 
@@ -46,7 +44,7 @@ class Simulation:
         self._request = request
         self._settled: Request | None = None  # the last with which all nodes were ready
         self._supervisor, self._monitor = supervisor, monitor
-        self._preparation: Preparation | None = None
+        self._asked: SessionControlSettings | None = None  # scene that is to be loaded
         self._unlisted = chain([listed_scene(request.scene.origin)], listed_scenes())
         self._listed: dict[str, ListedScene] = {}  # by what loads it
         self._bags_at = self._recording_at = 0.0
@@ -74,18 +72,13 @@ class Simulation:
             self._settled = self._request
             self._list_scenes()
             self._list_bags()
-        self._follow_preparation()
+        self._load_scene()
         self._report()
-
-    def close(self) -> None:
-        """End what is being prepared."""
-        if self._preparation is not None:
-            self._preparation.end()
 
     def check(self, wanted: SessionControlSettings, named: Collection[str]) -> None:
         """Raise UsSimError where the parameters ask for something impossible."""
         if _OF_SCENE & set(named):
-            load_scene(wanted.scene, volume=wanted.volume)
+            check_files(load_scene(wanted.scene, volume=wanted.volume))
             return
         if "record" in named and wanted.record:
             require_new(full_path(wanted.record))
@@ -113,8 +106,7 @@ class Simulation:
         """Begin to do as the parameters say."""
         self._problem = ""
         if _OF_SCENE & set(named):
-            self.close()
-            self._preparation = Preparation(wanted.scene, wanted.volume)
+            self._asked = wanted  # to be loaded after this has been answered
             return
         request = replace(
             self._request,
@@ -145,23 +137,18 @@ class Simulation:
         if values and wanted.replay:
             self._control.tell_player(self._supervisor.plan.player, values)
 
-    def _follow_preparation(self) -> None:
-        preparation = self._preparation
-        if preparation is None or not preparation.has_ended():
+    def _load_scene(self) -> None:
+        """Run the scene that was asked for, if any, in place of that which runs."""
+        asked, self._asked = self._asked, None
+        if asked is None:
             return
-        preparation.end()
-        self._preparation = None
-        refusal = preparation.refusal
-        if not refusal:
-            try:
-                scene = load_scene(preparation.name, volume=preparation.volume)
-                anew = set(self._supervisor.plan.nodes) - {VIEWER}
-                self._change(self._request.with_scene(scene), anew)
-                say(f"loading {scene.name}")
-            except UsSimError as error:
-                refusal = str(error)
-        if refusal:
-            self._problem = f"{refusal}; {self._request.scene.name} goes on"
+        try:
+            scene = load_scene(asked.scene, volume=asked.volume)
+            anew = set(self._supervisor.plan.nodes) - {VIEWER}
+            self._change(self._request.with_scene(scene), anew)
+            say(f"loading {scene.name}")
+        except UsSimError as error:
+            self._problem = f"{error}; {self._request.scene.name} goes on"
             say(self._problem)
         self._control.show(self._shown())
 
@@ -208,12 +195,7 @@ class Simulation:
         request, waiting = self._request, self._supervisor.waiting
         count = len(self._supervisor.plan.nodes)
         state, fraction = "running", 1.0
-        preparation = self._preparation
-        if preparation is not None:
-            fraction = preparation.fraction
-            name = Path(preparation.name.rpartition(":")[2]).stem  # of a file, or `case:NAME`
-            state = f"loading {name}: {preparation.step}"
-        elif waiting:
+        if waiting:
             fraction = (count - len(waiting)) / max(count, 1)
             state = f"starting: {count - len(waiting)} of {count} nodes"
         reports, replay = self._monitor.node.reports, self._control.values
@@ -230,7 +212,6 @@ class Simulation:
             "scene": request.scene.name,
             "origin": request.scene.origin,
             "volume": request.scene.volume.name,
-            "loading": preparation.name if preparation is not None else "",
             "fraction": f"{fraction:.2f}",
             "record": str(record or ""),
             "record_state": recorder.get("state", "starting") if record else "",

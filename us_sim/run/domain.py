@@ -1,0 +1,118 @@
+"""The ROS domain that `us-sim` runs on: its arguments, its context, and one simulation on it.
+
+The arguments after ``--ros-args`` of the command line are for all nodes that it starts.
+
+>>> from us_sim.run.domain import namespace, ros_arguments, take_ros_arguments
+>>> take_ros_arguments(["run", "arm", "--ros-args", "-r", "__ns:=/a", "--", "-x"])
+['run', 'arm', '-x']
+>>> ros_arguments(), namespace()
+(['-r', '__ns:=/a'], '/a')
+>>> take_ros_arguments([]), ros_arguments(), namespace()
+([], [], '/')
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from us_sim.errors import UsSimError
+
+if TYPE_CHECKING:
+    from rclpy.context import Context
+
+BEGIN, END = "--ros-args", "--"
+_taken: list[str] = []
+
+
+def take_ros_arguments(args: Sequence[str]) -> list[str]:
+    """Keep those among the arguments of a command; return the others.
+
+    Raises:
+        UsSimError: they would give all nodes the same name.
+    """
+    own = list(args)
+    _taken.clear()
+    while BEGIN in own:
+        first = own.index(BEGIN)
+        last = own.index(END, first) if END in own[first:] else len(own)
+        _taken.extend(own[first + 1 : last])
+        own[first : last + 1] = []
+    for each in _taken:
+        if each.startswith(("__node:=", "__name:=")):
+            raise UsSimError(f"{each}: would give all nodes one name: write NODE:{each}")
+    return own
+
+
+def ros_arguments() -> list[str]:
+    """Return those of the command that runs, without ``--ros-args``."""
+    return [*_taken]
+
+
+def namespace() -> str:
+    """Return the namespace that they put nodes in: the first counts, as in rcl."""
+    rule = "__ns:="
+    return next((a.removeprefix(rule) for a in _taken if a.startswith(rule)), "/")
+
+
+def domain() -> str:
+    """Return the ROS domain's number, as the environment says it."""
+    return os.environ.get("ROS_DOMAIN_ID") or "0"
+
+
+def enclave_of(node: str) -> str:
+    """Return the place where ROS 2's security finds a node's keys."""
+    return f"/us_sim/{node}"
+
+
+@contextlib.contextmanager
+def alone_on_domain(space: str | None = None) -> Iterator[None]:
+    """Have the domain to oneself, as far as simulations in a namespace and on this host go.
+
+    Args:
+        space: the namespace; None is that of ``--ros-args``.
+
+    Raises:
+        UsSimError: another simulation has it.
+    """
+    from filelock import FileLock, Timeout
+
+    names = ".".join([domain(), *filter(None, (space or namespace()).split("/"))])
+    file = Path(tempfile.gettempdir()) / f"us_sim_domain_{names}.lock"
+    try:
+        with FileLock(file, timeout=0, mode=0o666):  # of all users of this host
+            yield
+    except Timeout:
+        raise UsSimError(
+            f"another simulation runs already on ROS domain {domain()} of this host ({file} is "
+            f"locked): end it, or set ROS_DOMAIN_ID to another number for this one, or give it a "
+            f"namespace of its own (--ros-args -r __ns:=/left)"
+        ) from None
+
+
+def ros_context(number: int | None = None) -> Context:
+    """Return a context that handles no signals.
+
+    Args:
+        number: of the ROS domain; None is the environment's.
+
+    Raises:
+        UsSimError: ROS cannot be used.
+    """
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.signals import SignalHandlerOptions
+
+    from us_sim.nodes import ros_refusal
+
+    context, silent = Context(), SignalHandlerOptions.NO
+    given = [BEGIN, "--enclave", enclave_of("session_control"), *ros_arguments()]
+    try:
+        rclpy.init(args=given, context=context, domain_id=number, signal_handler_options=silent)
+    except Exception as error:  # what rcl raises differs between its versions
+        raise ros_refusal(error) from error
+    return context
