@@ -13,9 +13,9 @@ from us_sim.tissue.model import TissueModel
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds, set by hand."""
+    """Seconds of tqdm's clock, set by hand."""
     now = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
     return now
 
 
@@ -29,17 +29,17 @@ def test_short_work_draws_nothing(clock, capsys):
 def test_long_work_draws_a_bar_to_its_end_and_later_work_another(clock, capsys):
     show = progress.late_progress("solving")
     for start in (0.0, 100.0):
-        for seconds, fraction in ((0.0, 0.0), (1.5, 0.25), (9.0, 1.0)):
+        for seconds, fraction in ((0.0, 0.0), (4.0, 0.25), (9.0, 1.0)):
             clock[0] = start + seconds
             show(fraction, "the rest")
         drawn = capsys.readouterr().err
-        assert drawn.count("solving: 100 %") == 1
+        assert "solving: 100 %" in drawn
         assert drawn.endswith("the rest\n")
 
 
 def test_what_nobody_knows_the_end_of_is_named_without_a_percentage(clock, capsys):
     show = progress.late_progress("preparing the tissue")
-    for clock[0], text in ((0.0, "kernel 1"), (1.5, "kernel 2")):
+    for clock[0], text in ((0.0, "kernel 1"), (4.0, "kernel 2")):
         show(0.0, f"compiling fem, {text}")
     drawn = capsys.readouterr().err
     assert "preparing the tissue" in drawn
@@ -56,7 +56,7 @@ def test_a_sentence_begins_on_a_line_of_its_own_below_a_bar_that_was_broken_off(
 ):
     def fails(_):
         show = progress.late_progress("solving")
-        for clock[0], fraction in ((0.0, 0.0), (1.5, 0.25)):
+        for clock[0], fraction in ((0.0, 0.0), (4.0, 0.25)):
             show(fraction, "half")
         raise UsSimError("there is no such thing")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-import time
 from collections.abc import Callable
 
 from tqdm import tqdm
@@ -14,57 +13,56 @@ from us_sim.errors import printable
 _LONGEST = 200  # characters of what is being done
 _PATIENCE = 1.0  # s, for which work goes on without a bar
 _UNMEASURED = "{desc}{postfix}, {elapsed}"
-_late: list[Progress] = []  # bars that are drawn and not at their end
 
 
 class Progress:
     """A bar on stderr from 0 to ``total``; without a total, only the text.
 
-    Where stderr is no terminal it writes a line every few seconds instead. A bar that is not
-    ``measured`` yet has no percentage before `update` says one.
+    Where stderr is no terminal it writes a line every few seconds instead.
+
+    Args:
+        description: of the work.
+        total: amount of work.
+        unit: of the amount.
+        delay: s, before which nothing is drawn.
     """
 
     def __init__(
-        self,
-        description: str,
-        total: float | None = None,
-        unit: str = "",
-        *,
-        measured: bool = True,
+        self, description: str, total: float | None = None, unit: str = "", *, delay: float = 0.0
     ) -> None:
-        self._layout = (
+        self._measured = (
             "{desc}{postfix}"
             if total is None
-            else (
-                "{desc}: {percentage:3.0f} %|{bar}| {n:.0f}/{total:.0f}"
-                + f" {unit}, "
-                + "{elapsed}{postfix}"
-            )
+            else "{desc}: {percentage:3.0f} %|{bar}| {n:.0f}/{total:.0f} "
+            + f"{unit}, "
+            + "{elapsed}{postfix}"
         )
         self._bar = tqdm(
             desc=description,
             total=total,
-            bar_format=self._layout if measured else _UNMEASURED,
+            bar_format=self._measured,
             mininterval=0.1 if sys.stderr.isatty() else 3.0,
             ascii=not sys.stderr.isatty(),
             miniters=0,
             ncols=shutil.get_terminal_size((100, 24)).columns,
             leave=True,
+            delay=delay,
         )
 
     def update(self, done: float, text: str = "") -> None:
         """Show that ``done`` of the total is done."""
         if self._bar.total is not None:
             done = min(done, self._bar.total)
-        self._bar.bar_format = self._layout
-        self._bar.set_postfix_str(printable(text, _LONGEST), refresh=False)
-        self._bar.update(done - self._bar.n)
+        self._show(self._measured, text, done - self._bar.n)
 
     def tell(self, text: str) -> None:
         """Show the step of work whose amount is unknown."""
-        self._bar.bar_format = _UNMEASURED
+        self._show(_UNMEASURED, text, 0)
+
+    def _show(self, layout: str, text: str, more: float) -> None:
+        self._bar.bar_format = layout
         self._bar.set_postfix_str(printable(text, _LONGEST), refresh=False)
-        self._bar.update(0)
+        self._bar.update(more)
 
     def __enter__(self) -> Progress:
         return self
@@ -74,36 +72,29 @@ class Progress:
 
 
 def late_progress(description: str) -> Callable[[float, str], None]:
-    """A callback for work that is mostly short: it draws a bar once a second has passed.
+    """Return a callback for work that is mostly short: it draws a bar once a second has passed.
 
     It takes the fraction done and what is being done; 0 shows no percentage, since of what has
     just begun, or is compiled, nobody knows it. At 1 the bar is finished, and the next call begins
     another.
     """
-    begun: float | None = None
     bar: Progress | None = None
 
     def show(fraction: float, text: str) -> None:
-        nonlocal begun, bar
-        begun = time.monotonic() if begun is None else begun
-        if bar is None and fraction < 1.0 and time.monotonic() - begun > _PATIENCE:
-            bar = Progress(description, 100, "%", measured=fraction > 0.0)
-            _late.append(bar)
-        if bar is not None and fraction > 0.0:
+        nonlocal bar
+        bar = bar or Progress(description, 100, "%", delay=_PATIENCE)
+        if fraction > 0.0:
             bar.update(100 * fraction, text)
-        elif bar is not None:
+        else:
             bar.tell(text)
         if fraction >= 1.0:
-            if bar is not None:
-                bar.__exit__()
-                if bar in _late:
-                    _late.remove(bar)
-            begun = bar = None
+            bar.__exit__()
+            bar = None
 
     return show
 
 
 def end_late_bars() -> None:
     """End the lines of bars whose work was broken off, so that a sentence begins on its own."""
-    while _late:
-        _late.pop().__exit__()
+    for bar in [*tqdm._instances]:  # type: ignore[attr-defined]
+        bar.close()

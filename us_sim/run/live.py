@@ -190,12 +190,7 @@ def dry_run(request: Request) -> str:
     )
 
 
-def run(
-    request: Request,
-    *,
-    network: bool,
-    supervision: SupervisionSettings,
-) -> int:
+def run(request: Request, *, network: bool, supervision: SupervisionSettings) -> int:
     """Run a scene until its path ends, the duration is over, or Ctrl-C.
 
     Args:
@@ -255,13 +250,8 @@ def demo(request: Request, out: Path, *, network: bool, supervision: Supervision
     try:
         _report(scene, out, outcome, time.monotonic() - started)
     except UsSimError as error:
-        lost = outcome.sentence()
-        if not lost:
-            raise
-        from us_sim.run.session_summary import write_summary
-
-        write_summary({"scene": scene.name, "lost": outcome.summary()}, out / "summary.json")
-        raise UsSimError(f"{lost}; {error}") from error
+        why = filter(None, [outcome.sentence(), str(error)])
+        raise UsSimError("; ".join(why)) from error
     _require_nothing_lost(outcome)
     return 0
 

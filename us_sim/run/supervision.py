@@ -190,15 +190,14 @@ class Monitored:
         self.node: SessionMonitor = SessionMonitor(nodes, context=self._context)
         self._executor: Any = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._control: SessionControl | None = None
 
     def control(self, controlled: Controlled, settings: SessionControlSettings) -> SessionControl:
         """Make the node by which a simulation with these settings is controlled."""
         from us_sim.nodes.session_control import SessionControl
 
-        self._control = SessionControl(controlled, settings, context=self._context)
-        self._executor.add_node(self._control)
-        return self._control
+        control = SessionControl(controlled, settings, context=self._context)
+        self._executor.add_node(control)
+        return control
 
     def spin(self, seconds: float = 0.1) -> None:
         """Take the next message, waiting at most so long."""
@@ -219,10 +218,10 @@ class Monitored:
 
     def close(self) -> None:
         """Leave the domain."""
+        nodes = self._executor.get_nodes()
         self._executor.shutdown()
-        if self._control is not None:
-            self._control.destroy_node()
-        self.node.destroy_node()
+        for node in nodes:
+            node.destroy_node()
         self._context.try_shutdown()
 
 
