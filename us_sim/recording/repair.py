@@ -9,6 +9,7 @@ import sys
 from dataclasses import dataclass
 from importlib.metadata import distributions
 from pathlib import Path
+from typing import BinaryIO
 
 from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
@@ -33,20 +34,28 @@ def extract(bag: Path, folder: Path) -> list[Path]:
             raise BagError(f"{bag} has a file attached that is called {name!r}: not a file's name")
     files = []
     for name, each in attached.items():
-        file = folder / name
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with file.open("xb") as stream:
-                stream.write(each.data)
-        except FileExistsError:
-            raise BagError(f"{file} exists already: choose another folder with --out") from None
-        except OSError as error:
-            raise BagError(f"{file} cannot be written: {error.strerror}") from None
-        files.append(file)
+        files.append(folder / name)
+        with new_file(files[-1]) as stream:
+            stream.write(each.data)
     if damage:
         written = f"; the other {len(files)} are written" if files else ""
         raise BagError("; ".join(fault.text for fault in damage) + written)
     return files
+
+
+def new_file(file: Path) -> BinaryIO:
+    """Open a file for writing that was not there, in a folder that is made.
+
+    Raises:
+        BagError: it is there already, or cannot be written.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return file.open("xb")
+    except FileExistsError:
+        raise BagError(f"{file} exists already: choose another folder with --out") from None
+    except OSError as error:
+        raise BagError(f"{file} cannot be written: {error.strerror}") from None
 
 
 def versions() -> str:

@@ -8,21 +8,30 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from us_sim.errors import BagError, TrackingError
+from us_sim.recording.decoding import affine_from
 from us_sim.recording.path import is_pose
 from us_sim.recording.reader import Bag
+from us_sim.recording.repair import new_file
 from us_sim.recording.wrench import WRENCH_STAMPED
 from us_sim.run.resimulation import scene_of
 from us_sim.run.session_lerobot import PIXELS
 from us_sim.run.session_summary import read_session
-from us_sim.run.session_tables import SECOND, Progress, bodies_of, read_times, read_values
+from us_sim.run.session_tables import (
+    SECOND,
+    Progress,
+    bodies_of,
+    read_times,
+    read_values,
+    write_table,
+)
 from us_sim.settings.spelling import counted
 
 _KINDS = (("", "m"), ("f", "n"), ("t", "nm"))  # of numbers: position, force, torque
+_HELD = {"poses": "poses", "wrench": "wrench", "images": "image", "areas": "scene attached"}
 AREAS = 200  # images of which areas are measured, evenly over the session
 _UNITS = {f"{kind}{axis}": f"{kind}{axis}_{unit}" for kind, unit in _KINDS for axis in "xyz"}
 """Names of columns with their units."""
@@ -44,24 +53,22 @@ def write_parts(
         UsSimError: the scene for the areas cannot be read.
     """
     there = [topic for topic in bag.topics if topic.message_count]
-    wrenches = [topic.name for topic in there if topic.type_name == WRENCH_STAMPED]
-    images = [topic.name for topic in there if topic.type_name in PIXELS]
-    bodies = bodies_of(bag)
-    scenes = {"scene.yaml"} & bag.attachments([]).keys()
-    needed: dict[str, tuple[str, Collection[str]]] = {
-        "poses": ("poses", bodies),
-        "wrench": ("wrench", wrenches),
-        "images": ("image", images),
-        "areas": ("scene attached", scenes),
+    needed = {
+        "poses": bodies_of(bag),
+        "wrench": [topic.name for topic in there if topic.type_name == WRENCH_STAMPED],
+        "images": [topic.name for topic in there if topic.type_name in PIXELS],
+        "areas": [name for name in bag.attachments([]) if name == "scene.yaml"],
     }
-    if lacking := [part for part in parts if not needed[part][1]]:
-        missing = " and ".join(dict.fromkeys(f"no {needed[part][0]}" for part in lacking))
+    if lacking := [part for part in parts if not needed[part]]:
+        missing = " and ".join(f"no {_HELD[part]}" for part in lacking)
         leave = " and ".join(f"--{part}" for part in lacking)
         raise BagError(f"{bag.path} holds {missing}; leave out {leave}")
-    for name in [*("poses" in parts) * bodies, *("wrench" in parts) * wrenches]:
+    for name in [name for part in ("poses", "wrench") if part in parts for name in needed[part]]:
         yield from _write_values(bag, name, folder)
     if "images" in parts:
-        made = [each for name in images for each in _write_images(bag, name, folder, progress)]
+        made = [
+            each for name in needed["images"] for each in _write_images(bag, name, folder, progress)
+        ]
         yield from made
         if not any(isinstance(each, Path) for each in made):
             raise BagError(f"{bag.path} holds no image that can be decoded")
@@ -79,13 +86,13 @@ def _write_values(bag: Bag, name: str, folder: Path) -> Iterator[Path | str]:
     stamps, logged = times["stamp"].map(_seconds), times["logged"].map(_seconds)
     head = pd.DataFrame({"stamp_s": stamps, "recorded_s": logged, "frame": times["frame"]})
     file = folder / f"{_file_name(name)}.csv"
-    yield _write_csv(file, head.join(values.rename(columns=_UNITS)), na_rep="nan")
+    yield write_table(file, head.join(values.rename(columns=_UNITS)), na_rep="nan")
     usable = np.ones(len(values), bool)
     if "qw" in values:
         usable = is_pose(values.to_numpy())
         file = file.with_suffix(".tum")
         kept = head[["stamp_s"]].join(values)[usable]
-        yield _write_csv(file, kept, sep=" ", header=False)
+        yield write_table(file, kept, sep=" ", header=False)
         if rejected := int((~usable).sum()):
             are = counted(rejected, "pose is", "poses are")
             yield f"{name}: {are} not finite or without an orientation, and not in {file.name}"
@@ -116,9 +123,10 @@ def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iter
     stamps = read_times(bag, [name])[name]
     times = stamps["stamp"].where(stamps["stamp"] != 0, stamps["logged"])
     millimetres = [f"{1e3 * each:.6g}" for each in spacing] or ["", ""]
-    facts = f"topic {name}"
+    facts, scale = f"topic {name}", dict[str, Any]()
     if spacing:
         facts += "; pixel spacing {} mm across, {} mm down".format(*millimetres)
+        scale = {"dpi": tuple(0.0254 / each for each in spacing)}
     rows, odd = [], []
     for number, raw in enumerate(bag.messages([name])):
         progress(number / len(times), name)
@@ -129,15 +137,19 @@ def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iter
             odd.append(str(error))
             continue
         file, stamp = stem / f"{number:06d}.png", _seconds(times[number])
+        texts = PngInfo()
         told = f"stamp {stamp} s; frame {message.header.frame_id}; {facts}"
-        _write_png(file, pixels, spacing, told)
+        texts.add_itxt("Description", told)
+        texts.add_itxt("Software", "us_sim")
+        with new_file(file) as stream:
+            Image.fromarray(pixels).save(stream, "PNG", pnginfo=texts, compress_level=3, **scale)
         rows.append((file.name, stamp, *millimetres))
     progress(1.0, "")
     if odd:
         yield f"{name}: {counted(len(odd), 'image')} skipped: {odd[0]}"
     if rows:
         columns = ["image", "stamp_s", "column_spacing_mm", "row_spacing_mm"]
-        file = _write_csv(stem.with_suffix(".csv"), pd.DataFrame(rows, columns=columns))
+        file = write_table(stem.with_suffix(".csv"), pd.DataFrame(rows, columns=columns))
         yield file
         yield from _say_odd_stamps(name, stamps["stamp"], file.name)
         yield stem
@@ -156,7 +168,7 @@ def _write_areas(bag: Bag, folder: Path, progress: Progress) -> Path:
     for name in areas.area:
         table[f"{name}_mm2"] = 1e6 * areas.area[name]
         table[f"{name}_at_rest_mm2"] = 1e6 * areas.at_rest[name]
-    return _write_csv(folder / "areas.csv", table.round(6))
+    return write_table(folder / "areas.csv", table.round(6))
 
 
 def _file_name(topic: str) -> str:
@@ -170,41 +182,11 @@ def _seconds(nanoseconds: int) -> str:
     return f"{sign}{abs(nanoseconds) // SECOND}.{abs(nanoseconds) % SECOND:09d}"
 
 
-def _write_csv(file: Path, table: pd.DataFrame, **options: Any) -> Path:
-    with _new(file) as stream:
-        table.to_csv(stream, mode="wb", index=False, lineterminator="\n", **options)
-    return file
-
-
-def _new(file: Path) -> Any:
-    """A file that was not there, opened for writing."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        return file.open("xb")
-    except FileExistsError:
-        raise BagError(f"{file} exists already: choose another folder with --out") from None
-    except OSError as error:
-        raise BagError(f"{file} cannot be written: {error.strerror}") from None
-
-
-def _spacing(bag: Bag, name: str) -> tuple[float, ...]:
+def _spacing(bag: Bag, name: str) -> list[float]:
     """m from column to column and from row to row, where the recording says so."""
     matrices = f"{name.rpartition('/')[0]}/image_to_probe"
     if any(each.name == matrices for each in bag.topics):
         for message in bag.messages([matrices]):
-            values = np.array(bag.deserialize(message).data, float)
-            if values.shape == (16,) and np.isfinite(values).all():
-                spacing = np.linalg.norm(values.reshape(4, 4)[:3, :2], axis=0)
-                return tuple(spacing.tolist()) if spacing.all() else ()
-    return ()
-
-
-def _write_png(
-    file: Path, pixels: NDArray[np.uint8], spacing: tuple[float, ...], description: str
-) -> None:
-    texts = PngInfo()
-    texts.add_itxt("Description", description)
-    texts.add_itxt("Software", "us_sim")
-    dpi = {"dpi": tuple(0.0254 / each for each in spacing)} if spacing else {}
-    with _new(file) as stream:
-        Image.fromarray(pixels).save(stream, "PNG", pnginfo=texts, compress_level=3, **dpi)
+            spacing = np.linalg.norm(affine_from(bag.deserialize(message))[:3, :2], axis=0)
+            return spacing.tolist() if spacing.all() else []
+    return []

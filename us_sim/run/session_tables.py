@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from us_sim.errors import BagError
 from us_sim.recording.lerobot_writer import POSE_PARTS, WRENCH_PARTS
 from us_sim.recording.path import POSE_STAMPED, bodies_in, pose_rows
 from us_sim.recording.reader import Bag
+from us_sim.recording.repair import new_file
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import Fault
 from us_sim.recording.wrench import WRENCH_STAMPED
@@ -77,20 +79,17 @@ def bodies_of(bag: Bag) -> list[str]:
     return stamped or [name for names in bodies_in(bag).values() for name in names]
 
 
-def _components(*vectors: Any) -> Iterator[float]:
-    return (float(each) for vector in vectors for each in (vector.x, vector.y, vector.z))
+def _numbers(names: tuple[str, ...], linear: Any, angular: Any) -> dict[str, float]:
+    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    return dict(zip(names, map(float, values), strict=True))
 
 
-_VALUES: Mapping[str, Callable[[Any], Iterator[tuple[str, float]]]] = {
-    WRENCH_STAMPED: lambda m: zip(
-        WRENCH_PARTS, _components(m.wrench.force, m.wrench.torque), strict=True
+_VALUES: Mapping[str, Callable[[Any], dict[str, float]]] = {
+    WRENCH_STAMPED: lambda m: _numbers(WRENCH_PARTS, m.wrench.force, m.wrench.torque),
+    "geometry_msgs/msg/TwistStamped": lambda m: _numbers(
+        ("x", "y", "z", "rx", "ry", "rz"), m.twist.linear, m.twist.angular
     ),
-    "geometry_msgs/msg/TwistStamped": lambda m: zip(
-        ("x", "y", "z", "rx", "ry", "rz"), _components(m.twist.linear, m.twist.angular), strict=True
-    ),
-    "sensor_msgs/msg/JointState": lambda m: zip(
-        map(str, m.name), map(float, m.position), strict=False
-    ),
+    "sensor_msgs/msg/JointState": lambda m: dict(zip(m.name, m.position.tolist(), strict=False)),
 }
 VALUES = tuple(_VALUES)
 """Types whose numbers `read_values` reads, besides those of poses."""
@@ -112,22 +111,32 @@ def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
         BagError: there is no such topic or body, it has no numbers, or a message is unlike ROS 2's.
     """
     topic = bag.topic(name.partition(":")[0])
-    times: list[tuple[int, int, str]] = []
+    rows: list[tuple[int, int, str]] = []
     numbers: list[dict[str, float]] = []
-    if topic.type_name not in _VALUES:
-        for row in pose_rows(bag, name):
-            times.append((row.stamp, row.log_time, row.frame_id))
-            numbers.append(dict(zip(POSE_PARTS, row.pose, strict=True)))
-    else:
+    if topic.type_name in _VALUES:
         for raw in bag.messages([topic.name]):
             message = bag.deserialize(raw)
             try:
                 stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
-                times.append((stamp, raw.log_time, message.header.frame_id))
-                numbers.append(dict(_VALUES[topic.type_name](message)))
+                rows.append((stamp, raw.log_time, message.header.frame_id))
+                numbers.append(_VALUES[topic.type_name](message))
             except (AttributeError, TypeError, ValueError) as error:
-                raise BagError(
-                    f"{bag.path}, {topic.name}: no {topic.type_name} of ROS 2: {error}"
-                ) from None
-    found = pd.DataFrame(times, columns=["stamp", "logged", "frame"])
+                kind = f"no {topic.type_name} of ROS 2"
+                raise BagError(f"{bag.path}, {topic.name}: {kind}: {error}") from None
+    else:
+        for row in pose_rows(bag, name):
+            rows.append((row.stamp, row.log_time, row.frame_id))
+            numbers.append(dict(zip(POSE_PARTS, row.pose, strict=True)))
+    found = pd.DataFrame(rows, columns=["stamp", "logged", "frame"])
     return found, pd.DataFrame(numbers, index=found.index, dtype=float)
+
+
+def write_table(file: Path, table: pd.DataFrame, **options: Any) -> Path:
+    """Write a table as a new CSV file, with ``options`` of pandas; return its path.
+
+    Raises:
+        BagError: the file is there already, or cannot be written.
+    """
+    with new_file(file) as stream:
+        table.to_csv(stream, mode="wb", index=False, lineterminator="\n", **options)
+    return file
