@@ -1,7 +1,6 @@
 """Message definitions for a bag: the text of a type with all it refers to, and its RIHS01 hash.
 
-Where ROS 2 is installed the text is the installed ``.msg`` file, comments and all, exactly as
-rosbag2 writes it; elsewhere the definition of the same fields comes from rosbags.
+Where ROS 2 is installed they are of the installed ``.msg`` files, elsewhere those of Jazzy.
 """
 
 from __future__ import annotations
@@ -12,29 +11,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from us_sim.errors import BagError
 
-_RULE = "=" * 80
-_PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"} | {
-    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
-}
-_FIELD_TYPE = re.compile(r"^\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.MULTILINE)
-"""A field starts with its type; a constant or comment never names a message type."""
-
 _TYPE_NAME = re.compile(r"([a-zA-Z]\w*)/(?:msg/)?([a-zA-Z]\w*)")
-
-_DEFAULTS = {
-    "geometry_msgs/msg/Quaternion": {
-        "float64 x": "float64 x 0",
-        "float64 y": "float64 y 0",
-        "float64 z": "float64 z 0",
-        "float64 w": "float64 w 1",
-    }
-}
-"""rosbags keeps no default values, and this is the one message of common_interfaces with any."""
+_Fields = dict[str, tuple[Any, list[Any]]]  # constants and fields, by type, as rosbags has them
 
 
 def normalized_type(name: str) -> str:
@@ -46,12 +30,10 @@ def normalized_type(name: str) -> str:
 def schema_text(type_name: str) -> str:
     """The ``ros2msg`` schema of ``pkg/msg/Type``, followed by every type that it refers to.
 
-    The order is rosbag2's: depth first, the types that one message refers to by name.
-
     Raises:
         BagError: neither an installed package nor rosbags' Jazzy types define it.
     """
-    return _schema_text(type_name, os.environ.get("AMENT_PREFIX_PATH", ""))
+    return _installed(type_name, _prefixes()).generate_msgdef(type_name, ros_version=2)[0]
 
 
 def type_hash(type_name: str) -> str:
@@ -60,10 +42,7 @@ def type_hash(type_name: str) -> str:
     Raises:
         BagError: the type is not known.
     """
-    store = jazzy_definitions()
-    if type_name not in store.fielddefs or os.environ.get("ROS_DISTRO", "jazzy") != "jazzy":
-        store = definitions(type_name, schema_text(type_name))
-    return store.hash_rihs01(type_name)
+    return _installed(type_name, _prefixes()).hash_rihs01(type_name)
 
 
 @cache
@@ -99,28 +78,35 @@ def stamped(type_name: str, stamp: int, frame_id: str, **fields: Any) -> memoryv
     return store.serialize_cdr(message, type_name, little_endian=True)
 
 
+def _prefixes() -> str:
+    return os.environ.get("AMENT_PREFIX_PATH", "")
+
+
 @cache
-def _schema_text(type_name: str, prefixes: str) -> str:
-    parts: list[str] = []
-    seen = {type_name}
-
-    def append(name: str) -> None:
-        text = _definition(name, prefixes)
-        parts.append(text if not parts else f"{_RULE}\nMSG: {name.replace('/msg/', '/')}\n{text}")
-        package = name.split("/")[0]
-        referred = {field.group(1) for field in _FIELD_TYPE.finditer(text)} - _PRIMITIVES
-        for short in sorted(short if "/" in short else f"{package}/{short}" for short in referred):
-            dependency = normalized_type(short)
-            if dependency not in seen:
-                seen.add(dependency)
-                append(dependency)
-
-    append(type_name)
-    return "\n".join(parts)
+def _installed(type_name: str, prefixes: str) -> Typestore:
+    """A type with every one that it refers to."""
+    found: _Fields = {}
+    wanted = [type_name]
+    while wanted:
+        name = wanted.pop()
+        if name not in found:
+            found |= _definition(name, prefixes)
+            wanted += [other for _, kind in found[name][1] for other in _named(kind)]
+    store = get_typestore(Stores.EMPTY)
+    store.register(found)
+    return store
 
 
-def _definition(type_name: str, prefixes: str) -> str:
-    """The text of one message, without those that it refers to."""
+def _named(kind: Any) -> list[str]:
+    """The message that a field, or each element of one, is."""
+    node, content = kind
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return _named(content[0])
+    return [content] if node == Nodetype.NAME else []
+
+
+def _definition(type_name: str, prefixes: str) -> _Fields:
+    """One message, without those that it refers to."""
     match = _TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise BagError(f"{type_name!r} is not a message type: write it as package/msg/Type")
@@ -128,13 +114,11 @@ def _definition(type_name: str, prefixes: str) -> str:
     for prefix in filter(None, prefixes.split(os.pathsep)):
         file = Path(prefix, "share", package, "msg", f"{name}.msg")
         if file.is_file():
-            return file.read_bytes().decode("utf-8")
-    store = jazzy_definitions()
-    if type_name not in store.fielddefs:
+            return get_types_from_msg(file.read_text(encoding="utf-8"), type_name)
+    known = jazzy_definitions().fielddefs
+    if type_name not in known:
         raise BagError(
             f"message type {type_name} is unknown: install the ROS 2 package {package} and source "
             f"its setup file, or leave topics of this type out"
         )
-    text = store.generate_msgdef(type_name, ros_version=2)[0].split(_RULE)[0]
-    defaults = _DEFAULTS.get(type_name, {})
-    return "".join(f"{defaults.get(line, line)}\n" for line in text.splitlines())
+    return {type_name: known[type_name]}

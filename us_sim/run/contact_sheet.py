@@ -111,24 +111,18 @@ def contact_sheet(session: Session, scene: Scene, areas: LumenAreas | None, file
             lumens = {n: _colour(scene, name) for name in numbers for n in numbers[name]}
             _draw_outlines(axes, scanner.frame(pose, session.nodes[stamp]), lumens)
         axes.set_title(f"{title}: t = {times[i]:.2f} s, {_place(pose)}", fontsize=11)
-        axes.set_xlabel(_caption(areas, times[i]), fontsize=12)
+        axes.set_xlabel("lateral, mm" if areas is None else _caption(areas, times[i]), fontsize=12)
         if i % 3 == 0:
             axes.set_ylabel("depth, mm")
     figure.suptitle(f"us_sim: {scene.name} ({scene.volume.name})", fontsize=15)
-    notes = _DARK
     if areas is not None:
         colours = {name: _colour(scene, name) for name in areas.area}
         _plot_areas(figure.add_subplot(grid[-1, :]), areas, times, colours)
-        notes += _AREAS
-    figure.supxlabel(notes, fontsize=11)
+    figure.supxlabel(_DARK, fontsize=11)
     figure.savefig(file, dpi=80)
 
 
 _DARK = "Beams of the part of the face that does not touch the skin stay dark."
-_AREAS = (
-    "\nAreas are of the tissue in the image plane, also below a probe in the air. Above 100 % the "
-    "plane cuts more of the vessel than at rest."
-)
 
 
 def pick_moments(session: Session) -> dict[str, int]:
@@ -158,24 +152,18 @@ def pick_moments(session: Session) -> dict[str, int]:
 
 
 def _place(pose: Pose) -> str:
-    """Where the probe is over or below the skin at rest, and how far from upright."""
-    tilt = float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
-    tilted = f", tilted {tilt:.0f}°" if tilt >= 0.5 else ""
+    """How far the probe is over or below the skin at rest."""
     depth = 1e3 * float(pose.position[2])
-    place = f"pressed {depth:.1f} mm" if depth >= 0.05 else "on the skin"
-    return (place if depth > -0.05 else f"in the air, {-depth:.1f} mm high") + tilted
+    return f"pressed {depth:.1f} mm" if depth > -0.05 else f"in the air, {-depth:.1f} mm high"
 
 
-def _caption(areas: LumenAreas | None, time: float) -> str:
-    if areas is None:
-        return "lateral, mm"
+def _caption(areas: LumenAreas, time: float) -> str:
     sample = int(np.argmin(np.abs(areas.time - time)))
-    said = []
-    for name, area in areas.area.items():
-        percent = 100 * areas.fraction(name)[sample]
-        of_rest = f"{area[sample] * 1e6:.1f} mm² ({percent:.0f} %)"
-        said.append(f"{name} {'not whole in the image' if np.isnan(percent) else of_rest}")
-    return ",   ".join(said)
+    percents = {name: 100 * areas.fraction(name)[sample] for name in areas.area}
+    return ",   ".join(
+        f"{name} {'not whole in the image' if np.isnan(percent) else f'{percent:.0f} % of rest'}"
+        for name, percent in percents.items()
+    )
 
 
 def _colour(scene: Scene, name: str) -> Colour:

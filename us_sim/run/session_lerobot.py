@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,6 @@ _HIGHEST_RATE = 1000  # Hz
 _MOST_FRAMES = 10_000_000
 """Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""
 _LATE = SECOND  # ns that a stamp may be older than one before; more is another time
-_LONG = 0.5  # s between two messages, between which frames are told to be interpolated
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ class Track:
     notes: list[str]  # on messages that are not as they should be
     is_image: bool = False
     turns: bool = False  # whether the numbers are poses
-    damaged: int = field(default=0, init=False)  # of the images that were to be shown
+    damaged: int = 0  # of the images that were to be shown
 
     def __post_init__(self) -> None:
         if len(self.table) < 2:
@@ -143,9 +142,9 @@ class Track:
                 try:
                     pixels = PIXELS[raw.type_name](bag.deserialize(raw), "RGB")
                 except TrackingError as error:
-                    self.damaged += 1
                     if pixels is None:
                         raise BagError(f"{bag.path}: {self.name}: {error}") from error
+                    self.damaged += 1
             assert pixels is not None
             yield pixels
 
@@ -160,16 +159,14 @@ class Track:
                 f"{counted(len(moments) - count, 'frame repeats', 'frames repeat')} the one "
                 f"before, which is {oldest:.3f} s old at most"
             )
-            damaged = [f"{self.damaged} cannot be decoded"] if self.damaged else []
-            return "; ".join([f"{self.name}: {told}", *damaged, *self.notes])
-        after = np.clip(np.searchsorted(self.times, moments), 1, len(self.times) - 1)
-        gaps = (self.times[after] - self.times[after - 1]) / SECOND
-        between = "slerp" if self.turns else "linear"
-        messages = counted(len(self.times), "message")
-        told = f"{self.name}: {between} between {messages}, {gaps.max():.3f} s apart at most"
-        lie = counted(int((gaps > _LONG).sum()), "frame lies", "frames lie")
-        far = [f"{lie} between messages more than {_LONG} s apart"] if gaps.max() > _LONG else []
-        return "; ".join([told, *far, *self.notes])
+        else:
+            after = np.clip(np.searchsorted(self.times, moments), 1, len(self.times) - 1)
+            gap = (self.times[after] - self.times[after - 1]).max() / SECOND
+            between = "slerp" if self.turns else "linear"
+            messages = counted(len(self.times), "message")
+            told = f"{between} between {messages}, {gap:.3f} s apart at most"
+        damaged = [f"{self.damaged} cannot be decoded"] if self.damaged else []
+        return "; ".join([f"{self.name}: {told}", *damaged, *self.notes])
 
 
 class Episode:

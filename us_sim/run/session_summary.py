@@ -56,7 +56,7 @@ class Session:
         }
 
     def lumen_areas(
-        self, scene: Scene, samples: int, progress: Callable[[float], None] | None = None
+        self, scene: Scene, samples: int, progress: Callable[[float], None] = lambda _: None
     ) -> LumenAreas | None:
         """Vessel cross-sections at up to ``samples`` images; None without labels or tissue."""
         meter = self.measured_lumens(scene, samples, progress)
@@ -66,7 +66,7 @@ class Session:
         self,
         scene: Scene,
         samples: int,
-        progress: Callable[[float], None] | None = None,
+        progress: Callable[[float], None] = lambda _: None,
         lines: Mapping[str, CentreLine] | None = None,
     ) -> LumenMeter | None:
         """Likewise, with centre lines of the vessels for their places.
@@ -89,8 +89,7 @@ class Session:
         for k, stamp in enumerate((stamps[at] for at in picked), 1):
             pose = self.poses[stamp]
             meter.add((stamp - first) / SECOND, pose, scanner.labels(pose, self.nodes[stamp]))
-            if progress is not None:
-                progress(k / len(picked))
+            progress(k / len(picked))
         return meter
 
     def scanner_of_vessels(self, scene: Scene) -> tuple[dict[str, tuple[int, ...]], BMode | None]:
