@@ -91,12 +91,11 @@ def pose_from_text(text: str) -> Pose:
         PoseError: it is no pose.
     """
     try:
-        numbers = np.array([float(word) for word in text.split()])
+        x, y, z, *quaternion = map(float, text.split())
+        return Pose(np.array([x, y, z]), np.array(quaternion).reshape(4))
     except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) != 7:
-        raise PoseError(f"{text[:80]!r} is no pose: 7 numbers are one, x y z and a quaternion")
-    return Pose(numbers[:3], numbers[3:])
+        told = f"{text[:80]!r} is no pose: 7 numbers are one, x y z and a quaternion"
+        raise PoseError(told) from None
 
 
 def transform_from(message: Any) -> Pose:
@@ -126,11 +125,7 @@ def wrench_from(message: Any, frame: str | None = None) -> NDArray[np.float64]:
         FrameError: it is in another frame.
     """
     require_frame(message.header, frame)
-    f, t = message.wrench.force, message.wrench.torque
-    wrench = np.array([f.x, f.y, f.z, t.x, t.y, t.z])
-    if not np.isfinite(wrench).all():
-        raise MessageError(f"the wrench is not finite: {wrench.tolist()}")
-    return wrench
+    return _six_numbers("wrench", message.wrench.force, message.wrench.torque)
 
 
 def twist_from(message: Any) -> NDArray[np.float64]:
@@ -139,11 +134,18 @@ def twist_from(message: Any) -> NDArray[np.float64]:
     Raises:
         MessageError: a number is not finite.
     """
-    v, w = message.twist.linear, message.twist.angular
-    twist = np.array([v.x, v.y, v.z, w.x, w.y, w.z])
-    if not np.isfinite(twist).all():
-        raise MessageError(f"the velocity is not finite: {twist.tolist()}")
-    return twist
+    return _six_numbers("velocity", message.twist.linear, message.twist.angular)
+
+
+def _six_numbers(what: str, linear: Any, angular: Any) -> NDArray[np.float64]:
+    numbers = np.array([*_xyz(linear), *_xyz(angular)])
+    if not np.isfinite(numbers).all():
+        raise MessageError(f"the {what} is not finite: {numbers.tolist()}")
+    return numbers
+
+
+def _xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
 
 
 _KINDS = {7: "f4", 8: "f8"}  # by sensor_msgs/PointField's FLOAT32 and FLOAT64
@@ -232,8 +234,7 @@ def pixels_from(message: Any) -> NDArray[np.uint8]:
     Raises:
         VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
     """
-    if message.encoding not in ("mono8", "8UC1"):
-        raise VolumeError(f"the image is {message.encoding}; it must be mono8")
+    _require_encoding(message, "mono8", "8UC1")
     return rows_from(message, 1)
 
 
@@ -243,9 +244,13 @@ def colour_pixels_from(message: Any) -> NDArray[np.uint8]:
     Raises:
         VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
     """
-    if message.encoding != "rgb8":
-        raise VolumeError(f"the image is {message.encoding}; it must be rgb8")
+    _require_encoding(message, "rgb8")
     return rows_from(message, 3).reshape(int(message.height), int(message.width), 3)
+
+
+def _require_encoding(message: Any, *known: str) -> None:
+    if message.encoding not in known:
+        raise VolumeError(f"the image is {message.encoding}; it must be {known[0]}")
 
 
 def field_from(message: Any) -> NDArray[np.float32]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,6 @@ class BagMetadata:
     duration: int = 0  # ns
     message_count: int = 0
     compression_mode: str = ""  # "", "FILE" or "MESSAGE"
-    custom_data: Mapping[str, str] = field(default_factory=dict)
 
     def document(self) -> str:
         """The text of the file, for a bag of one MCAP file."""
@@ -62,7 +61,7 @@ class BagMetadata:
             "compression_mode": self.compression_mode,
             "relative_file_paths": [*self.files],
             "files": [{"path": file, **extent} for file in self.files],
-            "custom_data": dict(self.custom_data) or None,
+            "custom_data": None,
             "ros_distro": os.environ.get("ROS_DISTRO") or "jazzy",
         }
 
@@ -91,7 +90,6 @@ def read_metadata(file: Path) -> BagMetadata:
             duration=int(information["duration"]["nanoseconds"]),
             message_count=int(information["message_count"]),
             compression_mode=str(information.get("compression_mode") or "").upper(),
-            custom_data=dict(information.get("custom_data") or {}),
         )
     except OSError as error:
         raise BagError(f"{file} cannot be read: {error.strerror}") from None

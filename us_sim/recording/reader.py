@@ -30,7 +30,6 @@ from us_sim.errors import BagError, printable
 from us_sim.recording.metadata import BagMetadata
 from us_sim.recording.schemas import definitions, jazzy_definitions
 from us_sim.recording.storage import (
-    Scratch,
     Storage,
     bag_files,
     missing_files,
@@ -43,13 +42,10 @@ from us_sim.settings.spelling import aligned
 class Bag:
     """A bag opened for reading; made by :func:`read_bag`."""
 
-    def __init__(
-        self, path: Path, storages: list[Storage], metadata: BagMetadata | None, scratch: Scratch
-    ) -> None:
+    def __init__(self, path: Path, storages: list[Storage], metadata: BagMetadata | None) -> None:
         self.path = path
         self.metadata = metadata
         self._storages = storages
-        self._scratch = scratch  # kept alive with the files that it unpacked
         self._is_packed = metadata is not None and metadata.compression_mode == "MESSAGE"
         topics: dict[str, BagTopic] = {}
         for topic in (topic for storage in storages for topic in storage.topics):
@@ -278,9 +274,7 @@ def read_bag(path: str | Path, *further: Path) -> Bag:
     path = Path(path)
     try:
         files, metadata = bag_files(path)
-        scratch = Scratch()
-        storages = [open_storage(file, scratch) for file in (*files, *further)]
-        return Bag(path, storages, metadata, scratch)
+        return Bag(path, [open_storage(file) for file in (*files, *further)], metadata)
     except OSError as error:
         raise BagError(f"{path} cannot be read: {error.strerror or error}") from None
 

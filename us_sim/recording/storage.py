@@ -106,30 +106,28 @@ class NoBagError(BagError):
     """A file that is of another kind."""
 
 
-class Scratch:
-    """A temporary folder for unpacked files, made when needed and removed with this object."""
+def _open_packed(file: Path) -> Storage:
+    """The reader of a zstd file; of one that is cut off, of the bytes before the cut.
 
-    def __init__(self) -> None:
-        self._folder: str | None = None
-
-    def unpack(self, file: Path) -> Path:
-        """A decompressed copy of a zstd file; of one that is cut off, of the bytes before the cut.
-
-        Raises:
-            BagError: the file is damaged.
-        """
-        if self._folder is None:
-            self._folder = tempfile.mkdtemp(prefix="us_sim_bag_")
-            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-        copy = Path(self._folder, file.name.removesuffix(".zstd"))
-        try:
-            with file.open("rb") as packed, copy.open("wb") as unpacked:
-                frames = zstandard.ZstdDecompressor()
-                with frames.stream_reader(packed, read_across_frames=True) as reader:
-                    shutil.copyfileobj(reader, unpacked, 1 << 20)
-        except zstandard.ZstdError as error:
+    Its decompressed copy is removed with the reader.
+    """
+    folder = tempfile.mkdtemp(prefix="us_sim_bag_")
+    copy = Path(folder, file.name.removesuffix(".zstd"))
+    try:
+        with file.open("rb") as packed, copy.open("wb") as unpacked:
+            frames = zstandard.ZstdDecompressor()
+            with frames.stream_reader(packed, read_across_frames=True) as reader:
+                shutil.copyfileobj(reader, unpacked, 1 << 20)
+        if not copy.stat().st_size:
+            raise BagError(f"{file} is cut before anything of it can be unpacked: copy it again")
+        storage = open_storage(copy, str(file))
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, zstandard.ZstdError):
             raise BagError(f"{file} cannot be decompressed: {error}") from None
-        return copy
+        raise
+    weakref.finalize(storage, shutil.rmtree, folder, ignore_errors=True)
+    return storage
 
 
 def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
@@ -158,7 +156,7 @@ def bag_files(path: Path) -> tuple[list[Path], BagMetadata | None]:
     return files, None
 
 
-def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
+def open_storage(file: Path, label: str = "") -> Storage:
     """The reader of a file by its first bytes, whatever its name; errors name it, or the label.
 
     Raises:
@@ -175,10 +173,7 @@ def open_storage(file: Path, scratch: Scratch, label: str = "") -> Storage:
     if start == _SQLITE_MAGIC:
         return SqliteStorage(file, label)
     if start.startswith(_ZSTD_MAGIC):
-        copy = scratch.unpack(file)
-        if not copy.stat().st_size:
-            raise BagError(f"{label} is cut before anything of it can be unpacked: copy it again")
-        return open_storage(copy, scratch, label)
+        return _open_packed(file)
     if start.startswith(b"#ROSBAG"):
         raise BagError(f"{label} is a bag of ROS 1: convert it with rosbags-convert first")
     raise NoBagError(f"{label} is not a bag: it is neither MCAP nor SQLite, compressed or not")

@@ -118,7 +118,6 @@ class WriteBehind:
         if lost := self.losses:
             note = {topic: str(count) for topic, count in lost.items()}
             self._try(partial(self._bag.note, LOST, note))
-        self._bag.custom_data["messages_lost"] = str(lost.total())
         self._bag.close()
 
     def _run(self) -> None:

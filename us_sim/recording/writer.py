@@ -131,7 +131,6 @@ class BagWriter:
     ) -> None:
         if compression not in _COMPRESSIONS:
             raise BagError(f"chunks cannot be compressed with {compression!r}: use none or zstd")
-        self.custom_data: dict[str, str] = {}  # free text for the metadata
         self._counts: Counter[str] = Counter()  # messages by topic
         self._span: tuple[int, int] | None = None  # ns, of their log times
         self._topics: dict[str, BagTopic] = {}
@@ -366,7 +365,7 @@ class BagWriter:
         topics = tuple(
             replace(topic, message_count=self._counts[name]) for name, topic in self._topics.items()
         )
-        metadata = BagMetadata((self.path.name,), topics, custom_data=self.custom_data)
+        metadata = BagMetadata((self.path.name,), topics)
         if self._span is None:
             return metadata
         first, last = self._span
