@@ -24,7 +24,7 @@ def sweep(tmp_path):
 def test_a_sweep_becomes_a_case_that_says_what_was_done_and_not_of_whom(sweep, tmp_path):
     path, _ = sweep
     out = tmp_path / "arm"
-    options = ["--spacing", "1 mm", "--leave-one-out", "1", "--clip", "0", "0", "9", "9"]
+    options = ["--spacing", "1 mm", "--clip", "0", "0", "9", "9"]
     assert main(["reconstruct", str(path), "--out", str(out), *options]) == 0
     case = read_case(out)
     assert case.volume().shape == (10, 10, 12)

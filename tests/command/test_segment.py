@@ -96,7 +96,7 @@ def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, 
     [
         ([], "no labels yet: give --labels, --seeds, or --vessels dark"),
         (["--seeds", "SEEDS", "--vessels", "dark"], "two sources of labels"),
-        (["--seeds", "SEEDS", "--resample"], "--resample: is for --labels only"),
+        (["--seeds", "SEEDS", "--names", "3=vein"], "--names: is for --labels only"),
         (["--labels", "SEEDS", "--names", "3=Doe 1961"], "identity"),
     ],
 )

@@ -28,7 +28,7 @@ def case(shared_data, tmp_path_factory):
     """The liver sweep, reconstructed coarsely and segmented."""
     sweep = shared_data / "imfusion-liver-sweep" / "liver_sweep.igs.mha"
     folder = tmp_path_factory.mktemp("liver")
-    made = ["--method", "nearest", "--spacing", "1 mm"]
+    made = ["--spacing", "1 mm"]
     assert "140 frames" in run(folder, "reconstruct", sweep, "--out", "cases/liver", *made)
     run(folder, "segment", "cases/liver", "--seeds", "liver_sweep")
     return folder / "cases" / "liver"

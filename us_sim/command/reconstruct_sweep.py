@@ -12,16 +12,13 @@ from us_sim.command.volume_pictures import draw_slices
 from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.spelling import counted
 from us_sim.volume.cases.settings import CaseSettings
 from us_sim.volume.cases.writing import new_case, write_case_settings
 from us_sim.volume.files.writing import write_volume
 from us_sim.volume.reconstruction.calibration_file import SweepCalibration, read_calibration
 from us_sim.volume.reconstruction.reconstruction import (
-    Prediction,
     Progress,
     Rest,
-    leave_one_out,
     plan,
     reconstruct,
 )
@@ -53,11 +50,6 @@ class SweepSettings(Settings):
         Quantity("time", -10.0, 10.0),
         "to add to the images' times to find their poses",
         default=0.0,
-    )
-    leave_one_out: int = setting(
-        Quantity("number", 0, 1000),
-        "predict so many frames from the others, and say how like they are",
-        default=0,
     )
 
     def check(self) -> None:
@@ -126,9 +118,6 @@ def reconstruct_sweep(
     planned = plan(sweep, compounding, part, rest)
     made = reconstruct(planned, progress=progress)
     scanner = None if settings.is_volume else scanning_probe(sweep, part, planned.used)
-    prediction = None
-    if settings.leave_one_out:
-        prediction = leave_one_out(planned, settings.leave_one_out, progress)
     shape = " × ".join(map(str, made.volume.shape))
     size = f"{shape} voxels of {1e3 * planned.grid.spacing:.4g} mm"
     picture = settings.picture
@@ -145,8 +134,7 @@ def reconstruct_sweep(
             draw_slices(folder / picture.name, made.volume, made.covered, size)
     sentences = [
         f"{settings.out}: {size} ({100.0 * made.covered.mean():.0f} % covered, {made.filled} of "
-        f"them filled holes) from {made.frames} frames by {compounding.method} insertion and "
-        f"{compounding.compounding} compounding"
+        f"them filled holes) from {made.frames} frames"
     ]
     if left_out := sweep.left_out:
         why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())
@@ -158,20 +146,7 @@ def reconstruct_sweep(
         )
     if sweep.sequence.are_colours:
         sentences.append("its colour images were made grey")
-    if prediction is not None:
-        middle, worst = _correlations(prediction)
-        sentences.append(
-            f"{counted(len(prediction.frames), 'frame')} of {settings.leave_one_out} asked for, "
-            f"predicted from the others, correlate with what was seen by {middle:.3f} in the "
-            f"median and {worst:.3f} at worst"
-        )
     if scanner is not None:
         probe = scanner.probe and f"those of a {scanner.probe.geometry} array"
         sentences.append(f"its images are {probe or 'of a probe whose shape is guessed'}")
     return "; ".join([*sentences, f"slices in {picture}"])
-
-
-def _correlations(prediction: Prediction) -> tuple[float, float]:
-    """The median and the worst."""
-    found = prediction.correlations
-    return float(np.nanmedian(found)), float(np.nanmin(found))

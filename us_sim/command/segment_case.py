@@ -29,7 +29,7 @@ from us_sim.volume.segmentation.settings import (
 )
 from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.structure_names import anatomical_colour
-from us_sim.volume.surfaces.stl_file import write_stl
+from us_sim.volume.surfaces.closed_surface import write_stl
 from us_sim.volume.surfaces.structure_surface import StructureSurface, structure_surface
 from us_sim.volume.volume import LabelMap, Volume
 
@@ -88,8 +88,6 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelM
         return read_labels(
             asked.labels,
             volume,
-            resample=asked.resample,
-            table=asked.label_table,
             names=asked.given_names(),
             taken=RESERVED,
         )

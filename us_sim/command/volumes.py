@@ -10,8 +10,6 @@ from us_sim.command.options import add_setting_options, read_settings
 from us_sim.errors import UsSimError
 from us_sim.progress import late_progress
 
-_REPORT = Path("us_sim_import")
-
 
 def import_options(parser: argparse.ArgumentParser) -> None:
     from us_sim.volume.deidentification.settings import ImportSettings
@@ -29,12 +27,10 @@ def import_options(parser: argparse.ArgumentParser) -> None:
         help="new folder of a case, volume (.nrrd, .mha, .nii, .nii.gz), or .igs.mha for 2D images",
     )
     parser.add_argument(
-        "--report",
+        "--picture",
         type=Path,
-        nargs="?",
-        const=_REPORT,
-        metavar="FOLDER",
-        help=f"list what is kept, blanked and dropped, with a picture; default: {_REPORT}",
+        metavar="FILE",
+        help="write the first image as it is, with boxes around what is kept, as a PNG",
     )
     add_setting_options(parser, ImportSettings)
     parser.set_defaults(command=_import)
@@ -42,27 +38,19 @@ def import_options(parser: argparse.ArgumentParser) -> None:
 
 def _import(args: argparse.Namespace) -> int:
     from us_sim.volume.deidentification.importing import look_at
-    from us_sim.volume.deidentification.report import (
-        refuse_report,
-        report_text,
-        summary,
-        write_report,
-    )
     from us_sim.volume.deidentification.settings import ImportSettings
 
-    if args.out is None and args.report is None:
-        raise UsSimError("say where to with --out CASE|FILE, or --report to see what would be done")
-    settings = read_settings(args, ImportSettings)
-    if args.report is not None:
-        refuse_report(args.report)
-    found = look_at(args.files, args.out, settings)
-    if args.report is not None:  # before what is refused: its picture shows what to say
-        written = write_report(args.report, found)
-        print(report_text(found))
-        print(f"{written[0]} and {written[1].name} beside it, which may show a name")
+    if args.out is None and args.picture is None:
+        raise UsSimError(
+            "say where to with --out CASE|FILE, or --picture to see what would be done"
+        )
+    found = look_at(args.files, args.out, read_settings(args, ImportSettings))
+    if args.picture is not None:  # before what is refused: it shows what to say
+        found.draw(args.picture)
+        print(f"{args.picture}: may show a name")
     if args.out is not None:
         found.write(late_progress("import"))
-        print(f"{args.out}: {summary(found)}")
+    print(f"{args.out or args.picture}: {found.said}")
     return 0
 
 

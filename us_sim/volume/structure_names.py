@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from functools import cache
 
 from us_sim.share import shared_path
@@ -34,28 +34,6 @@ def _words() -> frozenset[str]:
     of the limbs. Words that are many people's names stand in `_PHRASES` with what goes with them.
     """
     return frozenset(shared_path("config/anatomy.txt").read_text(encoding="utf-8").split())
-
-
-def coded_name(codes: Sequence[str]) -> str:
-    """The meaning of SNOMED codes of a type and its modifier; empty where none is known.
-
-    The words are those of pydicom's dictionary of the standard, never a file's own.
-    """
-    meanings = [_meanings().get(code, "") for code in codes[:2]]
-    kind, modifier = (*meanings, "", "")[:2]
-    return readable(f"{modifier} {kind}").lower() if kind else ""
-
-
-@cache
-def _meanings() -> Mapping[str, str]:
-    try:
-        from pydicom.sr.codedict import codes
-    except ImportError:
-        return {}
-    terms = (getattr(codes.SCT, name) for name in codes.SCT.dir())
-    # "Structure of right kidney (body structure)" is a right kidney.
-    without = re.compile(r"\(.*|\bstructures?( of( the)?)?\b|[^\w ]+", re.IGNORECASE)
-    return {term.value: readable(without.sub(" ", term.meaning)) for term in terms}
 
 
 def readable(name: str) -> str:

@@ -154,12 +154,11 @@ def test_every_labelled_voxel_keeps_its_place_in_the_patient(order, signs, shift
     np.testing.assert_array_equal(made, expected)
 
 
-def test_another_grid_is_refused_or_resampled_as_itk_does(tmp_path):
+def test_another_grid_is_resampled_as_itk_does(tmp_path):
     affine = placed(0.4) @ np.diag([0.8, 0.8, 0.8, 1.0])
     array = block((1, 7), (1, 6), (1, 5), value=9).astype(np.int16) * 1000
     path = written(tmp_path / "fine.nrrd", array, None, affine)
-    refused(path, r"on another grid .*--resample")
-    read = read_labels(path, VOLUME, resample=True)
+    read = read_labels(path, VOLUME)
     reference = sitk.Resample(
         image_of(array, affine), image_of(VOLUME.intensities), interpolator=sitk.sitkNearestNeighbor
     )
@@ -184,22 +183,6 @@ def test_names_that_are_no_anatomy_are_not_kept_and_one_of_a_case_gets_a_number(
     assert read_labels(path, VOLUME, taken=RESERVED, names={1: "tissue"}).names[1] == "tissue"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "# ctbl\n1 unnamed 0 0 0 0\n6 portal_vein 0 0 255 255\n",
-        '0 0 0 0 0 0 0 "Clear Label"\n6 0 0 255 1 1 1 "Portal vein"\n',
-        "label,name\n6,portal vein\n",
-    ],
-)
-def test_tables_of_labels_name_them(tmp_path, text):
-    (tmp_path / "table.txt").write_text(text)
-    path = written(tmp_path / "a.nii.gz", block((1, 3), (1, 3), (1, 3), value=6))
-    read = read_labels(path, VOLUME, table=tmp_path / "table.txt")
-    assert read.names == {6: "portal vein"}
-    assert read.colours[6] == ((0.25, 0.4, 0.85) if text.startswith("label") else (0.0, 0.0, 1.0))
-
-
 ONES = np.ones(SHAPE, np.uint8)
 GRADIENT = np.arange(np.prod(SHAPE), dtype=np.int16).reshape(SHAPE)
 
@@ -219,14 +202,9 @@ def test_what_is_no_labels_is_refused(tmp_path, name, array, fields, word):
     refused(written(tmp_path / name, array, fields), word)
 
 
-def test_labels_of_another_place_and_broken_tables_are_refused(tmp_path):
+def test_labels_of_another_place_are_refused(tmp_path):
     away = VOLUME.index_to_patient @ shifted(100, 0, 0)
     refused(written(tmp_path / "a.nrrd", ONES, None, away), "wholly outside")
-    table = tmp_path / "table.txt"
-    for text, word in (("1 vein", "line 1"), ("", "no labels"), ("1,a\n1,b", "twice")):
-        table.write_text(text)
-        with pytest.raises(VolumeError, match=word):
-            read_labels(written(tmp_path / "b.nrrd", ONES), VOLUME, table=table)
 
 
 def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_file):
@@ -236,15 +214,3 @@ def test_real_segmentations_of_slicer_that_overlap_are_layers(shared_file):
     read = read_labels(folder / "SegmentationOverlapping.seg.nrrd", volume)
     columns = {f"{part} vertebral column" for part in ("cervical", "thoracic", "lumbar")}
     assert {"ribs", "right lung", *columns} <= set(read.names.values())
-
-
-def test_names_come_of_snomed_codes_where_a_files_own_cannot_be_kept(tmp_path):
-    entry = (
-        "Segmentation.Status:inprogress|TerminologyEntry:Own list of Jane~SCT^123037004^Doe~SCT^"
-    )
-    kidney = {"Tags": f"{entry}64033007^Doe~SCT^7771000^Jane~Anatomic codes~^^~^^|"}
-    unknown = {"Tags": f"{entry}99999^Doe~^^~x~^^~^^|"}
-    fields = segments(("Doe", 1, 0, kidney), ("Niere", 2, 0, unknown), ("liver", 3, 0, kidney))
-    array = sum(block((n, n + 1), (0, 2), (0, 2), value=n) for n in (1, 2, 3))
-    read = read_labels(written(tmp_path / "a.seg.nrrd", array, fields), VOLUME)
-    assert read.names == {1: "left kidney", 2: "structure 2", 3: "liver"}

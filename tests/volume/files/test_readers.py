@@ -111,10 +111,8 @@ def test_a_float_image_may_have_holes_and_a_vast_range(tmp_path):
     stored = np.zeros((3, 3, 3))
     stored[0, :2] = [-1.7e308, np.nan, 1.7e308], [np.inf, -np.inf, 0.0]
     path = _stored(tmp_path / "a.nrrd", stored)
-    grey, (_, missing, infinite) = grey_voxels(open_image(path))
+    grey, _ = grey_voxels(open_image(path))
     np.testing.assert_array_equal(grey[:, :2, 0].T, [[0, 0, 255], [255, 0, 128]])
-    assert missing.startswith("1 values")
-    assert infinite.startswith("2 infinite")
     assert not read_volume(_stored(path, np.full((3, 3, 3), 7, np.int16))).intensities.any()
     refused(_stored(path, np.full((3, 3, 3), np.nan)), "finite")
 

@@ -74,8 +74,8 @@ def test_growing_takes_what_hangs_together_and_opening_parts_it(two_tubes):
 
 def test_of_structures_that_overlap_the_first_stays_and_a_reach_ends_one(two_tubes):
     volume, tube, other = two_tubes
-    all_dark = {"upper": 50, "seeds_voxel": [[42, 30, 15]]}
-    left = DARK | {"seeds_voxel": [[20, 30, 15]], "open": "1.5 mm"}
+    all_dark = {"upper": 50, "seeds_mm": [point(42, 30, 15)]}
+    left = DARK | {"seeds_mm": [point(20, 30, 15)], "open": "1.5 mm"}
     made = found(volume, vein=left, fluid=all_dark)
     assert made.names == {1: "vein", 2: "fluid"}
     assert overlap(made.labels == 1, tube) > 0.95
@@ -109,8 +109,8 @@ DARK = {"method": "growing", "upper": 50}
     [
         (DARK, "needs seeds"),
         (DARK | {"seeds_mm": [[0, 0, 0]]}, r"vein: seeds_mm\[0\].*outside the volume.*spans"),
-        (DARK | {"seeds_voxel": [[5, 30, 15]]}, "seed 1 .*outside 0 to 50"),
-        (DARK | {"seeds_voxel": [[20, 30, 15]], "upper": 5, "lower": 9}, "swap them"),
+        (DARK | {"seeds_mm": [point(5, 30, 15)]}, "seed 1 .*outside 0 to 50"),
+        (DARK | {"seeds_mm": [point(20, 30, 15)], "upper": 5, "lower": 9}, "swap them"),
         ({"method": "dark_vessels", "thinnest": 5e-3, "thickest": 3e-3}, "less than thinnest"),
     ],
 )

@@ -9,8 +9,7 @@ from hypothesis.extra.numpy import arrays
 
 from us_sim.errors import VolumeError
 from us_sim.skin.surface import read_surface
-from us_sim.volume.surfaces.closed_surface import ClosedSurface
-from us_sim.volume.surfaces.stl_file import write_stl
+from us_sim.volume.surfaces.closed_surface import ClosedSurface, write_stl
 from us_sim.volume.surfaces.structure_surface import structure_surface
 from us_sim.volume.volume import Volume
 

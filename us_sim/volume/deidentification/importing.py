@@ -1,7 +1,8 @@
 """Files of scanners and other programs into a volume, a case or a sequence of images.
 
-Only voxels, their place and time, and the values of `kept_values` go on. The source is read, the
-rest is blanked, and the result is written anew: nothing is copied.
+Only voxels, and their place and time, go on. The source is read, what lies outside its ultrasound
+regions is blanked, and the result is written anew: nothing is copied. Text that is burned into what
+is kept is not looked for.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +29,7 @@ from us_sim.volume.deidentification.source import (
 from us_sim.volume.files.dicom.header import dicom_files, is_dicom, refuse_other
 from us_sim.volume.files.readers import ENDINGS
 from us_sim.volume.files.writing import write_image_sequence, write_volume
+from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
 
 _VOLUMES = (".nrrd", ".mha", ".nii", ".nii.gz")
@@ -58,20 +61,31 @@ class Import:
         return f"a volume of {columns} × {rows} × {count} voxels of {apart} mm"
 
     @property
-    def blanked(self) -> str:
-        """The part of the images that is not kept, for a person."""
-        if self.undecided:
-            return "nothing yet: it has to be said what is kept"
-        said = []
+    def said(self) -> str:
+        """What is made and blanked, and what nobody looked at, for a person."""
+        said = [self.what]
         if self.settings.part:
             said.append(f"all but columns and rows {self.settings.part} is cut off")
         if self.regions:
             listed = ", ".join(map(str, self.regions))
-            said.append(f"everything outside the ultrasound regions {listed}")
-        whole = "as was said"
-        if not self.settings.keep_whole_image:
-            whole = "volumes are not searched for text: look at the slices"
-        return "; ".join(said) or f"nothing ({whole})"
+            said.append(f"everything outside the ultrasound regions {listed} is black")
+        said += [*self.source.conversions, "all of the header but place and time is dropped"]
+        if self.undecided:
+            said.append(f"NOTHING CAN BE WRITTEN YET: {self.undecided}")
+        said.append("TEXT THAT IS BURNED INTO WHAT IS KEPT WAS NOT LOOKED FOR: look at the images")
+        return "; ".join(said)
+
+    def draw(self, file: Path) -> None:
+        """Write the first image as it was, with boxes around its kept parts, as a PNG.
+
+        It may show a name: it belongs where the original is kept.
+        """
+        picture = np.asarray(cv2.cvtColor(self.source.first, cv2.COLOR_GRAY2BGR), np.uint8)
+        for box in self.parts:
+            cv2.rectangle(picture, box[:2], box[2:], (80, 220, 80), 1)
+        with partial_file(file) as partial:
+            partial.touch(0o600)  # the owner's alone
+            partial.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
     def write(self, progress: Progress | None = None) -> None:
         """Write the result.
@@ -114,7 +128,7 @@ class Import:
                     progress(number / count, f"{number} of {count} images")
 
         shape = (count, *part.size[::-1])
-        write_image_sequence(out, images(), shape, source.times, self.pixel_mm, source.kept)
+        write_image_sequence(out, images(), shape, source.times, self.pixel_mm)
 
     def _write_volume(
         self, out: Path, placement: NDArray[np.float64], progress: Progress | None
@@ -124,13 +138,13 @@ class Import:
         assert source.voxels is not None
         volume = _cropped(source.voxels(self._keep, progress), placement, settings.part)
         if out.name.lower().endswith(_VOLUMES):
-            write_volume(out, volume, source.kept)
+            write_volume(out, volume)
             return
         from us_sim.volume.cases.settings import CaseSettings
         from us_sim.volume.cases.writing import new_case, write_case_settings
 
         with new_case(out) as folder:
-            write_volume(folder / "volume.nrrd", volume, source.kept)
+            write_volume(folder / "volume.nrrd", volume)
             del volume  # it is read again at the end, to propose where to start
             write_case_settings(folder, CaseSettings(name=settings.name or out.name))
 
@@ -164,18 +178,6 @@ def look_at(
             f"2D images, or a folder's name without an ending for a case"
         )
     return _planned(paths, out, settings, _source(paths, out, settings))
-
-
-def import_files(
-    files: Sequence[str | os.PathLike[str]],
-    out: Path,
-    settings: ImportSettings | None = None,
-    progress: Progress | None = None,
-) -> Import:
-    """De-identify files into ``out``; see `look_at` and `Import.write`."""
-    found = look_at(files, out, settings or ImportSettings())
-    found.write(progress)
-    return found
 
 
 def _source(paths: list[Path], out: Path | None, settings: ImportSettings) -> Source:
@@ -215,7 +217,7 @@ def _planned(
     if source.needs_part and not (regions or settings.part or settings.keep_whole_image):
         undecided.append(
             f"names and dates may be burned into its images, and nothing says which part of them "
-            f"holds echoes ({source.doubt}); look at the picture of --report, then give "
+            f"holds echoes ({source.doubt}); look at it with --picture FILE, then give "
             f"--crop X0,Y0,X1,Y1, or --keep-whole-image if there is nothing to hide"
         )
     pixel: Scale | None = None

@@ -1,17 +1,15 @@
-"""Sources of an import: images of any format, with the facts of their header.
+"""Sources of an import: images of any format, with their place or times.
 
 A scanner writes names, dates and hospitals around the echoes. Of its 2D images only the
 two-dimensional ultrasound regions of tissue and flow (PS3.3, C.8.5.5) are kept: grey bars,
 electrocardiograms, spectra and graphics are blanked with all that lies outside. Each region has a
-scale of its own. Of a MetaImage, NRRD or NIfTI header nothing goes on but where the voxels lie.
+scale of its own. Of a header nothing goes on but where and when the images are.
 """
 
 from __future__ import annotations
 
-import uuid
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.deidentification.kept_values import dropped_names, kept_values
 from us_sim.volume.deidentification.settings import Rectangle
 from us_sim.volume.files.dicom.header import DicomFile, groups_of, items, number, numbers, text
 from us_sim.volume.files.dicom.pixels import ImageFormat
 from us_sim.volume.files.dicom.placed_images import is_flat, opened_images, placed_images
-from us_sim.volume.files.dicom.planes import frame_times, is_cartesian
+from us_sim.volume.files.dicom.planes import frame_times
 from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.segments import holds_segments, no_grey_values
 from us_sim.volume.files.stored_image import grey_voxels
@@ -47,15 +44,12 @@ class Region:
 class Source:
     """Images of one volume or of one recording, as they come."""
 
-    kind: str  # of the files, for a person and for provenance
     shape: tuple[int, int, int]  # columns, rows, images
     first: NDArray[np.uint8]  # (rows, columns) the first image as it is
-    dropped: Mapping[str, int]  # elements of the header that do not go on, and how many of each
     conversions: tuple[str, ...]  # of the stored values
     placement: NDArray[np.float64] | None  # (4, 4) m, from (column, row, image); None: no volume
     voxels: Callable[[Keep, Progress | None], NDArray[np.uint8]] | None  # reads (i, j, k)
     images: Callable[[Keep], Iterator[NDArray[np.uint8]]] | None = None  # reads one after another
-    kept: Mapping[str, str] = field(default_factory=dict)  # values that go on, by their fields
     regions: tuple[Region, ...] = ()  # of echoes, as the header says
     doubt: str = ""  # why it states none, or is not believed
     needs_part: bool = False  # images that may show a name outside the regions
@@ -77,16 +71,8 @@ def file_source(path: Path, volume: int, spacing: tuple[float, ...] | None) -> S
     image.check(layers=False)
     placement = image.placement()
     voxels, conversions = grey_voxels(image, volume)
-    kind = {".mha": "MetaImage", ".mhd": "MetaImage", ".nrrd": "NRRD", ".nhdr": "NRRD"}
-    return Source(
-        f"{kind.get(path.suffix.lower(), 'NIfTI')} volume",
-        image.shape,
-        np.ascontiguousarray(voxels[:, :, 0].T),
-        {"all of the header but the grid": 1},
-        conversions,
-        placement,
-        lambda *_: voxels,
-    )
+    first = np.ascontiguousarray(voxels[:, :, 0].T)
+    return Source(image.shape, first, conversions, placement, lambda *_: voxels)
 
 
 def dicom_source(
@@ -117,20 +103,16 @@ def dicom_source(
         raise VolumeError(
             f"{paths[0]}: and the other files have pixels of different sizes; import each by itself"
         )
-    kept = _agreed_values(images.files)
     regions = {_ultrasound_regions(file, images.form) for file in images.files}
     burned = any(text(file.header, "BurnedInAnnotation") == "YES" for file in images.files)
     echoes, doubt = regions.pop()
     return Source(
-        _kind(images.files[0]),
         (images.form.columns, images.form.rows, len(which)),
         next(images.images(which[:1])),
-        sum((Counter(dropped_names(file.header, kept)) for file in images.files), Counter()),
         tuple(conversions),
         placed.placement if placed else None,
         placed.voxels if placed else None,
         lambda keep: images.images(which, keep),
-        kept,
         () if regions else echoes,
         "the files have different ultrasound regions" if regions else doubt,
         placed is None or burned,
@@ -178,25 +160,3 @@ def _stated_scale(file: DicomFile) -> Scale | None:
             if stated and all(1e-4 <= each <= 100.0 for each in stated):
                 return stated[1], stated[0]
     return None
-
-
-def _agreed_values(files: Sequence[DicomFile]) -> dict[str, str]:
-    """Return values on which all files agree, and a frame of reference that leads nowhere."""
-    first, *others = (kept_values(file.header).items() for file in files)
-    agreed = {name: word for name, word in first if all((name, word) in each for each in others)}
-    header = files[0].header
-    if text(header, "FrameOfReferenceUID") or text(header, "VolumeFrameOfReferenceUID"):
-        # Of random numbers (PS3.5, B.2), and not of the original's digits by any function.
-        agreed["frame_of_reference_uid"] = f"2.25.{uuid.uuid4().int}"
-    return agreed
-
-
-def _kind(file: DicomFile) -> str:
-    """Return the standard's name of the kind of files, which is no text of theirs."""
-    from pydicom.uid import UID
-
-    uid = text(file.header, "SOPClassUID")
-    if is_cartesian(file):
-        return "DICOM, Cartesian export of Philips"
-    name = UID(uid).name
-    return f"DICOM, {name}" if name != uid else "DICOM of an unknown class"

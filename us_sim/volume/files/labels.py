@@ -1,16 +1,13 @@
 """Labels from files of other programs, on the grid of the volume that they belong to.
 
-Any MHA, NRRD or NIfTI file will do, whose values are then labels; 3D Slicer's ``.seg.nrrd`` and
-DICOM segmentations with the names and colours of their segments; and a table of labels beside
-either.
+Any MHA, NRRD or NIfTI file will do, whose values are then labels; 3D Slicer's ``.seg.nrrd`` with
+the names and colours of its segments.
 """
 
 from __future__ import annotations
 
-import csv
 import os
-import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,55 +15,43 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.settings.spelling import counted, shown
-from us_sim.settings.text_files import read_text
-from us_sim.volume.files.dicom.header import is_dicom, open_dicom
-from us_sim.volume.files.readers import ENDINGS, open_image
+from us_sim.settings.spelling import counted
+from us_sim.volume.files.readers import open_image
 from us_sim.volume.files.segments import Segment, segments_of
 from us_sim.volume.files.stored_image import StoredImage
-from us_sim.volume.structure_names import Colour, coded_name, is_anatomical, readable
+from us_sim.volume.structure_names import Colour, is_anatomical, readable
 from us_sim.volume.volume import LabelMap, Volume
 
 _MOST = 255
 _Known = dict[int, tuple[str, Colour | None]]
-_SLICER = re.compile(r"(\d+)\s+(\S+)\s+(\d+)\s+(\d+)\s+(\d+)\s+\d+")
-_SNAP = re.compile(r"(\d+)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+[\d.]+){3}\s+\"(.*)\"")
 
 
 def read_labels(
     path: str | os.PathLike[str],
     like: Volume,
     *,
-    resample: bool = False,
-    table: str | os.PathLike[str] | None = None,
     names: Mapping[int, str] | None = None,
     taken: Collection[str] = (),
 ) -> LabelMap:
     """The labels in a file, on the grid of a volume.
 
-    Of names that come from the file, or a table, only those are kept that are made of anatomical
+    Of names that come from the file only those are kept that are made of anatomical
     words, since some hold a patient's; another structure is called by its number. Where segments
     overlap, a voxel is of the one that comes last, as when 3D Slicer exports a label map.
 
     Args:
-        path: MHA, NRRD, NIfTI, a segmentation of 3D Slicer or of DICOM.
+        path: MHA, NRRD, NIfTI, or a segmentation of 3D Slicer.
         like: the volume that they belong to.
-        resample: take the nearest voxel where the file's grid is another than the volume's.
-        table: names and colours, see `read_label_table`.
         names: by label, as a person gives them; they go before all others.
         taken: names that mean something else; a structure of that name gets a number.
 
     Raises:
-        VolumeError: a file cannot be read, its values are no labels, no voxel of it has one, or its
-            grid is another one and ``resample`` is not given.
+        VolumeError: a file cannot be read, its values are no labels, or no voxel of it has one.
     """
     path = Path(path)
     remarks: list[str] = []
     labels, known, placement = _read(path, remarks)
-    grid = like.shape, like.index_to_patient
-    labels, moved = on_grid(path, labels, placement, *grid, resample=resample)
-    listed = {} if table is None else read_label_table(Path(table))
-    known |= {label: entry for label, entry in listed.items() if label in known}
+    labels, moved = on_grid(path, labels, placement, like.shape, like.index_to_patient)
     there = {int(label) for label in _values_in(labels)} - {0}
     gone = [_plain(known[label][0], label) for label in known if label not in there]
     if gone:
@@ -80,24 +65,10 @@ def read_labels(
 
 def _read(path: Path, remarks: list[str]) -> tuple[NDArray[np.uint8], _Known, NDArray[np.float64]]:
     """Labels (i, j, k) on the file's grid, their names and colours, and its placement."""
-    if not path.name.lower().endswith(ENDINGS) and path.is_file() and is_dicom(path):
-        from us_sim.volume.files.dicom.segmentation import read_segmentation
-
-        found = read_segmentation(open_dicom(path))
-        made = _from_segments(path, found.shape, found.segments, found.mask, remarks)
-        return *made, found.placement
     image = open_image(path, layers=True)
     segments, layers = segments_of(path, image.texts), _layers(path, image)
-    if not segments:
-        return *_from_values(path, layers, remarks), image.placement()
-    deepest = max(segment.layer for segment in segments)
-    if deepest >= len(layers):
-        raise VolumeError(f"{path}: says that a segment is in layer {deepest} of {len(layers)}")
-
-    def mask(segment: Segment) -> NDArray[np.bool_]:
-        return np.asarray(layers[segment.layer] == segment.value)
-
-    return *_from_segments(path, image.shape, segments, mask, remarks), image.placement()
+    made = _from_segments if segments else _from_values
+    return *made(path, layers, segments, remarks), image.placement()
 
 
 def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
@@ -114,24 +85,22 @@ def _layers(path: Path, image: StoredImage) -> NDArray[np.generic]:
 
 
 def _from_segments(
-    path: Path,
-    shape: tuple[int, ...],
-    segments: list[Segment],
-    mask: Callable[[Segment], NDArray[np.bool_]],
-    remarks: list[str],
+    path: Path, layers: NDArray[np.generic], segments: list[Segment], remarks: list[str]
 ) -> tuple[NDArray[np.uint8], _Known]:
-    """Labels (i, j, k), names and colours of segments, of which each has a mask (i, j, k)."""
+    """Labels (i, j, k), names and colours of segments in their layers."""
+    deepest = max(segment.layer for segment in segments)
+    if deepest >= len(layers):
+        raise VolumeError(f"{path}: says that a segment is in layer {deepest} of {len(layers)}")
     if len(segments) > _MOST:
         raise VolumeError(f"{path}: has {len(segments)} segments; {_MOST} are read at most")
     values = [segment.value for segment in segments]
     keep = len(set(values)) == len(values) and min(values) > 0 and max(values) <= _MOST
-    labels = np.zeros(shape, np.uint8)
+    labels = np.zeros(layers.shape[1:], np.uint8)
     known: _Known = {}
     for number, segment in enumerate(segments, start=1):
         label = segment.value if keep else number
-        name = segment.name if is_anatomical(segment.name) else coded_name(segment.codes)
-        known[label] = (name or segment.name, segment.colour)
-        inside = mask(segment)
+        known[label] = (segment.name, segment.colour)
+        inside = np.asarray(layers[segment.layer] == segment.value)
         for other, both in zip(*np.unique(labels[inside], return_counts=True), strict=True):
             if other:
                 one, two = _plain(known[int(other)][0], int(other)), _plain(known[label][0], label)
@@ -142,7 +111,7 @@ def _from_segments(
 
 
 def _from_values(
-    path: Path, layers: NDArray[np.generic], remarks: list[str]
+    path: Path, layers: NDArray[np.generic], _: list[Segment], remarks: list[str]
 ) -> tuple[NDArray[np.uint8], _Known]:
     """Labels (i, j, k) of a file without segments, whose values they are."""
     stored = layers[0]
@@ -206,13 +175,11 @@ def on_grid(
     placement: NDArray[np.float64],
     shape: tuple[int, int, int],
     wanted: NDArray[np.float64],
-    *,
-    resample: bool = False,
 ) -> tuple[NDArray[np.uint8], list[str]]:
     """The labels on a grid of that shape, and remarks for a person.
 
     A file may hold only the part of a volume that is labelled, or its axes in another order or
-    direction; its voxels are then those of the volume, and nothing is resampled.
+    direction; its voxels are then those of the volume. Of other grids the nearest voxel is taken.
 
     Args:
         path: which errors name.
@@ -220,20 +187,13 @@ def on_grid(
         placement: (4, 4) m, from the file's indices.
         shape: of the grid that they shall be on.
         wanted: (4, 4) m, from its indices.
-        resample: take the nearest voxel where the grids differ.
     """
     to_grid = np.linalg.inv(wanted) @ placement
     whole = np.rint(to_grid)
-    corners = np.stack(np.meshgrid(*[[0, n - 1] for n in labels.shape], indexing="ij"), axis=-1)
-    apart = corners.reshape(-1, 3) @ (to_grid - whole)[:3, :3].T + (to_grid - whole)[:3, 3]
+    # Single precision, which NIfTI has, makes equal grids differ by less than 0.02 voxels.
+    off = np.abs(to_grid - whole) @ [*labels.shape, 1.0]
     is_turn = all((np.abs(whole[:3, :3]).sum(axis=axis) == 1.0).all() for axis in (0, 1))
-    # Voxels; single precision, which NIfTI has, makes equal grids differ by less.
-    is_same = is_turn and np.abs(apart).max() <= 0.02
-    if not (is_same or resample):
-        raise VolumeError(
-            f"{path}: its labels are on another grid ({_words(labels.shape, placement)}) than the "
-            f"volume ({_words(shape, wanted)}): have them resampled with --resample"
-        )
+    is_same = is_turn and off.max() <= 0.02
     made = labels
     if not is_same or labels.shape != shape or not np.array_equal(whole, np.eye(4)):
         to_file = np.rint(np.linalg.inv(whole)) if is_same else np.linalg.inv(to_grid)
@@ -247,10 +207,8 @@ def on_grid(
     if not is_same:
         sizes = _words(labels.shape, placement), _words(shape, wanted)
         return made, [f"labels of {sizes[0]} were resampled to {sizes[1]} by the nearest voxel"]
-    if before > after:
-        lost = f"{before - after} of {before} labelled voxels"
-        return made, [f"{lost} lie outside the volume and are left out"]
-    return made, []
+    lost = f"{before - after} of {before} labelled voxels lie outside the volume and are left out"
+    return made, [lost] if before > after else []
 
 
 def _words(shape: tuple[int, ...], placement: NDArray[np.float64]) -> str:
@@ -258,41 +216,3 @@ def _words(shape: tuple[int, ...], placement: NDArray[np.float64]) -> str:
     return (
         f"{' × '.join(map(str, shape))} voxels of {' × '.join(f'{side:.3g}' for side in sides)} mm"
     )
-
-
-def read_label_table(path: Path) -> dict[int, tuple[str, Colour | None]]:
-    """Names and colours by label.
-
-    Three forms are read: Slicer's colour tables (``.ctbl``: label, name, red, green, blue, alpha),
-    ITK-SNAP's label descriptions (label, red, green, blue, three more numbers, the name in quotes),
-    and comma-separated ones (label, name). Lines that begin with # are remarks, a first line of
-    words a heading.
-    """
-    try:
-        lines = read_text(path).lstrip("\ufeff").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise VolumeError(f"{path}: cannot be read as a table of labels: {error}") from error
-    table: dict[int, tuple[str, Colour | None]] = {}
-    for number, line in enumerate(map(str.strip, lines), start=1):
-        if not line or line.startswith("#") or (not table and not line[0].isdigit()):
-            continue
-        entry = _entry(line)
-        if entry is None or entry[0] in table:
-            why = "is there twice" if entry else "is none: write `6 vein 0 0 255 255`, or `6,vein`"
-            raise VolumeError(f"{path}: line {number}: the label {shown(line[:80])} {why}")
-        table[entry[0]] = entry[1:]
-    if not table:
-        raise VolumeError(f"{path}: holds no labels; write a line such as `6 vein 0 0 255 255`")
-    return table
-
-
-def _entry(line: str) -> tuple[int, str, Colour | None] | None:
-    if match := _SLICER.fullmatch(line):
-        label, name, *colour = match.groups()
-    elif match := _SNAP.fullmatch(line):
-        label, *colour, name = match.groups()
-    else:
-        label, name, *colour = (cell.strip() for cell in [*next(csv.reader([line])), ""][:2])
-        return (int(label), name, None) if label.isdecimal() and name else None
-    red, green, blue = (int(text) / 255 for text in colour)
-    return int(label), name.strip(), (red, green, blue) if max(red, green, blue) <= 1.0 else None

@@ -54,9 +54,9 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
     """
     path = Path(path)
     if files := _dicom_files(path):
-        from us_sim.volume.files.dicom.placed_images import placed_images
+        from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
 
-        placed = placed_images(files)
+        placed = placed_images(opened_images(files))
         return Volume(placed.voxels(), placed.placement)
     image, placement = _placed(path)
     return Volume(grey_voxels(image)[0], placement)
@@ -66,9 +66,9 @@ def read_placement(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Read where a volume file's voxels are: (4, 4) from indices to m, from its header alone."""
     path = Path(path)
     if files := _dicom_files(path):
-        from us_sim.volume.files.dicom.placed_images import placed_images
+        from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
 
-        return placed_images(files).placement
+        return placed_images(opened_images(files)).placement
     return _placed(path)[1]
 
 

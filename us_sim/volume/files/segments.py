@@ -27,7 +27,6 @@ class Segment:
     value: int  # of its voxels
     layer: int
     colour: Colour | None  # red, green, blue, 0 to 1
-    codes: tuple[str, ...] = ()  # of SNOMED CT: the structure, and which one of several
 
 
 def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
@@ -60,7 +59,6 @@ def segments_of(path: Path, pairs: Mapping[str, str]) -> list[Segment]:
                 int(value),
                 int(layer),
                 _colour(fields.get("Color", "")),
-                _codes(fields.get("Tags", "")),
             )
         )
     return segments
@@ -77,13 +75,6 @@ def no_grey_values(path: Path) -> VolumeError:
         f"{path}: is a segmentation, which has labels and no grey values; give it to "
         f"`us-sim segment CASE --labels {path.name}`"
     )
-
-
-def _codes(tags: str) -> tuple[str, ...]:
-    """The codes of type and modifier in ``TerminologyEntry:context~category~type~modifier~…``."""
-    _, found, entry = tags.partition("TerminologyEntry:")
-    parts = [part.split("^") for part in entry.partition("|")[0].split("~")[2:4]] if found else []
-    return tuple(part[1] for part in parts if part[0] == "SCT" and len(part) > 1)
 
 
 def _colour(text: str) -> Colour | None:

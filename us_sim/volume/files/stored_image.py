@@ -102,7 +102,7 @@ def check_brightness(path: Path | str, image: NDArray[Any]) -> None:
         path: which errors name.
         image: (j, i) of a volume, or of a sequence; beams along either axis.
     """
-    if image.dtype.kind not in "if" or max(image.shape) < 64:
+    if image.dtype.kind not in "if" or image.ndim != 2 or max(image.shape) < 64:
         return
     below = image < 0
     turns = max(np.mean(below[1:] != below[:-1]), np.mean(below[:, 1:] != below[:, :-1]))
@@ -181,26 +181,20 @@ class GreyLevels:
 
     low: float = 0.0
     high: float = 255.0
-    missing: int = 0  # how many are NaN
-    infinite: int = 0  # how many are +Inf or -Inf
 
     @classmethod
     def over(cls, path: Path | str, images: Iterable[NDArray[Any]]) -> GreyLevels:
         """Find the levels of images (rows, columns), read once; errors name the path."""
-        low, high, missing, infinite = math.inf, -math.inf, 0, 0
+        low, high = math.inf, -math.inf
         for number, image in enumerate(images):
             if number % 16 == 0:
                 check_brightness(path, image)
-            values = image
-            if image.dtype.kind == "f":
-                missing += int(np.count_nonzero(np.isnan(image)))
-                infinite += int(np.count_nonzero(np.isinf(image)))
-                values = image[np.isfinite(image)]
+            values = image[np.isfinite(image)]
             if values.size:
                 low, high = min(low, float(values.min())), max(high, float(values.max()))
         if low > high:
             raise VolumeError(f"{path}: holds no finite value")
-        return cls(low, high, missing, infinite)
+        return cls(low, high)
 
     def __call__(self, image: NDArray[Any]) -> NDArray[np.uint8]:
         """An image as grey values; 8-bit ones between 0 and 255 are taken as they are."""
@@ -211,15 +205,6 @@ class GreyLevels:
         level = height / ((self.high / 2 - self.low / 2) or 1.0)
         level = np.clip(np.nan_to_num(level, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
         return np.asarray(np.floor(level * 255.0 + 0.5).astype(np.uint8))
-
-    def described(self, bits: int) -> list[str]:
-        """The conversion in words, for a person."""
-        said = [f"{bits}-bit values spread over 0 to 255"]
-        if self.missing:
-            said.append(f"{self.missing} values that are no number are black")
-        if self.infinite:
-            said.append(f"{self.infinite} infinite values are white (+Inf) or black (-Inf)")
-        return said
 
 
 def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
@@ -237,7 +222,7 @@ def grey_voxels(image: StoredImage, volume: int = 1) -> tuple[NDArray[np.uint8],
     levels = GreyLevels()
     if stored.dtype != np.uint8:
         levels = GreyLevels.over(image.path, slices())
-        said += levels.described(8 * image.type.itemsize)
+        said.append(f"{8 * image.type.itemsize}-bit values spread over 0 to 255")
     if image.volumes > 1:
         said.append(f"volume {volume} of {image.volumes}")
     return volume_of_slices(map(levels, slices()), stored.shape[2]), tuple(said)
@@ -248,29 +233,18 @@ def volume_of_slices(
     count: int,
     progress: Callable[[float, str], None] | None = None,
 ) -> NDArray[np.uint8]:
-    """A volume (i, j, k) of slices (j, i), of which a few are in memory at a time.
-
-    OpenCV turns a plane in blocks that fit the cache, in a tenth of NumPy's time.
+    """A volume (i, j, k) of slices (j, i).
 
     Args:
         slices: in order; the first is read before memory is taken for all.
         count: how many come.
         progress: told the fraction that is there.
     """
-    import cv2  # which a node that plays poses alone does not need
-
-    voxels: NDArray[np.uint8] | None = None
-    slab: list[NDArray[np.uint8]] = []
-    for k, image in enumerate(slices, start=1):
-        if voxels is None:
-            voxels = np.empty((*image.shape[::-1], count), np.uint8)
-        slab.append(image)
-        if len(slab) * image.size >= 1 << 23 or k == count:
-            stack = np.stack(slab)
-            for j in range(stack.shape[1]):
-                voxels[:, j, k - len(slab) : k] = cv2.transpose(stack[:, j, :])
-            slab.clear()
-            if progress:
-                progress(k / count, f"{k} of {count} images")
-    assert voxels is not None
-    return voxels
+    stack = np.empty(0, np.uint8)
+    for k, image in enumerate(slices):
+        if not k:
+            stack = np.empty((count, *image.shape), np.uint8)
+        stack[k] = image
+        if progress:
+            progress((k + 1) / count, f"{k + 1} of {count} images")
+    return np.ascontiguousarray(stack.T)

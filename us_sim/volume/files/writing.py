@@ -1,19 +1,15 @@
 """Volumes, labels and image sequences into files: NRRD, MetaImage and NIfTI.
 
-A file is written beside its place under another name and renamed, so it is whole or absent. NRRD
-files are written a slab at a time: SimpleITK and nibabel, which write the others, and pynrrd have
-the whole image a second time, turned to the files' order of axes.
+A file is written beside its place under another name and renamed, so it is whole or absent.
 """
 
 from __future__ import annotations
 
-import gzip
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
@@ -25,13 +21,10 @@ from us_sim.volume.structure_names import Colour, anatomical_colour
 from us_sim.volume.volume import Volume
 
 _ENDINGS = (".seg.nrrd", ".nrrd", ".mha", ".nii.gz", ".nii")
-_SLAB = 1 << 23  # bytes
 _LEVEL = 1  # of compression: speckle hardly becomes smaller with any other
 
 
-def write_volume(
-    path: str | os.PathLike[str], volume: Volume, header: Mapping[str, str] | None = None
-) -> None:
+def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     """The grey values of a volume as an image file; a file of that name is replaced.
 
     Spacing, origin and direction are those of ``index_to_patient`` in millimetres, on DICOM's
@@ -40,16 +33,15 @@ def write_volume(
     Args:
         path: ends in .nrrd, .mha, .nii or .nii.gz.
         volume: its labels are not written here; see `write_labels`.
-        header: further fields for the file's header. NIfTI has no place for them.
 
     Raises:
-        VolumeError: the name ends otherwise, the grid has no right angles, a field cannot stand
-            in a header, or the file cannot be written.
+        VolumeError: the name ends otherwise, the grid has no right angles, or the file cannot be
+            written.
     """
     path = Path(path)
     if path.name.lower().endswith(".seg.nrrd"):
         raise VolumeError(f"{path}: .seg.nrrd is for labels; name the volume .nrrd")
-    _write_image(path, volume.intensities, volume, header or {}, packed=False)
+    _write_image(path, volume.intensities, volume, {}, packed=False)
 
 
 def write_labels(
@@ -81,7 +73,6 @@ def write_image_sequence(
     shape: tuple[int, int, int],
     times: Sequence[float],
     pixel_mm: tuple[float, float] = (1.0, 1.0),
-    header: Mapping[str, str] | None = None,
 ) -> None:
     """Images and their times as a new sequence file, without poses: a MetaImage as Plus writes it.
 
@@ -91,7 +82,6 @@ def write_image_sequence(
         shape: number of images, rows, columns.
         times: s, of each image.
         pixel_mm: width and height of a pixel.
-        header: further fields of one line each.
 
     Raises:
         VolumeError: the name ends otherwise, or the file cannot be written.
@@ -113,7 +103,6 @@ def write_image_sequence(
         "Kinds": "domain domain list",
         "UltrasoundImageOrientation": "MFA",
         "UltrasoundImageType": "BRIGHTNESS",
-        **(header or {}),
     }
     for number, time in enumerate(times):
         fields[f"Seq_Frame{number:04}_ImageStatus"] = "OK"
@@ -170,15 +159,11 @@ def _write_image(
             f"{path}: the volume's axes are {degrees_off(direction):.2g}° off a right angle, which "
             f"image files cannot hold; resample it on a grid with right angles"
         )
-    if not all(map(str.isprintable, (*fields, *fields.values()))):
-        raise VolumeError(f"{path}: a field of several lines cannot stand in an image's header")
     ending = next((end for end in _ENDINGS if path.name.lower().endswith(end)), None)
     if ending is None:
         raise VolumeError(f"{path}: its name must end in {', '.join(_ENDINGS)}")
     with partial_file(path, f"image{ending}") as partial:
-        if ending.endswith(".nrrd"):
-            _write_nrrd(partial, voxels, matrix, fields, packed=packed)
-        elif ending.startswith(".nii"):  # ITK refuses axes that are rounded
+        if ending.startswith(".nii"):  # ITK refuses axes that are rounded
             import nibabel  # which takes half a second
 
             affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ matrix
@@ -187,7 +172,7 @@ def _write_image(
             nifti.header.set_xyzt_units("mm")
             nifti.to_filename(partial)
         else:
-            image = sitk.GetImageFromArray(_in_file_order(voxels))
+            image = sitk.GetImageFromArray(voxels.transpose(2, 1, 0))
             image.SetSpacing(spacing.tolist())
             image.SetOrigin(matrix[:3, 3].tolist())
             image.SetDirection(direction.ravel().tolist())
@@ -197,48 +182,3 @@ def _write_image(
                 sitk.WriteImage(image, str(partial), packed, _LEVEL)
             except RuntimeError as error:
                 raise VolumeError(f"{path}: cannot be written: the disk may be full") from error
-
-
-def _in_file_order(voxels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(k, j, i) C-contiguous, the order of files, of a part (i, j, k) of a volume.
-
-    OpenCV turns a plane in blocks that fit the cache, in a tenth of NumPy's time.
-    """
-    made = np.empty(voxels.shape[::-1], np.uint8)
-    for j in range(voxels.shape[1]):
-        made[:, j, :] = cv2.transpose(voxels[:, j, :])
-    return made
-
-
-def _write_nrrd(
-    path: Path,
-    voxels: NDArray[np.uint8],
-    matrix: NDArray[np.float64],
-    fields: Mapping[str, str],
-    *,
-    packed: bool,
-) -> None:
-    """Write voxels (i, j, k) a slab at a time, placed by a matrix in mm, with keys and values."""
-    x, y, z, origin = (
-        f"({','.join(f'{each + 0.0:.17g}' for each in matrix[:3, n])})" for n in range(4)
-    )
-    lines = [
-        "NRRD0004",
-        "type: unsigned char",
-        "dimension: 3",
-        "space: left-posterior-superior",
-        f"sizes: {' '.join(map(str, voxels.shape))}",
-        f"space directions: {x} {y} {z}",
-        "kinds: domain domain domain",
-        "endian: little",
-        f"encoding: {'gzip' if packed else 'raw'}",
-        f"space origin: {origin}",
-        *(f"{key}:={value}" for key, value in fields.items()),
-    ]
-    with path.open("wb") as file:
-        file.write("\n".join([*lines, "", ""]).encode())
-        step = max(1, _SLAB // (voxels.shape[0] * voxels.shape[1]))
-        out = gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) if packed else file
-        with out:
-            for k in range(0, voxels.shape[2], step):
-                out.write(_in_file_order(voxels[:, :, k : k + step]).data)

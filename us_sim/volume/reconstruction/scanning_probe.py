@@ -94,9 +94,10 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
         shape = _named_fan(part, used, pixel) or fitted_part(seen, pixel, used)
     if shape is not None:
         return ScanningProbe(_probe(shape), _poses(matrices, shape, pixel))
-    has_clip = part.clip is not None
-    box = _box_around(used if has_clip or not (seen & used).any() else seen & used, pixel)
-    return ScanningProbe(_probe(box) if has_clip else None, _poses(matrices, box, pixel))
+    body = None if part.clip is not None else _body(seen & used)
+    box = _rectangle(used if body is None else body, pixel)
+    probe = None if part.clip is None else _probe(box)
+    return ScanningProbe(probe, _poses(matrices, box, pixel))
 
 
 def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
@@ -153,17 +154,6 @@ def _named_fan(part: ImagePart, used: NDArray[np.bool_], pixel: NDArray[np.float
     x, z = (float(place) for place in np.array(part.fan_origin) * pixel)
     side = float(pixel.mean())
     return Fan((x, z), (begins * side, ends * side), part.fan_angles)
-
-
-def _box_around(seen: NDArray[np.bool_], pixel: NDArray[np.float64]) -> Rectangle:
-    """The smallest rectangle of pixels around the largest part of those seen (rows, columns)."""
-    body = _body(seen)
-    rows, columns = np.nonzero(seen if body is None else body)
-    x, z = (
-        (float((each.min() - 0.5) * side), float((each.max() + 0.5) * side))
-        for each, side in ((columns, pixel[0]), (rows, pixel[1]))
-    )
-    return Rectangle(x, z)
 
 
 def _body(seen: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

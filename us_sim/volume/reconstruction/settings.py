@@ -8,11 +8,6 @@ from us_sim.errors import VolumeError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-METHODS = ("nearest", "linear")
-"""How a pixel is inserted: into the nearest voxel, or into the eight around it by their weights."""
-
-COMPOUNDINGS = ("mean", "median", "max")  # of several pixels in one voxel
-
 _PIXEL = Quantity("image distance", -1e5, 1e5)
 
 
@@ -26,10 +21,6 @@ class Compounding(Settings):
         Quantity("length", 1e-5, 0.02),
         "side of a voxel; not given: that of a pixel, or coarser for 134 million voxels at most",
         default=None,
-    )
-    method: str = setting(description="of insertion", choices=METHODS, default="linear")
-    compounding: str = setting(
-        description="of several pixels in one voxel", choices=COMPOUNDINGS, default="mean"
     )
     hole_radius: float | None = setting(
         Quantity("length", 0.0, 0.05),

@@ -72,7 +72,7 @@ class SeededGrowing(Settings):
             VolumeError: there is no seed, or one lies outside the range.
         """
         if not seeds:
-            raise VolumeError("growing needs seeds: give `seeds_mm` or `seeds_voxel`")
+            raise VolumeError("growing needs seeds: give `seeds_mm`")
         for number, seed in enumerate(seeds):
             if not self.lower <= (value := image[seed]) <= self.upper:
                 raise VolumeError(

@@ -18,7 +18,6 @@ from us_sim.volume.structure_names import Colour, problem_with
 
 _MOST = 255
 _MILLIMETRES = Quantity("number", -1e5, 1e5)
-_INDEX = Quantity("number", 0, 1 << 20)
 _RADIUS = Quantity("length", 0.0, 0.05)
 
 _Point = tuple[float, float, float]
@@ -39,9 +38,6 @@ class StructureSeeds(Settings):
     )
     seeds_mm: tuple[_Point, ...] = setting(
         _MILLIMETRES, "points in it, left-posterior-superior, mm", default=()
-    )
-    seeds_voxel: tuple[tuple[int, int, int], ...] = setting(
-        _INDEX, "points in it, as indices of voxels", default=()
     )
     reach: float | None = setting(
         Quantity("length", 1e-3, 1.0),
@@ -67,7 +63,7 @@ class StructureSeeds(Settings):
 
     def check(self) -> None:
         """Refuse a reach from nothing."""
-        if self.reach is not None and not (self.seeds_mm or self.seeds_voxel):
+        if self.reach is not None and not self.seeds_mm:
             raise self.refused("reach", "is from seeds, and there are none: give `seeds_mm`")
 
 
@@ -116,10 +112,6 @@ class SegmentRequest(Settings):
         description="labels from this file: .seg.nrrd of 3D Slicer, NRRD, MHA or NIfTI",
         default=None,
     )
-    label_table: Path | None = setting(
-        description="names and colours of labels: .ctbl of 3D Slicer, ITK-SNAP's, or CSV",
-        default=None,
-    )
     names: tuple[str, ...] = setting(
         description="names of labels, such as 3=gallbladder", default=()
     )
@@ -130,18 +122,14 @@ class SegmentRequest(Settings):
     vessels: str | None = setting(
         description="propose vessels without seeds", choices=("dark",), default=None
     )
-    resample: bool = setting(
-        description="take the nearest voxel of labels on another grid", default=False
-    )
 
     def check(self) -> None:
         """Refuse several sources, options of one that is not asked for, and names that are none."""
         asked = [key for key in ("labels", "seeds", "vessels") if getattr(self, key) is not None]
         if len(asked) > 1:
             raise self.refused(asked[1], f"and --{asked[0]} are two sources of labels: keep one")
-        for key in ("label_table", "names", "resample"):
-            if getattr(self, key) and self.labels is None:
-                raise self.refused(key, "is for --labels only")
+        if self.names and self.labels is None:
+            raise self.refused("names", "is for --labels only")
         self.given_names()
 
     def given_names(self) -> dict[int, str]:

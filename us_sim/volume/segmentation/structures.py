@@ -93,25 +93,17 @@ def _seeds(volume: Volume, asked: StructureSeeds) -> list[Index]:
     Raises:
         VolumeError: one is outside the volume.
     """
-    matrix = volume.patient_to_index
-    placed = [
-        (f"seeds_mm[{n}]: {list(point)} mm", matrix @ [*(1e-3 * np.array(point)), 1.0])
-        for n, point in enumerate(asked.seeds_mm)
-    ]
-    placed += [
-        (f"seeds_voxel[{n}]: {list(index)}", np.array(index, dtype=float))
-        for n, index in enumerate(asked.seeds_voxel)
-    ]
     seeds = []
-    for said, at in placed:
+    for n, point in enumerate(asked.seeds_mm):
+        at = volume.patient_to_index @ [*(1e-3 * np.array(point)), 1.0]
         i, j, k = (int(n) for n in np.floor(at[:3] + 0.5))
         if not all(0 <= n < size for n, size in zip((i, j, k), volume.shape, strict=True)):
             low, high = volume.extent * 1e3
             spans = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
             raise VolumeError(
-                f"{said} is outside the volume of {' × '.join(map(str, volume.shape))} voxels, "
-                f"which spans {spans} mm; points of a program that shows right-anterior-superior "
-                f"axes have their first two signs turned"
+                f"seeds_mm[{n}]: {list(point)} mm is outside the volume of "
+                f"{' × '.join(map(str, volume.shape))} voxels, which spans {spans} mm; points of a "
+                f"program that shows right-anterior-superior axes have their first two signs turned"
             )
         seeds.append((i, j, k))
     return seeds

@@ -1,14 +1,19 @@
-"""A closed surface of triangles with its volume, area and parts."""
+"""A closed surface of triangles with its volume, area and parts, and its STL file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from us_sim.volume.partial_file import partial_file
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,3 +54,21 @@ class ClosedSurface:
         count = len(self.vertices)
         joined = coo_array((np.ones(len(edges[0])), edges), shape=(count, count))
         return int(connected_components(joined, directed=False)[0])
+
+
+def write_stl(path: Path, surface: ClosedSurface) -> None:
+    """Write a surface to a binary file in millimetres; one of that name is replaced.
+
+    Its header says that the axes are left, posterior and superior (``SPACE=LPS``), which 3D Slicer
+    looks for; meshio writes no such header.
+
+    Raises:
+        VolumeError: the file cannot be written.
+    """
+    facets = np.zeros(len(surface.triangles), _FACET)
+    lengths = np.linalg.norm(surface.crosses, axis=1, keepdims=True)
+    facets["normal"] = surface.crosses / np.maximum(lengths, 1e-30)
+    facets["corners"] = 1e3 * surface.vertices[surface.triangles]
+    header = b"us_sim; millimetres; SPACE=LPS".ljust(80)
+    with partial_file(path) as partial:
+        partial.write_bytes(header + np.uint32(len(facets)).tobytes() + facets.tobytes())

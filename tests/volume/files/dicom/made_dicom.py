@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.encaps import encapsulate
-from pydicom.pixels.utils import pack_bits
 from pydicom.uid import UID, ExplicitVRLittleEndian, JPEG2000Lossless, RLELossless, generate_uid
 
 ENHANCED_US_VOLUME = "1.2.840.10008.5.1.4.1.1.6.2"
@@ -152,62 +151,3 @@ def turned(
     made[:3, :3] = rotation * spacing
     made[:3, 3] = (-12.5, 40.0, 7.75)
     return made
-
-
-SEGMENTED = np.diag([0.5e-3, 0.25e-3, 2e-3, 1.0])  # (4, 4) m, of the grid of LIVER and VEIN
-SEGMENTED[:3, 3] = (0.01, -0.02, 0.03)
-LIVER = np.zeros((7, 5, 6), bool)
-LIVER[1:4, 1:3, 2:5] = True
-VEIN = np.zeros((7, 5, 6), bool)
-VEIN[3:6, 2:4, 0] = VEIN[3:6, 2:4, 4] = True  # of its slices three in between have no frame
-
-SCT = {"CodingSchemeDesignator": "SCT"}
-
-
-def segment(number: int, label: str, code: str, side: str = "") -> Dataset:
-    """The description of a segment, with a patient's name where texts are free."""
-    kind = item(CodeValue=code, CodeMeaning="Doe Jane", **SCT)
-    if side:
-        modifier = item(CodeValue=side, CodeMeaning="x", **SCT)
-        kind.SegmentedPropertyTypeModifierCodeSequence = [modifier]
-    made = item(SegmentNumber=number, SegmentLabel=label, SegmentAlgorithmType="MANUAL")
-    made.SegmentedPropertyTypeCodeSequence = [kind]
-    made.RecommendedDisplayCIELabValue = [34885, 53485, 50171]  # a red
-    return made
-
-
-def segmentation(path: Path, kind: str = "BINARY") -> Path:
-    """LIVER as segment 1 and VEIN as segment 2, each slice with a voxel a frame."""
-    frames, groups = [], []
-    masks = {1: LIVER, 2: VEIN}
-    for number, mask in masks.items() if kind != "LABELMAP" else [(0, LIVER | VEIN)]:
-        for k in range(LIVER.shape[2]):
-            if not mask[:, :, k].any():
-                continue
-            values = np.where(VEIN, 2, LIVER)[:, :, k] if kind == "LABELMAP" else mask[:, :, k]
-            frames.append(values.T.astype(np.uint8) * (200 if kind == "FRACTIONAL" else 1))
-            at = (SEGMENTED @ [0, 0, k, 1])[:3] * 1e3
-            group = item(PlanePositionSequence=[item(ImagePositionPatient=at.tolist())])
-            if number:
-                referenced = item(ReferencedSegmentNumber=number)
-                group.SegmentIdentificationSequence = [referenced]
-            groups.append(group)
-    uid = "1.2.840.10008.5.1.4.1.1.66." + ("7" if kind == "LABELMAP" else "4")
-    made = header(np.array(frames), uid, Modality="SEG", SegmentationType=kind)
-    if kind == "BINARY":
-        made.BitsAllocated = made.BitsStored = 1
-        made.HighBit = 0
-        made.PixelData = pack_bits(np.array(frames))
-    if kind == "FRACTIONAL":
-        made.MaximumFractionalValue = 255
-    measures = item(PixelSpacing=[0.25, 0.5], SpacingBetweenSlices=2.0)
-    along = item(ImageOrientationPatient=[1, 0, 0, 0, 1, 0])
-    made.SharedFunctionalGroupsSequence = [
-        item(PixelMeasuresSequence=[measures], PlaneOrientationSequence=[along])
-    ]
-    made.PerFrameFunctionalGroupsSequence = groups
-    made.SegmentSequence = [
-        segment(1, "Doe Jane", "64033007", "7771000"),
-        segment(2, "portal vein", "32764006"),
-    ]
-    return write(path, made)

@@ -6,14 +6,14 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
-from made_dicom import US_IMAGE, US_MULTI_FRAME, enhanced, header, item, turned, write
+from made_dicom import US_IMAGE, enhanced, header, item, turned, write
 from pydicom.data import get_testdata_file
 from pydicom.uid import ImplicitVRLittleEndian, generate_uid
 
 from us_sim.errors import VolumeError
-from us_sim.volume.deidentification.importing import import_files
+from us_sim.volume.deidentification.importing import look_at
 from us_sim.volume.deidentification.settings import ImportSettings
-from us_sim.volume.files.dicom.placed_images import placed_images
+from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
 from us_sim.volume.files.readers import read_placement, read_volume
 from us_sim.volume.sequences.sweep import read_sweep
 
@@ -43,10 +43,10 @@ def test_of_several_volumes_each_can_be_had_and_the_echoes_are_taken(tmp_path):
     made = enhanced(VOXELS, PLACED, times=3)
     path = write(tmp_path / "a.dcm", made)
     for time in (1, 2, 3):
-        voxels = placed_images([path], volume=time).voxels()
+        voxels = placed_images(opened_images([path]), volume=time).voxels()
         np.testing.assert_array_equal(voxels, VOXELS + np.uint8(time - 1))
     with pytest.raises(VolumeError, match=r"3 volumes .*4"):
-        placed_images([path], volume=4)
+        placed_images(opened_images([path]), volume=4)
     for n, group in enumerate(made.PerFrameFunctionalGroupsSequence):
         kind = "TISSUE_INTENSITY" if 5 <= n < 10 else "FLOW_VELOCITY"
         group.ImageDataTypeSequence = [item(DataType=kind)]
@@ -82,9 +82,9 @@ def require_simpleitks(placed, folder):
 
 
 def test_series_of_files_lie_where_simpleitk_says(tmp_path):
-    require_simpleitks(placed_images(single_files(tmp_path)[::-1]), tmp_path)
+    require_simpleitks(placed_images(opened_images(single_files(tmp_path)[::-1])), tmp_path)
     files = real_series("98892001/CT5N")
-    require_simpleitks(placed_images(files), files[0].parent)
+    require_simpleitks(placed_images(opened_images(files)), files[0].parent)
 
 
 def real_series(name):
@@ -93,39 +93,6 @@ def real_series(name):
     if not folder.is_dir():
         pytest.skip(f"pydicom has come without {folder}")
     return [file for file in sorted(folder.iterdir()) if file.is_file()]
-
-
-def philips_cartesian():
-    voxels = np.stack([VOXELS, VOXELS + np.uint8(7)])  # two volumes in time
-    stack = voxels.transpose(0, 3, 2, 1).reshape(10, 6, 7).copy()
-    made = header(stack, "1.2.840.113543.6.6.1.3.10002", NumberOfFrames=2, FrameTime=50.0)
-    made.PhysicalDeltaX, made.PhysicalDeltaY = 0.05, 0.025  # cm
-    made.add_new(0x30010010, "LO", "Philips3D")
-    made.add_new(0x30011001, "UL", 5)
-    made.add_new(0x30011003, "FD", 0.2)
-    return made
-
-
-def test_philips_cartesian_export_is_read_as_slicerheart_reads_it(tmp_path):
-    path = write(tmp_path / "a.dcm", philips_cartesian())
-    volume = read_volume(path)
-    np.testing.assert_array_equal(volume.intensities, VOXELS)
-    np.testing.assert_allclose(np.diag(volume.index_to_patient), [5e-4, 2.5e-4, 2e-3, 1])
-    second = placed_images([path], volume=2)
-    np.testing.assert_array_equal(second.voxels(), VOXELS + np.uint8(7))
-
-
-def test_affiniti_and_artemis_state_distances_in_their_own_ways(tmp_path):
-    made = header(VOXELS.T.copy(), US_MULTI_FRAME)
-    made.add_new(0x200D0010, "LO", "Philips US Imaging DD 036")
-    made.add_new(0x200D1003, "LO", ["0.5", "0.25", "2.0"])
-    volume = read_volume(write(tmp_path / "a.dcm", made))
-    np.testing.assert_allclose(np.diag(volume.index_to_patient), [5e-4, 2.5e-4, 2e-3, 1])
-    made = header(VOXELS.transpose(2, 1, 0).copy(), US_MULTI_FRAME, PixelAspectRatio=[400, 400])
-    made.Manufacturer, made.ManufacturerModelName = "Eigen", "Artemis"
-    volume = read_volume(write(tmp_path / "b.dcm", made))
-    np.testing.assert_allclose(np.diag(volume.index_to_patient), [4e-4, 4e-4, 4e-4, 1])
-    np.testing.assert_allclose(volume.extent.sum(axis=0), 0.0, atol=1e-12)  # about its centre
 
 
 def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path):
@@ -178,7 +145,7 @@ def test_files_of_two_series_and_one_slice_are_refused(tmp_path):
     made.SeriesInstanceUID = generate_uid()
     made.save_as(paths[0])
     with pytest.raises(VolumeError, match="several series"):
-        placed_images(paths)
+        placed_images(opened_images(paths))
 
 
 @pytest.mark.parametrize(
@@ -199,9 +166,9 @@ def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
     made = enhanced(VOXELS[:, :, :1], turned(), times=times)
     path = write(tmp_path / "a.dcm", made)
     with pytest.raises(VolumeError, match=r"us-sim import a\.dcm"):
-        placed_images([path])
+        placed_images(opened_images([path]))
     out = tmp_path / "a.igs.mha"
-    import_files([path], out, ImportSettings(keep_whole_image=True))
+    look_at([path], out, ImportSettings(keep_whole_image=True)).write()
     sweep = read_sweep(out, tracked=False)
     np.testing.assert_allclose(sweep.times, 0.04 * np.arange(times))
     assert sitk.ReadImage(str(out)).GetSpacing()[:2] == (0.5, 0.25)

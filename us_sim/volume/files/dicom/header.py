@@ -1,4 +1,4 @@
-"""DICOM headers, read by pydicom; large values, such as the images, stay in the file."""
+"""DICOM files, read by pydicom."""
 
 from __future__ import annotations
 
@@ -14,10 +14,6 @@ from typing import Any
 from us_sim.errors import VolumeError
 
 EXTRA = "pip install 'us_sim[dicom]'"
-
-_DEFER = 1 << 20  # bytes of a value that stays in the file; a palette has 128 KiB a colour
-_DEFLATED = "1.2.840.10008.1.2.1.99"
-_PIXELS = (0x7FE00010, 0x7FE00008, 0x7FE00009)  # whole numbers, single and double precision
 
 
 @contextmanager
@@ -84,18 +80,6 @@ class DicomFile:
 
     path: Path
     header: Any  # pydicom.Dataset, whose values are read by the functions above
-    syntax: str  # UID of the transfer syntax
-
-    @property
-    def pixels(self) -> Any:
-        """The element of the images, without its value where this is large; None without one."""
-        tags = [tag for tag in _PIXELS if tag in self.header]
-        return self.header.get_item(tags[0], keep_deferred=True) if tags else None
-
-    @property
-    def deflated(self) -> bool:
-        """Whether all of the file is, so that its images were read with the header."""
-        return self.syntax == _DEFLATED
 
 
 def is_dicom(path: Path) -> bool:
@@ -124,7 +108,7 @@ def dicom_files(folder: Path) -> list[Path]:
 
 
 def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
-    """Read the header of a DICOM file."""
+    """Read a DICOM file."""
     path = Path(path)
     if not path.is_file():
         raise VolumeError(f"{path}: there is no such file")
@@ -137,23 +121,13 @@ def open_dicom(path: str | os.PathLike[str]) -> DicomFile:
         raise VolumeError(f"{path}: is no DICOM file: it does not begin as one does")
     try:
         with quiet():
-            header = dcmread(path, defer_size=_DEFER, force=True)
-            syntax = text(header.file_meta, "TransferSyntaxUID")
-            if syntax == _DEFLATED:
-                header = dcmread(path, force=True)
+            header = dcmread(path, force=True)
     except Exception as error:  # of many kinds, which may show values
         raise VolumeError(
             f"{path}: cannot be read as DICOM: its header is damaged or cut; copy it again"
         ) from error
-    if not syntax:  # older files do not say it
+    if "TransferSyntaxUID" not in header.file_meta:  # older files do not say it
         implicit = header.original_encoding[0] is not False
-        syntax = str(ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian)
-    made = DicomFile(path, header, syntax)
-    length = getattr(made.pixels, "length", 0xFFFFFFFF)
-    there = path.stat().st_size - getattr(made.pixels, "value_tell", 0)
-    if length != 0xFFFFFFFF and there < length and not made.deflated:
-        raise VolumeError(
-            f"{path}: breaks off: it holds {there} of the {length} bytes of its images; copy it "
-            f"again"
-        )
-    return made
+        syntax = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
+        header.file_meta.TransferSyntaxUID = syntax
+    return DicomFile(path, header)

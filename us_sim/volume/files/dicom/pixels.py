@@ -1,4 +1,4 @@
-"""The images of DICOM files as grey values, read and decoded by pydicom, one in memory at a time.
+"""The images of DICOM files as grey values, decoded by pydicom, one in memory at a time.
 
 8-bit values are taken as they are; all others are spread so that the least becomes 0 and the
 greatest 255, as `us_sim.volume.files.readers` does. Colour becomes grey by its brightness.
@@ -51,7 +51,9 @@ def image_format(file: DicomFile) -> ImageFormat:
     from pydicom.pixels.utils import get_expected_length, get_nr_frames
 
     header, path = file.header, file.path
-    if file.pixels is None:
+    keys = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
+    pixels = next((header[key] for key in keys if key in header), None)
+    if pixels is None:
         raise VolumeError(f"{path}: holds no image; give another DICOM file, or {EXPORT}")
     try:
         with quiet():
@@ -77,9 +79,8 @@ def image_format(file: DicomFile) -> ImageFormat:
             f"pixels; export it again"
         )
     check_claim(path, size, max(form.bits // 8, 1))
-    length = getattr(file.pixels, "length", None)  # none of images that came with the header
-    length = len(file.pixels.value) if length is None else length
-    if length not in (0xFFFFFFFF, expected, expected + expected % 2):
+    length = len(pixels.value)
+    if not pixels.is_undefined_length and length not in (expected, expected + expected % 2):
         raise VolumeError(
             f"{path}: holds {length} bytes of images where its header says {expected}; copy or "
             f"export it again"
@@ -91,22 +92,17 @@ def stored_frames(
     file: DicomFile, form: ImageFormat, frames: Sequence[int]
 ) -> Iterator[NDArray[Any]]:
     """Yield images of a file, (rows, columns) or (rows, columns, RGB), by their numbers."""
-    from pydicom.pixels import iter_pixels, pixel_array
+    from pydicom.pixels import iter_pixels
 
-    from us_sim.volume.files.dicom import twelve_bit_jpeg
-
-    twelve_bit_jpeg.add_plugin()
-    source: Any = file.header if file.deflated else file.path
-    more: dict[str, Any] = {}
-    if not file.deflated:
-        more = {"transfer_syntax_uid": file.syntax, "number_of_frames": form.frames}
     try:
+        if _has_twelve_bit_jpeg(file):
+            import SimpleITK as sitk
+
+            every = sitk.GetArrayFromImage(sitk.ReadImage(str(file.path)))
+            yield from every.reshape(-1, form.rows, form.columns)[list(frames)]
+            return
         with quiet():
-            if form.bits == 1:  # pydicom finds packed images that begin within a byte in all
-                every = pixel_array(source, **more).reshape(-1, form.rows, form.columns)
-                found = iter([every[n] for n in frames])
-            else:
-                found = iter_pixels(source, indices=list(frames), **more)
+            found = iter_pixels(file.header, indices=list(frames))
         for _ in frames:
             with quiet():
                 image = next(found)
@@ -118,6 +114,12 @@ def stored_frames(
             f"{file.path}: its images cannot be decoded ({' '.join(str(error).split())}); copy or "
             f"export it again, or install the decoders: {EXTRA}"
         ) from error
+
+
+def _has_twelve_bit_jpeg(file: DicomFile) -> bool:
+    """Whether images are in an encoding that pydicom's decoders read with 8 bits alone."""
+    syntax = str(file.header.file_meta.TransferSyntaxUID)
+    return syntax == "1.2.840.10008.1.2.4.51" and file.header.get("BitsStored", 8) > 8
 
 
 def _grey_palette(file: DicomFile) -> tuple[int, NDArray[np.uint8]]:
@@ -146,8 +148,7 @@ class GreyImages:
         self.formats = [image_format(file) for file in self.files]
         self.form = self.formats[0]
         for file, form in zip(self.files, self.formats, strict=True):
-            same = replace(form, frames=self.form.frames) == self.form
-            if not same or file.syntax != self.files[0].syntax:
+            if replace(form, frames=self.form.frames) != self.form:
                 raise VolumeError(
                     f"{file.path}: its images are of another size or type than those of "
                     f"{self.files[0].path}; import them one by one"
@@ -203,6 +204,8 @@ class GreyImages:
     @cached_property
     def _scales(self) -> list[list[tuple[float, float]]]:
         """Slope and offset of each image of each file (PS3.3, C.11.1): its own, or the file's."""
+        if _has_twelve_bit_jpeg(self.files[0]):  # whose values SimpleITK has scaled
+            return [[(1.0, 0.0)] * form.frames for form in self.formats]
         key = "PixelValueTransformationSequence"
         return [
             [

@@ -20,11 +20,8 @@ from us_sim.volume.files.dicom.planes import (
     grid_of,
     image_kinds,
     image_times,
-    one_image_after_another,
     stated_planes,
-    vendor_planes,
 )
-from us_sim.volume.files.segments import no_grey_values
 from us_sim.volume.files.stored_image import volume_of_slices
 
 SEGMENTATIONS = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
@@ -56,10 +53,13 @@ class PlacedImages:
 
 def opened_images(paths: Sequence[str | os.PathLike[str]]) -> GreyImages:
     """Open the images of one or several DICOM files."""
-    files = [one_image_after_another(open_dicom(path)) for path in paths]
+    files = [open_dicom(path) for path in paths]
     for file in files:
         if text(file.header, "SOPClassUID") in SEGMENTATIONS:
-            raise no_grey_values(file.path)
+            raise VolumeError(
+                f"{file.path}: is a segmentation, which has labels and no grey values; save it as "
+                f".seg.nrrd in 3D Slicer, and give that to `us-sim segment CASE --labels`"
+            )
     return GreyImages(files)
 
 
@@ -69,14 +69,14 @@ def is_flat(images: GreyImages, spacing: Sequence[float] = ()) -> bool:
 
 
 def placed_images(
-    paths: Sequence[str | os.PathLike[str]] | GreyImages,
+    images: GreyImages,
     volume: int = 1,
     spacing: Sequence[float] = (),
 ) -> PlacedImages:
     """Place the volume that DICOM files hold: an enhanced or multi-frame one, or an image each.
 
     Args:
-        paths: of the files, in any order; or their images.
+        images: of the files, in any order.
         volume: which one where there are several in time, the first of which is 1.
         spacing: mm, width and height of pixels and distance of images, of files that state where
             their images lie, but not the size of pixels; or empty.
@@ -85,7 +85,6 @@ def placed_images(
         VolumeError: the files hold no volume, or one that only its maker can read; or they do not
             belong together.
     """
-    images = paths if isinstance(paths, GreyImages) else opened_images(paths)
     path = images.files[0].path
     for key in ("SeriesInstanceUID", "FrameOfReferenceUID"):
         if len({text(file.header, key) for file in images.files}) > 1:
@@ -126,12 +125,11 @@ def _planes(images: GreyImages, spacing: Sequence[float]) -> tuple[list[Plane], 
     planes: list[Plane] = []
     times: list[float] = []
     for file, form in zip(images.files, images.formats, strict=True):
-        found = vendor_planes(file, form.frames)
-        own = found[0] if found else stated_planes(file, form.frames, spacing)
+        own = stated_planes(file, form.frames, spacing)
         if own is None:
             return [], []
         planes += own
-        times += found[1] if found else image_times(file, form.frames)
+        times += image_times(file, form.frames)
     return planes, times
 
 

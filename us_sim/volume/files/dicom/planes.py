@@ -5,17 +5,13 @@ apart pixels are (PS3.3, C.7.6.2). A volume is a set of such images at even dist
 common normal, in any order. pydicom leaves this to others; highdicom 0.28 finds no coordinate
 system in an Enhanced US Volume.
 
-Three makers' volumes are read as 3D Slicer's SlicerHeart and ITK-SNAP read them: Philips' Cartesian
-export from QLAB, Philips Affiniti, and Eigen Artemis. None of them says where the patient is: the
-axes are those of the grid. All others are refused with a way out.
+Makers' own volumes are refused with a way out.
 """
 
 from __future__ import annotations
 
-import copy
-import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -39,15 +35,12 @@ _PARALLEL = 1e-4  # difference of the components of directions that are the same
 _EVEN = 0.02  # of the distance between images, by which one may be off
 _ROUNDED = 0.01  # mm, to which some scanners round positions
 _ALONG_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-_CARTESIAN = "1.2.840.113543.6.6.1.3.10002"
-_SLICES, _DEPTH = 0x30011001, 0x30011003  # of the Cartesian export
-_ARTEMIS = ("Eigen", "Artemis")
 
 EXPORT = (
-    "export a maker's own 3D data as Enhanced US Volume or Cartesian DICOM (QLAB), or save it as "
-    ".nrrd in 3D Slicer with SlicerHeart"
+    "export a maker's own 3D data as Enhanced US Volume, or save it as .nrrd in 3D Slicer with "
+    "SlicerHeart"
 )
-"""Advice for GE's Kretz and movie groups, Philips' native 3D and Siemens' volumes."""
+"""Advice for GE's Kretz and movie groups, Philips' and Siemens' volumes."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +52,12 @@ class Plane:
     spacing: tuple[float, ...]  # (2,) mm, between rows, then between columns
 
 
-def grid_of(
-    path: Path | str, planes: Sequence[Plane], step: float | None = None, *, sparse: bool = False
-) -> tuple[list[int], NDArray[np.float64]]:
+def grid_of(path: Path | str, planes: Sequence[Plane]) -> tuple[list[int], NDArray[np.float64]]:
     """Return which slice of an even grid each image is, and (4, 4) m from (column, row, slice).
 
     Args:
         path: which errors name.
         planes: of two images or more.
-        step: mm between slices; else their mean distance, or the smallest of sparse ones.
-        sparse: slices may be missing, and several images be of the same one.
     """
     orientation, spacing, positions = (
         np.array([getattr(plane, key) for plane in planes])
@@ -82,21 +71,16 @@ def grid_of(
         )
     axes = _image_axes(path, planes[0].orientation)
     depth = positions @ axes[:, 2]
-    gaps = np.diff(np.sort(depth))
-    if sparse:
-        gaps = gaps[gaps > _ROUNDED]
-        step = step or (float(gaps.min()) if len(gaps) else 1.0)
-    else:
-        step = float(np.ptp(depth)) / (len(planes) - 1) or 1.0
+    step = float(np.ptp(depth)) / (len(planes) - 1) or 1.0
     slices = np.rint((depth - depth.min()) / step)
     first = positions[int(np.argmin(depth))]
-    step = float(np.ptp(depth) / slices.max()) if slices.any() else step
     off = np.abs(positions - first - np.outer(slices * step, axes[:, 2])).max()
-    is_whole = sparse or np.array_equal(np.sort(slices), np.arange(len(planes)))
+    is_whole = np.array_equal(np.sort(slices), np.arange(len(planes)))
     if not is_whole or not off <= max(_EVEN * step, _ROUNDED):
+        gaps = np.diff(np.sort(depth))
         raise VolumeError(
-            f"{path}: its images are {gaps.min(initial=step):g} to {gaps.max(initial=0):g} mm apart"
-            f" and shifted by up to {off:g} mm against an even grid: one may be missing"
+            f"{path}: its images are {gaps.min():g} to {gaps.max():g} mm apart and shifted by up "
+            f"to {off:g} mm against an even grid: one may be missing"
         )
     rows, columns = planes[0].spacing
     return slices.astype(int).tolist(), checked_placement(path, (columns, rows, step), axes, first)
@@ -179,78 +163,12 @@ def image_kinds(file: DicomFile, frames: int) -> list[str]:
     return [(*kinds, "")[0] for kinds in every]
 
 
-def is_cartesian(file: DicomFile) -> bool:
-    """Whether it is Philips' Cartesian export."""
-    return text(file.header, "SOPClassUID") == _CARTESIAN
-
-
-def one_image_after_another(file: DicomFile) -> DicomFile:
-    """Return the file with a header that counts images, where Philips' export counts volumes."""
-    if not is_cartesian(file):
-        return file
-    if not (slices := int(_private_number(file.header, _SLICES))):
-        raise VolumeError(f"{file.path}: does not say how many slices it has; export it again")
-    header = copy.copy(file.header)
-    header.NumberOfFrames = int(number(header, "NumberOfFrames") or 1) * slices
-    return replace(file, header=header)
-
-
-def vendor_planes(file: DicomFile, frames: int) -> tuple[list[Plane], list[float]] | None:
-    """Return the places of images that a maker states in a way of its own, and their times in s.
-
-    - Philips' Cartesian export: the number of slices and their distance in the private elements
-      (3001,1001) and (3001,1003), the other distances in the standard's; all in cm.
-    - Philips Affiniti: the distances in mm in an element of "Philips US Imaging DD 036".
-    - Eigen Artemis: voxels whose edge in mm is a thousandth of the pixels' aspect ratio.
-
-    The file is as `one_image_after_another` returns it.
-    """
-    header = file.header
-    if is_cartesian(file):
-        x, y = (number(header, f"PhysicalDelta{axis}") or 0.0 for axis in "XY")
-        z, slices = _private_number(header, _DEPTH), int(_private_number(header, _SLICES))
-        if not x * y * z:
-            return None
-        step = (number(header, "FrameTime") or 1000.0) * 1e-3  # s
-        grid = _stack((x * 10.0, y * 10.0, z * 10.0), slices)
-        return grid * (frames // slices), [step * (n // slices) for n in range(frames)]
-    spacing: tuple[float, ...] = ()
-    corner = np.zeros(3)
-    try:
-        private = header.private_block(0x200D, "Philips US Imaging DD 036")
-        spacing = numbers(header, private.get_tag(0x03), 3)
-    except KeyError:
-        if (text(header, "Manufacturer"), text(header, "ManufacturerModelName")) == _ARTEMIS:
-            spacing = ((number(header, "PixelAspectRatio") or 0.0) / 1000,) * 3
-            size = number(header, "Columns") or 1, number(header, "Rows") or 1, frames
-            corner = -(np.array(size) - 1) / 2 * spacing
-    if not spacing or frames < 2:
-        return None
-    return _stack(spacing, frames, corner), [0.0] * frames
-
-
-def _stack(
-    spacing: Sequence[float], count: int, corner: Sequence[float] | NDArray[np.float64] = (0, 0, 0)
-) -> list[Plane]:
-    """Place images one behind the other along the grid's axes, from a corner on; mm."""
-    x, y, z = spacing
-    left, top, front = map(float, corner)
-    return [Plane((left, top, front + n * z), _ALONG_AXES, (y, x)) for n in range(count)]
-
-
-def _private_number(header: Any, tag: int) -> float:
-    """Read a number whose type the file may not say: whole, or in double precision; else 0."""
-    found = next(iter(values(header, tag)), b"")
-    form = {2: "<H", 4: "<I", 8: "<d"}.get(len(found)) if isinstance(found, bytes) else None
-    return float(struct.unpack(form, found)[0]) if form else number(header, tag) or 0.0
-
-
 def frame_times(file: DicomFile, frames: int) -> list[float] | None:
     """Return times of a cine's images in s, from the first on; None where none are stated.
 
     `FrameTimeVector` says how long after the one before it each image came, `FrameTime` and the
-    rates say it of all (PS3.3, C.7.6.5). Without these, images of enhanced objects state their own
-    times (PS3.3, C.7.6.16.2).
+    rates say it of all (PS3.3, C.7.6.5). Without these, images of enhanced objects may state the
+    times of their volumes.
     """
     header = file.header
     steps = numbers(header, "FrameTimeVector", frames)[1:]  # ms
@@ -260,25 +178,6 @@ def frame_times(file: DicomFile, frames: int) -> list[float] | None:
         steps = (step,) * (frames - 1) if step else ()
     if frames == 1 or (steps and all(0.0 <= step < 1e7 for step in steps)):
         return list(accumulate((step * 1e-3 for step in steps), initial=0.0))
-    return _own_times(file, frames)
-
-
-def _own_times(file: DicomFile, frames: int) -> list[float] | None:
-    """Return of the images' own times those in which each is later than the one before it."""
-    from pydicom.valuerep import DT
-
-    every = [image_times(file, frames)]
-    for key in ("FrameReferenceDateTime", "FrameAcquisitionDateTime"):
-        try:
-            stamps = [
-                DT(text(item, key))
-                for groups in groups_of(file.header, frames)
-                for item in items(next(iter(groups), {}), "FrameContentSequence")[:1]
-            ]
-            every.append([(stamp - stamps[0]).total_seconds() for stamp in stamps])
-        except (TypeError, ValueError):  # an image without one, or no such day
-            continue
-    for times in every:
-        if len(times) == frames and all(a < b for a, b in pairwise(times)):
-            return [time - times[0] for time in times]
-    return None
+    times = image_times(file, frames)
+    is_rising = len(times) == frames and all(a < b for a, b in pairwise(times))
+    return [time - times[0] for time in times] if is_rising else None
