@@ -26,7 +26,7 @@ _BESIDE_THE_PROJECT = Path(__file__).resolve().parents[2] / "shared" / "data"
 _WORKER = "PYTEST_XDIST_WORKER"
 _MARKED = "US_SIM_TESTS_MARKED"
 
-_MEASURED = ("hand", "measured", "stability", "test_independent_residual", "tissue")
+_MEASURED = ("hand", "measured", "stability", "test_independent_forces", "tissue")
 _TISSUE = ("tissue", *(f"evaluation/{name}" for name in _MEASURED))
 """Tests of the kernels that take longest to compile: one process compiles them, and meanwhile
 the other one what is beside them."""

@@ -1,6 +1,7 @@
 """Forces that hold tissue at its displacements, by the equations of each method, in NumPy.
 
-They are written down a second time, in double precision, and share no kernel with a solver.
+They are written down a second time, in double precision, and share no kernel with a solver, so
+that rounding and omissions of a solver show: see `least_unbalanced`.
 
 >>> from us_sim.tissue.elasticity.material import Material
 >>> from us_sim.tissue.model import TissueModel
@@ -17,19 +18,48 @@ They are written down a second time, in double precision, and share no kernel wi
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.tissue.model import Deformation, TissueModel
 
-Array = NDArray[np.float64]
+Array: TypeAlias = NDArray[np.float64]
+Forces: TypeAlias = Callable[[Array], Array]
+"""(N, 3) N that hold the nodes at displacements (N, 3) m."""
 
 _ELEMENT_BULK = 5.0
 """Greatest (lambda + mu) / mu within tetrahedra; the rest acts on averages around nodes."""
 
-_YIELD = 1.5
-"""Growth of a tetrahedron's faces at which its volume term yields in an explicit method."""
+_ROUNDED = 10.0
+"""How many times the forces of rounding may be those of one random rounding of the nodes."""
+
+
+def least_unbalanced(
+    model: TissueModel, forces: Forces, deformation: Deformation
+) -> tuple[float, float, float]:
+    """Return what is unbalanced at least, what may be rounding of it, and the load at most, N.
+
+    These are norms over all nodes. Nothing balances the nodes that the probe does not touch; what
+    it leaves at those that it touches is not known here, nor the size of its forces. If the
+    reported residual is true, unbalanced over contact forces, they are at most the load.
+    """
+    displacement = deformation.nodes - model.mesh.nodes
+    touched = np.zeros(len(displacement), dtype=bool)
+    touched[deformation.contact_nodes] = True
+    noise = np.random.default_rng(0).standard_normal(displacement.shape)
+    noise *= np.finfo(np.float64).eps * np.abs(model.mesh.nodes).max()
+    with np.errstate(all="ignore"):
+        holding = forces(displacement)
+        rounding = _ROUNDED * np.linalg.norm((forces(displacement + noise) - holding)[~model.fixed])
+        pushed = np.linalg.norm(holding[touched & ~model.fixed])
+        unbalanced = np.linalg.norm(holding[~touched & ~model.fixed])
+    load = pushed / max(1.0 - deformation.residual, 1e-300)
+    return float(unbalanced), float(rounding), float(load)
 
 
 def hooke_forces(mesh: TetrahedralMesh, materials: TissueMaterials, displacement: Array) -> Array:
@@ -107,42 +137,6 @@ def spring_forces(
     np.add.at(force, edges[:, 1], pull[:, None] * now)
     np.add.at(force, edges[:, 0], -pull[:, None] * now)
     return force
-
-
-def volume_forces(
-    mesh: TetrahedralMesh, element: Array, nodal: Array, displacement: Array, yielding: bool = False
-) -> Array:
-    """(N, 3) N of energies of volume, of (M,) Pa in tetrahedra, and averaged around nodes.
-
-    ``yielding`` ones whose faces, squared and added, have grown to 1.5 times what they were keep
-    their strain and their stress in proportion to the square root of what is beyond.
-    """
-    gradient = _gradients(mesh)
-    slope = _slopes(mesh, gradient, displacement)
-    swelling = _swelling(slope)
-    cofactor = _cofactors(slope + np.eye(3))
-    left = np.ones(len(swelling))
-    if yielding:
-        faces = np.einsum("mij,maj->mai", cofactor, gradient)
-        grown = (faces**2).sum(axis=(1, 2)) / (gradient**2).sum(axis=(1, 2))
-        left = np.sqrt(np.minimum(_YIELD / np.maximum(grown, _YIELD), 1.0))
-    around = _around(mesh, nodal * mesh.volumes / 4, left * swelling)
-    pressure = left * (element * left * swelling + nodal * around)
-    stress = pressure[:, None, None] * cofactor
-    return _gathered(mesh, mesh.volumes, gradient, stress, np.zeros(len(pressure)))
-
-
-def rounding_of_forces(mesh: TetrahedralMesh, modulus: Array) -> float:
-    """N, about the norm of the forces that arise when coordinates are rounded to doubles.
-
-    ``modulus`` is (M,) Pa, the stiffest of each tetrahedron.
-    """
-    steep = np.linalg.norm(_gradients(mesh), axis=2)
-    digit = np.finfo(np.float64).eps * np.abs(mesh.nodes).max()
-    each = modulus * mesh.volumes * steep.sum(axis=1) * digit
-    nodal = np.zeros(len(mesh.nodes))
-    np.add.at(nodal, mesh.tetrahedra, each[:, None] * steep)
-    return float(np.linalg.norm(nodal))
 
 
 def _elements(

@@ -1,31 +1,28 @@
 """The evaluated tissue solvers, one entry each; those of other packages are not evaluated.
 
 >>> from us_sim.evaluation.tissue_methods import TISSUE_METHODS
->>> TISSUE_METHODS["msds"].has_springs, TISSUE_METHODS["fem"].equations({"threads": 2})
-(True, ('fem',))
+>>> TISSUE_METHODS["msds"].is_dynamic, TISSUE_METHODS["msds"].family("steps=5, stiffness=fitted")
+(True, 'fitted')
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 from us_sim.evaluation.figures import Look
 from us_sim.evaluation.independent_forces import (
+    Forces,
     averaged_hooke_forces,
     hooke_forces,
     neo_hookean_forces,
+    spring_forces,
 )
-from us_sim.evaluation.independent_residual import Residual, solid_residual, spring_residual
+from us_sim.tissue.elasticity.springs import springs_of
+from us_sim.tissue.model import TissueModel
 
-Setting = Mapping[str, Any]  # values of some of a solver's settings, by name
-
-_EFFORT = (
-    *("iterations", "steps", "threads", "contact_updates", "time_step"),
-    *("frame_tolerance", "frame_budget", "tolerance", "most_iterations"),
-)
-"""Settings that say how long a method tries, and not which equations it solves."""
+Setting: TypeAlias = Mapping[str, Any]  # values of some of a solver's settings, by name
 
 
 @dataclass(frozen=True)
@@ -35,12 +32,10 @@ class TissueMethod:
     name: str
     colour: str
     mark: str  # of its points in a plot, as Matplotlib names it
-    residual: Residual  # its equations, written down again
-    patient: Setting | None  # settings with which it converges; None where it solves directly
+    equations: Callable[[TissueModel], Forces]  # its equations, written down again
     tried: tuple[Setting, ...] = ()  # besides the defaults
-    has_springs: bool = False
-    is_quasi_static: bool = True  # without masses: a free tissue has no position of rest
-    is_explicit: bool = False  # only time steps up to a limit are stable
+    patient: Setting = field(default_factory=dict)  # settings with which it goes on until balance
+    is_dynamic: bool = False  # of springs and masses, in time steps that are stable up to a limit
     is_judged_at_rest: bool = False  # under a held probe it must come to balance, nothing inverted
     families: Mapping[str, str] = field(default_factory=dict)
     """Names in plots of settings that change the equations."""
@@ -50,35 +45,31 @@ class TissueMethod:
         """All that are tried, the defaults first."""
         return ({}, *self.tried)
 
-    def equations(self, setting: Setting) -> tuple[Any, ...]:
-        """Key of the equations: alike for settings that approach the same solution."""
-        return (self.name, *sorted(self.without_effort(setting).items()))
-
-    @staticmethod
-    def without_effort(setting: Setting) -> dict[str, Any]:
-        """The part of a setting that decides which equations are solved."""
-        return {name: value for name, value in setting.items() if name not in _EFFORT}
-
     def family(self, setting: str) -> str:
         """Difference of a setting's equations, written ``a=1, b=2``, from the default's."""
         parts = (self.families.get(part) for part in setting.split(", "))
         return ", ".join(part for part in parts if part)
 
 
-_OF_SPRINGS = {
-    "stiffness=fitted": "fitted",
-    "stiffness=algorithm_1": "Algorithm 1",
-    "volume=True": "volume term",
-    "volume=False": "no volume term",
-}
+def _spring_equations(model: TissueModel) -> Forces:
+    """Write down the forces of the springs of Algorithm 1."""
+    springs = springs_of(model.mesh, model.materials)
+    return lambda displacement: spring_forces(
+        springs.edges, springs.stiffness, model.mesh.nodes, displacement
+    )
+
+
+def _solid_equations(forces: Callable[..., Any]) -> Callable[[TissueModel], Forces]:
+    return lambda model: lambda displacement: forces(model.mesh, model.materials, displacement)
+
 
 _ALL = (
-    TissueMethod("fem", "#0072B2", "o", solid_residual(averaged_hooke_forces), patient=None),
+    TissueMethod("fem", "#0072B2", "o", _solid_equations(averaged_hooke_forces)),
     TissueMethod(
         "fem_nonlinear",
         colour="#D55E00",
         mark="D",
-        residual=solid_residual(neo_hookean_forces, surface=True),
+        equations=_solid_equations(neo_hookean_forces),
         is_judged_at_rest=True,
         patient={"frame_tolerance": 1e-7, "most_iterations": 4000, "tolerance": 1e-7},
         tried=(
@@ -92,16 +83,14 @@ _ALL = (
         "fem_cg",
         colour="#56B4E9",
         mark="s",
-        residual=solid_residual(hooke_forces),
-        patient={"iterations": 500, "tolerance": 1e-9},
+        equations=_solid_equations(hooke_forces),
         tried=tuple({"iterations": n} for n in (5, 10, 40, 80, 160)),
     ),
     TissueMethod(
         "msds",
         colour="#009E73",
         mark="^",
-        residual=spring_residual,
-        patient={"steps": 100, "rest_tolerance": 1e-8},
+        equations=_spring_equations,
         tried=(
             {"steps": 5},
             {"steps": 80},
@@ -109,10 +98,8 @@ _ALL = (
             {"stiffness": "fitted", "volume": True},
             {"stiffness": "fitted", "volume": True, "steps": 80},
         ),
-        has_springs=True,
-        is_quasi_static=False,
-        is_explicit=True,
-        families=_OF_SPRINGS,
+        is_dynamic=True,
+        families={"stiffness=fitted": "fitted", "volume=True": "volume term"},
     ),
 )
 TISSUE_METHODS = {method.name: method for method in _ALL}

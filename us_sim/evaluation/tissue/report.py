@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from us_sim.evaluation.block import MESHES
 from us_sim.evaluation.figures import Look, draw_error_over_parameter, draw_error_over_time
-from us_sim.evaluation.report import exponent
 from us_sim.evaluation.subject import Report, Subject
-from us_sim.evaluation.tissue.cases import LOCKING, MAIN_SCENE, SCENES
+from us_sim.evaluation.tissue.cases import MAIN_SCENE, SCENES
 from us_sim.evaluation.tissue.measure import plan_pieces
 from us_sim.evaluation.tissue_methods import LOOKS, TISSUE_METHODS
 
@@ -32,10 +31,9 @@ def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
         line=[_line(p.method, p.setting) for p in points.itertuples()],
         default=points["setting"] == "default",
     )
-    nonlinear, own = points[~points["own"]], points[points["own"]]
-    shown = nonlinear[(nonlinear["nodes"] == _NODES) & ~nonlinear["scene"].isin(LOCKING[1:])]
-    main = nonlinear[nonlinear["scene"] == MAIN_SCENE]
-    defaults = nonlinear[nonlinear["default"]]
+    shown = points[points["nodes"] == _NODES]
+    main = points[points["scene"] == MAIN_SCENE]
+    defaults = points[points["default"]]
     fronts = {scene: _pareto_front(some) for scene, some in shown.groupby("scene", sort=False)}
     places = {
         "references": references,
@@ -44,14 +42,8 @@ def report_tissue(references: pd.DataFrame, points: pd.DataFrame) -> Report:
         "defaults": _in_percent(defaults),
         "fronts": [f"**{scene}**: {_words(front)}." for scene, front in fronts.items()],
         "meshes": _draw_errors(main, "nodes", f"by nodes of the mesh, {SCENES[MAIN_SCENE].words}"),
-        "own_error": _draw_errors(
-            own[own["nodes"] == _NODES], "scene", "to each method's own converged equations"
-        ),
-        "own": _in_percent(own[(own["nodes"] == _NODES) & (own["scene"] == MAIN_SCENE)]),
-        "locking": _tabulate_locking(defaults),
         "estimates": _tabulate_estimates(defaults),
         "size": _draw_sizes(main[main["default"]]),
-        "sizes": _tabulate_sizes(main[main["default"]]),
     }
     return Report(list(_take_home(main, fronts)), places)
 
@@ -118,25 +110,13 @@ def _draw_sizes(points: pd.DataFrame) -> Figure:
 
 def _in_percent(points: pd.DataFrame) -> pd.DataFrame:
     """The rows' main columns, by the names that a reader reads."""
-    table = points[["scene", "method", "setting", "nodes"]].copy()
+    table = points[["scene", "method", "nodes"]].copy()
     table["ms"], table["p99 ms"] = points["ms_median"], points["ms_p99"]
     table["L2 %"], table["max mm"] = 100 * points["rel_l2_error"], points["max_error_mm"]
     table["force %"] = 100 * points["force_error"]
     table["volume %"] = 100 * points["volume_error"]
     table["smallest volume ratio"] = points["smallest_volume_ratio"]
-    if points["own"].any():
-        table["reference"] = points["reference"]
-    return table if (table["setting"] != "default").any() else table.drop(columns="setting")
-
-
-def _tabulate_locking(defaults: pd.DataFrame) -> pd.DataFrame | str:
-    """Error of the reaction as tissue becomes incompressible; nothing without those scenes."""
-    found = defaults[defaults["scene"].isin(LOCKING) & (defaults["nodes"] == _NODES)]
-    if found["scene"].nunique() < 2:
-        return ""
-    ratios = [f"ν = {SCENES[name].poisson_ratio}" for name in found["scene"]]
-    table = found.assign(ratio=ratios, error=100 * found["force_error"])
-    return table.pivot_table("error", "method", "ratio", sort=False).reset_index()
+    return table
 
 
 def _tabulate_estimates(defaults: pd.DataFrame) -> pd.DataFrame | str:
@@ -151,19 +131,11 @@ def _tabulate_estimates(defaults: pd.DataFrame) -> pd.DataFrame | str:
     return table
 
 
-def _tabulate_sizes(points: pd.DataFrame) -> pd.DataFrame:
-    """Costs by the number of nodes, and k in cost ~ nodes^k."""
-    costs = points.melt(["method", "nodes"], ["ms_median", "setup"], "cost")
-    table = costs.pivot_table("value", ["method", "cost"], "nodes", sort=False)
-    table["exponent"] = [exponent(row.to_dict()) for _, row in table.iterrows()]
-    return table.reset_index()
-
-
 TISSUE = Subject(
     "tissue",
     "Tissue: error against run time",
     plan_pieces,
     report_tissue,
-    hidden=("own", "setup", "smallest_volume_ratio"),
+    hidden=("setup", "smallest_volume_ratio"),
     libraries=("scikit-fem",),
 )
