@@ -1,14 +1,14 @@
 """Loss, shadows, and echoes by the angle of the beam, against closed forms.
 
->>> from us_sim.evaluation.image.acoustics import STATES, corners
->>> np.round(corners(STATES["rest"])[0] * 1e3, 3)  # mm, x and z of one
+>>> from us_sim.evaluation.image.acoustics import corners
+>>> np.round(corners(np.eye(3))[0] * 1e3, 3)  # mm, x and z of one
 array([-6., 14.])
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -39,32 +39,18 @@ Row: TypeAlias = "dict[str, Any]"
 
 _LOW, _HIGH = (-6e-3, 14e-3), (5.2e-3, 18e-3)  # m, x and z of a block of bone
 _PROBE = LinearProbe(aperture=0.03, depth=0.03)
-
-
-def _acoustics(
-    frequency: float,
-    compensation: float,
-    tissues: dict[str, TissueAcoustics],
-    *,
-    surfaces: bool = False,
-    anisotropy: bool = True,
-) -> Acoustics:
-    """Live acoustics of tissues by label, at a frequency (Hz), compensated by so many dB/cm/MHz."""
-    return Acoustics(
-        artefacts="live",
-        frequency=frequency,
-        compensation=compensation,
-        surfaces=surfaces,
-        anisotropy=anisotropy,
-        tissues=tissues,
-    )
+_live = partial(Acoustics, artefacts="live", surfaces=False)
 
 
 def attenuation_rows(quick: bool) -> Iterator[Row]:
     """Images of layers of one grey, whose levels are the loss alone (Beer and Lambert)."""
     volume = layered_volume()
+    tissues = {
+        layer.name: TissueAcoustics(attenuation=layer.attenuation, impedance=layer.impedance)
+        for layer in LAYERS
+    }
     for name, frequency in (("linear", 7e6), ("convex", 3.5e6), ("sector", 3e6)):
-        acoustics = _acoustics(frequency, 0.5, {layer.name: layer.tissue for layer in LAYERS})
+        acoustics = _live(frequency=frequency, compensation=0.5, tissues=tissues)
         probe = PROBES[name]
         scanner = BMode(volume, probe, acoustics=acoustics)
         for degrees in (0.0, 40.0) if quick else (0.0, 10.0, 20.0, 30.0, 40.0):
@@ -115,21 +101,13 @@ def _worst_depths(
         yield row_of(artefact, name, degrees, float(depth), float(mean[at]), shown_level, "dB")
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """Deformation of the tissue around a block of bone, and place of the probe."""
-
-    gradient: Array = field(default_factory=lambda: np.eye(3))
-    """(3, 3) of the deformation, the same everywhere."""
-    slid: float = 0.0  # m, of the probe along x
-
-
 STATES = {
-    "rest": State(),
+    "rest": (np.eye(3), 0.0),
     # Pressed by 12 %, which makes it wider, and sheared.
-    "pressed": State(np.array([[1.06, 0.0, 0.08], [0.0, 1.07, 0.0], [0.0, 0.0, 0.88]])),
-    "slid": State(slid=3.7e-3),
+    "pressed": (np.array([[1.06, 0.0, 0.08], [0.0, 1.07, 0.0], [0.0, 0.0, 0.88]]), 0.0),
+    "slid": (np.eye(3), 3.7e-3),
 }
+"""Gradients (3, 3) of the deformation around the bone, and m by which the probe is slid along x."""
 
 
 def _bone_volume() -> Volume:
@@ -144,10 +122,10 @@ def _bone_volume() -> Volume:
     return Volume(grey, to_patient, labels, {1: "muscle", 2: "bone"})
 
 
-def corners(state: State) -> Array:
+def corners(gradient: Array) -> Array:
     """(4, 2) m: x and z of the block's corners, in the plane y = 0."""
     rest = np.array([[x, 0.0, z] for x in (_LOW[0], _HIGH[0]) for z in (_LOW[1], _HIGH[1])])
-    return (rest @ state.gradient.T)[:, [0, 2]]
+    return (rest @ gradient.T)[:, [0, 2]]
 
 
 def _line_through(probe: Probe, pose: Pose, points: Array) -> Array:
@@ -179,14 +157,16 @@ def shadow_rows(quick: bool) -> Iterator[Row]:
         "sector": (SectorProbe(aperture=0.02, opening_angle=np.radians(70), depth=0.06), 3e6),
     }
     for name, (probe, frequency) in probes.items():
-        scanner = BMode(volume, probe, acoustics=_acoustics(frequency, 0.57, tissues))
+        scanner = BMode(
+            volume, probe, acoustics=_live(frequency=frequency, compensation=0.57, tissues=tissues)
+        )
         scanner.carry(carrier.nodes, carrier.tetrahedra)
         for degrees in (0.0, 15.0) if quick else (-20.0, -10.0, 0.0, 10.0, 20.0):
-            for state_name, state in STATES.items():
-                pose = Pose(np.array([state.slid, 0.0, 0.0]), tilted(degrees).orientation)
-                image = scanner.image(pose, carrier.nodes @ state.gradient.T)
-                places = _line_through(probe, pose, corners(state))
-                artefact = f"shadow_edge_{state_name}"
+            for state, (gradient, slid) in STATES.items():
+                pose = Pose(np.array([slid, 0.0, 0.0]), tilted(degrees).orientation)
+                image = scanner.image(pose, carrier.nodes @ gradient.T)
+                places = _line_through(probe, pose, corners(gradient))
+                artefact = f"shadow_edge_{state}"
                 for part in (0.6, 0.75, 0.9):
                     depth = part * probe.depth
                     yield from _edges(artefact, name, degrees, probe, image, places, depth)
@@ -245,7 +225,9 @@ def surface_rows(quick: bool) -> Iterator[Row]:
         "above": TissueAcoustics(attenuation=0.5, impedance=above),
         "below": TissueAcoustics(attenuation=0.5, impedance=below),
     }
-    acoustics = _acoustics(6e6, 0.5, media, surfaces=True, anisotropy=False)
+    acoustics = _live(
+        frequency=6e6, compensation=0.5, tissues=media, surfaces=True, anisotropy=False
+    )
     scanner = BMode(volume, _PROBE, acoustics=acoustics)
     ratio = (below - above) / (below + above)
     for degrees in _ANGLES[::2] if quick else _ANGLES:
@@ -273,7 +255,7 @@ def fibre_rows(quick: bool) -> Iterator[Row]:
         half_angle=0.3,
     )
     labels = np.ones(_BOX, dtype=np.uint8)
-    acoustics = _acoustics(6e6, 0.57, {"muscle": muscle})
+    acoustics = _live(frequency=6e6, compensation=0.57, tissues={"muscle": muscle})
     volume = Volume(np.full(_BOX, grey, np.uint8), _box_placed(), labels, {1: "muscle"})
     scanner = BMode(volume, _PROBE, acoustics=acoustics)
     sides = ((-0.05, 0.05), (-0.04, 0.04), (-0.03, 0.06))

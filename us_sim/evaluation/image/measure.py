@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
-from us_sim.slicing.acoustics.settings import TissueAcoustics
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe, Probe, SectorProbe
 from us_sim.volume.volume import Volume
 
@@ -66,11 +65,6 @@ class Layer:
     begin: float  # m, along z of ``patient``
     attenuation: float  # dB/cm/MHz
     impedance: float  # Rayl
-
-    @property
-    def tissue(self) -> TissueAcoustics:
-        """Its constants as settings."""
-        return TissueAcoustics(attenuation=self.attenuation, impedance=self.impedance)
 
 
 LAYERS = (
