@@ -35,7 +35,6 @@ def test_a_hand_over_a_single_marker_makes_it_be_missed_and_nothing_worse():
     assert row["views"] == 10
     assert row["detected"] < 10
     assert row["flipped"] == 0
-    assert np.isnan(row["pose_cpu_ms"]) == (not row["detected"])
 
 
 @pytest.mark.parametrize("lag", [-0.01, 0.0, 0.0137, 0.21])
@@ -85,6 +84,3 @@ def test_the_report_and_its_rows_are_written(tmp_path, monkeypatch, capsys):
     for picture in sorted(out.glob("*.png")):
         assert f"]({picture.name})" in text
     assert len((out / "filters.csv").read_text().splitlines()) == 8
-    with (out / "small_markers.csv").open() as file:
-        for row in csv.DictReader(file):
-            assert 0 < int(row["kept"]) == int(row["found_by_opencv"])

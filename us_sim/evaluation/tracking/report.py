@@ -27,7 +27,7 @@ from us_sim.evaluation.tracking.cases import (
     cases,
 )
 from us_sim.evaluation.tracking.filters import filter_pieces
-from us_sim.evaluation.tracking.measure import Tracking, small_marker_row
+from us_sim.evaluation.tracking.measure import Tracking
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
 _QUICK_SEQUENCES = {SMALL: 5, LARGE: 3}  # sequences of views a case, by the size of the images
@@ -39,14 +39,6 @@ def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     tracking = Tracking()
     return {
         "tracking": [_case_piece(tracking, case, quick) for case in cases(quick)],
-        "small_markers": [
-            Piece(
-                {"dictionary": name, "edge_px": edge},
-                partial(small_marker_row, name, edge, 40 if quick else 200),
-            )
-            for name in ("APRILTAG_36h11", "APRILTAG_25h9", "4X4_50")
-            for edge in (14.0, 18.0, 24.0, 32.0, 44.0)
-        ],
         "filters": filter_pieces(quick),
     }
 
@@ -65,7 +57,7 @@ def _case_piece(tracking: Tracking, case: Case, quick: bool) -> Piece:
     return Piece(columns, partial(tracking.row, case, sequences))
 
 
-def _report(table: pd.DataFrame, small: pd.DataFrame, filters: pd.DataFrame) -> Report:
+def _report(table: pd.DataFrame, filters: pd.DataFrame) -> Report:
     case = ["marker", "image_size", "distance_m", "angle_deg", "condition"]
     shots = pd.concat(
         [row.shots.assign(**{n: row[n] for n in case}) for _, row in table.iterrows()]
@@ -78,7 +70,6 @@ def _report(table: pd.DataFrame, small: pd.DataFrame, filters: pd.DataFrame) -> 
     ms = shots[(shots["marker"] == RIGID_BODY) & (shots["distance_m"] == 0.4)]
     ms = ms[ms["condition"] == "plain"].groupby("image_size")["cpu_ms"].median()
     flips = 100 * single["flipped"].sum() / max(1, single["detected"].sum())
-    kept, found = small["kept"].sum(), small["found_by_opencv"].sum()
     where = "4 visible 30 mm markers at 0.4 m, 640 × 480"
     targets = [
         Target.at_most("ms an image of 640 × 480 on one core, body of 6 markers", 8, ms[SMALL]),
@@ -90,9 +81,7 @@ def _report(table: pd.DataFrame, small: pd.DataFrame, filters: pd.DataFrame) -> 
         Target.at_most(f"{where}: degrees, 95th percentile", 0.6, body["degrees"].quantile(0.95)),
         Target.at_most(f"{where}: flips", 0, body["flipped"].sum()),
         Target.at_most("single 40 mm marker in plain views: % flipped", 0.5, flips),
-        Target.at_least("markers of 14 to 44 pixels: % kept of those OpenCV finds", 100,
-                        100 * kept / max(1, found)),
-    ]  # fmt: skip
+    ]
     hidden = near[(near["condition"] == "occlusion") & (near["marker"] == SINGLE)]
     best = filters[filters["default"]].set_index("filter")
     kalman, euro = best.loc["kalman"], best.loc["one_euro"]
@@ -102,14 +91,10 @@ def _report(table: pd.DataFrame, small: pd.DataFrame, filters: pd.DataFrame) -> 
         f"A single 40 mm marker flips to its mirror image in {flips:.2g} % of the views; a hand "
         f"over a third of it hides it in {100 * (1 - hidden['detected'].mean()):.0f} %, where a "
         f"body of several is still tracked.",
-        f"Of small markers that OpenCV finds {100 * kept / max(1, found):.3g} % are kept, their "
-        f"corners {small['p95_px'].max():.2g} pixels off at most (95 %), OpenCV's own "
-        f"{small['opencv_p95_px'].max():.2g}.",
         f"The Kalman filter is {kalman['lag_ms']:.1f} ms late and {kalman['error_mm']:.2g} mm off "
         f"in motion, the 1 € filter {euro['lag_ms']:.0f} ms and {euro['error_mm']:.2g} mm; at rest "
         f"that one trembles least.",
-    ]  # fmt: skip
-    seen = shots[shots["detected"] & (shots["condition"] == "plain")]
+    ]
     places = {
         "count": f"{len(shots):,}",
         "markers": [f"`{name}`: {marker.words}" for name, marker in MARKERS.items()],
@@ -140,23 +125,7 @@ def _report(table: pd.DataFrame, small: pd.DataFrame, filters: pd.DataFrame) -> 
         "bodies": _summed(
             shots[shots["condition"] == "plain"], ["marker", "image_size", "distance_m"]
         ),
-        "times": plain[plain["distance_m"] == 0.4]
-        .groupby(["marker", "image_size"], sort=False)[
-            ["cpu_ms_median", "detector_cpu_ms", "pose_cpu_ms"]
-        ]
-        .median()
-        .reset_index(),
         "conditions": _summed(near, ["marker", "condition"]),
-        "small": small,
-        "covariance": seen.groupby("marker", sort=False)
-        .agg(
-            **{
-                "within the 95 % ellipsoid, %": ("inside", lambda inside: 100 * inside.mean()),
-                "median error, mm": ("mm", "median"),
-                "said, mm": ("expected_mm", "median"),
-            }
-        )
-        .reset_index(),
         "filters": _draw_filters(filters),
         "filters_table": filters.drop(columns=["rate_hz", "noise_mm", "noise_deg"]),
     }
