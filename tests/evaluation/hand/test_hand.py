@@ -9,15 +9,12 @@ import pytest
 
 from us_sim.evaluation.hand import measure as following
 from us_sim.evaluation.hand import report as hand
-from us_sim.evaluation.hand.hand_motion import HASTES, Room
+from us_sim.evaluation.hand.hand_motion import Room
 from us_sim.evaluation.hand.measure import (
-    APPROACH,
+    BEGINS,
     CONVERGED,
-    RATE,
-    TISSUES,
     Converged,
     Motion,
-    Tissue,
     converged,
     follow,
 )
@@ -27,16 +24,14 @@ from us_sim.tissue.model import Deformation, TissueModel
 from us_sim.tissue.solvers.fem_cg import FemCg
 
 MODEL = TissueModel.block(nodes=(5, 5, 4))
-MOTION = Motion("small", "pressing", "brisk", 8, 0.5)
-BEGINS = round(APPROACH * RATE)
+MOTION = Motion("pressing", "brisk", 8, 0.5)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """A tissue that costs nothing."""
-    room = Room(above=0.002, deepest=0.008)
-    tissue = Tissue("a few tetrahedra", lambda: MODEL, room)
-    monkeypatch.setitem(TISSUES, "small", tissue)
+    monkeypatch.setattr(following, "arm", lambda: MODEL)
+    monkeypatch.setattr(following, "ROOM", Room(above=0.002, deepest=0.008))
 
 
 def answer():
@@ -44,8 +39,7 @@ def answer():
     count = len(MOTION.poses)
     nodes = MODEL.mesh.nodes + 1e-5 * np.arange(count)[:, None, None] * [0.0, 0.0, 1.0]
     nodes[:, MODEL.fixed] = MODEL.mesh.nodes[MODEL.fixed]
-    zero = np.zeros(count)
-    return Converged(nodes, zero, zero == 0.0, zero)
+    return Converged(nodes, np.zeros(count))
 
 
 class Oracle:
@@ -75,25 +69,18 @@ def test_what_knows_the_answer_has_no_error_and_skips_nothing(monkeypatch):
     live_by_its_own_clock(monkeypatch, solver := Oracle(answer()))
     row = follow(solver, MOTION, answer())
     assert row["frames"] == len(MOTION.poses) - BEGINS == 30
-    assert row["error_mm_worst"] == row["rms_mm_worst"] == 0.0
-    assert row["speed_mm_s"] == pytest.approx(1e3 * HASTES["brisk"].speed)
-    assert row["turning_deg_s"] == 0.0
-    assert row["live_skipped"] == 0.0
-    assert row["hold_frames_to_1e-3"] == 0
-    assert row["frames_inverted"] == row["fixed_nodes_moved_mm"] == 0
-    assert row["hold_inverted"] is False
+    assert row["error_mm_worst"] == row["live_skipped"] == row["frames_inverted"] == 0.0
 
 
 def test_what_has_not_converged_is_compared_with_nothing():
     known = answer()
     known.residual[BEGINS + 4 :] = 0.1
-    known.slipped[BEGINS] = 2e-6
     row = follow(Oracle(known), MOTION, known)
-    assert row["not_compared"] == 27
+    assert row["not_compared"] == 26
     assert row["error_mm_worst"] == 0.0
 
 
-def test_inverted_tetrahedra_and_fixed_nodes_that_move_are_seen_in_the_nodes():
+def test_inverted_tetrahedra_are_seen_in_the_nodes():
     def crushed(nodes):
         nodes[:, 2] *= -1.0
         return nodes
@@ -102,9 +89,6 @@ def test_inverted_tetrahedra_and_fixed_nodes_that_move_are_seen_in_the_nodes():
     assert set(row["every"]["inverted"]) == {len(MODEL.mesh.tetrahedra)}
     assert row["frames_inverted"] == 30
     assert row["live_frames_inverted"] == 30
-    assert row["hold_inverted"] is True
-    deepest = MODEL.mesh.nodes[MODEL.fixed, 2].max()
-    assert row["fixed_nodes_moved_mm"] == pytest.approx(2e3 * deepest)
 
 
 def live_by_its_own_clock(monkeypatch, solver):
@@ -135,8 +119,6 @@ def test_the_converged_answer_does_not_depend_on_the_way():
     around = [Pose(position=[x, 0.0, z]) for x, z in ((0.004, 0.004), (0.002, 0.01))] + straight
     found = converged(MODEL, around)
     assert found.residual.max() <= CONVERGED
-    assert found.trusted.all()
-    assert found.last_pressed == 2
     assert found.nodes[-1] == pytest.approx(converged(MODEL, straight).nodes[-1], abs=2e-7)
 
 
@@ -158,19 +140,17 @@ def test_the_report_has_a_row_for_each_method_and_says_what_broke(tmp_path, monk
         lambda name, m, **s: Raising(m) if name == "fem_cg" else made(name, m, **s),
     )
     monkeypatch.setattr(Raising, "warm_up", lambda _: None)
-    monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, seed=seed)])
+    monkeypatch.setattr(hand, "motions", lambda _, seed: [replace(MOTION, kind="free", seed=seed)])
     assert hand.HAND(tmp_path / "out", True) == 1
     with (tmp_path / "out" / "hand.csv").open(newline="", encoding="utf-8") as stream:
         rows = {row["method"]: row for row in csv.DictReader(stream)}
     assert rows["fem_cg"]["failure"] == "LinAlgError: Singular matrix"
-    assert float(rows["fem"]["speed_mm_s"]) == pytest.approx(60, rel=1e-3)
     # Linear strain is off by a tenth of a millimetre of 8, and the judged method by its haste.
     assert float(rows["fem_nonlinear"]["error_mm_worst"]) < 0.5
     assert float(rows["fem"]["error_mm_worst"]) > 0.1
-    assert float(rows["fem_nonlinear"]["hold_residual"]) < 1e-3
     report = (tmp_path / "out" / "hand.md").read_text(encoding="utf-8")
-    for name in ("time", "error", "hold_figure"):
+    for name in ("time", "error"):
         assert (tmp_path / "out" / f"hand_{name}.png").stat().st_size > 10_000
         assert f"hand_{name}.png" in report
     assert "LinAlgError: Singular matrix" in report
-    assert "failed: small" in capsys.readouterr().out
+    assert "failed: free" in capsys.readouterr().out
