@@ -71,12 +71,6 @@ def test_counts_latency_and_areas_are_in_the_summary(summary):
     assert min(areas["vein_mm2"]) > 0
 
 
-def test_the_recorder_misses_nothing_it_was_sent(summary):
-    for topic, counts in summary["recorder"].items():
-        if topic != "diagnostics":
-            assert counts["recorded"] >= counts["last_reported"] > 0, topic
-
-
 def test_the_contact_sheet_is_a_picture(demo):
     picture = cv2.imread(str(demo / "contact_sheet.png"))
     assert picture.shape[0] > 600

@@ -126,26 +126,13 @@ class McapStorage:
 
     def attachments(self, damage: list[Fault] | None) -> Iterator[BagAttachment]:
         """The files within this one; ``damage`` and errors are as in `Bag.attachments`."""
-        for content in self._contents(self._held.attachments):
-            try:
-                record = _parsed(Attachment, content)
-                (crc,) = _CRC.unpack_from(content, len(content) - _CRC.size)
-                if crc and zlib.crc32(content[: -_CRC.size]) != crc:
-                    raise ValueError(f"the checksum of {record.name} does not match")
-            except _DAMAGE as error:
-                self._tell(damage, f"is damaged in an attached file: {error}")
-            else:
-                yield BagAttachment(record.name, record.media_type, record.log_time, record.data)
+        for each in self._parsed_at(self._held.attachments, Attachment, "attached file", damage):
+            yield BagAttachment(each.name, each.media_type, each.log_time, each.data)
 
     def notes(self, damage: list[Fault] | None) -> Iterator[BagNote]:
         """The metadata records; ``damage`` and errors are as those of `attachments`."""
-        for content in self._contents(self._held.notes):
-            try:
-                record = _parsed(Metadata, content)
-            except _DAMAGE as error:
-                self._tell(damage, f"is damaged in a metadata record: {error}")
-            else:
-                yield BagNote(record.name, record.metadata)
+        for each in self._parsed_at(self._held.notes, Metadata, "metadata record", damage):
+            yield BagNote(each.name, each.metadata)
 
     def messages(
         self, topics: Collection[str], damage: list[Fault] | None, since: int | None = None
@@ -228,13 +215,24 @@ class McapStorage:
             raise BagError(f"{self._label} {what}; {remedy}") from None
         faults.append(Fault(f"{self._label} {what}", lost))
 
-    def _contents(self, places: list[_Place]) -> Iterator[memoryview]:
-        """Records without opcode and length."""
+    def _parsed_at(
+        self, places: list[_Place], kind: Any, what: str, damage: list[Fault] | None
+    ) -> Iterator[Any]:
+        """Records of a kind, of which one of an attachment has a checksum of its own."""
         size = self._path.stat().st_size
         with self._path.open("rb") as stream:
             for offset, length in places:
                 stream.seek(min(offset, size))
-                yield memoryview(stream.read(min(length, size)))[_HEADER.size :]
+                content = memoryview(stream.read(min(length, size)))[_HEADER.size :]
+                try:
+                    record = _parsed(kind, content)
+                    crc = kind is Attachment and _CRC.unpack_from(content[-_CRC.size :])[0]
+                    if crc and zlib.crc32(content[: -_CRC.size]) != crc:
+                        raise ValueError(f"the checksum of {record.name} does not match")
+                except _DAMAGE as error:
+                    self._tell(damage, f"is damaged in its {what}: {error}")
+                else:
+                    yield record
 
     def _topics(self) -> tuple[BagTopic, ...]:
         topics: dict[str, BagTopic] = {}

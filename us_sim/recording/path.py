@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError, TrackingError
+from us_sim.errors import BagError
 from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
 from us_sim.recording.probe_path import ProbePath
@@ -179,11 +179,7 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
     if is_tracker_recording(path):
         from us_sim.recording.plus_recording import read_tracker_recording
 
-        recording = read_tracker_recording(path)
-        if topic is None and len(recording.transforms) > 1:
-            names = ", ".join(recording.transforms)
-            raise TrackingError(f"{path}: has several transforms: name one by {option}, of {names}")
-        return recording.probe_path(topic)
+        return read_tracker_recording(path).probe_path(topic, option=option)
     try:
         bag = read_bag(path)
     except NoBagError as error:

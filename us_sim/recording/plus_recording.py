@@ -86,18 +86,22 @@ class TrackerRecording:
         found = along(self.transforms, self.chain(name, reference))
         return found.matrices, found.valid
 
-    def probe_path(self, name: str | None = None, reference: str | None = None) -> ProbePath:
+    def probe_path(
+        self, name: str | None = None, reference: str | None = None, option: str = "topic"
+    ) -> ProbePath:
         """The valid poses of a body as a path in the reference's frame, by the recorder's clock.
 
-        Arguments are as for :meth:`chain`; without a name it is the recording's only transform.
+        Arguments are as for :meth:`chain`; without a name it is the recording's only transform, and
+        ``option`` is what names it.
 
         Raises:
             TrackingError: see :meth:`chain`; or the name is missing, or no pose is valid.
         """
         if name is None:
             if len(self.transforms) != 1:
+                names = ", ".join(self.transforms)
                 raise TrackingError(
-                    f"{self.path}: has several transforms; name one of {', '.join(self.transforms)}"
+                    f"{self.path}: has several transforms: name one by {option}, of {names}"
                 )
             (name,) = self.transforms
         chain = self.chain(name, reference)

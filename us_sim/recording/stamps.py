@@ -12,7 +12,7 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import Bag
 from us_sim.recording.topic import BagTopic
 
-_HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
+_HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 _STAMP = {True: struct.Struct("<iI"), False: struct.Struct(">iI")}
 _COUNT = {True: struct.Struct("<I"), False: struct.Struct(">I")}
 _ENCAPSULATION = 4  # bytes before a message in CDR; the second tells the order of bytes
@@ -28,32 +28,21 @@ def stamp_reader(bag: Bag, topic: BagTopic) -> Stamp | None:
 
     The function raises struct.error for a message that is too short to have a stamp.
     """
-    if topic.encoding != "cdr":
-        return None
     try:
-        fields = bag.definitions(topic).fielddefs
+        fields = bag.definitions(topic).fielddefs if topic.encoding == "cdr" else {}
     except BagError:
         return None
 
-    def begins_with(type_name: str, wanted: str) -> bool:
-        (_, inside) = fields.get(type_name, (None, []))
-        return bool(inside) and inside[0][1] == (Nodetype.NAME, wanted)
+    def first_field(type_name: str) -> Any:
+        _, own = fields.get(type_name, (None, []))
+        return own[0][1] if own else (None, None)
 
-    if not begins_with(_HEADER, _TIME):
-        return None
-    if begins_with(topic.type_name, _HEADER):
+    kind, content = first_field(topic.type_name)
+    if (kind, content) == _HEADER:
         return _stamp
-    (_, own) = fields[topic.type_name]
-    kind, content = own[0][1] if own else (None, None)
-    if kind == Nodetype.SEQUENCE and begins_with(_name(content), _HEADER):
-        return _first_stamp
+    if kind == Nodetype.SEQUENCE and content[0][0] == Nodetype.NAME:
+        return _first_stamp if first_field(content[0][1]) == _HEADER else None
     return None
-
-
-def _name(sequence: Any) -> str:
-    """The type of a sequence's elements; nothing where it is no message."""
-    (kind, name), _ = sequence
-    return str(name) if kind == Nodetype.NAME else ""
 
 
 def _stamp(data: bytes, begin: int = _ENCAPSULATION) -> int:

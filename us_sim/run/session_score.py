@@ -89,13 +89,11 @@ def _force(bag: Bag, topic: str | None, begin: int) -> Force:
     if topic is None:
         wrenches = [each for each in bag.topics if each.type_name == WRENCH_STAMPED]
         names = [each.name for each in wrenches if each.message_count]
-        chosen = [name for name in names if name.endswith("probe/wrench")]
-        if len(chosen) != 1:
-            chosen = names
-        if len(chosen) != 1:
+        names = [name for name in names if name.endswith("probe/wrench")] or names
+        if len(names) != 1:
             several = f"wrenches on {', '.join(names)}: name one with --wrench"
             raise ScoreError(f"{bag.path} holds {several if names else 'no wrench'}")
-        topic = chosen[0]
+        topic = names[0]
     record = read_wrenches(bag.path, topic)
     newtons = np.linalg.norm(record.wrenches[:, :3], axis=1)
     later = np.r_[True, record.stamps[1:] > np.maximum.accumulate(record.stamps)[:-1]]

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.nodes.topics import published_counts
 from us_sim.recording.decoding import pixels_from, pose_from, tetrahedra_from, vectors_from
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.run.session_tables import SECOND, read_times
@@ -121,7 +120,6 @@ class Session:
         seconds = (stamps[-1] - stamps[0]) / SECOND
         latency = {t: _percentiles(self.times[t], "sent") for t in STAMPED[1:] if t in self.times}
         latency["end_to_end"] = _percentiles(self.times[IMAGE], "logged")
-        recorded = {topic.name.lstrip("/"): topic.message_count for topic in self.bag.topics}
         return {
             "poses_in": poses,
             "images_out": len(stamps),
@@ -129,12 +127,6 @@ class Session:
             "images_per_second": (len(stamps) - 1) / seconds if seconds else 0.0,
             "latency_ms": latency,
             "nodes": self.reports,
-            "recorder": {  # messages that each publisher last reported, beside those recorded
-                topic: {"last_reported": count, "recorded": recorded.get(topic, 0)}
-                for node, report in self.reports.items()
-                if node != "session_recorder"
-                for topic, count in published_counts(report).items()
-            },
             **({"areas": _summary_of(areas)} if areas is not None else {}),
         }
 
