@@ -124,7 +124,7 @@ def test_what_is_waited_for_is_said_and_is_what_the_recorder_records(bench, path
     other._awaited._since = 1e-9  # it waits for long
     bench.spin_until(lambda: "awaited" in other.health.values)
     assert "/probe/pose" in other.health.values["awaited"]
-    assert len(poses) == 10
+    assert {round(1e3 * pose.pose.position.z) for pose in poses[9:]} == {9}  # the first one holds
 
 
 @pytest.mark.parametrize("player", [PathPlayer, SessionPlayer])

@@ -1,8 +1,5 @@
 """The recorder: every topic as soon as it appears, readable at every moment."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from bench import pose_at
@@ -113,30 +110,3 @@ def test_each_simulator_on_a_domain_is_recorded_alone(bench, tmp_path, small_sce
     }
     ordered = "/a/ultrasound/labels"
     assert heard == {ordered} | {f"{space}/ultrasound/image" for space in ("", "/a", "/b")}
-
-
-GIVEN_BACK = """
-import os, sys
-from us_sim.nodes.session_recorder import give_back_large_buffers
-
-def resident():
-    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-give_back_large_buffers()
-larger = bytearray(1 << 22)
-del larger  # from then on glibc takes from its heap what is smaller
-before = resident()
-messages = [bytearray(b"x") * (1 << 20) for _ in range(200)]
-last = [bytearray(b"x") * 100_000 for _ in range(20)]
-assert resident() - before > 150
-del messages
-print(resident() - before)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's /proc")
-def test_memory_of_large_messages_is_given_back():
-    command = [sys.executable, "-c", GIVEN_BACK]
-    ran = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert float(ran.stdout.split()[-1]) < 20

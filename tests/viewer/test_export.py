@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageSequence
 
 from us_sim.errors import UsSimError
 from us_sim.viewer.export import exported, frames_of
@@ -43,32 +42,15 @@ def images(count: int, **told: Any) -> list[Any]:
     ]
 
 
-def played(kind: str, file: Path) -> list[tuple[float, float]]:
-    """When each picture begins, s, and how grey it is."""
-    if kind == "mp4":
-        film = cv2.VideoCapture(str(file))
-        found = []
-        while (read := film.read())[0]:
-            found.append((len(found) / film.get(cv2.CAP_PROP_FPS), float(read[1][:100].mean())))
-        return found
-    begins, found = 0.0, []
-    with Image.open(file) as film:
-        for picture in ImageSequence.Iterator(film):
-            found.append((begins, float(np.asarray(picture.convert("L"))[:100].mean())))
-            begins += 1e-3 * picture.info["duration"]
-    return found
-
-
-@pytest.mark.parametrize("kind", ["mp4", "gif"])
-def test_a_loop_plays_as_fast_as_it_came(kind: str, tmp_path: Path) -> None:
+def test_a_loop_plays_as_fast_as_it_came(tmp_path: Path) -> None:
     times = [100.0, 100.1, 100.9, 102.0]
-    file = tmp_path / f"loop.{kind}"
-    file.write_bytes(exported(kind, pictures(times, [(120, 160)] * 3 + [(131, 160)])))
-    pictured = played(kind, file)
+    file = tmp_path / "loop.mp4"
+    file.write_bytes(exported("mp4", pictures(times, [(120, 160)] * 3 + [(131, 160)])))
+    film, greys = cv2.VideoCapture(str(file)), []
+    while (read := film.read())[0]:
+        greys.append(read[1][:100].mean())
     for at, grey in ((0.04, 0), (0.5, 20), (1.5, 40), (2.0, 60)):
-        assert [each for begin, each in pictured if begin <= at + 0.04][-1] == pytest.approx(
-            grey, abs=3
-        )
+        assert greys[round(at * film.get(cv2.CAP_PROP_FPS))] == pytest.approx(grey, abs=3)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +104,7 @@ def test_without_pydicom_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
         ("exe", images(1)),
         ("mp4", [({"time": 0.0}, b"no picture")]),
         ("mp4", pictures([0.0, -1.0], [(8, 8)] * 2)),
-        ("gif", pictures([0.0, 1e9], [(8, 8)] * 2)),
+        ("mp4", pictures([0.0, 1e9], [(8, 8)] * 2)),
         ("dcm", images(1, rows=10**6)),
         ("dcm", [*images(1), *images(1, rows=15, columns=82)]),
         ("dcm", [(images(1)[0][0] | {"stamp": "9" * 40}, bytes(30 * 41))]),

@@ -11,18 +11,14 @@ from typing import Any
 from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.task import Future
 
 from us_sim.errors import BagError
-from us_sim.nodes.guarded_node import GuardedNode, Health
-from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.process import run_node
-from us_sim.nodes.sessions.playback import Playback
+from us_sim.nodes.sessions.playback import Player
 from us_sim.nodes.sessions.recorded_topic import message_type
 from us_sim.nodes.settings import SessionPlayerSettings
 from us_sim.recording.reader import read_bag
 from us_sim.recording.topic import BagMessage, BagTopic, Fault
-from us_sim.share import find_bag
 
 DEPTH = 10  # messages that publishers keep
 
@@ -31,23 +27,18 @@ _SHOWN = 100_000_000
 """ns of a recording that are published at once where it is gone to, so that there is an image."""
 
 
-class SessionPlayer(GuardedNode):
+class SessionPlayer(Player):
     """Every topic of a bag, its bytes and stamps untouched, in the recorded order and pace.
 
-    Its parameters are those of `SessionPlayerSettings`, its service that of `Playback`.
+    Its parameters are those of `SessionPlayerSettings`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__("session_player", **kwargs)
-        group = Group(SessionPlayerSettings())
-        self._live = LiveSettings(self, {"player": group}, use=lambda _: self._playback.use())
-        settings = self._settings
-        if not settings.path:
-            raise BagError("session_player's parameter `path` is missing; name a bag to play")
-        path = find_bag(settings.path)
-        self._bag = read_bag(path)
-        self.finished = Future()
-        self.health = Health(self, str(path))
+        super().__init__("session_player", SessionPlayerSettings(), **kwargs)
+        settings = self.settings
+        self._bag = read_bag(self.path)
+        self.first = self._bag.start or 0
+        self.length = (self._bag.end or 0) - self.first
         self._topics: dict[str, Publisher] = {}
         self._latched: set[str] = set()  # of them
         exclude = {*map(self.resolve_topic_name, filter(None, settings.exclude))}
@@ -56,7 +47,7 @@ class SessionPlayer(GuardedNode):
         left_out = [why for topic in offered if (why := self._offer(topic))]
         if not any(self._bag.topic(name).message_count for name in self._topics):
             why = "; ".join(left_out) or "no topic of it has a message"
-            raise BagError(f"{path} holds nothing that can be played: {why}")
+            raise BagError(f"{self.path} holds nothing that can be played: {why}")
         if left_out:
             self.health.warning = f"{'; '.join(left_out)}: left out"
             self.get_logger().warning(self.health.warning)
@@ -65,24 +56,8 @@ class SessionPlayer(GuardedNode):
         self._damage: list[Fault] = []
         self._messages: Iterator[BagMessage] = iter(())
         self._waiting: BagMessage | None = None
-        self._first = self._bag.start or 0
         self._shown = -1  # of the recording, ns: until when it is shown while it is paused
-        self._playback = Playback(
-            self,
-            lambda: self._settings,
-            self._first,
-            (self._bag.end or 0) - self._first,
-            self._go_to,
-            self._end,
-            self._say_progress,
-        )
-        self._playhead = self._playback.head
         self._start = self.create_timer(START_S, self._begin)
-
-    @property
-    def _settings(self) -> SessionPlayerSettings:
-        settings: SessionPlayerSettings = self._live.values["player"]
-        return settings
 
     def _offer(self, topic: BagTopic) -> str:
         if topic.encoding != "cdr":
@@ -103,46 +78,47 @@ class SessionPlayer(GuardedNode):
         return ""
 
     def _begin(self) -> None:
-        if not self._playback.now:
+        if not self.now:
             return
         self._start.cancel()
-        self._playback.restart()
-        if sought := round(1e9 * self._settings.time):
-            self._go_to(sought)
+        self.restart()
+        if sought := round(1e9 * self.settings.time):
+            self.go_to(sought)
         self.create_timer(0.002, self._tick)
-        self._playback.begin()
+        self.begin()
 
     def _tick(self) -> None:
         """Send the messages that are due."""
         if self.health.state == "finished":
-            if self._playback.loops:
-                self._playback.restart()
+            if self.loops:
+                self.restart()
             return
         elapsed = self._shown
-        if not self._settings.paused:  # then nothing is sent by itself
-            elapsed = max(elapsed, self._playhead.position(self._playback.now))
+        if not self.settings.paused:  # then nothing is sent by itself
+            elapsed = max(elapsed, self.head.position(self.now))
         while self._waiting is not None and self._age() <= elapsed:
             self._send(self._waiting)
-        self._say_progress()
-        if self._waiting is not None or self._settings.paused:
+        self.say_progress()
+        if self._waiting is not None or self.settings.paused:
             return
-        if self._playback.loops:
-            self._playback.restart()
+        if self.loops:
+            self.restart()
         else:
-            self._end()
+            self.end()
 
     def _age(self) -> float:
         """ns from the start of the recording to the next message; infinite after the last."""
-        return self._waiting.log_time - self._first if self._waiting else math.inf
+        return self._waiting.log_time - self.first if self._waiting else math.inf
 
     def _send(self, message: BagMessage) -> None:
         self._topics[message.topic].publish(message.data)
         self.health.published(message.topic)
         self._waiting = self._next()
 
-    def _end(self) -> None:
-        self._playback.finish()
-        if self._settings.stay:
+    def end(self) -> None:
+        """Be done, unless it shall stay."""
+        self.finish()
+        if self.settings.stay:
             return
         if self._damage:
             text = f"not all of the recording was played: {self._damage[0].text}"
@@ -150,26 +126,27 @@ class SessionPlayer(GuardedNode):
         else:
             self.finished.set_result(None)
 
-    def _say_progress(self) -> None:
+    def say_progress(self) -> None:
+        """Say how far it is."""
         self.health.values = {
-            "position": f"{1e-9 * self._playback.position:.3f}",
-            "duration": f"{1e-9 * self._playback.length:.3f}",
+            "position": f"{1e-9 * self.position:.3f}",
+            "duration": f"{1e-9 * self.length:.3f}",
         }
 
-    def _go_to(self, position: int, at: int | None = None) -> None:
+    def go_to(self, position: int, at: int | None = None) -> None:
         """Have the messages from there on wait, and show a moment of them even if it is paused.
 
         The last of what is kept for those who come later is sent again.
         """
         self._damage.clear()
-        since = self._first + position if position > 0 else None
+        since = self.first + position if position > 0 else None
         if since is not None:
             for message in self._bag.latest(self._latched, since, DEPTH):
                 self._topics[message.topic].publish(message.data)
         self._messages = iter(self._bag.messages(list(self._topics), self._damage, since))
         self._waiting = self._next()
         self._shown = position + _SHOWN if position and at is None else -1
-        self._playhead.go_to(position, self._playback.now if at is None else at)
+        self.head.go_to(position, self.now if at is None else at)
 
     def _next(self) -> BagMessage | None:
         """The next message; damaged parts are reported, and skipped where possible."""

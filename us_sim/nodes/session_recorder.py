@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import functools
 import os
 import sys
@@ -34,7 +33,6 @@ from us_sim.recording.write_behind import WriteBehind
 from us_sim.recording.writer import BagWriter
 from us_sim.settings.spelling import counted
 
-_M_MMAP_THRESHOLD, _LARGE = -3, 1 << 17  # of glibc's malloc.h; bytes
 _RESERVE = 16 * 1024 * 1024  # bytes of the disk, for the index of some hours
 _WITHOUT_METADATA = (
     "metadata.yaml in this folder belongs to another recording, so none is written; the file can "
@@ -259,18 +257,8 @@ def _load_types() -> None:
             type_hash(normalized_type(type_name))
 
 
-def give_back_large_buffers() -> None:
-    """Have memory of large messages go back to the system as soon as they are written.
-
-    glibc keeps what is freed once such sizes were freed before, unless it is told a threshold.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE)
-
-
 def main(args: list[str] | None = None) -> int:
     """Record until interrupted."""
-    give_back_large_buffers()
 
     def create() -> SessionRecorder:
         let_signals_wait()  # a file that is begun gets its end

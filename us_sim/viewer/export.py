@@ -28,11 +28,9 @@ Sent = tuple[Mapping[str, Any], bytes]
 """Header and payload of a frame, as the page was sent them; pictures are JPEG, with ``time``, s."""
 
 LARGEST = 2**28  # bytes of a page's message: it keeps a third of that
-MP4_RATE, GIF_RATE = 25.0, 12.5
+MP4_RATE = 25.0
 """Pictures a second, since the times of a page's images are never even."""
 _LONGEST = 60.0  # s; a page keeps ten
-_GIF_HEIGHT, _GIF_COLOURS = 480, 64
-"""Speckle cannot be compressed: at full size ten seconds were a hundred megabytes."""
 _US_IMAGE, _US_MULTI_FRAME = "1.2.840.10008.5.1.4.1.1.6.1", "1.2.840.10008.5.1.4.1.1.3.1"
 _SIMULATED = "Simulated ultrasound, computed by us_sim: not an image of a patient"
 _TWO_D, _TISSUE, _CENTIMETRES = 1, 1, 3  # PS3.3 C.8.5.5.1
@@ -60,7 +58,7 @@ def frames_of(message: bytes) -> list[Sent]:
 
 
 def exported(kind: str, frames: Sequence[Sent]) -> bytes:
-    """The file of a kind (``mp4``, ``gif``, ``dcm``) that holds these frames.
+    """The file of a kind (``mp4``, ``dcm``) that holds these frames.
 
     Raises:
         UsSimError: it cannot be made.
@@ -75,7 +73,7 @@ def exported(kind: str, frames: Sequence[Sent]) -> bytes:
 
 
 def _mp4(frames: Sequence[Sent]) -> bytes:
-    pictures = _evenly(frames, MP4_RATE)
+    pictures = _evenly(frames)
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     width, height = width + width % 2, height + height % 2  # as the format wants it
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +81,7 @@ def _mp4(frames: Sequence[Sent]) -> bytes:
         codec = cv2.VideoWriter.fourcc(*"mp4v")
         writer = cv2.VideoWriter(str(file), codec, MP4_RATE, (width, height))
         if not writer.isOpened():
-            raise UsSimError("this computer's OpenCV writes no MP4: save a GIF instead")
+            raise UsSimError("this computer's OpenCV writes no MP4: save DICOM instead")
         for picture in pictures:
             rows, columns = picture.shape[:2]
             border = (0, height - rows, 0, width - columns)
@@ -92,34 +90,13 @@ def _mp4(frames: Sequence[Sent]) -> bytes:
         return file.read_bytes()
 
 
-def _gif(frames: Sequence[Sent]) -> bytes:
-    from PIL import Image  # what draws this package's figures brings it
-
-    height, width = (
-        max(size[axis] for size in {_decoded(each).shape for each in frames}) for axis in (0, 1)
-    )
-    scale = min(1.0, _GIF_HEIGHT / height)
-    images = []
-    for picture in _evenly(frames, GIF_RATE):
-        border = (0, height - picture.shape[0], 0, width - picture.shape[1])
-        whole = cv2.copyMakeBorder(picture, *border, cv2.BORDER_CONSTANT)
-        small = cv2.resize(whole, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        image = Image.fromarray(np.ascontiguousarray(small[:, :, ::-1]))
-        images.append(image.quantize(_GIF_COLOURS))
-    told = io.BytesIO()
-    first, *others = images
-    duration = 1000.0 / GIF_RATE
-    first.save(told, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    return told.getvalue()
-
-
-def _evenly(frames: Sequence[Sent], rate: float) -> list[NDArray[np.uint8]]:
-    """The picture that was seen at each beat of the rate, from the first to the last."""
+def _evenly(frames: Sequence[Sent]) -> list[NDArray[np.uint8]]:
+    """The picture that was seen at each beat of the video, from the first to the last."""
     times = np.array([float(header["time"]) for header, _ in frames])
     times -= times[0]
     if not (np.isfinite(times).all() and (np.diff(times) >= 0.0).all() and times[-1] < _LONGEST):
         raise UsSimError("the times of these frames are not one after another")
-    beats = np.arange(int(times[-1] * rate) + 1) / rate
+    beats = np.arange(int(times[-1] * MP4_RATE) + 1) / MP4_RATE
     pictures = [_decoded(each) for each in frames]
     return [pictures[k] for k in np.searchsorted(times, beats + 1e-9, side="right") - 1]
 
@@ -231,5 +208,5 @@ def _region(header: Mapping[str, Any], region: Any) -> Any:
     return region
 
 
-KINDS: dict[str, Callable[[Sequence[Sent]], bytes]] = {"mp4": _mp4, "gif": _gif, "dcm": _dicom}
+KINDS: dict[str, Callable[[Sequence[Sent]], bytes]] = {"mp4": _mp4, "dcm": _dicom}
 """Makers of files, by the name's ending."""

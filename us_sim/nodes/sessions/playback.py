@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from abc import abstractmethod
+from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.clock import Clock
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from us_sim.nodes.guarded_node import GuardedNode
+from us_sim.errors import BagError
+from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import stamp_message
-from us_sim.nodes.parameters import declared
+from us_sim.nodes.parameters import Group, LiveSettings, declared
 from us_sim.nodes.sessions.triggers import offer
 from us_sim.nodes.settings import RECORDER, AwaitedSettings, PlayerSettings
 from us_sim.recording.playhead import Playhead
+from us_sim.share import find_bag
 
 CHECK_S, CHECKS = 0.05, 6
 """How often it is looked, and how often in a row everything must be there.
@@ -73,45 +77,57 @@ class Awaited:
         return ""
 
 
-class Playback:
-    """Does as a player's parameters say, and its service ``~/stop``.
+class Player(GuardedNode):
+    """Does as the parameters of a player say, and its service ``~/stop``.
 
-    The player publishes ``/clock`` where its parameter ``clock`` asks for it, and then goes by the
+    It publishes ``/clock`` where its parameter ``clock`` asks for that, and then goes by the
     computer's clock itself; else by its node's, also where that is set back.
 
     Args:
-        node: that plays; the state is told in its diagnostics.
-        settings: gives them as they are now.
-        first: ns since 1970, when what is played was recorded.
-        length: of the recording, ns.
-        go_to: has the node play on at a time of the recording, ns, from a time of `now` on; without
-            that at once, and then what is there is shown even if it is paused.
-        stop: ends playing early.
-        say: puts into the node's health how far it is.
+        name: of the node.
+        settings: its parameters by default.
     """
 
-    def __init__(
-        self,
-        node: GuardedNode,
-        settings: Callable[[], PlayerSettings],
-        first: int,
-        length: int,
-        go_to: Callable[[int, int | None], None],
-        stop: Callable[[], None],
-        say: Callable[[], None],
-    ) -> None:
-        self._node, self._settings, self._go_to, self._say = node, settings, go_to, say
-        self.first, self.length = first, length
-        self.head = Playhead(settings().rate)
+    def __init__(self, name: str, settings: PlayerSettings, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self._live = LiveSettings(self, {"player": Group(settings)}, use=lambda _: self.use())
+        chosen = self.settings
+        if not chosen.path:
+            raise BagError(f"{name}'s parameter `path` is missing; name a bag to play")
+        self.path = find_bag(chosen.path)
+        self.finished = Future()
+        self.health = Health(self, str(self.path))
+        self.head = Playhead(chosen.rate)
+        self.first = self.length = 0  # ns: since 1970 when it was recorded, and how long it is
         self.has_begun = self.is_stopped = False
         self._latest = 0  # ns, of `now`
-        self.clock = Clock() if settings().clock else node.get_clock()
-        if settings().clock:
-            self._clock = node.stream(ClockMessage, "/clock")
-            node.create_timer(1.0 / settings().clock, self.tell_time)
-        node.add_post_set_parameters_callback(self._seek)
-        if not getattr(settings(), "lockstep", False):
-            offer(node, "stop", lambda: self._stop(stop))
+        self.clock = Clock() if chosen.clock else self.get_clock()
+        if chosen.clock:
+            self._clock_messages = self.stream(ClockMessage, "/clock")
+            self.create_timer(1.0 / chosen.clock, self.tell_time)
+        self.add_post_set_parameters_callback(self._seek)
+        if not getattr(chosen, "lockstep", False):
+            offer(self, "stop", self._stop)
+
+    @property
+    def settings(self) -> Any:
+        """Its parameters as they are now, of the class of those by default."""
+        return self._live.values["player"]
+
+    @abstractmethod
+    def go_to(self, position: int, at: int | None = None) -> None:
+        """Play on at a time of the recording, ns, from a time of `now` on.
+
+        Without that it plays on at once, and shows what is there even if it is paused.
+        """
+
+    @abstractmethod
+    def say_progress(self) -> None:
+        """Put into the node's health how far it is."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """Be at the end."""
 
     @property
     def now(self) -> int:
@@ -128,16 +144,16 @@ class Playback:
         return min(max(self.head.position(self.now), 0), self.length)
 
     def tell_time(self) -> TimeMessage:
-        """The present time: of the recording where ``/clock`` is, which is published then."""
-        if not self._settings().clock:
-            return self._node.get_clock().now().to_msg()
+        """Return the present time: of the recording where ``/clock`` is, which is published."""
+        if not self.settings.clock:
+            return self.get_clock().now().to_msg()
         stamp = stamp_message(self.first + self.position)
         if self.has_begun:
-            self._clock.publish(ClockMessage(clock=stamp))
+            self._clock_messages.publish(ClockMessage(clock=stamp))
         return stamp
 
     def begin(self) -> None:
-        """Parameters are obeyed from now on, and those that are set already."""
+        """Obey parameters from now on, and those that are set already."""
         self.has_begun = True
         self.use()
 
@@ -145,33 +161,36 @@ class Playback:
         """Go on at the rate that was set, or hold still; before it began there is nothing to do."""
         if not self.has_begun:
             return
-        settings = self._settings()
+        settings = self.settings
         self.head.run_at(settings.rate, self.now)
         self.head.hold(settings.paused, self.now)
-        if self._node.health.state != "finished" or self.loops:
-            self._node.health.state = "paused" if settings.paused else "playing"
+        if self.health.state != "finished" or self.loops:
+            self._play()
         self._report()
 
     @property
     def loops(self) -> bool:
         """Whether it begins again at the end."""
-        return self._settings().loop and not self.is_stopped
+        return bool(self.settings.loop) and not self.is_stopped
 
     def restart(self, gap: int = 0) -> None:
         """Play from the start on, after a gap, ns."""
-        self._node.health.state = "paused" if self._settings().paused else "playing"
-        self._go_to(0, self.now + gap)
+        self._play()
+        self.go_to(0, self.now + gap)
 
     def finish(self) -> None:
-        """Be at the end."""
-        self._node.health.state = "finished"
+        """Say that it is at its end."""
+        self.health.state = "finished"
         self._report()
 
-    def _stop(self, stop: Callable[[], None]) -> str:
-        if not self.has_begun or self._node.health.state == "finished":
+    def _play(self) -> None:
+        self.health.state = "paused" if self.settings.paused else "playing"
+
+    def _stop(self) -> str:
+        if not self.has_begun or self.health.state == "finished":
             return "nothing is played"
         self.is_stopped = True
-        stop()
+        self.end()
         return ""
 
     def _seek(self, parameters: list[Parameter]) -> None:
@@ -180,10 +199,10 @@ class Playback:
         if not self.has_begun or not times:
             return
         self.is_stopped = False
-        self._go_to(times[-1], None)
-        self._node.health.state = "paused" if self._settings().paused else "playing"
+        self.go_to(times[-1])
+        self._play()
         self._report()
 
     def _report(self) -> None:
-        self._say()
-        self._node.health.report()
+        self.say_progress()
+        self.health.report()

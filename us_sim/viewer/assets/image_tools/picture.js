@@ -140,7 +140,6 @@ export const KINDS = {
   png: ["PNG", "png"],
   dcm: ["DICOM", "dcm", { isRaw: true }],
   mp4: ["10 s, MP4", "mp4", { isLoop: true }],
-  gif: ["10 s, GIF", "gif", { isLoop: true }],
   loop_dcm: ["10 s, DICOM", "dcm", { isLoop: true, isRaw: true }],
 };
 
