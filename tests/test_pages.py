@@ -82,7 +82,7 @@ def test_every_piece_of_a_scene_can_be_read(page):
         if "phantom" not in given.get("volume", {"phantom": ""}):
             base = {key: value for key, value in base.items() if key != "volume"}
         structures = given.get("structures", {})
-        if isinstance(structures, dict) and any("method" in one for one in structures.values()):
+        if isinstance(structures, dict) and any("seeds_mm" in one for one in structures.values()):
             Reader(str(page)).read(SegmentationSettings, given)  # seeds, and no scene
             continue
         document = merged(base, given)

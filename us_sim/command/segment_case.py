@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from us_sim.errors import CaseError, VolumeError
-from us_sim.settings.choice import Chosen
 from us_sim.settings.spelling import aligned
 from us_sim.share import shared_roots
 from us_sim.volume.cases.case import LABELS, SURFACES, TISSUE, VOLUME, read_case
@@ -22,12 +21,10 @@ from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_labels
 from us_sim.volume.segmentation.settings import (
-    SegmentationSettings,
     SegmentRequest,
-    StructureSeeds,
     read_seeds,
 )
-from us_sim.volume.segmentation.structures import segment
+from us_sim.volume.segmentation.structures import find_vessels, segment
 from us_sim.volume.structure_names import anatomical_colour
 from us_sim.volume.surfaces.closed_surface import write_stl
 from us_sim.volume.surfaces.structure_surface import StructureSurface, structure_surface
@@ -93,16 +90,15 @@ def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelM
         )
     if asked.seeds is not None:
         seeds = read_seeds(_seeds_file(asked.seeds))
-    elif asked.vessels is not None:
-        seeds = SegmentationSettings({"vessels": StructureSeeds(method=Chosen("dark_vessels"))})
-    else:
-        names = {label: name for label, name in volume.label_names.items() if label}
-        if volume.labels is None or not names:
-            raise VolumeError(
-                f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark"
-            )
-        return LabelMap(volume.labels, names)
-    return segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
+        return segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
+    if asked.vessels is not None:
+        return find_vessels(volume, lambda done, part: progress(0.1 + 0.7 * done, part))
+    names = {label: name for label, name in volume.label_names.items() if label}
+    if volume.labels is None or not names:
+        raise VolumeError(
+            f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark"
+        )
+    return LabelMap(volume.labels, names)
 
 
 def _seeds_file(path: Path) -> Path:

@@ -43,15 +43,6 @@ PHANTOMS = Choice(
     thrombosed_arm=f"{_PHANTOMS}:thrombosed_arm",
 )
 
-_SEGMENTATION = "us_sim.volume.segmentation"
-SEGMENTATIONS = Choice(
-    "segmentation method",
-    key="method",
-    error=VolumeError,
-    growing=f"{_SEGMENTATION}.methods:SeededGrowing",
-    dark_vessels=f"{_SEGMENTATION}.methods:DarkVessels",
-)
-
 PROBES = Choice(
     "probe",
     key="geometry",

@@ -1,7 +1,7 @@
 """Names of structures, which must not say whose they are, and their colours.
 
 A segmentation's names are free text, and some hold a patient's. Of those that come from a file only
-names made of known words are kept; those that a person writes here are checked for their form.
+names made of known words are kept.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from us_sim.share import shared_path
 _PHRASES = re.compile(r"\b(?:gr[ae]y|white) (?=matter\b)")
 
 _NUMERAL = re.compile(r"\d{1,2}|[ivx]{1,4}[ab]?|[a-d]|[lctsr]\d{1,2}")
-_LONGEST = 60
 
 
 def is_anatomical(name: str) -> bool:
@@ -39,20 +38,6 @@ def _words() -> frozenset[str]:
 def readable(name: str) -> str:
     """A name with blanks in place of underscores, dots and hyphens, as programs write them."""
     return " ".join(re.sub(r"[_\-.,]+", " ", name).split())
-
-
-def problem_with(name: str) -> str | None:
-    """Return the problem with a structure's name that a person wrote; None where there is none."""
-    if not re.fullmatch(r"[^\W_][\w \-']*", name) or len(name) > _LONGEST:
-        return (
-            f"must begin with a letter or digit, and hold at most {_LONGEST} letters, digits, "
-            f"blanks, - and _"
-        )
-    if re.search(r"\d{3}|\d\W+\d", name):
-        return (
-            "has a number of three digits or more, or several, which may be a date or an identity"
-        )
-    return None
 
 
 Colour = tuple[float, float, float]  # red, green and blue, 0 to 1

@@ -11,7 +11,7 @@ from scipy import ndimage
 from us_sim.errors import VolumeError
 from us_sim.settings.reading import Reader
 from us_sim.volume.files.readers import read_volume
-from us_sim.volume.segmentation.methods import DarkVessels, array_of, image_of
+from us_sim.volume.segmentation.methods import array_of, dark_vessels, image_of
 from us_sim.volume.segmentation.settings import SegmentationSettings, read_seeds
 from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.volume import Volume
@@ -61,7 +61,7 @@ def overlap(one, other):
 
 def test_growing_takes_what_hangs_together_and_opening_parts_it(two_tubes):
     volume, tube, other = two_tubes
-    dark = {"method": "growing", "upper": 50, "seeds_mm": [point(20, 30, 15)]}
+    dark = {"upper": 50, "seeds_mm": [point(20, 30, 15)]}
     leaked = found(volume, vein=dark).labels == 1
     reference, _ = ndimage.label(volume.intensities <= 50, np.ones((3, 3, 3)))
     assert leaked[42, 30, 15]
@@ -96,22 +96,21 @@ def test_of_structures_that_overlap_the_first_stays_and_a_reach_ends_one(two_tub
 def test_a_seed_is_in_its_structure_whatever_is_looked_at(two_tubes, seed, reach):
     volume, *_ = two_tubes
     value = int(volume.intensities[seed])
-    keys = {"method": "growing", "lower": value, "upper": min(value + 100, 255)}
+    keys = {"lower": value, "upper": min(value + 100, 255)}
     made = found(volume, part=keys | {"seeds_mm": [point(*seed)], "reach": reach})
     assert made.labels[seed] == 1
 
 
-DARK = {"method": "growing", "upper": 50}
+DARK = {"upper": 50}
 
 
 @pytest.mark.parametrize(
     ("vein", "word"),
     [
-        (DARK, "needs seeds"),
+        (DARK | {"seeds_mm": []}, "empty"),
         (DARK | {"seeds_mm": [[0, 0, 0]]}, r"vein: seeds_mm\[0\].*outside the volume.*spans"),
         (DARK | {"seeds_mm": [point(5, 30, 15)]}, "seed 1 .*outside 0 to 50"),
         (DARK | {"seeds_mm": [point(20, 30, 15)], "upper": 5, "lower": 9}, "swap them"),
-        ({"method": "dark_vessels", "thinnest": 5e-3, "thickest": 3e-3}, "less than thinnest"),
     ],
 )
 def test_what_cannot_be_found_is_one_sentence(two_tubes, vein, word):
@@ -122,9 +121,8 @@ def test_what_cannot_be_found_is_one_sentence(two_tubes, vein, word):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("structures: {'Doe/12.3.1961': {upper: 3}}", "the name must"),
-        ("structures: {vein 1961: {upper: 3}}", "identity"),
-        ("structures: {vein: {smooth: 3}}", "did you mean '3 mm'"),
+        ("structures: {'Doe/12.3.1961': {upper: 3, seeds_mm: [[0, 0, 0]]}}", "no path"),
+        ("structures: {vein: {smooth: 3, seeds_mm: [[0, 0, 0]]}}", "did you mean '3 mm'"),
     ],
 )
 def test_a_file_of_seeds_that_will_not_do_is_refused(tmp_path, text, sentence):
@@ -155,15 +153,15 @@ def fan():
     return np.where(data, np.clip(grey, 1, 255), 0).astype(np.float32), tubes, shadow
 
 
-def proposed(grey, size=1e-3, settings=None):
+def proposed(grey, size=1e-3, **how):
     image = image_of(grey.astype(np.float32), np.full(3, size))
-    return array_of((settings or DarkVessels()).found_in(image, (), lambda *_: None)) > 0
+    return array_of(dark_vessels(image, lambda *_: None, **how)) > 0
 
 
 @pytest.mark.parametrize("finer", [1])
 def test_tubes_are_found_and_a_shadow_is_not(fan, finer):
     grey, tubes, shadow = (np.kron(each, np.ones((finer,) * 3)) for each in fan)
-    found = proposed(grey, 1e-3 / finer, DarkVessels(thickest=12e-3))
+    found = proposed(grey, 1e-3 / finer, thickest=12e-3)
     inner = slice(6 * finer, -6 * finer)  # the proposal keeps off the border of the data
     assert overlap(found[..., inner], tubes[..., inner] > 0) > 0.8
     assert np.count_nonzero(found & (shadow > 0)) < 0.02 * np.count_nonzero(shadow)

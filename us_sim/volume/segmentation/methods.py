@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import Settings, setting
 
 Index = tuple[int, int, int]
 Progress = Callable[[float, str], None]
 
-_GREY = Quantity("number", 0.0, 255.0)
-_DIAMETER = Quantity("length", 5e-4, 0.05)
-_PART = Quantity("number", 0.0, 1.0)
-
+_CONTRAST, _EDGE_CONTRAST = 0.37, 0.29
+"""How much darker than its surroundings a vessel's middle is, and its edge."""
+_MARGIN = 4e-3  # m: what is nearer to the border of the data is left out
 _VOXELS_ACROSS = 3.0  # the thinnest vessel on the grid that is worked on
 _GAP = 2e-3  # m, gaps in the data up to twice as wide are closed
 _TUBE_PERCENTILE = 98.0  # of the tissue's response to the search for tubes, from which on one is
@@ -51,121 +47,87 @@ def in_voxels(length: float, image: sitk.Image) -> list[int]:
     return [round(length * 1e3 / side) for side in image.GetSpacing()]
 
 
-@dataclass(frozen=True)
-class SeededGrowing(Settings):
-    """The part connected with a seed through grey values in a range (ITK's ConnectedThreshold)."""
+def grow(image: sitk.Image, seeds: Sequence[Index], lower: float, upper: float) -> sitk.Image:
+    """Find the part connected with a seed through grey values in a range, as 1 in an image.
 
-    error = VolumeError
-
-    lower: float = setting(_GREY, "least grey value", default=0.0)
-    upper: float = setting(_GREY, "largest grey value", default=255.0)
-
-    def check(self) -> None:
-        """Refuse a range that holds nothing."""
-        if self.lower > self.upper:
-            raise self.refused("upper", f"{self.upper:g} is below lower, {self.lower:g}: swap them")
-
-    def found_in(self, image: sitk.Image, seeds: Sequence[Index], _: Progress) -> sitk.Image:
-        """Where the structure is, as 1 in an image of its own.
-
-        Raises:
-            VolumeError: there is no seed, or one lies outside the range.
-        """
-        if not seeds:
-            raise VolumeError("growing needs seeds: give `seeds_mm`")
-        for number, seed in enumerate(seeds):
-            if not self.lower <= (value := image[seed]) <= self.upper:
-                raise VolumeError(
-                    f"seed {number + 1} has the grey value {value:.0f}, outside {self.lower:g} to "
-                    f"{self.upper:g}, so nothing grows from it: move it, or widen the range"
-                )
-        return sitk.ConnectedThreshold(image, list(seeds), self.lower, self.upper)
+    Raises:
+        VolumeError: a seed lies outside the range.
+    """
+    for number, seed in enumerate(seeds):
+        if not lower <= (value := image[seed]) <= upper:
+            raise VolumeError(
+                f"seed {number + 1} has the grey value {value:.0f}, outside {lower:g} to "
+                f"{upper:g}, so nothing grows from it: move it, or widen the range"
+            )
+    return sitk.ConnectedThreshold(image, list(seeds), lower, upper)
 
 
-@dataclass(frozen=True)
-class DarkVessels(Settings):
-    """Dark tubes that brighter tissue surrounds, found without a seed; with seeds, those parts.
+def dark_vessels(
+    image: sitk.Image, progress: Progress, thinnest: float = 3e-3, thickest: float = 16e-3
+) -> sitk.Image:
+    """Find dark tubes that brighter tissue surrounds, without a seed, as 1 in an image.
 
     Blood hardly echoes, and neither do shadows, air, bone, and depth that no beam reaches: a place
     is proposed only if it is darker than its surroundings on all sides (a closing by a ball that no
     vessel can hold), and connected to a place that looks like a tube (`tubeness`).
+
+    Args:
+        image: of grey values, spacing in mm.
+        progress: told how far it is.
+        thinnest: m, least diameter of a vessel.
+        thickest: m, largest diameter of a vessel.
     """
+    progress(0.0, "where data are")
+    finest = thinnest * 1e3 / _VOXELS_ACROSS
+    factor = [max(1, int(finest / side)) for side in image.GetSpacing()]
+    data = sitk.BinShrink(sitk.Cast(image >= 1.0, sitk.sitkFloat32), factor) >= 0.5
+    data = sitk.BinaryMorphologicalClosing(data, in_voxels(_GAP, data), sitk.sitkBall)
+    parts = sitk.RelabelComponent(sitk.ConnectedComponent(data, True))
+    data = sitk.BinaryFillhole(parts == 1)
+    if not array_of(data).any():
+        return image < 0.0
+    vessels = _search(sitk.BinShrink(image, factor), data, thinnest, thickest, progress)
+    return _resampled(sitk.Cast(vessels, sitk.sitkFloat32), image) > 0.5
 
-    error = VolumeError
 
-    thinnest: float = setting(_DIAMETER, "least diameter of a vessel", default=3e-3)
-    thickest: float = setting(_DIAMETER, "largest diameter of a vessel", default=16e-3)
-    contrast: float = setting(
-        _PART, "how much darker than its surroundings a vessel's middle is", default=0.37
+def _search(
+    grey: sitk.Image, data: sitk.Image, thinnest: float, thickest: float, progress: Progress
+) -> sitk.Image:
+    """The same on the grid that is worked on."""
+    progress(0.1, "what surrounds each place")
+    level = _filled(grey, data, thinnest / 4.0)
+    # A closing by a large ball takes long, so half as fine.
+    coarse = sitk.BinShrink(level, [2, 2, 2])
+    reach = [max(1, count) for count in in_voxels(thickest / 2.0, coarse)]
+    closed = sitk.GrayscaleMorphologicalClosing(coarse, reach, sitk.sitkBall)
+    around = array_of(_resampled(closed, level))
+    inner = sitk.BinaryErode(data, in_voxels(_MARGIN, data), sitk.sitkBall, 0.0, 1.0, False)
+    tissue = array_of(inner).astype(bool)
+    tissue &= around > _least_of_tissue(around[array_of(data) > 0])
+    if not tissue.any():
+        return data < 0
+    # A closing keeps the peaks of speckle, so tissue itself is fainter than its surroundings.
+    relative = array_of(level) / np.maximum(around, 0.05)
+    contrast = 1.0 - relative / np.median(relative[tissue])
+    tubes = tubeness(
+        sitk.Log(level + 0.05),
+        thinnest,
+        thickest / 1.4,
+        lambda done, part: progress(0.35 + 0.45 * done, part),
     )
-    edge_contrast: float = setting(_PART, "likewise, at its edge", default=0.29)
-    margin: float = setting(
-        Quantity("length", 0.0, 0.05),
-        "what is nearer to the border of the data is left out",
-        default=4e-3,
-    )
-
-    def check(self) -> None:
-        """Refuse settings in the wrong order."""
-        if self.thinnest > self.thickest:
-            raise self.refused("thickest", "is less than thinnest: swap them")
-        if self.edge_contrast > self.contrast:
-            raise self.refused("edge_contrast", "is more than contrast: swap them")
-
-    def found_in(self, image: sitk.Image, _: Sequence[Index], progress: Progress) -> sitk.Image:
-        """Where vessels are, as 1 in an image of its own."""
-        progress(0.0, "where data are")
-        finest = self.thinnest * 1e3 / _VOXELS_ACROSS
-        factor = [max(1, int(finest / side)) for side in image.GetSpacing()]
-        data = sitk.BinShrink(sitk.Cast(image >= 1.0, sitk.sitkFloat32), factor) >= 0.5
-        data = sitk.BinaryMorphologicalClosing(data, in_voxels(_GAP, data), sitk.sitkBall)
-        parts = sitk.RelabelComponent(sitk.ConnectedComponent(data, True))
-        data = sitk.BinaryFillhole(parts == 1)
-        if not array_of(data).any():
-            return image < 0.0
-        vessels = self._search(sitk.BinShrink(image, factor), data, progress)
-        return _resampled(sitk.Cast(vessels, sitk.sitkFloat32), image) > 0.5
-
-    def _search(self, grey: sitk.Image, data: sitk.Image, progress: Progress) -> sitk.Image:
-        """The same on the grid that is worked on."""
-        progress(0.1, "what surrounds each place")
-        level = _filled(grey, data, self.thinnest / 4.0)
-        # A closing by a large ball takes long, so half as fine.
-        coarse = sitk.BinShrink(level, [2, 2, 2])
-        reach = [max(1, count) for count in in_voxels(self.thickest / 2.0, coarse)]
-        closed = sitk.GrayscaleMorphologicalClosing(coarse, reach, sitk.sitkBall)
-        around = array_of(_resampled(closed, level))
-        inner = sitk.BinaryErode(data, in_voxels(self.margin, data), sitk.sitkBall, 0.0, 1.0, False)
-        tissue = array_of(inner).astype(bool)
-        tissue &= around > _least_of_tissue(around[array_of(data) > 0])
-        if not tissue.any():
-            return data < 0
-        # A closing keeps the peaks of speckle, so tissue itself is fainter than its surroundings.
-        relative = array_of(level) / np.maximum(around, 0.05)
-        contrast = 1.0 - relative / np.median(relative[tissue])
-        tubes = tubeness(
-            sitk.Log(level + 0.05),
-            self.thinnest,
-            self.thickest / 1.4,
-            lambda done, part: progress(0.35 + 0.45 * done, part),
-        )
-        progress(0.8, "parts")
-        spacing = np.array(level.GetSpacing()) * 1e-3
-        edge = image_of((tissue & (contrast > self.edge_contrast)).astype(np.uint8), spacing)
-        edge = sitk.BinaryMorphologicalOpening(
-            edge, in_voxels(self.thinnest / 3.0, edge), sitk.sitkBall
-        )
-        clear = (contrast > self.contrast) & (
-            tubes > np.percentile(tubes[tissue], _TUBE_PERCENTILE)
-        )
-        parts, count = ndimage.label(array_of(edge), np.ones((3, 3, 3)))
-        least = _LEAST_LENGTH * np.pi / 4.0 * self.thinnest**3 / float(np.prod(spacing))
-        vessels = ndimage.mean(clear, parts, np.arange(count + 1)) >= _LEAST_TUBE
-        vessels &= np.bincount(parts.ravel(), minlength=count + 1) >= least
-        vessels[0] = False
-        made = image_of(vessels[parts].astype(np.uint8), spacing)
-        made.CopyInformation(level)
-        return made
+    progress(0.8, "parts")
+    spacing = np.array(level.GetSpacing()) * 1e-3
+    edge = image_of((tissue & (contrast > _EDGE_CONTRAST)).astype(np.uint8), spacing)
+    edge = sitk.BinaryMorphologicalOpening(edge, in_voxels(thinnest / 3.0, edge), sitk.sitkBall)
+    clear = (contrast > _CONTRAST) & (tubes > np.percentile(tubes[tissue], _TUBE_PERCENTILE))
+    parts, count = ndimage.label(array_of(edge), np.ones((3, 3, 3)))
+    least = _LEAST_LENGTH * np.pi / 4.0 * thinnest**3 / float(np.prod(spacing))
+    vessels = ndimage.mean(clear, parts, np.arange(count + 1)) >= _LEAST_TUBE
+    vessels &= np.bincount(parts.ravel(), minlength=count + 1) >= least
+    vessels[0] = False
+    made = image_of(vessels[parts].astype(np.uint8), spacing)
+    made.CopyInformation(level)
+    return made
 
 
 def tubeness(

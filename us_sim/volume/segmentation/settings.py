@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from us_sim.errors import VolumeError
-from us_sim.settings.choice import Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
-from us_sim.settings.registry import SEGMENTATIONS
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import read_yaml
-from us_sim.volume.structure_names import Colour, problem_with
+from us_sim.volume.cases.settings import check_name
+from us_sim.volume.structure_names import Colour
 
 _MOST = 255
 _MILLIMETRES = Quantity("number", -1e5, 1e5)
+_GREY = Quantity("number", 0.0, 255.0)
 _RADIUS = Quantity("length", 0.0, 0.05)
 
 _Point = tuple[float, float, float]
@@ -25,20 +25,16 @@ _Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class StructureSeeds(Settings):
-    """How one structure is found. Points are in millimetres, in the volume's own frame."""
+    """One structure: what is connected with its seeds through grey values in a range."""
 
     section = "structures"
     error = VolumeError
 
-    method: Chosen = setting(
-        description="how it is found, with that method's keys beside this one",
-        choice=SEGMENTATIONS,
-        place="beside",
-        default=Chosen("growing"),
-    )
     seeds_mm: tuple[_Point, ...] = setting(
-        _MILLIMETRES, "points in it, left-posterior-superior, mm", default=()
+        _MILLIMETRES, "points in it, left-posterior-superior, mm"
     )
+    lower: float = setting(_GREY, "least grey value", default=0.0)
+    upper: float = setting(_GREY, "largest grey value", default=255.0)
     reach: float | None = setting(
         Quantity("length", 1e-3, 1.0),
         "what is farther from all seeds is not looked at; not given: all is",
@@ -62,9 +58,11 @@ class StructureSeeds(Settings):
     )
 
     def check(self) -> None:
-        """Refuse a reach from nothing."""
-        if self.reach is not None and not self.seeds_mm:
-            raise self.refused("reach", "is from seeds, and there are none: give `seeds_mm`")
+        """Refuse no seeds, and a range that holds nothing."""
+        if not self.seeds_mm:
+            raise self.refused("seeds_mm", "is empty; give a point in it")
+        if self.lower > self.upper:
+            raise self.refused("upper", f"{self.upper:g} is below lower, {self.lower:g}: swap them")
 
 
 @dataclass(frozen=True)
@@ -83,8 +81,8 @@ class SegmentationSettings(Settings):
         if not 1 <= len(self.structures) <= _MOST:
             raise self.refused("structures", f"are {len(self.structures)}; give 1 to {_MOST}")
         for name in self.structures:
-            if problem := problem_with(name):
-                raise self.refused(f"structures.{name}", f"the name {problem}")
+            if problem := check_name(name):
+                raise self.refused("structures", problem)
 
 
 def read_seeds(path: Path) -> SegmentationSettings:
@@ -143,8 +141,8 @@ class SegmentRequest(Settings):
             match = re.fullmatch(r"(\d{1,3})=(.+)", text)
             if match is None or int(match[1]) not in range(1, 256):
                 raise self.refused("names", f"{text!r}: write LABEL=NAME, e.g. 3=gallbladder")
-            if problem := problem_with(match[2]):
-                raise self.refused("names", f"{text!r}: the name {problem}")
+            if problem := check_name(match[2]):
+                raise self.refused("names", problem)
             if int(match[1]) in names or match[2] in names.values():
                 raise self.refused("names", f"{text!r}: label or name is given twice")
             names[int(match[1])] = match[2]

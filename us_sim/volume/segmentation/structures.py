@@ -8,8 +8,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.settings.registry import SEGMENTATIONS
-from us_sim.volume.segmentation.methods import Index, Progress, array_of, image_of, in_voxels
+from us_sim.volume.segmentation.methods import (
+    Index,
+    Progress,
+    array_of,
+    dark_vessels,
+    grow,
+    image_of,
+    in_voxels,
+)
 from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
 from us_sim.volume.volume import LabelMap, Volume
 
@@ -27,13 +34,9 @@ def segment(
     names = dict(enumerate(settings.structures, start=1))
     remarks: list[str] = []
     for number, name in names.items():
-
-        def tell(part: float, work: str, done: int = number - 1, name: str = name) -> None:
-            progress((done + part) / len(names), f"{name}: {work}" if work else name)
-
-        tell(0.0, "")
+        progress((number - 1) / len(names), name)
         try:
-            mask, box = _found(volume, settings.structures[name], tell)
+            mask, box = _found(volume, settings.structures[name])
         except (VolumeError, RuntimeError) as error:  # the second is SimpleITK's
             raise VolumeError(f"structures.{name}: {error}") from error
         there = labels[box]
@@ -52,9 +55,21 @@ def segment(
     return LabelMap(labels, names, colours, tuple(remarks))
 
 
-def _found(
-    volume: Volume, asked: StructureSeeds, progress: Progress
-) -> tuple[NDArray[np.bool_], tuple[slice, ...]]:
+def find_vessels(volume: Volume, progress: Progress = lambda *_: None) -> LabelMap:
+    """Propose dark vessels, as one structure.
+
+    Raises:
+        VolumeError: there are none.
+    """
+    spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
+    found = dark_vessels(image_of(volume.intensities.astype(np.float32), spacing), progress)
+    labels = array_of(sitk.BinaryFillhole(found)).astype(np.uint8)
+    if not labels.any():
+        raise VolumeError("no dark vessels are found: give --seeds, or --labels")
+    return LabelMap(labels, {1: "vessels"})
+
+
+def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tuple[slice, ...]]:
     """Where a structure is, (i, j, k) in a box of the volume, and that box."""
     spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
     seeds = np.array(_seeds(volume, asked), dtype=int).reshape(-1, 3)
@@ -69,8 +84,7 @@ def _found(
     if asked.smooth:
         grey = ndimage.gaussian_filter(grey, asked.smooth / spacing, truncate=3.0)
     placed: list[Index] = [(int(i), int(j), int(k)) for i, j, k in seeds]
-    method = asked.method.settings(SEGMENTATIONS)
-    found = method.found_in(image_of(grey, spacing), placed, progress)
+    found = grow(image_of(grey, spacing), placed, asked.lower, asked.upper)
     if asked.reach is not None:
         near = np.ones(grey.shape, np.uint8)
         near[tuple(seeds.T)] = 0
@@ -79,9 +93,8 @@ def _found(
     found = sitk.BinaryMorphologicalOpening(found, in_voxels(asked.open, found), sitk.sitkBall)
     found = sitk.BinaryMorphologicalClosing(found, in_voxels(asked.close, found), sitk.sitkBall)
     mask = array_of(sitk.BinaryFillhole(found)).astype(bool)
-    if placed:
-        parts, _ = ndimage.label(mask, np.ones((3, 3, 3)))
-        mask = np.isin(parts, np.setdiff1d(parts[tuple(seeds.T)], 0))
+    parts, _ = ndimage.label(mask, np.ones((3, 3, 3)))
+    mask = np.isin(parts, np.setdiff1d(parts[tuple(seeds.T)], 0))
     if not mask.any():
         raise VolumeError("nothing is left of it: widen its range, or open it less")
     return mask, box

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -110,23 +109,6 @@ class TrackedSequence:
         """The images (rows, columns) in grey, turned to ``MF``; of these indices into `numbers`."""
         indices = range(len(self)) if which is None else which
         return self.require_images().read(int(self.numbers[i]) for i in indices)
-
-    def faults(self, transforms: FrameTransforms | None, *, images: bool) -> list[str]:
-        """(K,) why each frame cannot be used, given what is needed of it, or an empty text."""
-        found = [""] * len(self) if transforms is None else list(transforms.faults)
-        for k in np.flatnonzero(np.isnan(self.times)):
-            found[k] = found[k] or NO_TIME
-        if images:
-            for k in np.flatnonzero(~self.image_is_valid):
-                found[k] = NO_IMAGE
-        return found
-
-    def left_out(self, faults: Iterable[str]) -> dict[str, int]:
-        """How many frames cannot be used, by the reason; those not described are counted too."""
-        reasons = Counter(fault for fault in faults if fault)
-        if self.count > len(self):
-            reasons[NO_FIELDS] = self.count - len(self)
-        return dict(reasons)
 
 
 def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.errors import VolumeError
-from us_sim.volume.sequences.sequence import TrackedSequence, read_sequence
+from us_sim.volume.sequences.sequence import (
+    NO_FIELDS,
+    NO_IMAGE,
+    NO_TIME,
+    TrackedSequence,
+    read_sequence,
+)
 from us_sim.volume.sequences.transforms import (
     FrameTransforms,
     TransformChain,
@@ -104,8 +111,14 @@ def _sweep(
     sequence: TrackedSequence, placed: FrameTransforms | None, chain: TransformChain
 ) -> Sweep:
     sequence.require_images()
-    faults = sequence.faults(placed, images=True)
-    left_out = sequence.left_out(faults)
+    faults = [""] * len(sequence) if placed is None else list(placed.faults)
+    for k in np.flatnonzero(np.isnan(sequence.times)):
+        faults[k] = faults[k] or NO_TIME
+    for k in np.flatnonzero(~sequence.image_is_valid):
+        faults[k] = NO_IMAGE
+    left_out = dict(Counter(filter(None, faults)))
+    if sequence.count > len(sequence):
+        left_out[NO_FIELDS] = sequence.count - len(sequence)
     used = np.array([not fault for fault in faults], dtype=bool)
     if not used.any():
         why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())

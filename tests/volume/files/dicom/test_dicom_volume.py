@@ -112,7 +112,7 @@ def test_a_makers_own_volume_is_refused_with_what_to_do(tmp_path):
     [
         (lambda g: place(g[2], 0, 0.7), "one may be missing"),
         (lambda g: place(g[2], 1, 3.0), "shifted"),
-        (lambda g: g.__setitem__(2, g[1]), "every place"),
+        (lambda g: g.__setitem__(2, g[1]), "same place"),
         (None, "right angles"),
     ],
 )

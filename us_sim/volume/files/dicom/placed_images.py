@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +97,10 @@ def placed_images(
         kinds += image_kinds(file, form.frames)
     kind = "TISSUE_INTENSITY" if "TISSUE_INTENSITY" in kinds else kinds[0]
     wanted = images.all
-    groups = _in_time(path, [n for n in range(len(wanted)) if kinds[n] == kind], planes, times)
+    at_time: dict[float, list[int]] = {}
+    for n in (n for n in range(len(wanted)) if kinds[n] == kind):
+        at_time.setdefault(times[n], []).append(n)
+    groups = [at_time[time] for time in sorted(at_time)]
     if not 1 <= volume <= len(groups):
         raise VolumeError(
             f"{path}: holds {len(groups)} volumes in time; number {volume} is none of them"
@@ -110,6 +111,10 @@ def placed_images(
         raise VolumeError(
             f"{path}: has {' × '.join(map(str, shape))} voxels; a volume needs two or more along "
             f"each axis"
+        )
+    if len({planes[n].position for n in chosen}) < len(chosen):
+        raise VolumeError(
+            f"{path}: several of its images are at the same place; give the files of one volume"
         )
     slices, placement = grid_of(path, [planes[n] for n in chosen])
     steps = np.linalg.norm(placement[:3, :3], axis=0) * 1e3
@@ -131,28 +136,6 @@ def _planes(images: GreyImages, spacing: Sequence[float]) -> tuple[list[Plane], 
         planes += own
         times += image_times(file, form.frames)
     return planes, times
-
-
-def _in_time(
-    path: Path, here: Sequence[int], planes: Sequence[Plane], times: Sequence[float]
-) -> list[list[int]]:
-    """Return the images of each volume, by their times, or where these are alike as they follow."""
-    at_time: dict[float, list[int]] = {}
-    for n in here:
-        at_time.setdefault(times[n], []).append(n)
-    if len(at_time) > 1:
-        return [at_time[time] for time in sorted(at_time)]
-    seen: Counter[tuple[float, ...]] = Counter()
-    made: dict[int, list[int]] = {}
-    for n in here:
-        made.setdefault(seen[planes[n].position], []).append(n)
-        seen[planes[n].position] += 1
-    if len(set(seen.values())) > 1:
-        raise VolumeError(
-            f"{path}: several of its images are at the same place, but not at every place as many; "
-            f"give the files of one volume"
-        )
-    return list(made.values())
 
 
 def _why_flat(images: GreyImages, planes: Sequence[Plane]) -> str:
