@@ -64,7 +64,6 @@ SOLVED = (
             "ions`",
         ),
         ("tissue", SOLVED % "{fem_nonlinaer: {}}", "tissue.settings.fem_nonlinaer", "linear`"),
-        ("slice", "{method: scan_conversion, regions: 4}", "slice.regions", "row_subdivision"),
         ("tracker", "{source: camera, camera: {}, haptic: {}}", "tracker.haptic", "camera"),
         ("tracker", "{entry: 0}", "tracker.entry", "pose_array"),
         ("structures", "{vein: {color: [1, 0, 0]}}", "structures.vein.color", "`colour`"),

@@ -147,7 +147,6 @@ def scanner_of(scene: Scene, volume: Volume, *, threads: int = 1) -> BMode:
             scene.imaging.acoustics,
             method=scene.slice.name,
             threads=threads,
-            settings=scene.slice.given,
         )
     except ProbeError as error:
         raise SceneError(f"{scene.origin}: {error}") from error

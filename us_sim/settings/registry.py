@@ -30,7 +30,6 @@ SLICERS = Choice(
     "slicing method",
     key="method",
     scan_conversion="us_sim.slicing.cutting.scan_conversion:ScanConversion",
-    row_subdivision="us_sim.slicing.cutting.row_subdivision:RowSubdivision",
     per_pixel="us_sim.slicing.cutting.per_pixel:PerPixel",
 )
 

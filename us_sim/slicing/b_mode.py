@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_faces import boundary_triangles
 from us_sim.geometry.pose import Pose
-from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer, warm_up
 from us_sim.slicing.formation.image_formation import ImageFormation
 from us_sim.slicing.frame import Frame, Mesh
@@ -44,7 +43,6 @@ class BMode:
         imaging: the console's settings.
         acoustics: what sound meets along the beams; None for no more than the volume holds.
         method: how slices through deformed tissue are cut, see `us_sim.settings.registry.SLICERS`.
-        settings: of the method's own class, or None for the defaults.
 
     Raises:
         ProbeError: the acoustics do not go with volume and probe, see `BeamAcoustics`.
@@ -59,12 +57,10 @@ class BMode:
         *,
         method: str = "scan_conversion",
         threads: int = 1,
-        settings: Settings | None = None,
     ) -> None:
         self._volume = volume
         self._method = method
         self._threads = threads
-        self._settings = settings
         self._mesh: Mesh | None = None
         self._slicer: Slicer | None = None
         self._surface: ContactSurface | None = None
@@ -128,12 +124,7 @@ class BMode:
         if not (np.size(rest_nodes) and np.size(tetrahedra)):
             raise MeshError("the mesh has no tetrahedra, so it cannot carry a volume")
         self._slicer = create_slicer(
-            self._method,
-            self._volume,
-            rest_nodes,
-            tetrahedra,
-            threads=self._threads,
-            settings=self._settings,
+            self._method, self._volume, rest_nodes, tetrahedra, threads=self._threads
         )
         self._mesh = np.asarray(rest_nodes, dtype=np.float64), np.asarray(tetrahedra, np.int32)
         self._surface = None

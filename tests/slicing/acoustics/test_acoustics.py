@@ -65,12 +65,11 @@ def test_behind_bone_is_dark_and_behind_blood_is_bright():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["per_pixel", "row_subdivision"])
-def test_every_way_of_cutting_has_the_same_acoustics(method):
+def test_every_way_of_cutting_has_the_same_acoustics():
     mesh = box_mesh([-0.018, 0.0, 0.018], [-0.009, 0.009], [-0.008, 0.01, 0.035])
     pressed = mesh.nodes * [1.05, 1.0, 0.93]
     images = []
-    for name in (method, "scan_conversion"):
+    for name in ("per_pixel", "scan_conversion"):
         scanner = BMode(ball(2), PROBE, acoustics=LIVE, method=name)
         scanner.carry(mesh.nodes, mesh.tetrahedra)
         images.append(scanner.image(Pose(), pressed).astype(int))

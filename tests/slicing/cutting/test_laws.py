@@ -26,7 +26,7 @@ from us_sim.errors import MeshError
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.cutting.resampling import sample_labels, sample_plane
 from us_sim.slicing.cutting.slicer import create_slicer
-from us_sim.slicing.cutting.trilinear import SLACK
+from us_sim.slicing.cutting.span_sampling import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh

@@ -71,34 +71,23 @@ def test_every_pixel_is_where_linear_algebra_puts_it(kind, seed):
     assert not labels[~somewhere].any()
 
 
-CASES = {"scan_conversion": 80, "row_subdivision": 20}
-"""How many of each kind; the same ones always, since a pixel may lie within rounding of an edge."""
-
 _CLOSE = 0.1
 """Voxels by which a place at rest may be off."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("method", CASES)
-def test_a_method_equals_the_location_of_every_pixel(method, kind):
-    @settings(max_examples=CASES[method], deadline=None, derandomize=True)
-    @given(seed=st.integers(0, 2**32 - 1), threads=st.integers(1, 3))
-    def agree(seed, threads):
-        case = random_case(kind, seed)
-        assert_agreement(case, method, threads)
-
-    agree()
-
-
-def assert_agreement(case, method, threads):
+@settings(max_examples=80, deadline=None, derandomize=True)  # a pixel may lie on an edge
+@given(seed=st.integers(0, 2**32 - 1), threads=st.integers(1, 3))
+def test_scan_conversion_equals_the_location_of_every_pixel(kind, seed, threads):
     """Coverage, places at rest, grey values and labels are those of the oracle.
 
     Where tetrahedra overlap, a pixel must agree with one of those that hold it.
     """
+    case = random_case(kind, seed)
     _, _, nodes, plane, volume = case
     oracle = create_slicer("per_pixel", volume, *case[:2])
-    slicer = create_slicer(method, volume, *case[:2], threads=threads)
+    slicer = create_slicer("scan_conversion", volume, *case[:2], threads=threads)
     expected, found = (s.rest_coordinates(nodes, plane) for s in (oracle, slicer))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected), "coverage")
     assert slicer.skipped == oracle.skipped

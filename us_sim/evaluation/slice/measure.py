@@ -2,7 +2,7 @@
 
 >>> from us_sim.evaluation.slice.measure import SLICING_METHODS
 >>> [name for name in SLICING_METHODS if name != "vtk"]
-['scan_conversion', 'row_subdivision', 'per_pixel']
+['scan_conversion', 'per_pixel']
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 OURS = "scan_conversion"
 """The method that the others are compared with, and that the targets are about."""
 
-SLICING_METHODS = {OURS: (1, 2), "row_subdivision": (1, 2), "per_pixel": (1,), "vtk": (1, 2)}
+SLICING_METHODS = {OURS: (1, 2), "per_pixel": (1,), "vtk": (1, 2)}
 """Numbers of threads that each method is timed with, in the report's order.
 
 VTK knows nothing of the rigid volume around the tissue: it is compared where tissue is.

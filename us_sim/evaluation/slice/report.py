@@ -87,7 +87,6 @@ def _report(table: pd.DataFrame, recorded: pd.DataFrame | None = None) -> Report
         Target.at_most(f"{what}, one core", 2.0, wall.get(1, np.nan), "ms"),
         Target.at_most(f"{what}, two cores", 1.2, wall.get(2, np.nan), "ms"),
         Target.at_least("times as fast as VTK (filter and sampling)", 20, ratio("vtk")),
-        Target.at_least("times as fast as `row_subdivision`", 5, ratio("row_subdivision")),
         Target.at_most(f"pixels of {pixels:,} with a wrong coverage", 0, wrong),
         Target.at_most("grey levels that a pixel is off", 1, own["max_grey_difference"].max()),
         Target.at_most(

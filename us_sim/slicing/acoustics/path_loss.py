@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.kernels import njit
-from us_sim.slicing.cutting.trilinear import SLACK
+from us_sim.slicing.cutting.span_sampling import SLACK
 
 NOTHING = 0  # the medium where there is no tissue
 _BEGIN = -0.5 - SLACK

@@ -21,7 +21,7 @@ from us_sim.slicing.cutting.resampling import (
 )
 from us_sim.slicing.cutting.section import INSIDE, finite_nodes
 from us_sim.slicing.cutting.slicer import Slicer
-from us_sim.slicing.cutting.trilinear import SLACK
+from us_sim.slicing.cutting.span_sampling import SLACK
 from us_sim.slicing.probe.plane import SlicePlane
 
 _ON_PLANE = 1e-9  # pixels off the plane that count as on it, as for a section

@@ -20,8 +20,12 @@ from numpy.typing import NDArray
 from us_sim.errors import VolumeError
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.cut_polygons import END_SHIFT, NO_OUTLINE
-from us_sim.slicing.cutting.span_sampling import MOST_VOXELS, MOST_VOXELS_A_SIDE, sample_spans
-from us_sim.slicing.cutting.trilinear import inside_volume
+from us_sim.slicing.cutting.span_sampling import (
+    MOST_VOXELS,
+    MOST_VOXELS_A_SIDE,
+    SLACK,
+    sample_spans,
+)
 from us_sim.slicing.probe.plane import SlicePlane
 
 if TYPE_CHECKING:
@@ -235,7 +239,14 @@ def label_voxels(volume: Volume) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sample_nearest(voxels, shape, maps, elements, first_row, last_row, image):
-    """Labels of the nearest voxels; arguments as for `trilinear.sample_linear`."""
+    """Labels of the nearest voxels in rows ``first_row`` to ``last_row - 1`` of an image.
+
+    Args:
+        voxels: (I*J*K,) uint8, shape: (3,) its sides.
+        maps: (E, 3, 3) from (1, column, row) to voxel indices.
+        elements: (rows, columns) int32, which map holds at a pixel; negative for none (0).
+        image: (rows, columns) uint8, filled here.
+    """
     for row in range(first_row, last_row):
         for i in range(elements.shape[1]):
             element = elements[row, i]
@@ -246,12 +257,14 @@ def sample_nearest(voxels, shape, maps, elements, first_row, last_row, image):
             x = (m[0, 0] + m[0, 2] * row) + m[0, 1] * i
             y = (m[1, 0] + m[1, 2] * row) + m[1, 1] * i
             z = (m[2, 0] + m[2, 2] * row) + m[2, 1] * i
-            if (
-                inside_volume(x, shape[0])
-                and inside_volume(y, shape[1])
-                and inside_volume(z, shape[2])
-            ):
+            if _is_within(x, shape[0]) and _is_within(y, shape[1]) and _is_within(z, shape[2]):
                 ix = np.int64(min(max(x, 0.0), shape[0] - 1.0) + 0.5)
                 iy = np.int64(min(max(y, 0.0), shape[1] - 1.0) + 0.5)
                 iz = np.int64(min(max(z, 0.0), shape[2] - 1.0) + 0.5)
                 image[row, i] = voxels[np.uint64((ix * shape[1] + iy) * shape[2] + iz)]
+
+
+@njit(inline="always", error_model="numpy")
+def _is_within(index, count):
+    """Whether an index lies between the outer faces of the outermost voxels."""
+    return index >= -0.5 - SLACK and index <= count - 0.5 + SLACK

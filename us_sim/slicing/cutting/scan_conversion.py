@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from us_sim.geometry.mesh_faces import face_order
-from us_sim.settings.setting import Settings
 from us_sim.slicing.cutting.cut_polygons import (
     NO_OUTLINE,
     Outline,
@@ -58,7 +57,7 @@ from us_sim.slicing.probe.plane import SlicePlane
 class ScanConversion(Slicer):
     """Cuts exact images, and fast."""
 
-    def _prepare(self, _: Settings | None) -> None:
+    def _prepare(self) -> None:
         volume, mesh = self._volume, self._mesh
         self._clusters = Clusters(mesh.nodes, mesh.tetrahedra)
         self._determinants = mesh.determinants[self._clusters.order]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,20 +50,18 @@ class Slicer(ABC):
         tetrahedra: ArrayLike,
         *,
         threads: int = 1,
-        settings: Any = None,
     ) -> None:
         """``rest_nodes`` (N, 3) m lie in the undeformed volume; ``tetrahedra`` (M, 4) index them.
 
-        The image does not depend on the number of threads. ``settings`` are of the class's own
-        kind, or None for the defaults.
+        The image does not depend on the number of threads.
         """
         if threads < 1:
             raise ValueError(f"give at least one thread, not {threads}")
         self._volume, self._threads = volume, threads
         self._mesh = RestMesh(rest_nodes, tetrahedra, volume.patient_to_index)
-        self._prepare(settings)
+        self._prepare()
 
-    def _prepare(self, settings: Any) -> None:  # noqa: B027
+    def _prepare(self) -> None:  # noqa: B027
         """Prepare everything that all images of the mesh share."""
 
     @abstractmethod
@@ -141,7 +139,6 @@ def create_slicer(
     tetrahedra: ArrayLike,
     *,
     threads: int = 1,
-    settings: Settings | None = None,
 ) -> Slicer:
     """The slicer of that name among `SLICERS`; further arguments as for `Slicer`.
 
@@ -150,7 +147,7 @@ def create_slicer(
         MeshError: the mesh cannot be used.
     """
     made = SLICERS.load(name)
-    slicer: Slicer = made(volume, rest_nodes, tetrahedra, threads=threads, settings=settings)
+    slicer: Slicer = made(volume, rest_nodes, tetrahedra, threads=threads)
     return slicer
 
 

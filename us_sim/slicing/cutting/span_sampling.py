@@ -20,7 +20,9 @@ from numba.extending import intrinsic
 
 from us_sim.kernels import njit
 from us_sim.slicing.cutting.cut_polygons import CUT_SHIFT, END_SHIFT, mark_covered
-from us_sim.slicing.cutting.trilinear import SLACK
+
+SLACK = 1e-6
+"""Voxels by which a point may miss the volume's outer faces: rounding of the map, no more."""
 
 _FRACTION = 17  # bits behind the point of a coordinate
 _DROPPED = 2  # number of these bits that a blend leaves out
