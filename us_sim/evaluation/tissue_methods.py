@@ -95,11 +95,9 @@ _ALL = (
             {"steps": 5},
             {"steps": 80},
             {"stiffness": "fitted"},
-            {"stiffness": "fitted", "volume": True},
-            {"stiffness": "fitted", "volume": True, "steps": 80},
         ),
         is_dynamic=True,
-        families={"stiffness=fitted": "fitted", "volume=True": "volume term"},
+        families={"stiffness=fitted": "fitted"},
     ),
 )
 TISSUE_METHODS = {method.name: method for method in _ALL}

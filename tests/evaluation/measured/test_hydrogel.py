@@ -76,17 +76,13 @@ def test_an_inhomogeneous_deformation_is_that_of_quadratic_elements_of_another_p
     assert errors[1] < 0.5 * _length(box.at(box.linear(ratio), points) - expected)
 
 
-@pytest.mark.parametrize("ratio", [0.25, 0.45])
-def test_springs_are_hookes_law_where_strains_are_small(ratio):
+def test_springs_are_hookes_law_of_poissons_ratio_a_quarter_where_strains_are_small():
     def faces(points):
         x, y, z = (points / _SIZE).T
         dent = 1e-4 * _SIZE * np.exp(-(((x - 0.5) ** 2 + (y - 0.4) ** 2) / 0.1)) * z**2
         return np.stack([0 * x, 0 * x, -dent], axis=1)
 
     box = PrescribedBox(_LOWER, _UPPER, _SIZE / 10, faces)
-    law = box.linear(ratio)
-    mechanics = _length(law - box.harmonic)
-    assert _length(box.springs(ratio, volume=True) - law) < 0.15 * mechanics
     alone = box.springs(0.45)
     assert _length(alone - box.linear(0.25)) < 0.5 * _length(alone - box.linear(0.45))
 

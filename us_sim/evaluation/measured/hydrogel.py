@@ -33,10 +33,10 @@ from us_sim.tissue.elasticity.linear_tetrahedra import lame_stiffness, shape_gra
 from us_sim.tissue.elasticity.material import Material
 from us_sim.tissue.elasticity.materials import TissueMaterials, uniform_material
 from us_sim.tissue.elasticity.neo_hookean import NeoHookean
+from us_sim.tissue.elasticity.springs import springs_of
 from us_sim.tissue.mesh.embedding import locate
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.tissue.model import TissueModel
-from us_sim.tissue.solvers.msds import MsdsSettings, spring_tissue
 from us_sim.tissue.solvers.newton import Newton
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ _LAYERS = 1e-6 * np.array([30.0, 48.0, 60.0, 72.0, 80.0, 86.0])  # m, borders
 _MOST_STEPS = 200
 _TOLERANCE = 1e-6  # residual norm over that of the harmonic start
 _FRAMES, _FRAME_TOLERANCE = 30, 1e-3
-_METHODS = ("linear", "nonlinear", "springs", "springs and volume")
+_METHODS = ("linear", "nonlinear", "springs")
 BEST = "nonlinear, graded"
 _AXIS = 205.2e-6  # m, along x
 _FITTING_MESH, _MESH = 24e-6, 16e-6  # m
@@ -133,19 +133,18 @@ class PrescribedBox:
         balance(newton, _TOLERANCE * newton.residual_norm)
         return newton.displacement.T.copy()
 
-    def springs(self, ratio: float, softening: float = 0.0, *, volume: bool = False) -> Array:
-        """(N, 3) m, equilibrium of springs: those of `msds`, or fitted ones with volume.
+    def springs(self, ratio: float, softening: float = 0.0) -> Array:
+        """(N, 3) m, equilibrium of the springs of `msds`.
 
         The other arguments are those of `nonlinear`, and its error.
         """
         nodes, still = self.mesh.nodes, np.zeros_like(self.faces)
-        chosen = MsdsSettings(stiffness="fitted", volume=True) if volume else MsdsSettings()
-        springs, term = spring_tissue(self._model(ratio, softening), chosen, yielding=False)
+        springs = springs_of(self.mesh, self._model(ratio, softening).materials)
+        springs = springs.without(self.fixed)
         free = np.repeat(~self.fixed, 3)
 
         def residual(field: Array) -> Array:
-            force = springs.forces(nodes + field, still) + term.forces(nodes + field, still)
-            return np.asarray(force.ravel()[free])
+            return np.asarray(springs.forces(nodes + field, still).ravel()[free])
 
         field = self.harmonic
         force = residual(field)
@@ -154,9 +153,9 @@ class PrescribedBox:
             if np.linalg.norm(force) <= goal:
                 return field
             # Gauss and Newton's step, since the energy is a sum of squares
-            factors = [part.factor(nodes + field)[:, free] for part in (springs, term)]
+            factor = springs.factor(nodes + field)[:, free]
             step = np.zeros(field.size)
-            step[free] = splu(csc_array(sum(f.T @ f for f in factors))).solve(force)
+            step[free] = splu(csc_array(factor.T @ factor)).solve(force)
             for length in 0.5 ** np.arange(8):
                 tried = field + length * step.reshape(-1, 3)
                 if np.linalg.norm(residual(tried)) < np.linalg.norm(force):
@@ -166,8 +165,8 @@ class PrescribedBox:
 
     def solved(self, method: str, ratio: float, softening: float) -> Array:
         """(N, 3) m, by one of `_METHODS`."""
-        if method.startswith("springs"):
-            return self.springs(ratio, softening, volume=method != "springs")
+        if method == "springs":
+            return self.springs(ratio, softening)
         return (self.linear if method == "linear" else self.nonlinear)(ratio, softening)
 
     def frame_ms(self, ratio: float, softening: float) -> float:

@@ -12,16 +12,15 @@ tissue is put back to its undeformed state, which is then the state of rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from us_sim.errors import SolverError
 from us_sim.kernels import njit
-from us_sim.tissue.elasticity.springs import SpringNetwork, VolumeTerm, area_vectors
+from us_sim.tissue.elasticity.springs import SpringNetwork
 from us_sim.tissue.model import TissueModel
 
 _MARGIN = 1.05  # Safety factor of masses and sub-steps on Gershgorin's bound of stability
@@ -40,20 +39,20 @@ def step_limit(frequency: float, damping_factor: float) -> float:
 
 
 def highest_frequency(
-    factors: Sequence[csr_array], mass: NDArray[np.float64], fixed: NDArray[np.bool_]
+    factor: csr_array, mass: NDArray[np.float64], fixed: NDArray[np.bool_]
 ) -> float:
     """1/s, the largest circular frequency of small undamped oscillations.
 
     By Lanczos iterations on the largest generalised eigenvalue of stiffness and mass, to 1e-4.
 
     Args:
-        factors: B (rows, 3N) of each kind of force, whose B'B add up to the stiffness.
+        factor: B (rows, 3N), such that B'B is the stiffness.
         mass: (N,) kg.
         fixed: (N,), held nodes.
     """
     scale = np.repeat(np.where(fixed, 0.0, 1 / np.sqrt(mass)), 3)
     free = np.repeat(~fixed, 3)
-    factor = csr_array(vstack(factors).multiply(scale).tocsc()[:, free])
+    factor = csr_array(factor.multiply(scale).tocsc()[:, free])
     size = factor.shape[1]
     if size <= 30:
         return math.sqrt(max(np.linalg.eigvalsh((factor.T @ factor).toarray())[-1], 0.0))
@@ -64,29 +63,25 @@ def highest_frequency(
     return math.sqrt(largest[0])
 
 
-def node_stiffness(factors: Sequence[csr_array]) -> NDArray[np.float64]:
+def node_stiffness(factor: csr_array) -> NDArray[np.float64]:
     """(N,) N/m, d such that the stiffness is nowhere above 2 diag(d) (S. Gershgorin's bound).
 
-    For springs alone it is the sum of a node's spring constants, which holds however they turn and
-    stretch. With or without a volume term it is about 2.7 times the
-    bound that the undeformed tissue needs.
+    It is the sum of a node's spring constants, which holds however they turn and stretch, and about
+    2.7 times the bound that the undeformed tissue needs.
 
     Args:
-        factors: as in `highest_frequency`.
+        factor: as in `highest_frequency`.
     """
-    count = factors[0].shape[1] // 3
+    count = factor.shape[1] // 3
     axes = np.repeat(np.arange(count), 3), np.arange(3 * count)
     merge = csr_array((np.ones(3 * count), axes[::-1]), shape=(3 * count, count))
-    total = np.zeros(count)
-    for factor in factors:
-        size = csr_array(factor.multiply(factor) @ merge).sqrt()
-        total += 0.5 * (size.T @ np.asarray(size.sum(axis=1)).ravel())
-    return total
+    size = csr_array(factor.multiply(factor) @ merge).sqrt()
+    return np.asarray(0.5 * (size.T @ np.asarray(size.sum(axis=1)).ravel()))
 
 
 def stabilise(
     model: TissueModel,
-    factors: Sequence[csr_array],
+    factor: csr_array,
     time_step: float,
     damping_factor: float,
     stabilisation: str,
@@ -99,7 +94,7 @@ def stabilise(
 
     Args:
         model: whose lumped masses are simulated where possible.
-        factors: as in `highest_frequency`.
+        factor: as in `highest_frequency`.
         time_step: s, as set.
         damping_factor: s, damping constant over stiffness.
         stabilisation: ``mass_scaling``, ``substeps``, or ``none``, which only adds the remark.
@@ -110,19 +105,19 @@ def stabilise(
     mass, free = model.lumped_mass, ~model.fixed
     if not free.any():
         return mass, 1, ""
-    stiffness = node_stiffness(factors)
+    stiffness = node_stiffness(factor)
     span = time_step**2 + 2 * damping_factor * time_step
     needed = 0.5 * _MARGIN * span * stiffness
     if not (needed > mass)[free].any():
         return mass, 1, ""
-    limit = step_limit(highest_frequency(factors, mass, model.fixed), damping_factor)
+    limit = step_limit(highest_frequency(factor, mass, model.fixed), damping_factor)
     unstable = f"steps beyond {1e3 * limit:.2g} ms are unstable"
     if stabilisation == "none":
         return mass, 1, unstable
     if stabilisation == "mass_scaling":
         scaled = np.maximum(mass, needed)
-        factor = (scaled / mass)[free]
-        low, high = factor.min(), factor.max()
+        raised = (scaled / mass)[free]
+        low, high = raised.min(), raised.max()
         return scaled, 1, f"masses scaled {low:.0f} to {high:.0f} times: unscaled, {unstable}"
     bound = math.sqrt(2 * _MARGIN * (stiffness / mass)[free].max())
     substeps = math.ceil(time_step / step_limit(bound, damping_factor))
@@ -184,7 +179,13 @@ def count_inverted(nodes, tetrahedra):
     """How many tetrahedra (M, 4) have no positive volume."""
     count = 0
     for t in range(len(tetrahedra)):
-        if not area_vectors(nodes, tetrahedra, t)[0] > 0.0:
+        a, b, c, d = tetrahedra[t, 0], tetrahedra[t, 1], tetrahedra[t, 2], tetrahedra[t, 3]
+        x, y, z = nodes[a, 0], nodes[a, 1], nodes[a, 2]
+        bx, by, bz = nodes[b, 0] - x, nodes[b, 1] - y, nodes[b, 2] - z
+        cx, cy, cz = nodes[c, 0] - x, nodes[c, 1] - y, nodes[c, 2] - z
+        dx, dy, dz = nodes[d, 0] - x, nodes[d, 1] - y, nodes[d, 2] - z
+        px, py, pz = cy * dz - cz * dy, cz * dx - cx * dz, cx * dy - cy * dx
+        if not bx * px + by * py + bz * pz > 0.0:
             count += 1
     return count
 
@@ -205,15 +206,9 @@ class ElasticResidual:
         self.largest_load = 0.0  # N, largest norm of contact forces since the tissue was at rest
 
     @classmethod
-    def of(
-        cls, springs: SpringNetwork, volume: VolumeTerm, nodes: NDArray[np.float64]
-    ) -> ElasticResidual:
-        """The residual of springs and volumes that are undeformed at nodes (N, 3) m."""
+    def of(cls, springs: SpringNetwork, nodes: NDArray[np.float64]) -> ElasticResidual:
+        """The residual of springs that are undeformed at nodes (N, 3) m."""
         stiffness = float(np.linalg.norm(springs.stiffness))
-        if len(volume.tetrahedra):
-            # A tetrahedron resists as a spring of its modulus and size.
-            size = np.cbrt(volume.rest_volume)
-            stiffness += float(np.linalg.norm((volume.element + volume.nodal) * size))
         return cls(4 * float(np.finfo(np.float64).eps * np.abs(nodes).max()) * stiffness)
 
     def reset(self) -> None:

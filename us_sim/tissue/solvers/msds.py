@@ -22,15 +22,7 @@ from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import setting
 from us_sim.settings.spelling import counted
 from us_sim.tissue.contact.probe_gap import only_forward, push_out, pushing_gap
-from us_sim.tissue.elasticity.springs import (
-    SpringNetwork,
-    VolumeTerm,
-    add_volume_forces,
-    fitted_springs,
-    spring_forces,
-    springs_of,
-    volume_term,
-)
+from us_sim.tissue.elasticity.springs import fitted_springs, spring_forces, springs_of
 from us_sim.tissue.elasticity.stability import (
     ElasticResidual,
     InversionWatch,
@@ -62,12 +54,8 @@ class MsdsSettings(SolverSettings):
         choices=("algorithm_1", "fitted"),
         default="algorithm_1",
         description="how springs get their stiffness: algorithm_1 is the paper's; fitted fits them "
-        "to the elasticity of the same mesh, and needs no stiffness_factor",
-    )
-    volume: bool = setting(
-        default=False,
-        description="whether tetrahedra resist changes of volume as the material does, and not "
-        "only as springs do, which have Poisson's ratio 1/4",
+        "to the elasticity of the same mesh, at their own Poisson's ratio of 1/4, and needs no "
+        "stiffness_factor",
     )
     stiffness_factor: float = setting(
         Quantity("length", 1e-9, 1e3),
@@ -92,27 +80,6 @@ class MsdsSettings(SolverSettings):
         "which only the last good state is kept",
     )
     maximum_substeps: int = setting(COUNT, "of one step; more are refused", default=100)
-
-
-def spring_tissue(
-    model: TissueModel, settings: MsdsSettings, *, yielding: bool = True
-) -> tuple[SpringNetwork, VolumeTerm]:
-    """The springs, without those between fixed nodes, and the volume term, as the settings say.
-
-    Args:
-        model: the tissue.
-        settings: of the solver.
-        yielding: as in `us_sim.tissue.elasticity.springs.volume_term`.
-    """
-    mesh, materials, damping = model.mesh, model.materials, settings.damping_factor
-    if settings.stiffness == "fitted":
-        springs = fitted_springs(mesh, materials, damping, with_volume=settings.volume)
-    else:
-        springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
-    term = VolumeTerm.empty(len(mesh.nodes))
-    if settings.volume:
-        term = volume_term(mesh, materials, springs, damping, yielding=yielding)
-    return springs.without(model.fixed), term
 
 
 class Particles(NamedTuple):
@@ -184,18 +151,23 @@ class Msds(TissueSolver):
     ) -> None:
         settings = settings or MsdsSettings()
         super().__init__(model, settings, progress)
-        self._springs, self._volume = spring_tissue(model, settings)
-        self._residual_norm = ElasticResidual.of(self._springs, self._volume, model.mesh.nodes)
+        mesh, materials, damping = model.mesh, model.materials, settings.damping_factor
+        if settings.stiffness == "fitted":
+            springs = fitted_springs(mesh, materials, damping)
+        else:
+            springs = springs_of(mesh, materials, settings.stiffness_factor, damping)
+        self._springs = springs.without(model.fixed)
+        self._residual_norm = ElasticResidual.of(self._springs, mesh.nodes)
         self._inversion = InversionWatch(model)
         self._positions = model.mesh.nodes.copy()
         self._velocity = np.zeros_like(self._positions)
         self._steps = settings.steps
         self._rest_tolerance = settings.rest_tolerance
         self._damping_factor = settings.damping_factor
-        self._factors = [part.factor(model.mesh.nodes) for part in (self._springs, self._volume)]
+        self._factor = self._springs.factor(mesh.nodes)
         self.mass, self._substeps, remark = stabilise(
             model,
-            self._factors,
+            self._factor,
             settings.time_step,
             settings.damping_factor,
             settings.stabilisation,
@@ -221,7 +193,7 @@ class Msds(TissueSolver):
         """s, the longest stable step of small oscillations with the masses as simulated."""
         if self.model.fixed.all():
             return math.inf
-        frequency = highest_frequency(self._factors, self.mass, self.model.fixed)
+        frequency = highest_frequency(self._factor, self.mass, self.model.fixed)
         return step_limit(frequency, self._damping_factor)
 
     def _restore(self, state: TissueState) -> None:
@@ -246,7 +218,6 @@ class Msds(TissueSolver):
         self._contact.wrench[:] = 0.0
         advance_frame(
             self._springs.arrays,
-            self._volume.arrays,
             self._particles,
             probe,
             self._contact,
@@ -324,7 +295,6 @@ class Msds(TissueSolver):
         inverted, words, interventions = self._untangle(is_touched)
         still = np.zeros_like(self._velocity)
         elastic = self._springs.forces(self._positions, still)
-        elastic += self._volume.forces(self._positions, still)
         elastic[self.model.fixed] = 0.0
         touched = self.model.movable_contact_nodes[self._contact.touched]
         normal = np.zeros((0, 3)) if pose is None else self._gap(pose)[1][self._contact.touched]
@@ -355,12 +325,11 @@ class Msds(TissueSolver):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance_frame(springs, volumes, particles, probe, contact, time_step, substeps, steps):
+def advance_frame(springs, particles, probe, contact, time_step, substeps, steps):
     """Moves the particles by ``steps`` of ``substeps`` of ``time_step`` (s) each, symplectic Euler.
 
     Args:
         springs: their `SpringArrays`.
-        volumes: their `VolumeArrays`.
         particles: `Particles`, moved here.
         probe: `ProbeMotion` of S = ``steps`` steps, or of none.
         contact: `Contact`, filled in here as of the last sub-step; its wrench is added to.
@@ -370,8 +339,6 @@ def advance_frame(springs, volumes, particles, probe, contact, time_step, subste
     for step in range(steps):
         for _sub in range(substeps):
             spring_forces(springs, positions, velocity, force)
-            if len(volumes.tetrahedra) > 0:
-                add_volume_forces(volumes, positions, velocity, force)
             for i in range(len(positions)):
                 for axis in range(3):
                     v = velocity[i, axis] + time_step * inverse_mass[i] * force[i, axis]
