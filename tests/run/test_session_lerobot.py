@@ -12,7 +12,7 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import stamped
 from us_sim.recording.writer import BagWriter
-from us_sim.run.session_lerobot import Episode, Wanted
+from us_sim.run.session_lerobot import Episode
 
 JOINTS = "sensor_msgs/msg/JointState"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -52,7 +52,7 @@ def compressed(stamp, pixels):
 
 
 def frames_of(file, rate=None, **wanted):
-    episode = Episode(read_bag(file), Wanted(**wanted))
+    episode = Episode(read_bag(file), **wanted)
     moments = episode.moments(rate or episode.usual_rate)
     frames = list(episode.frames(moments))
     return moments, frames, episode.names, list(episode.told(moments))
@@ -74,7 +74,7 @@ def test_a_session_gives_what_it_was_made_of_at_a_third_of_its_rate(session):
 
 
 def test_the_rate_is_that_of_the_images_unless_it_is_said(session):
-    assert Episode(read_bag(session), Wanted()).usual_rate == 60
+    assert Episode(read_bag(session)).usual_rate == 60
     assert len(frames_of(session)[0]) == len(frames_of(session, 60)[0]) == 120
 
 
@@ -160,7 +160,7 @@ def test_clocks_that_differ_are_told_and_log_times_help(tmp_path):
 )
 def test_a_topic_of_no_use_is_refused(session, wanted, said):
     with pytest.raises(BagError, match=said):
-        Episode(read_bag(session), Wanted(**wanted))
+        Episode(read_bag(session), **wanted)
 
 
 def test_a_rate_that_is_none_is_refused(session, tmp_path, capsys, monkeypatch):
@@ -173,7 +173,7 @@ def test_a_rate_that_is_none_is_refused(session, tmp_path, capsys, monkeypatch):
 def test_a_bag_of_nothing_that_is_known_is_refused(tmp_path):
     file = write(tmp_path / "a.mcap", [("/p", pose(EPOCH), EPOCH)], {"/p": TYPES["/probe/pose"]})
     with pytest.raises(BagError, match="/p is left out: has 1 message of use, and two are needed"):
-        Episode(read_bag(file), Wanted())
+        Episode(read_bag(file))
 
 
 def test_a_bag_by_the_real_rosbag2_gives_the_poses_that_it_holds(shared_data):

@@ -145,10 +145,18 @@ def _repair(args: argparse.Namespace) -> int:
 
 def _to_lerobot(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
-    from us_sim.run.session_lerobot import Wanted, to_lerobot
+    from us_sim.run.session_lerobot import to_lerobot
 
-    wanted = Wanted(args.topics, args.action, args.rate, args.by_log_time)
-    show = late_progress("bag to-lerobot")
-    for line in to_lerobot(args.files, args.out, wanted, args.task, show, is_video=args.video):
+    for line in to_lerobot(
+        args.files,
+        args.out,
+        args.task,
+        late_progress("bag to-lerobot"),
+        rate=args.rate,
+        is_video=args.video,
+        topics=args.topics,
+        action=args.action,
+        by_log_time=args.by_log_time,
+    ):
         print(line)
     return 0

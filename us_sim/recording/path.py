@@ -186,11 +186,13 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
         single = Path(path).suffix.lower() in TRANSFORM_SUFFIXES
         remedy = "a single transform belongs in `registration` or `calibration`; " if single else ""
         raise BagError(f"{error}; {remedy}{_PATHS}") from None
-    name, rows = _read(bag, topic or _only_body(bag, option))
+    name = whole_name(bag, topic or _only_body(bag, option))
+    rows = list(pose_rows(bag, name))
     if topic is None and len(_frames(rows)) > 1:  # a hand and a device took turns
         poses = [each.name for each in bag.topics if each.type_name == POSE_STAMPED]
         of_probe = [each for each in poses if each.endswith("/probe/pose") and each != name]
-        name, rows = _read(bag, of_probe[0]) if len(of_probe) == 1 else (name, rows)
+        if len(of_probe) == 1:
+            name, rows = of_probe[0], list(pose_rows(bag, of_probe[0]))
     return _usable(bag, name, rows)
 
 
@@ -259,11 +261,10 @@ def is_pose(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.isfinite(poses).all(axis=1) & has_orientation
 
 
-def _read(bag: Bag, name: str) -> tuple[str, list[Row]]:
-    """A body's whole name, and its recorded poses."""
+def whole_name(bag: Bag, name: str) -> str:
+    """A topic's or body's name with its leading slash, where the bag has one."""
     topic, colon, body = name.partition(":")
-    name = bag.topic(topic).name + colon + body
-    return name, list(pose_rows(bag, name))
+    return bag.topic(topic).name + colon + body
 
 
 def _frames(rows: list[Row]) -> list[str]:

@@ -40,7 +40,14 @@ from us_sim.settings.spelling import aligned
 
 
 class Bag:
-    """A bag opened for reading; made by :func:`read_bag`."""
+    """A bag opened for reading; made by :func:`read_bag`.
+
+    Attributes:
+        start: lowest log time in ns since the epoch; None without messages.
+        end: highest log time.
+        message_count: on all topics.
+        is_indexed: whether every file of it has an index, so that none is read to open it.
+    """
 
     def __init__(self, path: Path, storages: list[Storage], metadata: BagMetadata | None) -> None:
         self.path = path
@@ -55,28 +62,11 @@ class Bag:
             topics.setdefault(entry.name, replace(entry, message_count=0))
         self.topics = tuple(topics.values())
         self._topics = topics
-
-    @property
-    def start(self) -> int | None:
-        """Lowest log time in ns since the epoch; None without messages."""
-        times = [storage.start for storage in self._storages if storage.start is not None]
-        return min(times, default=None)
-
-    @property
-    def end(self) -> int | None:
-        """Highest log time in ns since the epoch; None without messages."""
-        times = [storage.end for storage in self._storages if storage.end is not None]
-        return max(times, default=None)
-
-    @property
-    def message_count(self) -> int:
-        """Number of messages on all topics."""
-        return sum(topic.message_count for topic in self.topics)
-
-    @property
-    def is_indexed(self) -> bool:
-        """Whether every file of it has an index, so that none is read to open it."""
-        return all(storage.is_indexed for storage in self._storages)
+        starts, ends = [each.start for each in storages], [each.end for each in storages]
+        self.start = min((time for time in starts if time is not None), default=None)
+        self.end = max((time for time in ends if time is not None), default=None)
+        self.message_count = sum(topic.message_count for topic in self.topics)
+        self.is_indexed = all(storage.is_indexed for storage in storages)
 
     @property
     def note(self) -> str:

@@ -19,7 +19,7 @@ from us_sim.recording.lerobot_writer import (
     LeRobotWriter,
     require_lerobot,
 )
-from us_sim.recording.path import is_pose
+from us_sim.recording.path import is_pose, whole_name
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.resampling import Times, latest, linear, slerp
 from us_sim.run.session_tables import (
@@ -44,56 +44,40 @@ _MOST_FRAMES = 10_000_000
 _LATE = SECOND  # ns that a stamp may be older than one before; more is another time
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """The parts of sessions that are wanted, and how they are to be resampled.
-
-    Args:
-        topics: or bodies, as ``/tf:probe``; where there are none, all topics of a type that is
-            known, and bodies of others only without any PoseStamped.
-        action: a topic or body that is the action; it may be named here alone.
-        rate: frames a second; by default that of the first session's images, or else of the
-            fastest topic.
-        by_log_time: go by when messages were recorded, and not by their stamps.
-    """
-
-    topics: Sequence[str] = ()
-    action: str | None = None
-    rate: int | None = None
-    by_log_time: bool = False
-
-
 def to_lerobot(
     sessions: Sequence[Path],
     folder: Path,
-    wanted: Wanted,
     task: str,
     progress: Progress,
     *,
+    rate: int | None = None,
     is_video: bool = False,
+    **wanted: Any,
 ) -> Iterator[str]:
     """Write sessions as episodes, and say of each topic what became of its messages.
 
     Args:
         sessions: bags of any kind.
         folder: to make.
-        wanted: their parts.
         task: in words.
         progress: takes the fraction done, and what is being done.
+        rate: frames a second; by default that of the first session's images, or else of the
+            fastest topic.
         is_video: code images as video, which loses speckle.
+        wanted: their parts, as for `Episode`.
 
     Raises:
         BagError: a session cannot be read, or has nothing that is wanted, or at no time all of it.
         EpisodeError: as for `LeRobotWriter`.
     """
     require_lerobot()
-    if wanted.rate is not None and not 1 <= wanted.rate <= _HIGHEST_RATE:
-        raise BagError(f"--rate: {wanted.rate} is outside 1 to {_HIGHEST_RATE} frames a second")
-    rate = wanted.rate or Episode(read_bag(sessions[0]), wanted).usual_rate
+    if rate is not None and not 1 <= rate <= _HIGHEST_RATE:
+        raise BagError(f"--rate: {rate} is outside 1 to {_HIGHEST_RATE} frames a second")
+    rate = rate or Episode(read_bag(sessions[0]), **wanted).usual_rate
     frames = 0
     with LeRobotWriter(folder, rate, is_video=is_video) as writer:
         for session in sessions:
-            episode = Episode(read_bag(session), wanted)
+            episode = Episode(read_bag(session), **wanted)
             moments = episode.moments(rate)
             given = episode.frames(moments, progress)
             writer.write_episode(given, episode.names, task, str(session))
@@ -172,23 +156,35 @@ class Track:
 class Episode:
     """The wanted parts of a session.
 
+    Args:
+        bag: the session.
+        topics: or bodies, as ``/tf:probe``; where there are none, all topics of a type that is
+            known, and bodies of others only without any PoseStamped.
+        action: a topic or body that is the action; it may be named here alone.
+        by_log_time: go by when messages were recorded, and not by their stamps.
+
     Raises:
         BagError: the session has none, or one that was named cannot be used.
     """
 
-    def __init__(self, bag: Bag, wanted: Wanted) -> None:
-        self._bag, self._by_log_time = bag, wanted.by_log_time
+    def __init__(
+        self,
+        bag: Bag,
+        topics: Sequence[str] = (),
+        action: str | None = None,
+        by_log_time: bool = False,
+    ) -> None:
+        self._bag, self._by_log_time = bag, by_log_time
         self._left_out = [fault.text for fault in bag.opening_faults]
         self._left_out += [f"the recorder lost {n} of {name}" for name, n in bag.lost().items()]
-        self._action = wanted.action and _whole_name(bag, wanted.action)
-        named = [_whole_name(bag, name) for name in wanted.topics]
-        action = [self._action] if self._action else []
+        self._actions = [whole_name(bag, action)] if action else []
+        named = [whole_name(bag, name) for name in topics] + self._actions
         self._tracks: list[Track] = []
-        for name in dict.fromkeys([*(named or _known(bag)), *action]):
+        for name in dict.fromkeys([*(named if topics else _known(bag)), *self._actions]):
             try:
                 self._tracks.append(self._track(name))
             except (BagError, TrackingError) as error:
-                if name in (*named, *action):
+                if name in named:
                     raise BagError(f"{bag.path}: {name}: {error}") from error
                 self._left_out.append(f"{name} is left out: {error}")
         if not self._tracks:
@@ -197,6 +193,11 @@ class Episode:
                 f"used; {'; '.join(self._left_out) or 'it has other topics alone'}"
             )
         self._tracks.sort(key=lambda track: not track.is_image)
+        numbers = [track for track in self._tracks if not track.is_image]
+        self._numbers = {
+            STATE: [track for track in numbers if track.name not in self._actions],
+            "action": [track for track in numbers if track.name in self._actions],
+        }
 
     @property
     def usual_rate(self) -> int:
@@ -212,14 +213,6 @@ class Episode:
             feature: [f"{each.name.strip('/')}.{part}" for each in tracks for part in each.table]
             for feature, tracks in self._numbers.items()
         }
-
-    @property
-    def _numbers(self) -> dict[str, list[Track]]:
-        found: dict[str, list[Track]] = {STATE: [], "action": []}
-        for track in self._tracks:
-            if not track.is_image:
-                found["action" if track.name == self._action else STATE].append(track)
-        return found
 
     def moments(self, rate: int) -> Times:
         """Times of frames, ns: from when all topics have begun until one of them ends.
@@ -269,7 +262,7 @@ class Episode:
         topic = self._bag.topic(name.partition(":")[0])
         if topic.type_name not in PIXELS:
             return self._track_of_numbers(name, turns=topic.type_name not in VALUES)
-        if name == self._action:
+        if name in self._actions:
             raise BagError("is a topic of images, which are no action")
         for raw in self._bag.messages([name]):  # refused at once where it cannot be decoded
             PIXELS[topic.type_name](self._bag.deserialize(raw), "RGB")
@@ -321,12 +314,6 @@ class Episode:
             are = counted(count, "message is", "messages are")
             notes.append(f"{are} stamped before one that was recorded earlier")
         return times, notes
-
-
-def _whole_name(bag: Bag, name: str) -> str:
-    """A topic's or body's name with its leading slash, where the bag has one."""
-    topic, colon, body = name.partition(":")
-    return bag.topic(topic).name + colon + body
 
 
 def _known(bag: Bag) -> list[str]:
