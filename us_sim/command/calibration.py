@@ -138,15 +138,7 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
             write exists.
     """
     out = settings.out
-    board = printed_board(
-        settings.board,
-        settings.size,
-        settings.dictionary,
-        marker=settings.marker,
-        square=settings.square,
-        separation=settings.separation,
-        legacy=settings.legacy,
-    )
+    board = printed_board(settings)
     photos = find_photos(settings.photos)
     if not photos:
         raise CalibrationError("no photo is given; name files, a folder or a pattern")

@@ -14,7 +14,7 @@ from pathlib import Path
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.tracking.settings import BOARDS, MARKER_SIZE
+from us_sim.tracking.settings import BoardSettings
 
 Progress = Callable[[float, str], None]
 """A callback that is told the fraction done, and what is being done."""
@@ -50,20 +50,11 @@ class CalibrationSettings(Settings):
 
 
 @dataclass(frozen=True)
-class CameraSettings(CalibrationSettings):
+class CameraSettings(CalibrationSettings, BoardSettings):
     """Lens and focal length from photos of a board."""
 
     photos: tuple[str, ...] = setting(
         description="files, folders or patterns such as 'shots/*.jpg'"
-    )
-    size: str = setting(description="squares or markers across and down: 5x7", kw_only=True)
-    board: str = setting(description="its kind", choices=BOARDS, default="charuco")
-    square: float | None = setting(MARKER_SIZE, "side of a ChArUco board's square", default=None)
-    marker: float | None = setting(MARKER_SIZE, "side of a marker", default=None)
-    separation: float | None = setting(MARKER_SIZE, "between the markers of a grid", default=None)
-    dictionary: str = setting(description="of the markers", default="4X4_50")
-    legacy: bool = setting(
-        description="the ChArUco board is as OpenCV before 4.6 drew it", default=False
     )
     name: str = setting(description="the camera's name in the file", default="camera")
     out: Path = _out(": camera info", "camera.yaml")

@@ -52,10 +52,10 @@ Colour = tuple[float, float, float]
 # Parts of a ring's long sides, of each of its corners, and of the rounding from front to side.
 _ALONG, _ROUND, _LATITUDES = 16, 6, 6
 _NOSE = 0.006  # m, of the face's part that is straight behind its rounding
-# m, lengths of the taper, the grip, the strain relief, and the cable's stub.
-_SHOULDER, _GRIP, _RELIEF, _CABLE = 0.022, 0.058, 0.020, 0.045
+# m, lengths of the taper, the grip, its rounded end, and the cable's stub.
+_SHOULDER, _GRIP, _END, _CABLE = 0.022, 0.058, 0.010, 0.065
 _NARROWEST, _WIDEST = 0.024, 0.034  # m, a grip across its flat, as a hand holds it
-_CABLE_RADIUS, _RELIEF_RADIUS = 0.0028, 0.0055
+_CABLE_RADIUS = 0.0028
 _NOTCH = (0.0016, 0.0022, 0.009)  # m, half the orientation notch's height, width and length
 FACE, HOUSING = (0.20, 0.23, 0.26), (0.86, 0.88, 0.89)
 CABLE, NOTCH = (0.13, 0.14, 0.16), (0.31, 0.70, 0.75)
@@ -82,48 +82,21 @@ def transducer_mesh(collider: Collider) -> list[TransducerPart]:
     width, depth = 2 * (half_x + rounding), 2 * (half_y + rounding)
     grip_x = min(max(0.62 * width, _NARROWEST), _WIDEST) / 2
     grip_y = min(max(1.15 * depth, 0.018), 0.024) / 2
-    housing = [nose]
     top = behind - _NOSE
+    end = top - _SHOULDER - _GRIP
     # From a box of the face's shape to a rounder one of the grip's.
     round_grip = 0.9 * min(grip_x, grip_y)
+    grip = np.array([grip_x - round_grip, grip_y - round_grip, round_grip])
+    housing = [nose]
     for part in np.linspace(0.0, 1.0, 9)[1:]:
         ease = 0.5 - 0.5 * math.cos(math.pi * part)
-
-        def between(a: float, b: float, ease: float = ease) -> float:
-            return a + (b - a) * ease
-
-        housing.append(
-            _flat_ring(
-                between(half_x, grip_x - round_grip),
-                between(half_y, grip_y - round_grip),
-                between(rounding, round_grip),
-                top - _SHOULDER * part,
-            )
-        )
-    end = top - _SHOULDER - _GRIP
-    housing.append(_flat_ring(grip_x - round_grip, grip_y - round_grip, round_grip, end))
-    # The end is rounded: an ellipse's quarter, from the grip to where the cable leaves it.
-    for angle in np.radians([25.0, 50.0, 70.0, 85.0]):
-        shrink = _RELIEF_RADIUS / grip_y + (1 - _RELIEF_RADIUS / grip_y) * math.cos(angle)
-        housing.append(
-            _flat_ring(
-                (grip_x - round_grip) * math.cos(angle),
-                (grip_y - round_grip) * shrink,
-                round_grip * shrink,
-                end - 0.010 * math.sin(angle),
-            )
-        )
-    last = end - 0.010
-    tube = [
-        _flat_ring(0.0, 0.0, radius, z)
-        for radius, z in (
-            (_RELIEF_RADIUS, last),
-            (0.9 * _RELIEF_RADIUS, last - 0.3 * _RELIEF),
-            (_CABLE_RADIUS, last - _RELIEF),
-            (_CABLE_RADIUS, last - _RELIEF - _CABLE),
-        )
-    ]
-    housing.append(_flat_ring(0.0, 0.0, _RELIEF_RADIUS, last))
+        x, y, radius = (1 - ease) * np.array([half_x, half_y, rounding]) + ease * grip
+        housing.append(_flat_ring(x, y, radius, top - _SHOULDER * part))
+    # The end is rounded: an ellipse's quarter, into which the cable leads.
+    for angle in np.radians([0.0, 25.0, 50.0, 70.0, 85.0]):
+        x, y, radius = math.cos(angle) * grip
+        housing.append(_flat_ring(x, y, radius, end - _END * math.sin(angle)))
+    cable = [_flat_ring(0.0, 0.0, _CABLE_RADIUS, end - way) for way in (0.0, _END + _CABLE)]
     high, wide, long = _NOTCH
     middle = top - _SHOULDER - 0.012
     # At -x, on the side of the image's first column: the mark is at the image's left.
@@ -139,7 +112,7 @@ def transducer_mesh(collider: Collider) -> list[TransducerPart]:
     return [
         _part("face", FACE, [*front, side, nose], has_front=False),
         _part("housing", HOUSING, housing),
-        _part("cable", CABLE, tube),
+        _part("cable", CABLE, cable),
         _part("notch", NOTCH, notch),
     ]
 

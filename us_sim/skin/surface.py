@@ -30,44 +30,25 @@ class TriangleSurface:
     """Vertices and triangles, wound so that their normals point out of the body.
 
     Raises:
-        MeshError: wrong shapes, vertices that are not finite, indices out of range, a triangle
-            that names a vertex twice, or a vertex in no triangle.
+        MeshError: a vertex is not finite, an index is out of range, or there is no triangle.
     """
 
     vertices: NDArray[np.float64]  # (N, 3), m, frame patient
-    triangles: NDArray[np.int32]  # (T, 3), indices into vertices
+    triangles: NDArray[np.int32]  # (T, 3), indices into vertices, each of which is in one
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64, order="C")
-        corners = np.asarray(self.triangles)
-        if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise MeshError(f"surface vertices have shape {vertices.shape}: give (N, 3)")
+        triangles = np.array(self.triangles, dtype=np.int32, order="C")
         finite = np.isfinite(vertices).all(axis=1)
         if not finite.all():
             bad = int(np.argmin(finite))
             raise MeshError(f"surface vertex {bad} is not finite: {vertices[bad].tolist()}")
-        if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
+        if not triangles.size:
+            raise MeshError("the surface has no triangles")
+        if triangles.min() < 0 or triangles.max() >= len(vertices):
             raise MeshError(
-                f"surface triangles have shape {corners.shape} and type {corners.dtype}: give "
-                f"(T, 3) integers"
-            )
-        if not corners.size:
-            raise MeshError("the surface has no triangle: give one at least")
-        if corners.min() < 0 or corners.max() >= len(vertices):
-            raise MeshError(
-                f"surface triangles name vertices {corners.min()} to {corners.max()}, but there "
-                f"are only {len(vertices)}"
-            )
-        triangles = np.array(corners, dtype=np.int32, order="C")
-        twice = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-        if twice.any():
-            bad = int(np.argmax(twice))
-            raise MeshError(f"surface triangle {bad} names a vertex twice: {triangles[bad]}")
-        used = np.zeros(len(vertices), dtype=bool)
-        used[triangles] = True
-        if not used.all():
-            raise MeshError(
-                f"surface vertex {int(np.argmin(used))} is in no triangle: leave it out"
+                f"surface triangles name vertices {triangles.min()} to {triangles.max()}, but "
+                f"there are only {len(vertices)}"
             )
         vertices.flags.writeable = False
         triangles.flags.writeable = False
@@ -99,9 +80,9 @@ def plane_surface(size: tuple[float, float], spacing: float) -> TriangleSurface:
         spacing: m, the greatest distance of neighbours along x or y.
 
     Raises:
-        MeshError: a length is not positive, or the sheet would have over four million vertices.
+        MeshError: the sheet would have over four million vertices.
     """
-    x, y = _steps("size", size[0], spacing), _steps("size", size[1], spacing)
+    x, y = _steps(size[0], spacing), _steps(size[1], spacing)
     return _sheet(np.column_stack([x, np.zeros_like(x)]), y)
 
 
@@ -117,21 +98,14 @@ def bent_surface(
         radius: m, of the arcs; each spans ``(size[0] - flat_width) / (2 radius)`` radians.
 
     Raises:
-        MeshError: a length is not positive, the flat part is wider than the sheet, or an arc
-            is more than half a circle.
+        MeshError: an arc is more than half a circle, or there would be too many vertices.
     """
-    if not (math.isfinite(flat_width) and 0.0 <= flat_width <= size[0]):
-        raise MeshError(
-            f"the sheet's flat_width is {flat_width!r} m: give 0 to its size along x, {size[0]!r} m"
-        )
-    if not (math.isfinite(radius) and radius > 0.0):
-        raise MeshError(f"the sheet's radius is {radius!r} m: give a length above zero")
     if (size[0] - flat_width) / (2 * radius) > math.pi:
         raise MeshError(
             f"the sheet's sides of {(size[0] - flat_width) / 2:g} m are more than half a circle "
             f"of radius {radius:g} m: give a larger radius or a smaller size"
         )
-    along, y = _steps("size", size[0], spacing), _steps("size", size[1], spacing)
+    along, y = _steps(size[0], spacing), _steps(size[1], spacing)
     flat = np.clip(along, -flat_width / 2, flat_width / 2)
     angle = (along - flat) / radius
     profile = np.column_stack([flat + radius * np.sin(angle), radius * (1 - np.cos(angle))])
@@ -155,16 +129,12 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
     path = Path(path)
     if not os.path.isfile(path):
         raise MeshError(f"{path}: there is no such surface file")
-    if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
-        raise MeshError(f"{path}: metres_per_unit is {metres_per_unit!r}: give a number above zero")
     faces: NDArray[np.integer]
     try:
         if path.suffix.lower() == ".obj":
             points, faces = parse_wavefront(read_text(path, errors="replace"))
         else:
             points, faces = _faces_by_meshio(path)
-        if not len(faces):
-            raise MeshError("the file has no triangles")
         places, joined = np.unique(points, axis=0, return_inverse=True)
         triangles = joined.reshape(-1)[faces]
         proper = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
@@ -195,11 +165,8 @@ def _faces_by_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]
     return points, np.concatenate(parts)
 
 
-def _steps(name: str, length: float, spacing: float) -> NDArray[np.float64]:
+def _steps(length: float, spacing: float) -> NDArray[np.float64]:
     """Evenly spaced coordinates over a length around 0, at most ``spacing`` apart."""
-    for what, value in ((name, length), ("spacing", spacing)):
-        if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-            raise MeshError(f"the sheet's {what} is {value!r} m: give a length above zero")
     count = math.ceil(length / spacing - 1e-9)
     if count > 2000:
         raise MeshError(

@@ -34,6 +34,31 @@ MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 
 @dataclass(frozen=True)
+class BoardSettings(Settings):
+    """A flat board of markers, as the options of a command describe it."""
+
+    board: str | None = setting(
+        description="its kind", choices=BOARDS, default="charuco", kw_only=True
+    )
+    size: str | None = setting(
+        description="squares or markers across and down: 5x7", default=None, kw_only=True
+    )
+    square: float | None = setting(
+        MARKER_SIZE, "side of a ChArUco board's square", default=None, kw_only=True
+    )
+    marker: float | None = setting(MARKER_SIZE, "side of a marker", default=None, kw_only=True)
+    separation: float | None = setting(
+        MARKER_SIZE, "between the markers of a grid", default=None, kw_only=True
+    )
+    dictionary: str = setting(description="of the markers", default="4X4_50", kw_only=True)
+    legacy: bool = setting(
+        description="the ChArUco board is as OpenCV before 4.6 drew it",
+        default=False,
+        kw_only=True,
+    )
+
+
+@dataclass(frozen=True)
 class CameraSettings(Settings):
     """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``."""
 

@@ -104,22 +104,13 @@ class RestSurface:
         """The surface's closest point to one (3,) m."""
         offsets = self._centres - point
         distances = np.sqrt(np.einsum("tx,tx->t", offsets, offsets))
-        least = distances - self._radii
-        near = np.flatnonzero(least <= distances.min())
-        order = near[np.argsort(least[near])]
-        target, found = point.tolist(), (math.inf, 0, (1.0, 0.0, 0.0))
-        # Few are looked at: a point on the surface is within the spheres of some eight triangles.
-        for triangle, bound in zip(order.tolist(), least[order].tolist(), strict=True):
-            if bound > 0.0 and bound * bound > found[0]:
-                break
-            a, b, c = self._corners[triangle].tolist()
-            weights = _closest_weights(a, b, c, target)
-            square = sum(
-                (weights[0] * a[k] + weights[1] * b[k] + weights[2] * c[k] - target[k]) ** 2
-                for k in range(3)
-            )
-            found = min(found, (square, triangle, weights))
-        return self._foot(found[1], np.array(found[2]))
+        # No other triangle's sphere comes as near as the nearest centre.
+        near = np.flatnonzero(distances - self._radii <= distances.min())
+        corners = self._corners[near]
+        weights = _closest_weights(corners, point)
+        off = np.einsum("tc,tcx->tx", weights, corners) - point
+        best = int(np.einsum("tx,tx->t", off, off).argmin())
+        return self._foot(int(near[best]), weights[best])
 
     def above(self, x: float, y: float) -> Foot:
         """The first point of the surface on the way along +z through x, y (m).
@@ -190,47 +181,23 @@ def _area(
 
 
 def _closest_weights(
-    a: list[float], b: list[float], c: list[float], point: list[float]
-) -> tuple[float, float, float]:
-    """Barycentric weights of the closest point of a triangle to a point, m.
-
-    By the region in which the point lies (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
-    """
-    ab, ac = _from(a, b), _from(a, c)
-    to = _from(a, point)
-    d1, d2 = _dot(ab, to), _dot(ac, to)
-    if d1 <= 0.0 and d2 <= 0.0:
-        return 1.0, 0.0, 0.0
-    to = _from(b, point)
-    d3, d4 = _dot(ab, to), _dot(ac, to)
-    if d3 >= 0.0 and d4 <= d3:
-        return 0.0, 1.0, 0.0
-    to = _from(c, point)
-    d5, d6 = _dot(ab, to), _dot(ac, to)
-    if d6 >= 0.0 and d5 <= d6:
-        return 0.0, 0.0, 1.0
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v = d1 / (d1 - d3)
-        return 1.0 - v, v, 0.0
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / (d2 - d6)
-        return 1.0 - w, 0.0, w
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 >= d3 and d5 >= d6:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        return 0.0, 1.0 - w, w
-    total = va + vb + vc
-    return va / total, vb / total, vc / total
-
-
-def _from(start: list[float], end: list[float]) -> tuple[float, float, float]:
-    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
-
-
-def _dot(first: tuple[float, float, float], second: tuple[float, float, float]) -> float:
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+    corners: NDArray[np.float64], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(T, 3) barycentric weights of the points of triangles (T, 3, 3) m closest to one (3,) m."""
+    sides = np.roll(corners, -1, axis=1) - corners  # of each corner to the next
+    to = point - corners
+    across = np.cross(sides[:, 0], sides[:, 1])
+    # The areas opposite to the corners, where the plane's closest point is in the triangle.
+    opposite = np.roll(np.cross(sides, to), -1, axis=1)
+    inside = np.einsum("tcx,tx->tc", opposite, across) / (across**2).sum(axis=1, keepdims=True)
+    along = (to * sides).sum(axis=2) / (sides**2).sum(axis=2)
+    along = np.clip(along, 0.0, 1.0)
+    off = ((to - along[..., None] * sides) ** 2).sum(axis=2)
+    rows, nearest = np.arange(len(corners)), off.argmin(axis=1)
+    on_side = np.zeros((len(corners), 3))
+    on_side[rows, nearest] = 1.0 - along[rows, nearest]
+    on_side[rows, (nearest + 1) % 3] = along[rows, nearest]
+    return np.where((inside >= 0.0).all(axis=1, keepdims=True), inside, on_side)
 
 
 class Approach:

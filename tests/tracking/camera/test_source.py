@@ -15,7 +15,7 @@ from us_sim.tracking.camera.encodings import decode_image
 from us_sim.tracking.camera.fiducial_detector import FiducialDetector, detect_corners
 from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rendered_views import Conditions, RenderedView
-from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
+from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.camera.source import CameraSource
 from us_sim.tracking.settings import CameraSettings
 
@@ -248,7 +248,10 @@ def test_a_chessboard_is_measured_where_its_markers_are_too_small():
 def test_webcam_videos_are_tracked_in_every_frame(video, body, least, shared_data):
     folder = shared_data / "marker-sksurgery-aruco-video"
     camera = CameraModel(640, 480, [[560, 0, 320], [0, 560, 240], [0, 0, 1]], [0.1, 0, 0, 0, 0])
-    source = CameraSource(camera, read_rigid_body(folder / body) if body == str(body) else body)
+    if body == str(body):  # a line is a marker's number, its middle and its corners in mm
+        rows = np.loadtxt(folder / body)
+        body = RigidBody("ARUCO_ORIGINAL", rows[:, 0], 1e-3 * rows[:, 4:].reshape(-1, 4, 3))
+    source = CameraSource(camera, body)
     frames = cv2.VideoCapture(str(folder / video))
     before, count = None, 0
     while True:

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import Settings, setting
+from us_sim.settings.setting import setting
 from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.rigid_body import RigidBody, printed_board
-from us_sim.tracking.settings import BOARDS, MARKER_SIZE
+from us_sim.tracking.settings import BOARDS, MARKER_SIZE, BoardSettings
 
 PAPERS = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height in mm."""
@@ -43,20 +43,16 @@ _DOTS = 300  # per inch, of a picture
 
 
 @dataclass(frozen=True)
-class PrintSettings(Settings):
+class PrintSettings(BoardSettings):
     """Options of ``us-sim print-marker``: the markers and the paper."""
 
     error = TrackingError
 
-    id: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
     board: str | None = setting(
-        description="a board in place of one marker", choices=BOARDS, default=None
+        description="a board in place of one marker", choices=BOARDS, default=None, kw_only=True
     )
-    size: str | None = setting(description="a board's columns and rows: 5x7", default=None)
-    marker: float = setting(MARKER_SIZE, "edge of a marker: '40 mm'", default=0.04)
-    square: float | None = setting(MARKER_SIZE, "edge of a ChArUco board's square", default=None)
-    separation: float | None = setting(MARKER_SIZE, "between the markers of a grid", default=None)
-    dictionary: str = setting(description="that the markers are of", default="4X4_50")
+    marker: float = setting(MARKER_SIZE, "edge of a marker", default=0.04, kw_only=True)
+    id: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
     paper: str = setting(description="of the sheets", choices=tuple(PAPERS), default="A4")
 
     def body(self) -> RigidBody:
@@ -67,21 +63,13 @@ class PrintSettings(Settings):
         """
         if self.board is None:
             return RigidBody.single(self.dictionary, self.id, self.marker)
-        return printed_board(
-            self.board,
-            self.size,
-            self.dictionary,
-            marker=self.marker,
-            square=self.square,
-            separation=self.separation,
-        )
+        return printed_board(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
     """The print on one sheet of paper; mm from its upper left corner, x right, y down."""
 
-    body: RigidBody
     paper: str
     ids: tuple[int, ...]
     marked: NDArray[np.float64]  # (n, 4, 2), corners of each marker, as the body orders them
@@ -91,7 +79,7 @@ class Sheet:
 
 
 def sheets(body: RigidBody, paper: str = "A4") -> list[Sheet]:
-    """The sheets that show every marker of a body at true scale.
+    """Lay out the sheets that show every marker of a body at true scale.
 
     A flat body is one piece on one sheet. Markers of another are printed one by one, to be cut
     out with the white margin of one cell and glued where the body's file says.
@@ -101,10 +89,37 @@ def sheets(body: RigidBody, paper: str = "A4") -> list[Sheet]:
     """
     if paper not in PAPERS:
         raise TrackingError(f"--paper {paper}: there are {', '.join(PAPERS)}")
-    flat = _in_plane(body)
-    if flat is not None:
-        return [_board(body, flat * 1e3, paper)]
-    return _cut_outs(body, paper)
+    parts = [body]
+    if not _is_flat(body):
+        parts = [
+            RigidBody(body.dictionary, body.ids[k : k + 1], body.corners[k : k + 1])
+            for k in range(len(body.ids))
+        ]
+    pieces = [_piece(part) for part in parts]
+    pitch = np.max([size for *_, size in pieces], axis=0) + _GAP
+    room = np.array(PAPERS[paper]) - [2 * _MARGIN, 2 * _MARGIN + _FOOT]
+    across, down = ((room + _GAP) // pitch).astype(int).tolist()
+    if not across * down:
+        wide, high = pitch - _GAP
+        raise TrackingError(
+            f"what is to be printed is {wide:.0f} × {high:.0f} mm with its white margin; "
+            f"{paper} has room for {room[0]:.0f} × {room[1]:.0f}: take a larger --paper or "
+            f"smaller markers"
+        )
+    pages = []
+    for first in range(0, len(pieces), across * down):
+        marked, black, labels = [], [], []
+        for k, (corners, dark, size) in enumerate(pieces[first : first + across * down]):
+            place = _MARGIN + pitch * [k % across, k // across]
+            marked.append(corners + place)
+            black += [each + place for each in dark]
+            if len(pieces) > 1:
+                x, y = place.tolist()
+                labels.append((x, y + float(size[1]) + 0.7 * _GAP, str(body.ids[first + k])))
+        ids = body.ids[first : first + across * down] if len(pieces) > 1 else body.ids
+        there = tuple(ids.tolist())
+        pages.append(Sheet(paper, there, np.concatenate(marked), black, labels, _describe(body)))
+    return pages
 
 
 def print_markers(body: RigidBody, out: Path, paper: str = "A4") -> list[Sheet]:
@@ -113,15 +128,14 @@ def print_markers(body: RigidBody, out: Path, paper: str = "A4") -> list[Sheet]:
     Raises:
         TrackingError: the file exists or is neither, or the paper is too small.
     """
-    if out.suffix.lower() not in (".pdf", ".png"):
+    kind = out.suffix.lower()
+    if kind not in (".pdf", ".png"):
         raise TrackingError(f"{out}: must be a file that ends in .pdf or .png")
-    if out.exists():
-        raise TrackingError(f"{out}: exists already; choose another name")
     pages = sheets(body, paper)
-    if out.suffix.lower() == ".png" and len(pages) > 1:
+    if kind == ".png" and len(pages) > 1:
         raise TrackingError(f"{out}: the body needs {len(pages)} sheets; write a .pdf")
     content = io.BytesIO()
-    if out.suffix.lower() == ".png":
+    if kind == ".png":
         _figure(pages[0]).savefig(content, format="png", dpi=_DOTS)
     else:
         with PdfPages(content, metadata={"Title": pages[0].foot, "CreationDate": None}) as pdf:
@@ -135,92 +149,48 @@ def print_markers(body: RigidBody, out: Path, paper: str = "A4") -> list[Sheet]:
     return pages
 
 
-def _in_plane(body: RigidBody) -> NDArray[np.float64] | None:
-    """Corners (M, 4, 2) m in the plane of the markers, x right and y down as one sees them; None
-    where they are not in one plane.
+def _is_flat(body: RigidBody) -> bool:
+    """Whether all markers are in one plane and face the same way."""
+    offsets = (body.corners - body.corners[0, 0]) @ body.normals[0]
+    return bool(np.abs(offsets).max() <= _FLAT and (body.normals @ body.normals[0]).min() >= 0.999)
+
+
+_Piece = tuple[NDArray[np.float64], list[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _piece(body: RigidBody) -> _Piece:
+    """Corners (M, 4, 2) of a flat body's markers, what is black, and the size (2,), all in mm.
+
+    From its upper left corner, x right and y down as one sees it, with the white about it.
     """
-    normal = body.normals[0]
-    offsets = (body.corners - body.corners[0, 0]) @ normal
-    if np.abs(offsets).max() > _FLAT or (body.normals @ normal).min() < 0.999:
-        return None
     right = body.corners[0, 1] - body.corners[0, 0]
-    right /= np.linalg.norm(right)
-    down = np.cross(right, normal)
-    return np.asarray(body.corners @ np.stack([right, down], axis=1))
-
-
-def _board(body: RigidBody, corners: NDArray[np.float64], paper: str) -> Sheet:
-    cell = _cell(body, corners[0])
-    quiet = cell
+    edge = float(np.linalg.norm(right))
+    down = np.cross(right / edge, body.normals[0])
+    corners = 1e3 * body.corners @ np.stack([right / edge, down], axis=1)
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    quiet = 1e3 * edge / (dictionary(body.dictionary).markerSize + 2)  # a cell
     black: list[NDArray[np.float64]] = []
     if body.chessboard is not None:
-        side = body.chessboard.square * 1e3
+        board, side = body.chessboard, 1e3 * body.chessboard.square
         # The markers are in the middles of the white squares, so the others are black.
-        board = (body.corners[..., :2] * 1e3).mean(axis=1)
-        white = {tuple(place) for place in np.floor(board / side).astype(int).tolist()}
-        shift = corners.mean(axis=1)[0] - board[0]
-        for row in range(body.chessboard.rows):
-            for column in range(body.chessboard.columns):
-                if (column, row) not in white:
-                    black.append(shift + side * (_UNIT + np.array([column, row])))
-        low = shift
-        high = shift + side * np.array([body.chessboard.columns, body.chessboard.rows])
+        middles = 1e3 * body.centres[:, :2]
+        white = set(map(tuple, np.floor(middles / side).astype(int).tolist()))
+        low = corners[0].mean(axis=0) - middles[0]
+        high = low + side * np.array([board.columns, board.rows])
         quiet = 0.2 * side
-    else:
-        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    start = np.array([_MARGIN, _MARGIN]) + quiet
-    _require_fits(high - low + 2 * quiet, paper)
-    move = start - low
-    corners = corners + move
-    black = [square + move for square in black]
+        black += [
+            low + side * (_UNIT + np.array([column, row]))
+            for row in range(board.rows)
+            for column in range(board.columns)
+            if (column, row) not in white
+        ]
     for number, quadrilateral in zip(body.ids.tolist(), corners, strict=True):
         black += _cells(body.dictionary, number, quadrilateral)
-    return Sheet(body, paper, tuple(body.ids.tolist()), corners, black, [], _describe(body))
-
-
-def _cut_outs(body: RigidBody, paper: str) -> list[Sheet]:
-    """Markers one by one, row by row, and sheet by sheet."""
-    width, height = PAPERS[paper]
-    pages: list[Sheet] = []
-    placed: list[tuple[int, NDArray[np.float64]]] = []
-    labels: list[tuple[float, float, str]] = []
-    x, y, tallest = _MARGIN, _MARGIN, 0.0
-
-    def finish() -> None:
-        black = [part for number, at in placed for part in _cells(body.dictionary, number, at)]
-        ids = tuple(number for number, _ in placed)
-        marked = np.array([at for _, at in placed])
-        pages.append(Sheet(body, paper, ids, marked, black, list(labels), _describe(body)))
-        placed.clear()
-        labels.clear()
-
-    for number, corners in zip(body.ids.tolist(), body.corners, strict=True):
-        flat = _in_plane(RigidBody(body.dictionary, np.array([number]), corners[None]))
-        assert flat is not None
-        shape = flat[0] * 1e3
-        quiet = _cell(body, shape)
-        size = np.ptp(shape, axis=0) + 2 * quiet
-        _require_fits(size, paper)
-        if x + size[0] > width - _MARGIN:
-            x, y, tallest = _MARGIN, y + tallest + _GAP, 0.0
-        if y + size[1] > height - _MARGIN - _FOOT:
-            finish()
-            x, y, tallest = _MARGIN, _MARGIN, 0.0
-        placed.append((number, shape - shape.min(axis=0) + [x + quiet, y + quiet]))
-        labels.append((x + quiet, y + size[1] + 0.7 * _GAP, str(number)))
-        x += size[0] + _GAP
-        tallest = max(tallest, float(size[1]))
-    finish()
-    return pages
+    move = quiet - low
+    return corners + move, [each + move for each in black], high - low + 2 * quiet
 
 
 _UNIT = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
-
-
-def _cell(body: RigidBody, corners: NDArray[np.float64]) -> float:
-    """A marker's cell, in the unit of its corners."""
-    edge = float(np.linalg.norm(corners[1] - corners[0]))
-    return edge / (dictionary(body.dictionary).markerSize + 2)
 
 
 def _cells(name: str, number: int, corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -250,17 +220,6 @@ def _describe(body: RigidBody) -> str:
             f"{board.size * 1e3:g} mm, {body.dictionary}"
         )
     return f"{body.dictionary}, {numbers}{more}: {edge:.4g} mm"
-
-
-def _require_fits(size: NDArray[np.float64], paper: str) -> None:
-    width, height = PAPERS[paper]
-    room = width - 2 * _MARGIN, height - 2 * _MARGIN - _FOOT
-    if size[0] > room[0] or size[1] > room[1]:
-        raise TrackingError(
-            f"what is to be printed is {size[0]:.0f} × {size[1]:.0f} mm with its white margin; "
-            f"{paper} has room for {room[0]:.0f} × {room[1]:.0f}: take a larger --paper or "
-            f"smaller markers"
-        )
 
 
 def _figure(sheet: Sheet) -> Figure:

@@ -1,4 +1,4 @@
-"""Rigid bodies of markers, and the files that define them: YAML, text tables, PLUS' marker maps.
+"""Rigid bodies of markers, and the YAML files that define them.
 
 >>> from us_sim.tracking.camera.rigid_body import RigidBody
 >>> board = RigidBody.grid("6X6_1000", columns=4, rows=5, size=0.0375, separation=0.005)
@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +29,7 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml, read_text
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
-from us_sim.tracking.settings import MARKER_SIZE
+from us_sim.tracking.settings import MARKER_SIZE, BoardSettings
 
 _FLATNESS = 0.02  # of a marker's edge: how far a corner may be from the plane of the others
 
@@ -48,7 +47,6 @@ class Chessboard:
 
     def __post_init__(self) -> None:
         _require_counts(self.columns, self.rows, 2)
-        _require_size(self.size)
         if not self.size < self.square:
             raise TrackingError(
                 f"a ChArUco board's markers ({self.size:g} m) must be smaller than its squares "
@@ -117,7 +115,6 @@ class RigidBody:
         Raises:
             TrackingError: there is no such marker, or the size (m) is impossible.
         """
-        _require_size(size)
         return cls(dictionary, np.array([number]), square(size)[None])
 
     @classmethod
@@ -139,12 +136,6 @@ class RigidBody:
             TrackingError: a count or a size (m) is impossible, or the dictionary is too small.
         """
         _require_counts(columns, rows, 1)
-        _require_size(size)
-        if not 0 < separation < 1:
-            raise TrackingError(
-                f"the separation of a board's markers is {separation:g} m: it must be more than "
-                f"0 and less than 1 m"
-            )
         marker = size * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         row, column = np.divmod(np.arange(columns * rows), columns)
         places = np.stack([column, row, 0 * row], axis=1) * (size + separation)
@@ -195,15 +186,8 @@ def _normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _require_counts(columns: int, rows: int, least: int) -> None:
     for name, count in (("columns", columns), ("rows", rows)):
-        if count != int(count) or not least <= count <= 100:
+        if not least <= count <= 100:
             raise TrackingError(f"a board's {name} are {count}: they must be {least} to 100")
-
-
-def _require_size(size: float) -> None:
-    try:
-        MARKER_SIZE.parse(size)
-    except ValueError as error:
-        raise TrackingError(f"a marker's size: {error}") from error
 
 
 def _require_in_dictionary(name: str, number: int) -> None:
@@ -308,40 +292,22 @@ class CharucoBoard(Settings):
         return RigidBody.charuco(dictionary, **asdict(self))
 
 
-def printed_board(
-    kind: str,
-    size: str | None,
-    dictionary: str,
-    *,
-    marker: float | None,
-    square: float | None,
-    separation: float | None,
-    legacy: bool = False,
-) -> RigidBody:
-    """A board as options of a command describe it.
-
-    Args:
-        kind: charuco or grid.
-        size: columns and rows, as a person writes them: 5x7.
-        dictionary: of the markers.
-        marker, square, separation: m.
-        legacy: a ChArUco board is as OpenCV before 4.6 drew it.
+def printed_board(given: BoardSettings) -> RigidBody:
+    """Make the board that the options of a command describe.
 
     Raises:
         TrackingError: an option is missing, or the board is impossible.
     """
-    lengths = {"marker": marker, "square": square, "separation": separation}
-    needed = ("marker", "square" if kind == "charuco" else "separation")
-    for name, value in (("size", size), *((name, lengths[name]) for name in needed)):
-        if value is None:
-            raise TrackingError(f"--board {kind} needs --{name}")
-    columns, _, rows = str(size).lower().partition("x")
+    for name in ("size", "marker", "square" if given.board == "charuco" else "separation"):
+        if getattr(given, name) is None:
+            raise TrackingError(f"--board {given.board} needs --{name}")
+    columns, _, rows = str(given.size).lower().partition("x")
     if not (columns.isdigit() and rows.isdigit()):
-        raise TrackingError(f"--size {size}: write columns and rows, e.g. 5x7")
-    shape, edge = (int(columns), int(rows)), marker or 0.0
-    if kind == "charuco":
-        return RigidBody.charuco(dictionary, *shape, square or 0.0, edge, legacy)
-    return RigidBody.grid(dictionary, *shape, edge, separation or 0.0)
+        raise TrackingError(f"--size {given.size}: write columns and rows, e.g. 5x7")
+    shape, edge = (int(columns), int(rows)), given.marker or 0.0
+    if given.board == "charuco":
+        return RigidBody.charuco(given.dictionary, *shape, given.square or 0.0, edge, given.legacy)
+    return RigidBody.grid(given.dictionary, *shape, edge, given.separation or 0.0)
 
 
 _BOARDS = Choice(
@@ -370,107 +336,36 @@ class _Body(Settings):
             raise self.refused("markers", "give a list of markers, or a board in place of it")
 
 
-_PLUS_DICTIONARIES = {
-    "ARUCO": "ARUCO_ORIGINAL",
-    "ARUCO_MIP_36H12": "ARUCO_MIP_36h12",
-    "TAG16H5": "APRILTAG_16h5",
-    "TAG25H9": "APRILTAG_25h9",
-    "TAG36H10": "APRILTAG_36h10",
-    "TAG36H11": "APRILTAG_36h11",
-}
-
-
 def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> RigidBody:
-    """The body that a file describes.
+    """Read the body that a YAML file describes.
 
-    Three kinds of file are read:
-
-    - YAML: ``dictionary`` and either ``markers`` (each with ``id`` and either ``corners``,
-      4 × 3 m, or ``size`` with the marker's ``position`` and ``orientation`` in the body), or
-      ``board`` (``kind: grid`` with ``columns``, ``rows``, ``size``, ``separation`` and ``first``,
-      or ``kind: charuco`` with ``columns``, ``rows``, ``square``, ``size`` and ``legacy``);
-    - a marker map of the ArUco library, which PLUS's OpticalMarkerTracker takes as MarkerMapFile:
-      YAML with ``aruco_bc_dict`` and ``aruco_bc_markers``, metres;
-    - a text table (scikit-surgery's): a line for each marker with its number, its middle and its
-      four corners, millimetres.
+    It has ``dictionary`` and either ``markers`` (each with ``id`` and either ``corners``, 4 × 3 m,
+    or ``size`` with the marker's ``position`` and ``orientation`` in the body), or ``board``
+    (``kind: grid`` with ``columns``, ``rows``, ``size``, ``separation`` and ``first``, or
+    ``kind: charuco`` with ``columns``, ``rows``, ``square``, ``size`` and ``legacy``).
 
     Args:
-        path: the file; its name's end says which kind it is (``.txt`` is a table).
+        path: the file.
         dictionary: of a file that names none.
 
     Raises:
         TrackingError: the file, or the body in it, cannot be used.
     """
-    path = Path(path)
     try:
-        text = read_text(path)
+        content = load_yaml(read_text(Path(path)))
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise TrackingError(f"{path}: not a text file of markers") from error
-    try:
-        if path.suffix.lower() in (".txt", ".tsv", ".csv"):
-            return _table(text, dictionary)
-        content = _yaml(text)
-        if "aruco_bc_markers" in content:
-            return _marker_map(content, dictionary)
-        return _body(path, content, dictionary)
-    except TrackingError as error:
-        said = str(error)
-        raise TrackingError(said if said.startswith(f"{path}: ") else f"{path}: {said}") from error
-
-
-def _table(text: str, dictionary: str) -> RigidBody:
-    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
-    try:
-        rows = np.array([line for line in lines if line], dtype=np.float64)
-        if rows.shape[1:] != (16,):
-            raise ValueError(f"not {rows.shape[-1]}")
-        ids = np.array([int(number) for number in rows[:, 0]])
-    except (ValueError, OverflowError) as error:
-        raise TrackingError(
-            f"a marker is a line of 16 numbers, its own, the middle and four corners in mm: {error}"
-        ) from error
-    return RigidBody(dictionary, ids, rows[:, 4:].reshape(-1, 4, 3) * 1e-3)
-
-
-def _yaml(text: str) -> Mapping[str, Any]:
-    # OpenCV heads its files with "%YAML:1.0", which YAML itself does not know.
-    lines = text.splitlines()
-    if lines and lines[0].startswith("%YAML:"):
-        lines[0] = ""
-    try:
-        content = load_yaml("\n".join(lines))
-    except YamlError as error:
-        raise TrackingError(f"not a YAML file: {error}") from error
+    except (UnicodeDecodeError, YamlError) as error:
+        raise TrackingError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(content, Mapping):
-        raise TrackingError("it must be a mapping with dictionary and markers or board")
-    return content
-
-
-def _marker_map(content: Mapping[str, Any], dictionary: str) -> RigidBody:
-    if content.get("aruco_bc_mInfoType") != 1:
-        raise TrackingError(
-            "its markers are in pixels (aruco_bc_mInfoType is not 1); convert the map to metres"
-        )
-    named = content.get("aruco_bc_dict")
-    if named is not None:
-        dictionary = _PLUS_DICTIONARIES.get(str(named).upper(), str(named))
+        raise TrackingError(f"{path}: it must be a mapping with dictionary and markers or board")
+    written = Reader(str(path), error=TrackingError).read(_Body, content)
+    dictionary = written.dictionary or dictionary
     try:
-        ids = [marker["id"] for marker in content["aruco_bc_markers"]]
-        corners = np.array([marker["corners"] for marker in content["aruco_bc_markers"]], float)
-    except (TypeError, KeyError, ValueError) as error:
-        raise TrackingError(
-            f"aruco_bc_markers must be a list, of id and 4 × 3 corners in metres each ({error})"
-        ) from error
-    return RigidBody(dictionary, np.array(ids), corners)
-
-
-def _body(path: Path, content: Mapping[str, Any], dictionary: str) -> RigidBody:
-    body = Reader(str(path), error=TrackingError).read(_Body, content)
-    dictionary = body.dictionary or dictionary
-    if body.board is not None:
-        board: GridBoard | CharucoBoard = body.board.settings(_BOARDS)
-        return board.body(dictionary)
-    corners = np.array([marker.points for marker in body.markers])
-    return RigidBody(dictionary, np.array([marker.id for marker in body.markers]), corners)
+        if written.board is not None:
+            board: GridBoard | CharucoBoard = written.board.settings(_BOARDS)
+            return board.body(dictionary)
+        corners = np.array([marker.points for marker in written.markers])
+        return RigidBody(dictionary, np.array([marker.id for marker in written.markers]), corners)
+    except TrackingError as error:
+        raise TrackingError(f"{path}: {error}") from error
