@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
-import tempfile
+import os
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,13 +15,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from us_sim.cache import Form, kept
+from us_sim.errors import SolverError
 from us_sim.kernels import njit
 from us_sim.tissue.elasticity.linear_tetrahedra import (
     AveragedPressure,
     averaged_pressure,
     require_held,
 )
-from us_sim.tissue.linear_algebra.low_rank_fields import LowRankFields
 from us_sim.tissue.linear_algebra.multifrontal import eliminate
 from us_sim.tissue.model import TissueModel
 
@@ -107,18 +105,15 @@ def _quadratic(gram, rows, loads):
     return total
 
 
-_VERSION = 5  # Part of the cache's key: raise it when the bytes change
+_VERSION = 6  # Part of the cache's key: raise it when the bytes change
 # Numbers in the fields below which they are in double precision, as single would save little
 # time.
 _DOUBLE = 4_000_000
 # Numbers in the fields from which on they are cached, as making them takes a second.
 _KEPT = 12_000_000
-# Numbers in the fields from which on they are compressed, and made in single precision.
-_COMPRESSED = 100_000_000
-# Singular values that compression leaves out, over the largest displacement by each force: a
-# whole press is then off by about a tenth of that.
-_TOLERANCE = 1e-4
-# Number of single forces, and of presses, by which the error of compression is measured.
+# Numbers in the fields from which on all is in single precision, and the residual is sampled.
+_LARGE = 100_000_000
+# Number of single forces, and of presses, by which the error of large fields is measured.
 _SAMPLES = 12
 _PRESSED = 16  # nodes of the surface over those that such a press is on
 
@@ -129,12 +124,12 @@ class SurfaceCompliance:
 
     nodes: NDArray[np.int32]  # (S,), the model's movable contact nodes
     matrix: NDArray[np.float64]  # (3S, 3S), m/N, displacement 3 s + axis of force 3 t + axis
-    fields: DenseFields | LowRankFields  # of all nodes not fixed; if dense, without the surface's
+    fields: DenseFields  # of all nodes that are neither fixed nor of the surface
     count: int  # N, nodes of the mesh
     # (3S, 3S), products of the unbalanced forces that rounding leaves in the fields of two unit
-    # forces; nothing where they are compressed
+    # forces; nothing where they are large
     gram: NDArray[np.float32]
-    compression: float  # unbalanced force in a compressed field, over the force; NaN: not measured
+    rounding: float  # unbalanced force in a large field, over the force; NaN: not measured
 
     def __post_init__(self) -> None:
         # Read-only as from the cache, for which numba compiles kernels of their own; and those that
@@ -166,15 +161,14 @@ class SurfaceCompliance:
     def _add_surface(
         self, forces: NDArray[np.float64], places: NDArray[np.int64], displacement: NDArray
     ) -> None:
-        if isinstance(self.fields, DenseFields):
-            rows = np.flatnonzero(forces)
-            columns = self.matrix[:, None, :]
-            _add_rows(columns, rows, forces.ravel()[rows], places, displacement.reshape(-1, 1))
+        rows = np.flatnonzero(forces)
+        columns = self.matrix[:, None, :]
+        _add_rows(columns, rows, forces.ravel()[rows], places, displacement.reshape(-1, 1))
 
     def unbalanced(self, forces: NDArray[np.float64]) -> float:
         """The norm of the unbalanced force in the field of forces (S, 3) N, over that of these."""
         if len(self.gram) == 0:
-            return self.compression
+            return self.rounding
         rows = np.flatnonzero(forces)
         loads = forces.ravel()[rows]
         return math.sqrt(max(_quadratic(self.gram, rows, loads), 0.0) / float(loads @ loads))
@@ -196,10 +190,17 @@ def surface_compliance(
         has_error: whether `SurfaceCompliance.unbalanced` is asked for, a fifth of the work.
 
     Raises:
-        SolverError: the tissue is not held, or its moduli are too different.
+        SolverError: the tissue is not held, its moduli are too different, or the fields do not fit
+            into memory.
     """
     require_held(model.mesh, model.fixed)
     touched, free = len(model.movable_contact_nodes), int((~model.fixed).sum())
+    if 4 * 9 * touched * free > _memory() / 2:
+        raise SolverError(
+            f"{touched} nodes that the probe can touch, in a mesh of {free}, make fields of "
+            f"{36e-9 * touched * free:.0f} GB, more than half of this machine's memory: give a "
+            f"coarser mesh, or choose fem_cg or msds"
+        )
     if 9 * touched * free < _KEPT:
         return _compute(model, None, has_error)
 
@@ -237,20 +238,19 @@ def _compute(
     nodes, points = model.movable_contact_nodes, model.mesh.nodes
     free = np.flatnonzero(~model.fixed)
     size = 9 * len(nodes) * len(free)
-    compressed = size >= _COMPRESSED
+    is_large = size >= _LARGE
     system = averaged_pressure(model.mesh, model.materials)
     matrix = np.empty((3 * len(nodes), 3 * len(nodes)))
     done = 0
     # Products of matrices this small take longer on several threads.
-    with threadpool_limits(1, user_api="blas"), _scratch(compressed) as file:
+    with threadpool_limits(1, user_api="blas"):
         eliminated = eliminate(
             model.mesh,
             system,
             model.fixed,
             nodes,
-            np.float32 if compressed else np.float64,
+            np.float32 if is_large else np.float64,
             lambda fraction: show(0.6 * fraction),
-            file,
         )
 
         def solve(chosen: NDArray[np.int64]) -> NDArray[np.floating]:
@@ -262,29 +262,25 @@ def _compute(
             show(0.6 + 0.4 * done / len(nodes))
             return moved
 
-        found: DenseFields | LowRankFields
-        if compressed:
-            found = LowRankFields.compress(points, free, points[nodes], solve, _TOLERANCE)
-        else:
-            precision = np.float64 if size < _DOUBLE else np.float32
-            inner = np.setdiff1d(free, nodes)
-            found = DenseFields.compute(inner, len(nodes), solve, precision)
+        precision = np.float64 if size < _DOUBLE else np.float32
+        inner = np.setdiff1d(free, nodes)
+        found = DenseFields.compute(inner, len(nodes), solve, precision)
         matrix += matrix.T  # symmetric to the last digit
         matrix /= 2
         none = np.zeros((0, 0), np.float32)
-        made = SurfaceCompliance(nodes, matrix, found, len(points), none, 0.0)
+        made = SurfaceCompliance(nodes, matrix, found, len(points), none, math.nan)
         if not has_error:
-            return replace(made, compression=math.nan)
-        if isinstance(found, DenseFields):
+            return made
+        if not is_large:
             return replace(made, gram=_gram(made, found, system, model.fixed))
-    return replace(made, compression=_compression(made, points[nodes], system, model.fixed))
+    return replace(made, rounding=_rounding(made, points[nodes], system, model.fixed))
 
 
-def _scratch(needed: bool) -> AbstractContextManager[Any]:
-    with contextlib.suppress(OSError):
-        if needed:
-            return tempfile.TemporaryFile(buffering=0)
-    return contextlib.nullcontext()
+def _memory() -> float:
+    """Bytes of this machine's memory; no limit where the system does not say."""
+    if not hasattr(os, "sysconf"):
+        return math.inf
+    return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _gram(
@@ -306,7 +302,7 @@ def _gram(
     return left @ left.T
 
 
-def _compression(
+def _rounding(
     made: SurfaceCompliance, points: NDArray, system: AveragedPressure, fixed: NDArray
 ) -> float:
     """The unbalanced force over the norm of the forces: the median of single ones and of presses,
@@ -346,19 +342,17 @@ def _key(model: TissueModel) -> str:
 
 def _pack(made: SurfaceCompliance) -> tuple[dict[str, NDArray], dict[str, Any]]:
     own = {"surface": made.nodes, "matrix": made.matrix, "gram": made.gram}
-    facts = {"count": made.count, "compression": made.compression}
-    return {**own, **vars(made.fields)}, facts
+    return {**own, **vars(made.fields)}, {"count": made.count, "rounding": made.rounding}
 
 
 def _unpack(arrays: dict[str, NDArray], facts: dict[str, Any]) -> SurfaceCompliance:
-    kind = LowRankFields if "major" in arrays else DenseFields
     return SurfaceCompliance(
         arrays["surface"],
         arrays["matrix"],
-        kind(**{field.name: arrays[field.name] for field in fields(kind)}),
+        DenseFields(arrays["nodes"], arrays["fields"]),
         count=int(facts["count"]),
         gram=arrays["gram"],
-        compression=float(facts["compression"]),
+        rounding=float(facts["rounding"]),
     )
 
 

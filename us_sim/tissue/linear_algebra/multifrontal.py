@@ -15,11 +15,8 @@ factor, then the pressures by one of the negative.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from io import FileIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,37 +91,8 @@ def _bound(part: Part, graph: csr_array, eliminated: NDArray[np.bool_]) -> None:
     part.boundary = boundary[~eliminated[boundary]].astype(np.int64)
 
 
-_LARGE = 100_000  # Numbers in a matrix from which on it may be kept in a file
 # Unknowns, and the Schur complement on them.
 _Update = tuple[NDArray[np.int64], NDArray[np.float64]]
-
-
-@dataclass(frozen=True, eq=False)
-class _Stored:
-    matrix: NDArray[np.floating]  # empty if in a file
-    file: FileIO | None
-    place: int  # where in the file it begins
-    shape: tuple[int, ...]
-
-    @classmethod
-    def put(cls, matrix: NDArray[np.floating], file: FileIO | None) -> _Stored:
-        """At the end of a file, if the matrix is large, and the file is given and not full."""
-        if file is not None and matrix.size >= _LARGE:
-            place = file.seek(0, os.SEEK_END)
-            with contextlib.suppress(OSError):
-                if file.write(np.ascontiguousarray(matrix).data) == matrix.nbytes:
-                    return cls(matrix[:0].copy(), file, place, matrix.shape)
-        return cls(matrix, None, 0, matrix.shape)
-
-    def get(self) -> NDArray[np.floating]:
-        """The matrix."""
-        if self.file is None:
-            return self.matrix
-        self.file.seek(self.place)
-        matrix = np.empty(self.shape, self.matrix.dtype)
-        if self.file.readinto(matrix.data) != matrix.nbytes:
-            raise OSError("a temporary file has become shorter")
-        return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +101,8 @@ class _Front:
 
     own: NDArray[np.int64]  # (O,), unknowns of the part
     around: NDArray[np.int64]  # (R,), unknowns of parts above that they touch
-    response: _Stored  # (O, R), of its own per unknown around it
-    inverse: _Stored | None  # (O, O), of its own per force; None where none can be
+    response: NDArray[np.floating]  # (O, R), of its own per unknown around it
+    inverse: NDArray[np.floating] | None  # (O, O), of its own per force; None where none can be
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +136,11 @@ class Eliminated:
         for front in self._fronts:
             if front.inverse is not None and loaded[front.own].any():
                 loaded[front.around] = True
-                fields[front.around] += front.response.get().T @ fields[front.own]
+                fields[front.around] += front.response.T @ fields[front.own]
         for front in reversed(self._fronts):
-            moved = front.response.get() @ fields[front.around]
+            moved = front.response @ fields[front.around]
             if front.inverse is not None and loaded[front.own].any():
-                moved += front.inverse.get() @ fields[front.own]
+                moved += front.inverse @ fields[front.own]
             fields[front.own] = moved
         return fields[: 3 * self._nodes].reshape(self._nodes, 3, -1)
 
@@ -184,7 +152,6 @@ def eliminate(
     loaded: NDArray[np.integer],
     precision: type = np.float64,
     report: Callable[[float], None] | None = None,
-    file: FileIO | None = None,
 ) -> Eliminated:
     """Eliminate all nodes.
 
@@ -193,13 +160,12 @@ def eliminate(
         loaded: (K,) nodes that are not fixed, on which there will be forces.
         precision: of the numbers that say how parts follow.
         report: told the fraction of the arithmetic done.
-        file: where the larger matrices are kept while there is place, rather than in memory.
 
     Raises:
         SolverError: to rounding, the stiffness is not positive definite.
     """
     root = nested_dissection(mesh.nodes, mesh.edges)
-    elimination = _Elimination(system, fixed, loaded, precision, report, file)
+    elimination = _Elimination(system, fixed, loaded, precision, report)
     try:
         elimination.run(root)
     except LinAlgError as error:
@@ -221,10 +187,8 @@ class _Elimination:
         loaded: NDArray[np.integer],
         precision: type,
         report: Callable[[float], None] | None,
-        file: FileIO | None,
     ) -> None:
         count = len(fixed)
-        self._file = file
         self.fronts: list[_Front] = []
         self._free = ~fixed
         self._precision = precision
@@ -278,17 +242,14 @@ class _Elimination:
             _Front(
                 own,
                 around,
-                self._stored(response),
-                self._stored(factor.solve(np.eye(len(own)))) if loaded else None,
+                response.astype(self._precision),
+                factor.solve(np.eye(len(own))).astype(self._precision) if loaded else None,
             )
         )
         if self._report is not None and self._total:  # there is nothing to do where all is fixed
             self._done += len(own) * float(len(own) + len(around)) ** 2
             self._report(self._done / self._total)
         return around, schur
-
-    def _stored(self, matrix: NDArray[np.float64]) -> _Stored:
-        return _Stored.put(matrix.astype(self._precision), self._file)
 
     def _assembled(
         self, own: NDArray, around: NDArray, updates: list[_Update]

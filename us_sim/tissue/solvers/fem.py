@@ -3,9 +3,7 @@
 The stiffness is constant. So the displacement field of a unit force on each node that the probe can
 reach is computed once (`us_sim.tissue.linear_algebra.compliance`). A frame finds the forces on
 these nodes, as a small complementarity problem (`us_sim.tissue.contact.compliant_contact`), and
-adds up their fields. Those of a large mesh are compressed
-(`us_sim.tissue.linear_algebra.low_rank_fields`): its nodes are then within some 1e-5 of the largest
-displacement, and only the surface is solved to rounding.
+adds up their fields.
 
 >>> from us_sim.geometry.pose import Pose
 >>> from us_sim.tissue.solvers.fem import Fem
@@ -48,17 +46,16 @@ class FemSettings(SolverSettings):
 class Fem(TissueSolver):
     """Linear elasticity under a probe, by the compliance of the surface that it can reach.
 
-    The residual is the error of the stored fields, by rounding or compression, together with the
-    forces along the surface of a curved probe. Of rounding it is exact, by products of what it
-    leaves unbalanced in the fields of unit forces; of compression a median, as measured when the
-    fields were made.
+    The residual is the error of the stored fields by rounding, together with the forces along the
+    surface of a curved probe. Rounding is told exactly, by products of what it leaves unbalanced in
+    the fields of unit forces; of a large mesh by a median, as measured when the fields were made.
 
     Args:
         model: at least three fixed nodes that are not on one line in every connected part.
         settings: see `FemSettings`.
 
     Raises:
-        SolverError: a setting is out of range, or the tissue is not held.
+        SolverError: a setting is out of range, the tissue is not held, or is too large.
     """
 
     name: ClassVar[str] = "fem"
