@@ -70,7 +70,7 @@ def difference(made, volume):
 
 def test_undoing_the_pressure_brings_the_tissue_back(pressed):
     scene, volume, sweep = pressed
-    how = Compounding(spacing=volume_spacing(volume), method="linear")
+    how = Compounding(spacing=volume_spacing(volume))
     as_seen = reconstruct(plan(sweep, how))
     rest = rest_placement(scene, sweep, ImagePart())
     at_rest = reconstruct(plan(sweep, how, rest=rest))
