@@ -1,4 +1,4 @@
-"""Processes: their processor time and memory, and what a running graph sends.
+"""The simulator in a process of its own: what it sends, its processor time and its memory.
 
 >>> import os
 >>> from us_sim.evaluation.processes import usage_of
@@ -12,14 +12,21 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import signal
+import subprocess
+import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+
+from us_sim.errors import UsSimError
 
 if TYPE_CHECKING:
     from us_sim.evaluation.latency.arrivals import Arrivals
@@ -47,60 +54,41 @@ def usage_of(pid: int) -> Usage | None:
     return Usage(ticks / os.sysconf("SC_CLK_TCK"), 1024.0 * int(share[1]))
 
 
-@dataclass
 class UsageOverTime:
-    """Usage of one process, or of several of one name, at several times."""
+    """Usage of the processes that another has started, those of one name added up."""
 
-    times: list[float] = field(default_factory=list)  # s
-    uses: list[Usage] = field(default_factory=list)
+    def __init__(self, parent: int) -> None:
+        self._parent, self._began = parent, time.monotonic()
+        self._rows: list[dict[str, Any]] = []
 
-    def add(self, time: float, usage: Usage | None) -> None:
-        """Append the usage at a time (s), if it is known."""
-        if usage is not None:
-            self.times.append(time)
-            self.uses.append(usage)
-
-    @property
-    def processor(self) -> float:
-        """Processor time over time: 1 is one core."""
-        if len(self.times) < 2:
-            return np.nan
-        used = self.uses[-1].processor - self.uses[0].processor
-        return used / (self.times[-1] - self.times[0])
-
-    @property
-    def memory(self) -> float:
-        """Bytes in the end."""
-        return self.uses[-1].memory if self.uses else np.nan
-
-    @property
-    def growth(self) -> float:
-        """Bytes a minute after the first minute, by least squares; NaN in less than two minutes."""
-        if not self.times or self.times[-1] - self.times[0] < 120.0:
-            return np.nan
-        time = np.array(self.times) - self.times[0]
-        late = time >= 60.0
-        memory = np.array([use.memory for use in self.uses])
-        return 60.0 * float(np.polyfit(time[late], memory[late], 1)[0])
-
-
-class UsageByName:
-    """Usage of processes over time, those of one name added up."""
-
-    def __init__(self) -> None:
-        self.uses: dict[str, UsageOverTime] = {}
-        self._began = time.monotonic()
-
-    def update(self, processes: dict[int, str]) -> None:
-        """Add the usage of processes, whose names are given by their numbers."""
+    def update(self) -> None:
+        """Note what every process has used until now."""
         passed = time.monotonic() - self._began
-        sums: dict[str, Usage] = {}
-        for pid, name in processes.items():
+        for pid, name in started_by(self._parent).items():
             if (usage := usage_of(pid)) is not None:
-                before = sums.get(name, Usage(0.0, 0.0))
-                sums[name] = Usage(before.processor + usage.processor, before.memory + usage.memory)
-        for name, usage in sums.items():
-            self.uses.setdefault(name, UsageOverTime()).add(passed, usage)
+                use = {"processor": usage.processor, "MB": 1e-6 * usage.memory}
+                self._rows.append({"process": name, "s": passed, **use})
+
+    def table(self) -> pd.DataFrame:
+        """A row a process and moment: ``process``, ``s``, ``processor`` (s) and ``MB``."""
+        rows = pd.DataFrame(self._rows, columns=["process", "s", "processor", "MB"])
+        return rows.groupby(["process", "s"], sort=False, as_index=False).sum()
+
+    def columns(self) -> dict[str, float]:
+        """Cores, memory in the end and its growth after a minute, of every process, for a row.
+
+        Growth is by least squares, and NaN in less than two minutes.
+        """
+        found = {}
+        for name, rows in self.table().groupby("process", sort=False):
+            passed = float(rows["s"].max() - rows["s"].min())
+            worked = float(rows["processor"].iloc[-1] - rows["processor"].iloc[0])
+            late = rows[rows["s"] >= rows["s"].min() + 60.0]
+            grown = 60.0 * np.polyfit(late["s"], late["MB"], 1)[0] if passed >= 120.0 else np.nan
+            found[f"cores_{name}"] = worked / passed if passed else np.nan
+            found[f"memory_mb_{name}"] = float(rows["MB"].iloc[-1])
+            found[f"growth_mb_a_minute_{name}"] = float(grown)
+        return found
 
 
 def started_by(pid: int) -> dict[int, str]:
@@ -124,13 +112,63 @@ def _name(pid: int) -> str:
     return "browser" if "chrom" in words[0] else Path(words[0]).name
 
 
-@contextlib.contextmanager
-def listening(*, viewer: bool) -> Iterator[Arrivals]:
-    """Note arrivals, in a thread of this process, until the context is left.
+@dataclass
+class Simulation:
+    """`us-sim` in a process of its own."""
 
-    Args:
-        viewer: whether it also takes the annotated image and the structures.
-    """
+    process: subprocess.Popen[bytes]
+    output: IO[bytes]
+    began: float
+
+    def said(self) -> str:
+        """Output so far."""
+        return Path(self.output.name).read_text(encoding="utf-8", errors="replace")
+
+    def check(self) -> None:
+        """Raise UsSimError when it has ended."""
+        if self.process.poll() is not None:
+            lines = self.said().strip().splitlines()
+            raise UsSimError(f"us-sim has ended{': ' if lines else ''}{''.join(lines[-1:])}")
+
+    def await_images(self, arrivals: Arrivals) -> None:
+        """Wait for the first image.
+
+        Raises:
+            UsSimError: the simulation has ended, or no image comes.
+        """
+        while not arrivals.heard("ultrasound/image"):
+            self.check()
+            if time.monotonic() - self.began > 300.0:  # the first run compiles
+                raise UsSimError("no image came in 300 s")
+            time.sleep(0.02)
+
+
+@contextlib.contextmanager
+def simulating(*words: str) -> Iterator[Simulation]:
+    """Run `us-sim` with these words until the context is left, which interrupts it."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
+    with tempfile.NamedTemporaryFile(prefix="us_sim_evaluate_") as output:
+        began = time.monotonic()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "us_sim", *words],
+            env=environment,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            yield Simulation(process, output, began)
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(20.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+@contextlib.contextmanager
+def listening() -> Iterator[Arrivals]:
+    """Note arrivals, in a thread of this process, until the context is left."""
     import rclpy
     from rclpy.context import Context
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -141,7 +179,7 @@ def listening(*, viewer: bool) -> Iterator[Arrivals]:
 
     context = Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = Arrivals(viewer=viewer, context=context)
+    node = Arrivals(context=context)
 
     def spin() -> None:
         executor = SingleThreadedExecutor(context=context)

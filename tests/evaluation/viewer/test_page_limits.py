@@ -13,7 +13,8 @@ def test_what_is_asked_is_compared_with_the_run_without_a_viewer():
         {"case": "1 browser, path", "images_a_second_made": 51.0},
         {"case": "1 browser, hand", **shown},
     ]
-    table = pd.DataFrame(rows, columns=columns).assign(seconds=8.0, memory=[[], [], []])
+    memory = pd.DataFrame(columns=["process", "s", "MB"])
+    table = pd.DataFrame(rows, columns=columns).assign(seconds=8.0, memory=[memory] * 3)
     seen = {target.what: (target.seen, target.met) for target in report_of(table).targets}
     assert seen["images a second that the simulator loses to a page"] == ("15 %", False)
     assert seen["images a second in a browser, hand"] == ("26", True)

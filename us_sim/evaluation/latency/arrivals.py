@@ -11,7 +11,6 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
-from visualization_msgs.msg import MarkerArray
 
 from us_sim.nodes.qos import EVERY
 
@@ -24,27 +23,18 @@ HOPS = {
 }
 """Topics that carry the stamp of the tracker's pose, in the order of the graph."""
 
-EYE = {"tissue/structures": MarkerArray, "ultrasound/image_annotated": Image}
-"""Topics that are computed only for subscribers."""
-
 _HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
 
 
 class Arrivals(Node):  # type: ignore[misc]
-    """Subscribes to topics without looking at more of their messages than the stamps.
+    """Subscribes to topics without looking at more of their messages than the stamps."""
 
-    Args:
-        viewer: whether it also takes what is made for the eye.
-    """
-
-    def __init__(self, *, viewer: bool = False, **kwargs: Any) -> None:
+    def __init__(self, **kwargs: Any) -> None:
         super().__init__("arrivals", **kwargs)
         self._heard: dict[str, list[tuple[int, int]]] = {topic: [] for topic in HOPS}
         for topic, kind in HOPS.items():
             note = partial(self._note, self._heard[topic])
             self.create_subscription(kind, topic, note, EVERY, raw=True)
-        for topic, kind in EYE.items() if viewer else ():
-            self.create_subscription(kind, topic, lambda _: None, EVERY, raw=True)
 
     def heard(self, topic: str) -> Sequence[tuple[int, int]]:
         """Stamp and time of arrival of every message so far, ns."""

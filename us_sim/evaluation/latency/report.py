@@ -9,11 +9,9 @@ import numpy as np
 import pandas as pd
 
 from us_sim.evaluation.figures import draw_lines
-from us_sim.evaluation.latency.measure import BUSY, DEMO, LIVE, Case, cases, run_case
+from us_sim.evaluation.latency.measure import BUSY, DEMO, Case, cases, run_case
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
-from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import prepare_ros
-from us_sim.scene.reading import load_scene
 
 _SHOWN = {
     "case": "",
@@ -36,7 +34,6 @@ _SHOWN = {
 
 def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     prepare_ros(network=False)
-    prepare_scene(load_scene("upper_arm"))
     return {"latency": [Piece(case.columns, partial(run_case, case)) for case in cases(quick)]}
 
 
@@ -47,16 +44,16 @@ def _report(table: pd.DataFrame) -> Report:
         return float(rows[column].iloc[0]) if len(rows) else np.nan
 
     age, worst = "ultrasound_image_ms_p50", "ultrasound_image_ms_p99"
-    name, busy = str(LIVE), "demo's method, cores busy"
+    name, busy = "demo", "demo, cores busy"
     targets = [
-        Target.at_most(f"{name}: poses without an image", 0, seen(LIVE, "dropped")),
-        Target.at_most(f"{name}: ms from a pose to its image, median", 12, seen(LIVE, age), "ms"),
-        Target.at_most(f"{name}: likewise, 99th percentile", 25, seen(LIVE, worst), "ms"),
-        Target.at_most(f"{name}: images not recorded", 0, seen(LIVE, "not_recorded")),
+        Target.at_most(f"{name}: ms from a pose to its image, median", 12, seen(DEMO, age), "ms"),
+        Target.at_most(f"{name}: likewise, 99th percentile", 25, seen(DEMO, worst), "ms"),
+        Target.at_least(f"{name}: images a second", 59, seen(DEMO, "images_a_second")),
+        Target.at_most(f"{name}: images not recorded", 0, seen(DEMO, "not_recorded")),
         Target.at_most(
             f"{name}: growth of the fastest growing process after the first minute",
             1,
-            seen(LIVE, "growth_mb_a_minute"),
+            seen(DEMO, "growth_mb_a_minute"),
             "MB/min",
         ),
         Target.at_least(f"{busy}: images a second", 50, seen(BUSY, "images_a_second")),
@@ -66,7 +63,7 @@ def _report(table: pd.DataFrame) -> Report:
     hops = [f"{name}_ms_p50" for name in ("probe_pose", "tissue_nodes", "ultrasound_image")]
     pose, nodes, image = (seen(DEMO, hop) for hop in hops)
     take_home = [
-        f"`fem` on 2,000 nodes: an image is {seen(Case(), age):.3g} ms old when it comes, "
+        f"With `fem` an image is {seen(Case(), age):.3g} ms old when it comes, "
         f"{seen(Case(), worst):.3g} ms at the 99th percentile, at "
         f"{seen(Case(), 'images_a_second'):.3g} images a second of 60 poses.",
         f"`fem_nonlinear`, as in the demo: {image:.3g} and {seen(DEMO, worst):.3g} ms; of these "

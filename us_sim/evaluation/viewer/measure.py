@@ -12,19 +12,13 @@ import math
 import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from us_sim.errors import UsSimError
-from us_sim.evaluation.processes import UsageByName, UsageOverTime, listening, started_by
+from us_sim.evaluation.processes import Simulation, UsageOverTime, listening, simulating
 from us_sim.evaluation.report import percentile
 from us_sim.share import find_bag
 
@@ -50,13 +44,11 @@ def cases(quick: bool) -> list[Case]:
     chosen = [
         Case(viewer=False),
         Case(),
-        Case(browsers=1),
+        Case(browsers=1, seconds=130.0),
         Case(browsers=1, by_hand=True),
         Case(browsers=2),
     ]
-    if quick:
-        return [replace(case, seconds=8.0) for case in chosen]
-    return [*chosen, Case(browsers=1, seconds=600.0)]
+    return [replace(case, seconds=8.0) for case in chosen] if quick else chosen
 
 
 ARGUMENTS = (
@@ -90,8 +82,8 @@ MOVE = """([x, y, seconds, drag, period, rate]) => new Promise((resolve) => {
 
 
 @contextlib.contextmanager
-def showing(count: int, command: _Command) -> Iterator[Pages]:
-    """Show so many pages of the command in one Chromium; none needs none.
+def showing(count: int, simulation: Simulation) -> Iterator[Pages]:
+    """Show so many pages of the simulation in one Chromium; none needs none.
 
     Raises:
         UsSimError: Chromium or playwright is not installed.
@@ -106,18 +98,20 @@ def showing(count: int, command: _Command) -> Iterator[Pages]:
     chromium = os.environ.get("US_SIM_TEST_CHROMIUM") or shutil.which("chromium")
     if not chromium:
         raise UsSimError("there is no chromium on PATH: install it to have it measured")
-    address = command.address()
+    while not (found := _ADDRESS.search(simulation.said())):
+        simulation.check()
+        time.sleep(0.005)
     with sync_playwright() as tool:
         browser = tool.chromium.launch(executable_path=chromium, args=list(ARGUMENTS))
         shown = Pages([])
         for _ in range(count):
             page = browser.new_page(viewport={"width": 1280, "height": 720})
             began = time.monotonic()
-            page.goto(address)
+            page.goto(found[0])
             page.wait_for_function("window.usSim?.images?.() > 0", timeout=60_000)
             if not shown.pages:
                 shown.opened = time.monotonic() - began
-                shown.started = time.monotonic() - command.began
+                shown.started = time.monotonic() - simulation.began
             shown.pages.append(page)
         yield shown
         browser.close()
@@ -168,23 +162,21 @@ def run_case(case: Case) -> list[dict[str, Any]]:
     Raises:
         UsSimError: the simulation ends, or no image comes.
     """
+    path = ["--path", str(find_bag("press_and_slide.mcap")), "--param", "path_player.loop=true"]
+    words = ["view" if case.viewer else "run", "upper_arm", *([] if case.by_hand else path)]
+    words += ["--port", "0"] if case.viewer else []
     with (
-        listening(viewer=False) as arrivals,
-        _command(case) as command,
-        showing(case.browsers, command) as pages,
+        listening() as arrivals,
+        simulating(*words) as simulation,
+        showing(case.browsers, simulation) as pages,
     ):
-        deadline = time.monotonic() + 300.0  # the first run compiles
-        while not arrivals.heard("ultrasound/image"):
-            command.check()
-            if time.monotonic() > deadline:
-                raise UsSimError("no image came in 300 s")
-            time.sleep(0.02)
+        simulation.await_images(arrivals)
         pages.wait(2.0, drag=case.by_hand)  # these images do not count
-        usage = UsageByName()
+        usage = UsageOverTime(os.getpid())  # browsers, too
         began, began_ns, shown = time.monotonic(), time.time_ns(), pages.images()
         while (passed := time.monotonic() - began) < case.seconds:
-            command.check()
-            usage.update(started_by(command.process.pid) | started_by(os.getpid()))
+            simulation.check()
+            usage.update()
             pages.wait(min(2.0, case.seconds - passed), drag=case.by_hand)
         ended_ns, seconds = time.time_ns(), time.monotonic() - began
         drawn = [(b - a) / seconds for a, b in zip(shown, pages.images(), strict=True)]
@@ -193,7 +185,7 @@ def run_case(case: Case) -> list[dict[str, Any]]:
     images = {stamp for stamp, _ in heard["ultrasound/image"]}
     poses = {stamp for stamp, _ in heard["tracker/pose"]}
     ages = [1e-6 * (came - stamp) for stamp, came in heard["ultrasound/image"]]
-    uses = {name: usage.uses.get(name, UsageOverTime()) for name in ("viewer", "browser")}
+    used = usage.columns()
     return [
         {
             "images_a_second_made": len(images) / seconds,
@@ -206,66 +198,11 @@ def run_case(case: Case) -> list[dict[str, Any]]:
             "delays": delays["count"],
             "start_s": pages.started,
             "page_opened_s": pages.opened,
-            **{f"cores_{name}": use.processor for name, use in uses.items()},
-            **{f"memory_mb_{name}": 1e-6 * use.memory for name, use in uses.items()},
-            **{f"growth_mb_a_minute_{name}": 1e-6 * use.growth for name, use in uses.items()},
-            "memory": [
-                {"process": name, "s": at, "MB": 1e-6 * each.memory}
-                for name, use in usage.uses.items()
-                for at, each in zip(use.times, use.uses, strict=True)
-            ],
+            **{
+                f"{part}_{name}": used.get(f"{part}_{name}", math.nan)
+                for part in ("cores", "memory_mb", "growth_mb_a_minute")
+                for name in ("viewer", "browser")
+            },
+            "memory": usage.table(),
         }
     ]
-
-
-@dataclass
-class _Command:
-    """`us-sim run` or `us-sim view` in a process of its own."""
-
-    process: subprocess.Popen[bytes]
-    output: IO[bytes]
-    began: float
-
-    def said(self) -> str:
-        """Output so far."""
-        return Path(self.output.name).read_text(encoding="utf-8", errors="replace")
-
-    def check(self) -> None:
-        """Raise UsSimError when it has ended."""
-        if self.process.poll() is not None:
-            lines = self.said().strip().splitlines()
-            raise UsSimError(f"us-sim has ended{': ' if lines else ''}{''.join(lines[-1:])}")
-
-    def address(self) -> str:
-        """Address of the page, once it is printed."""
-        while not (found := _ADDRESS.search(self.said())):
-            self.check()
-            if time.monotonic() - self.began > 300.0:
-                raise UsSimError("us-sim has printed no address in 300 s")
-            time.sleep(0.005)
-        return found[0]
-
-
-@contextlib.contextmanager
-def _command(case: Case) -> Iterator[_Command]:
-    """The simulation, which ends with the context."""
-    path = ["--path", str(find_bag("press_and_slide.mcap")), "--param", "path_player.loop=true"]
-    words = ["view" if case.viewer else "run", "upper_arm", *([] if case.by_hand else path)]
-    words += ["--port", "0"] if case.viewer else []
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
-    with tempfile.NamedTemporaryFile(prefix="us_sim_viewer_") as output:
-        began = time.monotonic()
-        process = subprocess.Popen(
-            [sys.executable, "-m", "us_sim", *words],
-            env=environment,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        )
-        try:
-            yield _Command(process, output, began)
-        finally:
-            process.send_signal(signal.SIGINT)
-            killer = threading.Timer(20.0, process.kill)
-            killer.start()
-            process.wait()
-            killer.cancel()

@@ -11,9 +11,7 @@ import pandas as pd
 from us_sim.evaluation.figures import draw_lines
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
 from us_sim.evaluation.viewer.measure import cases, run_case
-from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import prepare_ros
-from us_sim.scene.reading import load_scene
 
 SHOWN = {
     "case": "",
@@ -34,7 +32,6 @@ SHOWN = {
 
 def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     prepare_ros(network=False)
-    prepare_scene(load_scene("upper_arm"))
     return {
         "viewer": [
             Piece({"case": str(case), "seconds": case.seconds}, partial(run_case, case))
@@ -47,9 +44,8 @@ def report_of(table: pd.DataFrame) -> Report:
     """What the table says of the page."""
 
     def seen(name: str, column: str) -> float:
-        """Of two cases of one name that of the longer, last one."""
         rows = table[table["case"] == name]
-        return float(rows[column].iloc[-1]) if len(rows) else np.nan
+        return float(rows[column].iloc[0]) if len(rows) else np.nan
 
     browser, hand = "1 browser, path", "1 browser, hand"
     shown = "images_a_second_shown"
@@ -88,7 +84,7 @@ def report_of(table: pd.DataFrame) -> Report:
         "rows": table[list(SHOWN)].rename(columns=SHOWN),
         "longest": str(longest["case"]),
         "memory": draw_lines(
-            pd.DataFrame(longest["memory"], columns=["process", "s", "MB"]),
+            longest["memory"],
             "s",
             "MB",
             f"Memory: {longest['case']}, {longest['seconds']:g} s",
