@@ -3,12 +3,12 @@
 import copy
 import dataclasses
 
+import liver_sweep
 import numpy as np
 import pytest
 import yaml
 
 from us_sim.errors import SceneError, UsSimError
-from us_sim.evaluation.slice.recorded import LIVER_SWEEP
 from us_sim.geometry.collider import Sphere
 from us_sim.scene.building import collider_of, probe_of
 from us_sim.scene.reading import load_scene, parse_scene
@@ -174,13 +174,13 @@ def test_the_installed_scenes_are_valid(tmp_path):
 def test_the_liver_scene_is_the_middle_frame_of_the_sweep_that_made_its_volume(shared_data):
     folder = shared_data / "imfusion-liver-sweep"
     scene = load_scene("liver_sweep", volume=folder / "liver_sweep_compounded_1mm.mha")
-    recorded = LIVER_SWEEP.probe(0.314818e-3)
+    recorded = liver_sweep.probe()
     probe = probe_of(scene)
     assert probe.radius == pytest.approx(recorded.radius, abs=1e-5)
     assert probe.depth == pytest.approx(recorded.depth, abs=1e-5)
     assert probe.opening_angle == pytest.approx(recorded.opening_angle, abs=1e-5)
     sweep = read_sweep(folder / "liver_sweep.igs.mha")
-    middle = LIVER_SWEEP.pose(sweep.image_to_reference[len(sweep.numbers) // 2])
+    middle = liver_sweep.probe_pose(sweep.image_to_reference[len(sweep.numbers) // 2])
     place = scene.volume.pose.pose @ middle
     np.testing.assert_allclose(place.matrix, np.eye(4), atol=2e-6)
 

@@ -120,10 +120,7 @@ EVALUATIONS = Choice(
     key="subject",
     tissue=Option(f"{_EVALUATION}.tissue.report:TISSUE", _NOTHING),
     stability=Option(f"{_EVALUATION}.stability.report:STABILITY", _NOTHING),
-    slice=Option(
-        f"{_EVALUATION}.slice.report:SLICE",
-        f"{_EVALUATION}.settings:RecordedSweep",
-    ),
+    slice=Option(f"{_EVALUATION}.slice.report:SLICE", _NOTHING),
     hand=Option(
         f"{_EVALUATION}.hand.report:HAND",
         f"{_EVALUATION}.settings:HandSettings",

@@ -1,20 +1,8 @@
-"""Images that `us-sim evaluate slice` cuts of a block of speckle, and their true grey values.
+"""Images that `us-sim evaluate slice` cuts of a block of speckle.
 
-The truth is brute force in float64 by NumPy and SciPy, which shares no arithmetic with the slicers:
-every pixel is tried in every tetrahedron whose bounding box it lies in.
-
->>> from us_sim.evaluation.slice.cases import MAIN, dented, exact_slice
->>> from us_sim.geometry.pose import Pose
->>> from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
+>>> from us_sim.evaluation.slice.cases import MAIN, dented
 >>> MAIN.name, len(MAIN.mesh().nodes), float(dented(np.zeros((1, 3)), 0.012)[0, 2])
 ('512 px, 32x16x16 nodes, pressed_12mm, straight', 8192, 0.012)
->>> to_patient = np.diag([1e-3, 1e-3, 1e-3, 1.0])
->>> to_patient[:2, 3] = -0.02
->>> volume = Volume(np.tile(np.arange(50, dtype=np.uint8), (41, 41, 1)), to_patient)
->>> mesh = box_mesh([-0.02, 0.02], [-0.02, 0.02], [0.0, 0.02, 0.04])
->>> plane = LinearProbe(aperture=0.02, depth=0.02, columns=8, rows=5).plane(Pose())
->>> exact_slice(volume, mesh.nodes, mesh.tetrahedra, mesh.nodes * [1, 1, 0.5], plane).grey[:, 0]
-array([ 4., 12., 20., 28., 36.])
 """
 
 from __future__ import annotations
@@ -155,50 +143,22 @@ def dented(nodes: Array, depth: float) -> Array:
 
 @cache
 def speckle(seed: int = 1) -> Volume:
-    """The block's volume, and a little around it: speckle with balls and bright layers."""
-    axes = _voxel_axes()
+    """The block's volume, and a little around it: speckle with bright layers."""
+    axes = [
+        low - _BEYOND + _VOXEL * (np.arange(math.ceil((high - low + 2 * _BEYOND) / _VOXEL)) + 0.5)
+        for low, high in EXTENT
+    ]
     generator = np.random.default_rng(seed)
     echo = generator.standard_normal([len(axis) for axis in axes], dtype=np.float32)
     for axis in range(3):
         echo = ndimage.correlate1d(echo, np.array([0.25, 0.5, 0.25], np.float32), axis)
     echo *= np.float32(60.0 / echo.std())
     grey = np.abs(echo, out=echo)
-    for _ in range(40):
-        centre = [generator.uniform(axis[0], axis[-1]) for axis in axes]
-        radius = generator.uniform(3e-3, 9e-3)
-        part = tuple(
-            slice(*np.searchsorted(axis, [c - radius, c + radius]))
-            for axis, c in zip(axes, centre, strict=True)
-        )
-        inside = [(axis[p] - c) ** 2 for axis, p, c in zip(axes, part, centre, strict=True)]
-        x, y, z = np.ix_(*inside)
-        grey[part][x + y + z < radius**2] *= np.float32(generator.choice([0.2, 2.0]))
     for depth in (0.008, 0.02, 0.035, 0.05, 0.07, 0.09):  # m below the skin
         grey[:, :, np.abs(axes[2] - depth) < 0.6e-3] *= np.float32(2.5)
-    return _placed(np.minimum(grey, 255.0, out=grey).astype(np.uint8))
-
-
-@cache
-def black_and_white(seed: int = 1) -> Volume:
-    """Of the same shape and place: every voxel black or white, so that a shift is seen at once."""
-    shape = [len(places) for places in _voxel_axes()]
-    bits = np.random.default_rng(seed).integers(0, 2, shape, dtype=np.uint8)
-    return _placed(np.multiply(bits, 255, out=bits))
-
-
-def _voxel_axes() -> list[Array]:
-    """m, the centres of the voxels along x, y and z."""
-    counts = (math.ceil((high - low + 2 * _BEYOND) / _VOXEL) for low, high in EXTENT)
-    return [
-        np.asarray(low - _BEYOND + _VOXEL * (np.arange(count) + 0.5))
-        for (low, _), count in zip(EXTENT, counts, strict=True)
-    ]
-
-
-def _placed(voxels: NDArray[np.uint8]) -> Volume:
     placed = np.diag([_VOXEL, _VOXEL, _VOXEL, 1.0])
-    placed[:3, 3] = [axis[0] for axis in _voxel_axes()]
-    return Volume(voxels, placed)
+    placed[:3, 3] = [axis[0] for axis in axes]
+    return Volume(np.minimum(grey, 255.0, out=grey).astype(np.uint8), placed)
 
 
 def _turn(about_z: float, about_x: float) -> Array:
@@ -206,96 +166,3 @@ def _turn(about_z: float, about_x: float) -> Array:
     sx, cx = math.sin(about_x / 2), math.cos(about_x / 2)
     sz, cz = math.sin(about_z / 2), math.cos(about_z / 2)
     return np.array([cz * sx, sz * sx, sz * cx, cz * cx])
-
-
-_PAIRS = 1_000_000  # pairs of a pixel and a tetrahedron that are tried at once
-
-
-@dataclass(frozen=True)
-class ExactSlice:
-    """The truth of every pixel of an image."""
-
-    rest: Array  # (rows, columns, 3) m; NaN where there is nothing
-    tissue: NDArray[np.bool_]  # (rows, columns): in the deformed mesh
-    grey: Array  # (rows, columns)
-
-
-def exact_slice(
-    volume: Volume,
-    rest_nodes: Array,
-    tetrahedra: NDArray[np.int32],
-    nodes: Array,
-    plane: SlicePlane,
-) -> ExactSlice:
-    """The image of tissue with its nodes at ``nodes`` (N, 3) m, as `slicing.slicer` defines it."""
-    pixels = plane.pixels()
-    rest = _located(rest_nodes, tetrahedra, nodes, plane)
-    tissue = ~np.isnan(rest[..., 0])
-    rest[~tissue] = pixels[~tissue]
-    if not tissue.all():
-        was = ~np.isnan(_located(rest_nodes, tetrahedra, rest_nodes, plane)[..., 0])
-        rest[was & ~tissue] = np.nan
-    return ExactSlice(rest, tissue, sampled(volume, rest))
-
-
-def sampled(volume: Volume, rest: Array) -> Array:
-    """Trilinear grey values at ``rest`` (rows, columns, 3) m; 0 at NaN and beyond the volume."""
-    index = rest @ volume.patient_to_index[:3, :3].T + volume.patient_to_index[:3, 3]
-    beyond = ~((index >= -0.5) & (index <= np.array(volume.shape) - 0.5)).all(axis=-1)
-    index[beyond] = 0.0
-    grey = ndimage.map_coordinates(
-        volume.intensities, np.moveaxis(index, -1, 0), np.float64, order=1, mode="nearest"
-    )
-    grey[beyond] = 0.0
-    return np.asarray(grey)
-
-
-def voxel_distance(volume: Volume, one: Array, other: Array) -> Array:
-    """(rows, columns) voxels between two sets of positions (rows, columns, 3) m."""
-    return np.asarray(np.linalg.norm((one - other) @ volume.patient_to_index[:3, :3].T, axis=-1))
-
-
-def _located(
-    rest_nodes: Array, tetrahedra: NDArray[np.int32], nodes: Array, plane: SlicePlane
-) -> Array:
-    """(rows, columns, 3) m at rest of every pixel in the mesh; NaN of the others."""
-    placed = nodes @ plane.to_pixel[:, :3].T + plane.to_pixel[:, 3]  # column, row, height
-    corners = placed[tetrahedra]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    last = np.array([plane.columns - 1, plane.rows - 1, 0])
-    first = np.maximum(np.ceil(low[:, :2] - 1e-6), 0).astype(int)
-    end = np.minimum(np.floor(high[:, :2] + 1e-6), last[:2]).astype(int) + 1
-    near = ((low <= last + 1e-6) & (high >= -1e-6)).all(axis=1) & (end > first).all(axis=1)
-    before = _determinants(rest_nodes, tetrahedra)
-    upright = _determinants(nodes, tetrahedra) * np.sign(before) > 1e-6 * np.abs(before)
-    chosen = np.flatnonzero(near & upright)
-
-    found = np.full((plane.rows, plane.columns, 3), np.nan)
-    counts = (end - first)[chosen].prod(axis=1)
-    groups = np.searchsorted(np.cumsum(counts), np.arange(_PAIRS, counts.sum(), _PAIRS))
-    for members in np.split(chosen, groups):
-        width, height = (end - first)[members].T
-        number = np.repeat(np.arange(len(members)), width * height)
-        place = np.arange(len(number)) - np.repeat(
-            np.cumsum(width * height) - width * height, width * height
-        )
-        row, column = np.divmod(place, width[number])
-        column += first[members, 0][number]
-        row += first[members, 1][number]
-        edges = np.moveaxis(corners[members, 1:] - corners[members, :1], 1, 2)
-        inverse = np.linalg.inv(edges)
-        away = np.stack([column, row, np.zeros(len(row))], axis=1) - corners[members, 0][number]
-        weights = np.einsum("pij,pj->pi", inverse[number], away)
-        inside = (weights.min(axis=1) >= -1e-9) & (weights.sum(axis=1) <= 1.0 + 1e-9)
-        number, weights = number[inside], weights[inside]
-        origin = rest_nodes[tetrahedra[members]][number]
-        found[row[inside], column[inside]] = origin[:, 0] + np.einsum(
-            "pk,pki->pi", weights, origin[:, 1:] - origin[:, :1]
-        )
-    return found
-
-
-def _determinants(nodes: Array, tetrahedra: NDArray[np.int32]) -> Array:
-    """(M,) m3, six times the signed volumes."""
-    corners = nodes[tetrahedra]
-    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))

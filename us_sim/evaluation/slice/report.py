@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,26 +10,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from us_sim.evaluation.figures import draw_error_over_time, draw_image_grid, draw_lines
+from us_sim.evaluation.figures import draw_error_over_time, draw_lines
 from us_sim.evaluation.report import exponent
-from us_sim.evaluation.settings import RecordedSweep
 from us_sim.evaluation.slice.cases import MAIN, PLANES, cases
 from us_sim.evaluation.slice.measure import OURS, case_rows
-from us_sim.evaluation.slice.recorded import recorded_rows
 from us_sim.evaluation.subject import Piece, Report, Subject, Target
-
-SHOWN = (
-    MAIN,
-    replace(MAIN, deformation="pressed_30mm", plane="oblique"),
-    replace(MAIN, deformation="pressed_30mm", plane="corner"),
-)
-"""The cases of the picture of differences, a row each."""
 
 _FRAME = {"16.7 ms: 60 images a second": 1000.0 / 60.0}
 
 
-def _pieces(quick: bool, recorded: RecordedSweep | None = None) -> Mapping[str, Sequence[Piece]]:
-    pieces = {
+def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
+    return {
         "slice": [
             Piece(
                 {
@@ -43,12 +33,8 @@ def _pieces(quick: bool, recorded: RecordedSweep | None = None) -> Mapping[str, 
                 partial(case_rows, case, _seconds(quick, case)),
             )
             for case in cases(quick)
-        ],
+        ]
     }
-    if recorded is not None and recorded.volume is not None and recorded.sweep is not None:
-        compare = partial(recorded_rows, recorded.volume, recorded.sweep, quick)
-        pieces["recorded_frames"] = [Piece({"frame": "every frame"}, compare)]
-    return pieces
 
 
 def _seconds(quick: bool, case: Any) -> float:
@@ -57,7 +43,7 @@ def _seconds(quick: bool, case: Any) -> float:
     return main if case == MAIN else other
 
 
-def _report(table: pd.DataFrame, recorded: pd.DataFrame | None = None) -> Report:
+def _report(table: pd.DataFrame) -> Report:
     table = table.assign(pixels=table["size"] ** 2)
     nodes = int(np.prod(MAIN.counts))
     image = table[(table["deformation"] == MAIN.deformation) & (table["plane"] == MAIN.plane)]
@@ -112,11 +98,8 @@ def _report(table: pd.DataFrame, recorded: pd.DataFrame | None = None) -> Report
             limits={**_FRAME, "y:a tenth of a voxel": 0.1},
             labels={"ms": "ms an image (median)", "max_voxel_error": "worst pixel, voxels at rest"},
         ),
-        "differences": _draw_differences(table),
         "pixels": _draw_times(sizes, "pixels"),
-        "by_size": _across(sizes, "size"),
         "meshes": _draw_times(meshes, "nodes"),
-        "by_mesh": _across(meshes, "nodes"),
         "planes": "; ".join(f"`{name}`: {view.words}" for name, view in PLANES.items()),
         "by_case": _across(
             table[(table["nodes"] == nodes) & (table["size"] == MAIN.size)], "deformation", "plane"
@@ -130,13 +113,6 @@ def _report(table: pd.DataFrame, recorded: pd.DataFrame | None = None) -> Report
         f"From 2,000 to 65,536 nodes the time grows {by_nodes.iloc[-1] / by_nodes.iloc[0]:.2g} "
         f"times; with the pixels as their power {power:g}.",
     ]
-    if recorded is not None:
-        ncc = recorded["ncc_raw"]
-        take_home.append(
-            f"{(ncc >= 0.8).sum()} of {len(ncc)} recorded frames are found again in the volume "
-            f"with a correlation of 0.8 or more (lowest {ncc.min():.3f})."
-        )
-        places |= _recorded_places(recorded)
     return Report(take_home, places, targets)
 
 
@@ -177,62 +153,10 @@ def _draw_times(rows: pd.DataFrame, across: str) -> Figure:
     )
 
 
-def _draw_differences(table: pd.DataFrame) -> Figure | str:
-    """A row a case: for every method how far each pixel is from its true place."""
-    grid: dict[str, dict[str, Any]] = {}
-    rows = table[(table["threads"] == 1) & (table["size"] == MAIN.size)]
-    rows = rows[rows["nodes"] == int(np.prod(MAIN.counts))]
-    for case in SHOWN:
-        mine = rows[(rows["deformation"] == case.deformation) & (rows["plane"] == case.plane)]
-        if len(mine):
-            grid[f"{case.deformation}\n{PLANES[case.plane].words}"] = {
-                row.method: np.log10(np.maximum(row.distance, 1e-14)) for row in mine.itertuples()
-            }
-    title = "Where each pixel's tissue is taken from (grey: nothing there, or wrong coverage)"
-    look: Any = {"span": (-13.0, -2.0), "colours": "magma", "aspect": 4 / 3}
-    words = "log10 of voxels from the true place at rest"
-    return draw_image_grid(grid, title, words=words, **look) if grid else ""
-
-
-def _recorded_places(recorded: pd.DataFrame) -> dict[str, Any]:
-    """Table, numbers and pictures of the frames of a sweep."""
-    shown = recorded[recorded["pair"].notna()]
-    white = float(np.percentile([pair.recorded for pair in shown["pair"]], 99.2))
-    grid: dict[str, dict[str, Any]] = {"recorded": {}, "simulated": {}}
-    for row in shown.itertuples():
-        name = f"frame {row.frame}, NCC {row.ncc_raw:.3f}"
-        grid["recorded"][name] = row.pair.recorded
-        grid["simulated"][name] = row.pair.simulated
-    columns = {
-        "ncc_raw": "the frame as recorded",
-        "ncc_smoothed": "it, smoothed by 1 mm, as the volume is",
-        "ncc_mirrored": "the smoothed frame, left and right swapped",
-    }
-    ncc = recorded[list(columns)]
-    table = pd.DataFrame(
-        {
-            "normalised cross-correlation with": list(columns.values()),
-            "lowest": ncc.min().to_list(),
-            "median": ncc.median().to_list(),
-            "highest": ncc.max().to_list(),
-            "at least 0.8": [f"{(ncc[name] >= 0.8).sum()} of {len(ncc)}" for name in columns],
-        }
-    )
-    title = "Real frames of a freehand sweep, and the volume made from it cut at their poses"
-    return {
-        "count": str(len(recorded)),
-        "coverage": f"{100 * recorded['coverage'].mean():.0f}",
-        "recorded": table,
-        "rigid": str(recorded["grey_difference_rigid"].max()),
-        "frames": draw_image_grid(grid, title, span=(0.0, white)),
-    }
-
-
 SLICE = Subject(
     "slice",
     "Slices: error against run time",
     _pieces,
     _report,
-    hidden=("distance", "pair"),
     libraries=("numpy", "scipy", "numba", "vtk"),
 )
