@@ -75,7 +75,7 @@ def test_rows_plots_and_report_are_written(tmp_path, monkeypatch):
             assert row["coverage_mismatch_px"] == "0"
             assert float(row["max_grey_difference"]) <= 1
             assert float(row["max_voxel_error"]) < 0.1
-    assert len(rows) == 2 * 7
+    assert len(rows) == 2 * 5
     report = (out / "slice.md").read_text(encoding="utf-8")
     assert "$" not in report
     for picture in re.findall(r"\]\((\S+\.png)\)", report):
