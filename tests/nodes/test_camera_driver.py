@@ -87,21 +87,6 @@ def test_a_looping_video_goes_on_and_the_latency_makes_stamps_earlier(bench, vid
         camera_from(infos[0])
 
 
-@pytest.mark.slow
-def test_a_video_that_began_earlier_goes_on_where_it_would_be(bench, video):
-    now = bench.peer.get_clock().now().nanoseconds
-    begun = 1e-9 * now - 30.0
-    images = bench.collect(Image, "camera/image_raw")
-    node = bench.make(CameraDriver, source=str(video), rate=0.2, begun=begun)  # 5 s an image
-    bench.spin_until(lambda: images)
-    assert float(node.health.values["begun"]) == pytest.approx(begun, abs=1e-5)
-    number = round(1e-9 * nanoseconds(images[0]) - begun) // 5
-    assert number >= 6  # the first that was due since
-    assert 1e-9 * nanoseconds(images[0]) - begun == pytest.approx(5 * number, abs=1e-3)
-    expected = cv2.cvtColor(frames_of(video)[number], cv2.COLOR_BGR2GRAY)
-    np.testing.assert_array_equal(decode_image(images[0], "GRAY"), expected)
-
-
 class PaperCamera:
     """A stand-in for `cv2.VideoCapture` of a camera that gives ``left`` grey images, then none."""
 

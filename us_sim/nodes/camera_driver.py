@@ -19,12 +19,12 @@ from us_sim.nodes.mailbox import Mailbox
 from us_sim.nodes.messages import image_message, stamp_message
 from us_sim.nodes.parameters import declared
 from us_sim.nodes.process import run_node
-from us_sim.nodes.sessions.playback import CHECK_S, Awaited
 from us_sim.nodes.settings import CameraDriverSettings
 from us_sim.share import full_path
 from us_sim.tracking.camera.model import CameraModel, read_camera_info
 from us_sim.tracking.camera.source import VideoSource
 
+CHECK_S = 0.05  # how often it is looked for a subscriber
 RETRY_S = 1.0  # how long a camera that is not there is left alone
 END_S = 1.0  # how long an image that is awaited may hold up the node's end
 
@@ -32,10 +32,10 @@ END_S = 1.0  # how long an image that is awaited may hold up the node's end
 class CameraDriver(GuardedNode):
     """``camera/image_raw`` and, with the same stamp, ``camera/camera_info`` of each image.
 
-    Its parameters are those of `CameraDriverSettings` and `AwaitedSettings`. A camera is asked for
-    the size in its calibration; a stamp is by ``latency`` earlier than the image came.
+    Its parameters are those of `CameraDriverSettings`. A camera is asked for the size in its
+    calibration; a stamp is by ``latency`` earlier than the image came.
 
-    A file begins when somebody subscribes, and what is awaited is there.
+    A file begins when somebody subscribes.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -45,14 +45,12 @@ class CameraDriver(GuardedNode):
         self._frame, self._loop = settings.frame_id, settings.loop
         self._encoding = settings.encoding
         self._latency = round(1e9 * settings.latency)
-        self._begun = round(1e9 * settings.begun)  # ns, when a file's first image was due
         self._camera = read_camera_info(full_path(info)) if info else None
         size = (self._camera.width, self._camera.height) if self._camera else None
         self._video = VideoSource(source, size=size, rate=settings.rate)
         self.finished = Future()
         self.health = Health(self, source)
         self._images = self.stream(Image, "camera/image_raw")
-        self._awaited = Awaited(self, self._images)
         self._descriptions = self.stream(CameraInfo, "camera/camera_info")
         if self._camera is None:
             self.get_logger().warning(
@@ -110,21 +108,18 @@ class CameraDriver(GuardedNode):
     def _play(self) -> None:
         """A file, as fast as it was recorded."""
         self.health.state = "waiting for a subscriber"
-        while not self._awaited.has_come():
+        while not self._images.get_subscription_count():
             if self._closing.wait(CHECK_S):
                 return
-        there, number = self.get_clock().now().nanoseconds, 0
-        begun = self._begun if 0 < self._begun < there else there
-        shown = True
+        begun, number, shown = self.get_clock().now().nanoseconds, 0, True
         while not self._closing.is_set():
             due = begun + round(1e9 * number * self._video.interval)
             now = self.get_clock().now().nanoseconds
-            self.health.values = {"played": str(number), "begun": f"{1e-9 * begun:.9f}"}
+            self.health.values = {"played": str(number)}
             if self._closing.wait(max(due - now, 0) * 1e-9):
                 return
             # It was exposed when it was due, however long it takes to decode.
-            # One that was due before this process was there is passed over.
-            if self._video.grab() is None or not (due < there or (shown := self._keep(due))):
+            if self._video.grab() is None or not (shown := self._keep(due)):
                 # A file that holds nothing at all would be begun again without end.
                 if not (self._loop and number and shown and self._video.open()):
                     break

@@ -30,7 +30,7 @@ HELD = 5.0
 class PathPlayer(Player):
     """A bag's poses on ``tracker/pose``.
 
-    Its parameters are those of `PathPlayerSettings` and `AwaitedSettings`.
+    Its parameters are those of `PathPlayerSettings`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -49,7 +49,7 @@ class PathPlayer(Player):
         self._poses = self.stream(PoseStamped, "tracker/pose", EVERY if lockstep else SENT)
         if lockstep:
             self.subscribe(Image, "ultrasound/image", self._on_image, EVERY)
-        self._awaited = Awaited(self, self._poses)
+        self._awaited = Awaited(self, self._poses, settings)
         self.health.state = "waiting"
         self._ticking = self._timer_at_its_pace()  # now, so that its thread goes first, too
         self._ticking.cancel()

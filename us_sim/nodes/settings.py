@@ -92,18 +92,6 @@ OF_SIMULATORS = tuple(f"/{topic.name}" for topic in TOPICS if not topic.from_dri
 
 
 @dataclass(frozen=True)
-class AwaitedSettings(Settings):
-    """Of nodes that play: when they begin."""
-
-    await_topics: tuple[str, ...] = setting(
-        description="begin when each of these has a publisher", default=()
-    )
-    await_recorded: tuple[str, ...] = setting(
-        description="and session_recorder subscribes to each of these", default=()
-    )
-
-
-@dataclass(frozen=True)
 class PlayerSettings(Settings):
     """Of nodes that play: what ``ros2 bag play`` has under the same names, and more."""
 
@@ -142,6 +130,12 @@ class PathPlayerSettings(PlayerSettings):
     )
     lockstep: bool = setting(
         description="send the next pose when the image of the last has come", default=False
+    )
+    await_topics: tuple[str, ...] = setting(
+        description="begin when each of these has a publisher", default=()
+    )
+    await_recorded: tuple[str, ...] = setting(
+        description="and session_recorder subscribes to each of these", default=()
     )
     begun: float = setting(
         BEGUN,
@@ -396,12 +390,6 @@ class CameraDriverSettings(Settings):
         "from the middle of the exposure to the image's arrival",
         default=0.0,
     )
-    begun: float = setting(
-        BEGUN,
-        "since 1970, when a file's first image was shown: play on where it would be by now; 0: "
-        "from the start",
-        default=0.0,
-    )
 
 
 @dataclass(frozen=True)
@@ -449,11 +437,11 @@ NODES: dict[str, tuple[type[Settings], ...]] = {
     "haptic_renderer": (SceneNodeSettings,),
     "scorer": (SceneNodeSettings, ScorerSettings, ScoreSettings),
     "openigtlink_bridge": (SceneNodeSettings, OpenIGTLinkBridgeSettings),
-    "path_player": (PathPlayerSettings, AwaitedSettings),
+    "path_player": (PathPlayerSettings,),
     "session_player": (SessionPlayerSettings,),
     "session_recorder": (SessionRecorderSettings,),
     "session_control": (SessionControlSettings,),
-    "camera_driver": (CameraDriverSettings, AwaitedSettings),
+    "camera_driver": (CameraDriverSettings,),
     "space_mouse_driver": (SpaceMouseDriverSettings,),
     "probe_robot": (RobotSettings,),
     "image_writer": (ImageWriterSettings,),

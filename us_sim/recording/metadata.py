@@ -11,7 +11,7 @@ from typing import Any
 from us_sim.errors import BagError
 from us_sim.recording.schemas import normalized_type
 from us_sim.recording.topic import BagTopic, as_yaml, qos_from_yaml
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import YamlError, load_yaml
 
 _KEY = "rosbag2_bagfile_information"
 _NEWEST_VERSION = 9
@@ -73,7 +73,7 @@ def read_metadata(file: Path) -> BagMetadata:
         BagError: it cannot be read, is not such a file, or is of a newer version.
     """
     try:
-        document = load_yaml(read_text(file))
+        document = load_yaml(file.read_text(encoding="utf-8"))
         information = document[_KEY]
         version = int(information["version"])
         if version > _NEWEST_VERSION:

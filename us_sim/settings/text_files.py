@@ -1,10 +1,6 @@
-"""Text files and YAML that a person or a stranger wrote, of limited size, each key once.
+"""YAML that a person wrote, each key once.
 
->>> from us_sim.settings.text_files import load_yaml, read_text
->>> read_text("/dev/zero")
-Traceback (most recent call last):
-    ...
-OSError: [Errno 27] more than 64 MiB, and no text is so long: '/dev/zero'
+>>> from us_sim.settings.text_files import load_yaml
 >>> load_yaml("probe: {depth: 4 cm}")
 {'probe': {'depth': '4 cm'}}
 >>> load_yaml("depth: 4 cm\\ndepth: 5 cm")
@@ -14,35 +10,12 @@ us_sim.settings.text_files.YamlError: line 2: key `depth` is there twice, first 
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from us_sim.errors import UsSimError
-
-_LARGEST = 64 << 20
-
-
-def read_text(path: Path | str, encoding: str = "utf-8", errors: str = "strict") -> str:
-    """The text of a file, or of a pipe, that is not endless.
-
-    Raises:
-        OSError: it cannot be read, or has more than 64 MiB.
-        UnicodeDecodeError: it is no text of that encoding.
-    """
-    return read_bytes(path).decode(encoding, errors)
-
-
-def read_bytes(path: Path | str) -> bytes:
-    """Likewise, of a text whose encoding is said in it."""
-    with Path(path).open("rb") as file:
-        data = file.read(_LARGEST + 1)
-    if len(data) > _LARGEST:
-        raise OSError(errno.EFBIG, "more than 64 MiB, and no text is so long", str(path))
-    return data
-
 
 LARGEST_YAML = 1 << 20
 """Characters of a text that is read."""
@@ -83,7 +56,7 @@ def read_yaml(path: Path, error_type: type[UsSimError], label: Path | None = Non
         UsSimError: of that type, it cannot be read, or as `load_yaml`.
     """
     try:
-        return load_yaml(read_text(path))
+        return load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise error_type(f"{label or path}: cannot be read: {error}") from error
     except YamlError as error:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from us_sim.errors import MeshError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.settings.spelling import shown
-from us_sim.settings.text_files import read_text
 
 _CORNERS = {"triangle": 3, "quad": 4}
 
@@ -132,7 +131,7 @@ def read_surface(path: Path | str, metres_per_unit: float = 1.0) -> TriangleSurf
     faces: NDArray[np.integer]
     try:
         if path.suffix.lower() == ".obj":
-            points, faces = parse_wavefront(read_text(path, errors="replace"))
+            points, faces = parse_wavefront(path.read_text(encoding="utf-8", errors="replace"))
         else:
             points, faces = _faces_by_meshio(path)
         places, joined = np.unique(points, axis=0, return_inverse=True)

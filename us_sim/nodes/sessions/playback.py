@@ -16,9 +16,9 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from us_sim.errors import BagError
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.messages import stamp_message
-from us_sim.nodes.parameters import Group, LiveSettings, declared
+from us_sim.nodes.parameters import Group, LiveSettings
 from us_sim.nodes.sessions.triggers import offer
-from us_sim.nodes.settings import RECORDER, AwaitedSettings, PlayerSettings
+from us_sim.nodes.settings import RECORDER, PathPlayerSettings, PlayerSettings
 from us_sim.recording.playhead import Playhead
 from us_sim.share import find_bag
 
@@ -31,18 +31,20 @@ TELL_AFTER_S = 5.0  # after so long it is said what is waited for
 
 
 class Awaited:
-    """Waits for the topics that `AwaitedSettings` name, and for a subscriber.
+    """Waits for the topics that a path player's settings name, and for a subscriber.
 
     After a while what is missing is said, and told in diagnostics as ``awaited``.
 
     Args:
         node: that plays.
         publisher: to which somebody must have subscribed.
+        settings: of the node.
     """
 
-    def __init__(self, node: GuardedNode, publisher: Publisher) -> None:
-        self._node, self._publisher = node, publisher
-        self._settings = declared(node, AwaitedSettings())
+    def __init__(
+        self, node: GuardedNode, publisher: Publisher, settings: PathPlayerSettings
+    ) -> None:
+        self._node, self._publisher, self._settings = node, publisher, settings
         self._checks = 0
         self._since = 0.0  # s, monotonic; when it was first looked
         self._told = ""

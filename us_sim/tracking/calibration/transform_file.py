@@ -32,7 +32,7 @@ from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.volume.sequences.itk_transform import TRANSFORM_SUFFIXES, read_slicer_transform
 
 
@@ -121,7 +121,7 @@ def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = load_yaml(read_text(path))
+        document = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (UnicodeDecodeError, YamlError) as error:

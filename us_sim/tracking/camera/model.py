@@ -22,7 +22,7 @@ import yaml
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import YamlError, load_yaml
 
 _OPENCVS = (4, 5, 8, 12, 14)  # k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]
 DISTORTION_MODELS = {
@@ -189,7 +189,7 @@ def read_camera_info(path: Path | str) -> CameraModel:
     """
     path = Path(path)
     try:
-        content = load_yaml(read_text(path))
+        content = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, YamlError) as error:

@@ -27,7 +27,7 @@ from us_sim.settings.choice import Choice, Chosen
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
-from us_sim.settings.text_files import YamlError, load_yaml, read_text
+from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
 from us_sim.tracking.settings import MARKER_SIZE, BoardSettings
 
@@ -352,7 +352,7 @@ def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> Rig
         TrackingError: the file, or the body in it, cannot be used.
     """
     try:
-        content = load_yaml(read_text(Path(path)))
+        content = load_yaml(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise TrackingError(f"{path}: {error.strerror or error}") from error
     except (UnicodeDecodeError, YamlError) as error:
