@@ -13,17 +13,20 @@ from command import us_sim
 from us_sim.recording.reader import read_bag
 
 AT_EXIT = """
-import atexit, json, os, pathlib, sys
+import json, os, pathlib, sys
 
-def write():
+end = os._exit  # by which a process that was forked ends
+
+def write(status):
     names = [name for name in sys.modules if name.startswith("us_sim.")]
     folder = pathlib.Path(os.environ["MODULES_OF_PROCESSES"])
     part = folder / f"{os.getpid()}.part"
     part.write_text(json.dumps([sys.argv[0], names]))
     part.rename(part.with_suffix(".json"))  # one that is ended meanwhile has said nothing
+    end(status)
 
 if "MODULES_OF_PROCESSES" in os.environ:
-    atexit.register(write)
+    os._exit = write
 """
 
 
@@ -42,7 +45,6 @@ def run_and_list_modules(scene: Path, tmp_path: Path) -> tuple[dict[str, set[str
     for file in modules.glob("*.json"):
         program, names = json.loads(file.read_text())
         by_node[Path(program).stem] = set(names)
-    by_node.pop("__main__", None)  # the command's own
     return by_node, {topic.name for topic in read_bag(recording).topics}
 
 

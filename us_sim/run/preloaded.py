@@ -9,15 +9,8 @@ import signal
 
 from us_sim.run.forked import end_with_parent
 
-_SHARED = (
-    "us_sim.nodes.messages",
-    "us_sim.nodes.settings",
-    "us_sim.scene.case_tissue",
-    "us_sim.skin.membrane",
-    "us_sim.slicing.b_mode",
-    "us_sim.tissue.live_tissue",
-    "us_sim.tissue.solvers.fem_nonlinear",
-)
+_SHARED = ("scipy.sparse", "us_sim.nodes.messages", "us_sim.nodes.settings")
+"""No part of a scene: one that a scene does not name is not imported."""
 
 
 def preload() -> None:

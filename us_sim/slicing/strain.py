@@ -36,7 +36,6 @@ from us_sim.slicing.cutting.resampling import evaluate
 from us_sim.slicing.cutting.section import FLAT
 from us_sim.slicing.drawing.overlay import ColourScale
 from us_sim.slicing.frame import Frame
-from us_sim.tissue.elasticity.materials import label_fractions
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 
 
@@ -105,6 +104,8 @@ class AxialStrain:
             raise MeshError("no tissue carries the volume, so there is no strain")
         tissue = None
         if sharp and frame.volume.labels is not None:
+            from us_sim.tissue.elasticity.materials import label_fractions  # for strain alone
+
             mesh, volume = TetrahedralMesh(*frame.mesh), frame.volume
             found = label_fractions(mesh, frame.volume.labels, volume.patient_to_index)
             tissue = found.labels[found.fractions.argmax(axis=1)]
