@@ -14,6 +14,7 @@ the rows' points on it, in the order of x. `draw_image_grid` has a row and a col
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -71,7 +72,7 @@ def draw_lines(
     filled: str = "",
     join: bool = True,
     limits: Mapping[str, float] | None = None,
-    floor: float = 0.0,
+    floor: float = -math.inf,
     share_y: bool = True,
 ) -> Figure:
     """Draw one column of a table over another.
