@@ -44,6 +44,8 @@ class Supervisor:
 class Control:
     """Shows what it is told."""
 
+    is_list_wanted = True
+
     def __init__(self):
         self.values = SessionControlSettings()
         self.told, self.to_player = [], []

@@ -190,7 +190,6 @@ class PathPlayer(Player):
     def end(self) -> None:
         """Hold the last pose, or be done."""
         self.finish()
-        self.health.report()  # or the last second of the path would seem not to be played
         self.get_logger().info("the path is at its end")
         if not self.settings.stay:
             self.finished.set_result(None)

@@ -94,6 +94,11 @@ class SessionControl(GuardedNode):
             parameters = [Parameter(name, value=each) for name, each in values.items()]
             self._player(node).set_parameters(parameters)
 
+    @property
+    def is_list_wanted(self) -> bool:
+        """Whether somebody hears which scenes there are."""
+        return self._scenes.get_subscription_count() > 0
+
     def tell_scenes(self, scenes: Sequence[ListedScene]) -> None:
         """Publish which scenes and cases can be loaded."""
         message = self._array()

@@ -173,7 +173,9 @@ class Simulation:
         self._control.show(self._shown())
 
     def _list_scenes(self) -> None:
-        """Read one scene more; publish the list once all are read."""
+        """Read one scene more while somebody wants the list; publish it once all are read."""
+        if not self._control.is_list_wanted:
+            return
         for scene in self._unlisted:
             self._listed.setdefault(scene.origin, scene)
             return

@@ -25,18 +25,22 @@ array([-0.05, -0.05, -0.05], dtype=float32)
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import itertools
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
 
 from us_sim.errors import MeshError
-from us_sim.slicing.cutting.resampling import evaluate
-from us_sim.slicing.cutting.section import FLAT
+from us_sim.kernels import njit
+from us_sim.slicing.cutting.resampling import evaluate, parallel_rows
+from us_sim.slicing.cutting.section import adjugate, is_solid
 from us_sim.slicing.drawing.overlay import ColourScale
 from us_sim.slicing.frame import Frame
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
+from us_sim.slicing.probe.probe import LinearProbe, Probe
+
+if TYPE_CHECKING:
+    from us_sim.volume.volume import Volume
 
 
 def displacement(frame: Frame) -> NDArray[np.float32]:
@@ -61,6 +65,186 @@ def displacement(frame: Frame) -> NDArray[np.float32]:
     return evaluate(across @ (now - rest), located.elements, threads=frame.threads)
 
 
+_PARTS = 5  # of an edge: the points that are looked up lie evenly, 56 in each tetrahedron
+
+
+def main_labels(
+    nodes: NDArray[np.float64], tetrahedra: NDArray[np.integer], volume: Volume
+) -> NDArray[np.uint8]:
+    """(M,) the label with most of some evenly spaced points; 0 without labels.
+
+    Args:
+        nodes: (N, 3) m, at rest. tetrahedra: (M, 4).
+    """
+    if volume.labels is None:
+        return np.zeros(len(tetrahedra), dtype=np.uint8)
+    to_index = volume.patient_to_index
+    index = nodes @ to_index[:3, :3].T + to_index[:3, 3]
+    last = np.array(volume.shape) - 1
+    corners = index[tetrahedra]
+    counts = itertools.product(range(_PARTS + 1), repeat=3)
+    inner = [(*each, _PARTS - sum(each)) for each in counts if sum(each) <= _PARTS]
+    weights = [(np.array(each) + 0.25) / (_PARTS + 1.0) for each in inner]  # none on a face
+    most = np.zeros(len(tetrahedra), dtype=np.int16)
+    found = np.zeros(len(tetrahedra), dtype=np.uint8)
+    seen = np.stack(
+        [
+            volume.labels[tuple(np.clip(np.rint(place), 0, last).astype(np.intp).T)]
+            for place in (np.einsum("k,ekj->ej", weight, corners) for weight in weights)
+        ],
+        axis=1,
+    )
+    for label in np.unique(seen):
+        count = (seen == label).sum(axis=1, dtype=np.int16)
+        more = count > most
+        most[more], found[more] = count[more], label
+    return found
+
+
+class Corners(NamedTuple):
+    """The P corners that tetrahedra of one tissue share: a node between two tissues is two."""
+
+    numbers: NDArray[np.int32]  # (M, 4) of the tetrahedra's corners
+    starts: NDArray[np.int64]  # (P + 1,) of the list of tetrahedra around each, one after the other
+    members: NDArray[np.int32]  # (starts[-1],)
+
+
+def corners_by_tissue(tetrahedra: NDArray[np.int32], tissue: NDArray[np.integer]) -> Corners:
+    """Corners over which strain is averaged, and not from one tissue to another.
+
+    Args:
+        tetrahedra: (M, 4). tissue: (M,) which one each is of, at least 0.
+    """
+    width = int(tissue.max(initial=0)) + 1
+    keys = tetrahedra.astype(np.int64) * width + np.asarray(tissue, dtype=np.int64)[:, None]
+    _, numbers = np.unique(keys.ravel(), return_inverse=True)
+    numbers = numbers.ravel()  # NumPy 2.0 gives it the shape of the keys
+    count = int(numbers.max(initial=-1)) + 1
+    starts = np.zeros(count + 1, dtype=np.int64)
+    np.cumsum(np.bincount(numbers, minlength=count), out=starts[1:])
+    members = (np.argsort(numbers, kind="stable") // 4).astype(np.int32)
+    return Corners(numbers.reshape(-1, 4).astype(np.int32), starts, members)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nodal_deformation(
+    shown, tetrahedra, corners, starts, members, before, now, to_pixel, pixel_volume, steps, place,
+    deformed, done, mean,
+):  # fmt: skip
+    """Fills ``mean`` (P, 3) at the corners of the tetrahedra that are shown.
+
+    It is c in the image's plane: lateral by lateral, lateral by axial, axial by axial. A corner
+    around which all tetrahedra are inverted or flat is left without deformation: 1, 0, 1.
+
+    Args:
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes.
+        corners, starts, members: as `Corners`.
+        before, now: (N, 3) m, nodes in the other state and now.
+        to_pixel: (3, 4) from m to column, row and height. pixel_volume: m³ per unit of those.
+        steps: (2,) m, from one column to the next, and from one row to the next.
+        place: (N, 3) column, row and height of the nodes now, filled here.
+        deformed: (M, 4) room for volume and c of tetrahedra. done: (M + P,) bool, room.
+    """
+    for n in range(len(now)):
+        for a in range(3):
+            place[n, a] = (
+                to_pixel[a, 3]
+                + to_pixel[a, 0] * now[n, 0]
+                + to_pixel[a, 1] * now[n, 1]
+                + to_pixel[a, 2] * now[n, 2]
+            )
+    for i in range(len(done)):
+        done[i] = False
+    count = len(tetrahedra)
+    for s in shown:
+        for k in range(4):
+            n = corners[s, k]
+            if done[count + n]:
+                continue
+            done[count + n] = True
+            volume = 0.0
+            first = 0.0
+            mixed = 0.0
+            last = 0.0
+            for q in range(starts[n], starts[n + 1]):
+                e = members[q]
+                if not done[e]:
+                    done[e] = True
+                    _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed)
+                volume += deformed[e, 0]
+                first += deformed[e, 0] * deformed[e, 1]
+                mixed += deformed[e, 0] * deformed[e, 2]
+                last += deformed[e, 0] * deformed[e, 3]
+            mean[n, 0] = first / volume if volume > 0.0 else 1.0
+            mean[n, 1] = mixed / volume if volume > 0.0 else 0.0
+            mean[n, 2] = last / volume if volume > 0.0 else 1.0
+
+
+@njit(inline="always", error_model="numpy")
+def _deform(tetrahedra, e, before, place, pixel_volume, steps, deformed):
+    """Fills a tetrahedron's row: its volume now in any unit (0 if it is not solid), and c."""
+    n0 = tetrahedra[e, 0]
+    n1 = tetrahedra[e, 1]
+    n2 = tetrahedra[e, 2]
+    n3 = tetrahedra[e, 3]
+    size, to_1, to_2, to_3 = adjugate(place, n0, n1, n2, n3)
+    ax = before[n1, 0] - before[n0, 0]
+    ay = before[n1, 1] - before[n0, 1]
+    az = before[n1, 2] - before[n0, 2]
+    bx = before[n2, 0] - before[n0, 0]
+    by = before[n2, 1] - before[n0, 1]
+    bz = before[n2, 2] - before[n0, 2]
+    cx = before[n3, 0] - before[n0, 0]
+    cy = before[n3, 1] - before[n0, 1]
+    cz = before[n3, 2] - before[n0, 2]
+    earlier = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+    if not is_solid(size, pixel_volume, earlier):
+        deformed[e, 0] = 0.0
+        deformed[e, 1] = 0.0
+        deformed[e, 2] = 0.0
+        deformed[e, 3] = 0.0
+        return
+    # How fast the place in the other state changes along the image's columns and rows.
+    p = 1.0 / (size * steps[0])
+    ux = p * (to_1[1] * ax + to_2[1] * bx + to_3[1] * cx)
+    uy = p * (to_1[1] * ay + to_2[1] * by + to_3[1] * cy)
+    uz = p * (to_1[1] * az + to_2[1] * bz + to_3[1] * cz)
+    r = 1.0 / (size * steps[1])
+    wx = r * (to_1[2] * ax + to_2[2] * bx + to_3[2] * cx)
+    wy = r * (to_1[2] * ay + to_2[2] * by + to_3[2] * cy)
+    wz = r * (to_1[2] * az + to_2[2] * bz + to_3[2] * cz)
+    deformed[e, 0] = abs(size)
+    deformed[e, 1] = ux * ux + uy * uy + uz * uz
+    deformed[e, 2] = ux * wx + uy * wy + uz * wz
+    deformed[e, 3] = wx * wx + wy * wy + wz * wz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def to_pixels(shown, tetrahedra, corners, place, mean, maps):
+    """Fills ``maps`` (E, 3, 3): coefficients of (1, column, row) of the corners' values.
+
+    Args:
+        shown: (E,) numbers of tetrahedra. tetrahedra: (M, 4) nodes. corners: (M, 4).
+        place: (N, 3) column, row and height of the nodes.
+        mean: (P, 3), as `nodal_deformation` fills it.
+    """
+    for s in range(len(shown)):
+        e = shown[s]
+        n0 = tetrahedra[e, 0]
+        size, to_1, to_2, to_3 = adjugate(
+            place, n0, tetrahedra[e, 1], tetrahedra[e, 2], tetrahedra[e, 3]
+        )
+        r = 1.0 / size
+        for k in range(3):
+            at = mean[corners[e, 0], k]
+            b = r * (mean[corners[e, 1], k] - at)
+            c = r * (mean[corners[e, 2], k] - at)
+            d = r * (mean[corners[e, 3], k] - at)
+            maps[s, k, 0] = at + b * to_1[0] + c * to_2[0] + d * to_3[0]
+            maps[s, k, 1] = b * to_1[1] + c * to_2[1] + d * to_3[1]
+            maps[s, k, 2] = b * to_1[2] + c * to_2[2] + d * to_3[2]
+
+
 class AxialStrain:
     """Strain images of a mesh's deformations.
 
@@ -77,17 +261,17 @@ class AxialStrain:
         tissue: NDArray[np.integer] | None = None,
     ) -> None:
         self._rest = np.array(rest_nodes, dtype=np.float64)
-        self._tetrahedra = np.array(tetrahedra, dtype=np.int64)
-        shape, count = self._tetrahedra.shape, len(self._tetrahedra)
-        keys = self._tetrahedra
-        if tissue is not None:  # a node between two tissues is two corners
-            keys = keys * (int(tissue.max(initial=0)) + 1) + tissue.astype(np.int64)[:, None]
-        numbers = np.unique(keys.ravel(), return_inverse=True)[1].ravel()
-        self._corners = numbers.reshape(shape)  # (M, 4)
-        ends = np.arange(0, numbers.size + 1, 4)
-        # (corners, M), which tetrahedra are around each corner.
-        self._around = csr_array((np.ones(numbers.size), numbers, ends), (count, numbers.max() + 1))
-        self._around = self._around.T.tocsr()
+        self._tetrahedra = np.array(tetrahedra, dtype=np.int32)
+        nodes, count = self._rest.shape, len(self._tetrahedra)
+        self._corners = corners_by_tissue(
+            self._tetrahedra, np.zeros(count, dtype=np.int64) if tissue is None else tissue
+        )
+        corners = len(self._corners.starts) - 1
+        self._now, self._before, self._place = np.empty(nodes), np.empty(nodes), np.empty(nodes)
+        self._mean = np.empty((corners, 3))
+        self._deformed = np.empty((count, 4))
+        self._done = np.empty(count + corners, dtype=np.bool_)
+        self._directions: tuple[Probe, NDArray[np.float32]] | None = None
 
     @classmethod
     def of(cls, frame: Frame, *, sharp: bool = False) -> AxialStrain:
@@ -102,14 +286,10 @@ class AxialStrain:
         """
         if frame.mesh is None:
             raise MeshError("no tissue carries the volume, so there is no strain")
-        tissue = None
-        if sharp and frame.volume.labels is not None:
-            from us_sim.tissue.elasticity.materials import label_fractions  # for strain alone
-
-            mesh, volume = TetrahedralMesh(*frame.mesh), frame.volume
-            found = label_fractions(mesh, frame.volume.labels, volume.patient_to_index)
-            tissue = found.labels[found.fractions.argmax(axis=1)]
-        return cls(*frame.mesh, tissue)
+        nodes, tetrahedra = frame.mesh
+        return cls(
+            nodes, tetrahedra, main_labels(nodes, tetrahedra, frame.volume) if sharp else None
+        )
 
     def image(self, frame: Frame, before: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
         """(rows, columns): the strain along each pixel's beam, negative where tissue got shorter.
@@ -125,80 +305,91 @@ class AxialStrain:
                 as this mesh has.
             ProbeError: the pose is nowhere near.
         """
-        located, to_pixel = frame.located, frame.plane.to_pixel
-        now = self._require_nodes(frame.nodes)
-        then = self._rest if before is None else self._require_nodes(before)
-        place = now @ to_pixel[:, :3].T + to_pixel[:, 3]  # (N, 3) column, row and height
-        numbers = self._corners[located.tetrahedra]
-        corners, corner = np.unique(numbers, return_inverse=True)
-        mean = self._average(corners, then, place, frame)[corner.reshape(numbers.shape)]
-        edges, origin = _edges(place, self._tetrahedra[located.tetrahedra])
-        size, inverse = _inverted(edges)
-        slopes = inverse / size[:, None, None] @ (mean[:, 1:] - mean[:, :1])  # (E, 3, 3)
-        constant = mean[:, 0] - np.einsum("ea,eak->ek", origin, slopes)
-        maps = np.stack([constant, slopes[:, 0], slopes[:, 1]], axis=2)
-        first, mixed, last = np.moveaxis(
-            evaluate(maps, located.elements, threads=frame.threads), 2, 0
-        )
-        x, z = frame.probe.pixel_directions
-        one = np.float32(1.0)
-        return np.asarray(one / np.sqrt(x * (x * first + 2 * z * mixed) + z * z * last) - one)
-
-    def _average(
-        self,
-        corners: NDArray[np.integer],
-        then: NDArray[np.float64],
-        place: NDArray[np.float64],
-        frame: Frame,
-    ) -> NDArray[np.float64]:
-        """(K, 3) of c at corners: lateral by lateral, lateral by axial, axial by axial.
-
-        A corner around which all tetrahedra are inverted or flat is without deformation: 1, 0, 1.
-        """
-        around = self._around[corners]
-        used, column = np.unique(around.indices, return_inverse=True)
-        edges, _ = _edges(place, self._tetrahedra[used])
-        before, _ = _edges(then, self._tetrahedra[used])
-        size, inverse = _inverted(edges)
-        earlier, _ = _inverted(before)
-        pixel = float(np.linalg.det(frame.plane.basis))  # m³ per unit of size
-        is_solid = size * pixel * np.sign(earlier) > FLAT * np.abs(earlier)
-        volume = np.where(is_solid, np.abs(size), 0.0)
-        steps = frame.probe.pixel_spacing
-        safe = np.where(volume > 0.0, size, 1.0)[:, None]
-        # How fast the place in the other state changes along the image's columns and rows.
-        lateral, axial = ((inverse[:, a, None] @ before)[:, 0] / (safe * steps[a]) for a in (0, 1))
-        c = np.stack(
-            [(one * other).sum(axis=1) for one, other in
-             ((lateral, lateral), (lateral, axial), (axial, axial))], axis=1
+        located, plane = frame.located, frame.plane
+        now = self._as_kernels_take(frame.nodes, self._now)
+        then = self._rest if before is None else self._as_kernels_take(before, self._before)
+        shown = located.tetrahedra
+        nodal_deformation(
+            shown, self._tetrahedra, *self._corners, then, now, plane.to_pixel,
+            float(np.linalg.det(plane.basis)), frame.probe.pixel_spacing, self._place,
+            self._deformed, self._done, self._mean,
         )  # fmt: skip
-        weights = csr_array((volume[column], column, around.indptr), (len(corners), len(used)))
-        total = weights.sum(axis=1)[:, None]
-        whole = np.array([1.0, 0.0, 1.0])
-        return np.asarray(np.where(total > 0.0, weights @ c / np.maximum(total, 1e-300), whole))
+        maps = np.empty((len(shown), 3, 3))
+        numbers = self._corners.numbers
+        to_pixels(shown, self._tetrahedra, numbers, self._place, self._mean, maps)
+        values = np.empty(located.elements.shape, dtype=np.float32)
+        elements, directions = located.elements, self._directions_of(frame.probe)
+        parallel_rows(
+            frame.threads,
+            plane.rows,
+            lambda first, end: _strain(maps, elements, directions, first, end, values),
+        )
+        return values
 
-    def _require_nodes(self, nodes: ArrayLike | None) -> NDArray[np.float64]:
+    def _as_kernels_take(self, nodes: ArrayLike | None, room: NDArray[np.float64]) -> Any:
         array = np.asarray(nodes)
-        if array.shape != self._rest.shape:
+        if array.shape != room.shape:
             raise MeshError(
-                f"the strain is that of a mesh of {len(self._rest)} nodes, but {array.shape} came"
+                f"the strain is that of a mesh of {len(room)} nodes, but {array.shape} came"
             )
-        return np.asarray(array, dtype=np.float64)
+        room[:] = array
+        return room
+
+    def _directions_of(self, probe: Probe) -> NDArray[np.float32]:
+        """As `Probe.pixel_directions`; of one row and column where all beams are parallel."""
+        if self._directions is None or self._directions[0] is not probe:
+            directions = probe.pixel_directions
+            if isinstance(probe, LinearProbe):
+                directions = directions[:, :1, :1]
+            self._directions = probe, np.array(directions)
+        return self._directions[1]
 
 
-def _edges(
-    place: NDArray[np.float64], tetrahedra: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(E, 3, 3), from the first corner of each tetrahedron to the others; (E, 3), that corner."""
-    corners = place[tetrahedra]
-    return corners[:, 1:] - corners[:, :1], corners[:, 0]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _strain(maps, elements, directions, first_row, end_row, values):
+    """Fills rows of ``values`` (rows, columns) a run of pixels of one tetrahedron at a time.
 
-
-def _inverted(edges: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Determinants (E,) of matrices (E, 3, 3), and their inverses times these."""
-    a, b, c = np.moveaxis(edges, 1, 0)
-    columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
-    return np.einsum("ea,ea->e", a, columns[:, :, 0]), columns
+    Args:
+        maps: (E, 3, 3) as `to_pixels` fills them. elements: (rows, columns).
+        directions: (2, rows, columns) x and z of each pixel's beam, or (2, 1, 1) for 0 and 1.
+    """
+    columns = elements.shape[1]
+    along_z = directions.shape[1] == 1 and directions.shape[2] == 1
+    one = np.float32(1.0)
+    for row in range(first_row, end_row):
+        line = elements[row]
+        start = 0
+        while start < columns:
+            element = line[start]
+            end = start + 1
+            while end < columns and line[end] == element:
+                end += 1
+            if element < 0 or element >= len(maps):
+                for i in range(start, end):
+                    values[row, i] = np.nan
+                start = end
+                continue
+            m = maps[element]
+            axial = np.float32(m[2, 0] + m[2, 2] * row)
+            d_axial = np.float32(m[2, 1])
+            if along_z:
+                for i in range(start, end):
+                    values[row, i] = one / np.sqrt(axial + d_axial * np.float32(i)) - one
+            else:
+                lateral = np.float32(m[0, 0] + m[0, 2] * row)
+                d_lateral = np.float32(m[0, 1])
+                mixed = np.float32(m[1, 0] + m[1, 2] * row)
+                d_mixed = np.float32(m[1, 1])
+                for i in range(start, end):
+                    at = np.float32(i)
+                    x = directions[0, row, i]
+                    z = directions[1, row, i]
+                    values[row, i] = one / np.sqrt(
+                        x * x * (lateral + d_lateral * at)
+                        + np.float32(2.0) * x * z * (mixed + d_mixed * at)
+                        + z * z * (axial + d_axial * at)
+                    ) - one  # fmt: skip
+            start = end
 
 
 class Compression(NamedTuple):

@@ -109,8 +109,9 @@ _VERSION = 6  # Part of the cache's key: raise it when the bytes change
 # Numbers in the fields below which they are in double precision, as single would save little
 # time.
 _DOUBLE = 4_000_000
-# Numbers in the fields from which on they are cached, as making them takes a second.
-_KEPT = 12_000_000
+# Numbers in the fields from which on they are cached, as making them takes a second, and up to
+# which: nobody looks for more than a gigabyte in a cache.
+_KEPT, _MOST_KEPT = 12_000_000, 250_000_000
 # Numbers in the fields from which on all is in single precision, and the residual is sampled.
 _LARGE = 100_000_000
 # Number of single forces, and of presses, by which the error of large fields is measured.
@@ -201,8 +202,8 @@ def surface_compliance(
             f"{36e-9 * touched * free:.0f} GB, more than half of this machine's memory: give a "
             f"coarser mesh, or choose fem_cg or msds"
         )
-    if 9 * touched * free < _KEPT:
-        return _compute(model, None, has_error)
+    if not _KEPT <= 9 * touched * free <= _MOST_KEPT:
+        return _compute(model, progress, has_error)
 
     def waiting() -> None:
         if progress is not None:

@@ -32,18 +32,22 @@ True
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry.pose import Pose
+from us_sim.kernels import njit
 from us_sim.tissue.contact.complementarity import predict_forces
 from us_sim.tissue.contact.probe_gap import FlaredProbe
 from us_sim.tissue.elasticity.linear_tetrahedra import shape_gradients
 from us_sim.tissue.elasticity.materials import TissueMaterials
 from us_sim.tissue.linear_algebra.compliance import SurfaceCompliance
-from us_sim.tissue.mesh.tetrahedral_mesh import EDGES, TetrahedralMesh
+from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import TissueModel
+
+_LOOP: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
 def relative_error(
@@ -110,7 +114,11 @@ def force_error(
     strain -= np.einsum("ekk->e", strain)[:, None, None] * np.eye(3) / 3
     strain = strain.reshape(-1, 9)
     shear = mesh.volumes * materials.young_modulus / (2 * (1 + materials.poisson_ratio))
-    lacking = _nodal_mean(mesh, shear, strain)[mesh.tetrahedra] - strain[:, None]
+    around, count = mesh.tetrahedra.ravel(), len(mesh.nodes)
+    weighted = np.repeat(shear[:, None] * strain, 4, axis=0)
+    total = np.stack([np.bincount(around, column, count) for column in weighted.T], axis=1)
+    mean = total / np.bincount(around, np.repeat(shear, 4), count)[:, None]
+    lacking = mean[mesh.tetrahedra] - strain[:, None]
     squares = (lacking**2).sum(axis=(1, 2)) + (lacking.sum(axis=1) ** 2).sum(axis=1)
     return float(shear @ squares / 20 / (shear @ (strain**2).sum(axis=1)))
 
@@ -121,32 +129,85 @@ def interpolation_error(
     """L2 norms over the volume, in m times the root of m3, of the quadratic functions that a
     displacement (N, 3) m misses, and of itself.
     """
-    slope = np.einsum("eac,ead->ecd", displacement[mesh.tetrahedra], shape_gradients(mesh))
-    gradients = _nodal_mean(mesh, mesh.volumes, slope.reshape(-1, 9)).reshape(-1, 3, 3)
-    # On each edge, with a and b the linear functions of its ends, 4 a b m is missing. m is what a
-    # quadratic function is at the edge's middle beyond their mean: an eighth of the change of the
-    # gradient along it, times its length. The integral of the square of the sum over a tetrahedron
-    # of volume V is 2 V / 105 times the square of the sum of all m, plus those of the sums at each
-    # node, plus those of each.
-    ends = mesh.tetrahedra[:, EDGES]  # (M, 6, 2)
-    change = gradients[ends[..., 0]] - gradients[ends[..., 1]]
-    beyond = np.einsum("mecd,med->mec", change, mesh.nodes[ends[..., 0]] - mesh.nodes[ends[..., 1]])
-    beyond /= 8
-    at_node = np.stack(
-        [beyond[:, np.any(k == EDGES, axis=1)].sum(axis=1) for k in range(4)], axis=1
-    )
-    squares = (beyond**2).sum(axis=(1, 2)) + (at_node**2).sum(axis=(1, 2))
-    squares += (beyond.sum(axis=1) ** 2).sum(axis=1)
-    missing = 2 / 105 * float(mesh.volumes @ squares)
-    volumes = np.bincount(mesh.tetrahedra.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.nodes))
+    gradients, volumes = np.zeros((len(mesh.nodes), 3, 3)), np.zeros(len(mesh.nodes))
+    _add_gradients(mesh.nodes, mesh.tetrahedra, displacement, gradients, volumes)
+    gradients /= np.maximum(volumes, np.finfo(float).tiny)[:, None, None]
+    missing = _missing(mesh.nodes, mesh.tetrahedra, gradients)
     return math.sqrt(missing), math.sqrt(float(volumes @ (displacement**2).sum(axis=1)))
 
 
-def _nodal_mean(
-    mesh: TetrahedralMesh, weight: NDArray[np.float64], values: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(N, K), the mean of tetrahedra's values (M, K) around each node, by their weight (M,)."""
-    around, count = mesh.tetrahedra.ravel(), len(mesh.nodes)
-    weighted = np.repeat(weight[:, None] * values, 4, axis=0)
-    total = np.stack([np.bincount(around, column, count) for column in weighted.T], axis=1)
-    return np.asarray(total / np.bincount(around, np.repeat(weight, 4), count)[:, None])
+@njit(**_LOOP)
+def _add_gradients(nodes, tetrahedra, displacement, gradients, volumes):
+    """Add to gradients (N, 3, 3) and volumes (N,) a quarter of each tetrahedron's gradient times
+    its volume, and of its volume.
+    """
+    e, area = np.empty((3, 3)), np.empty((3, 3))
+    for t in range(len(tetrahedra)):
+        four = tetrahedra[t]
+        for k in range(3):
+            for d in range(3):
+                e[k, d] = nodes[four[k + 1], d] - nodes[four[0], d]
+        for k in range(3):
+            a, b = e[(k + 1) % 3], e[(k + 2) % 3]
+            for d in range(3):
+                i, j = (d + 1) % 3, (d + 2) % 3
+                area[k, d] = (a[i] * b[j] - a[j] * b[i]) / 24
+        volume = e[0, 0] * area[0, 0] + e[0, 1] * area[0, 1] + e[0, 2] * area[0, 2]
+        sign = 1.0 if volume >= 0.0 else -1.0
+        for k in range(4):
+            volumes[four[k]] += sign * volume
+        for c in range(3):
+            first = displacement[four[0], c]
+            x, y, z = (
+                displacement[four[1], c] - first,
+                displacement[four[2], c] - first,
+                displacement[four[3], c] - first,
+            )
+            for d in range(3):
+                own = sign * (x * area[0, d] + y * area[1, d] + z * area[2, d])
+                for k in range(4):
+                    gradients[four[k], c, d] += own
+
+
+@njit(**_LOOP)
+def _missing(nodes, tetrahedra, gradients):
+    """The integral of the square of the sum of 4 a b m over the edges of each tetrahedron.
+
+    a and b are the linear functions of an edge's ends, and m is what a quadratic function is at its
+    middle beyond their mean: an eighth of the change of the gradient along it, times its length. In
+    a tetrahedron of volume V the integral is 2 V / 105 times the square of the sum of all m, plus
+    those of the sums at each node, plus those of each.
+    """
+    total = 0.0
+    sums, e = np.empty(4), np.empty((3, 3))
+    for t in range(len(tetrahedra)):
+        four = tetrahedra[t]
+        for k in range(3):
+            for d in range(3):
+                e[k, d] = nodes[four[k + 1], d] - nodes[four[0], d]
+        volume = abs(
+            e[0, 0] * (e[1, 1] * e[2, 2] - e[1, 2] * e[2, 1])
+            + e[0, 1] * (e[1, 2] * e[2, 0] - e[1, 0] * e[2, 2])
+            + e[0, 2] * (e[1, 0] * e[2, 1] - e[1, 1] * e[2, 0])
+        )
+        squares = 0.0
+        for c in range(3):
+            sums[:] = 0.0
+            for i in range(1, 4):
+                for j in range(i):
+                    a, b = four[i], four[j]
+                    m = 0.0
+                    for d in range(3):
+                        change = gradients[a, c, d] - gradients[b, c, d]
+                        m += change * (nodes[a, d] - nodes[b, d])
+                    m /= 8
+                    sums[i] += m
+                    sums[j] += m
+                    squares += m * m
+            whole = 0.0
+            for k in range(4):
+                whole += sums[k] / 2
+                squares += sums[k] * sums[k]
+            squares += whole * whole
+        total += volume / 6 * 2 / 105 * squares
+    return total
