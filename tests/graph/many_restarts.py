@@ -28,6 +28,7 @@ probe: {image: [64, 64]}
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP)
 WINDOW_S = 0.5
 FULL = 0.9
+PATH_RATE = 60.0  # poses a second; images that waited come faster for a moment
 LIMIT_S = 60.0
 PATIENCE_S = 10.0
 
@@ -91,7 +92,8 @@ class Listener:
             rate = self.rate(time.monotonic() - 2.0)
             if rate >= FULL * self.usual_rate:
                 break
-        self.usual_rate = max(self.rate(time.monotonic() - 2.0), 0.5 * self.usual_rate)
+        now = min(self.rate(time.monotonic() - 2.0), PATH_RATE)
+        self.usual_rate = max(now, 0.5 * self.usual_rate)
 
     def full_since(self, after, rate):
         """When a window began, after a time, in which images came at that rate; None if none."""
@@ -134,16 +136,16 @@ def nodes_of(run):
     return {title: pid for title, pid in all_of_it.items() if title in NODES}
 
 
-def restart(listener, node, number, pid):
+def restart(listener, node, number, own):
     """End a process and wait until all is as before: nodes report, images come at their rate.
 
     What forks nodes ends with all of them.
     """
     before = listener.pids
-    ended = before.keys() if node == FORKS else {node}
+    ended = own.keys() - {FORKS} if node == FORKS else {node}
     rate = listener.usual_rate
     began = time.monotonic()
-    os.kill(pid, number)
+    os.kill(own[node], number)
     back = full = None
     while back is None or full is None:
         listener.spin(0.1)
@@ -152,7 +154,11 @@ def restart(listener, node, number, pid):
         # What was on its way when the node ended does not make a window full.
         full = listener.full_since(began + 0.1, rate)
         if time.monotonic() - began > LIMIT_S:
-            raise SystemExit(f"{node} was not back {LIMIT_S:g} s after {number.name}")
+            silent = sorted(each for each in ended if listener.pids[each] == before[each])
+            raise SystemExit(
+                f"{node} was not back {LIMIT_S:g} s after {number.name}: {rate:.1f} images/s "
+                f"before, no report of {', '.join(silent) or 'none'}"
+            )
     makes_images = node not in ("session_recorder", "skin_deformer")
     seconds = full - began if makes_images else back
     now = listener.pids
@@ -196,7 +202,7 @@ def main():
             own = nodes_of(run.pid) | {FORKS: children_of(run.pid)[FORKS]}
             node = chance.choice(sorted(own))
             number = signal.SIGKILL if node == FORKS else chance.choice(SIGNALS)
-            done.append(restart(listener, node, number, own[node]))
+            done.append(restart(listener, node, number, own))
             print(len(done), node, done[-1].number.name, f"{done[-1].seconds:.2f} s", flush=True)
             assert not done[-1].others, done[-1]
             for file in sorted(folder.glob("*.mcap"), key=lambda f: f.stat().st_mtime)[:-2]:
