@@ -15,7 +15,7 @@ from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
-every_method = pytest.mark.parametrize("method", SLICERS)
+every_method = pytest.mark.parametrize("method", [*SLICERS])
 
 KINDS = ("box", "cloud", "tangled", "squashed", "aligned", "through_nodes", "coarse", "fan")
 SIZE = np.array([0.06, 0.04, 0.05])
