@@ -94,8 +94,8 @@ def test_labels_of_slicer_go_in_by_their_names_and_keep_no_path(case, tmp_path, 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([], "no labels yet: give --labels, --seeds, or --vessels dark"),
-        (["--seeds", "SEEDS", "--vessels", "dark"], "two sources of labels"),
+        ([], "no labels yet: give --labels or --seeds"),
+        (["--seeds", "SEEDS", "--labels", "SEEDS"], "two sources of labels"),
         (["--seeds", "SEEDS", "--names", "3=vein"], "--names: is for --labels only"),
         (["--labels", "SEEDS", "--names", "3=a/b"], "no path"),
     ],

@@ -11,6 +11,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from us_sim.errors import CaseError, VolumeError
 from us_sim.settings.spelling import aligned
 from us_sim.share import shared_roots
@@ -20,18 +22,14 @@ from us_sim.volume.cases.writing import changed_case, write_case_settings
 from us_sim.volume.files.labels import read_labels
 from us_sim.volume.files.readers import read_volume
 from us_sim.volume.files.writing import write_labels
-from us_sim.volume.segmentation.settings import (
-    SegmentRequest,
-    read_seeds,
-)
-from us_sim.volume.segmentation.structures import find_vessels, segment
+from us_sim.volume.segmentation.settings import SegmentRequest, read_seeds
+from us_sim.volume.segmentation.structures import segment
 from us_sim.volume.structure_names import anatomical_colour
-from us_sim.volume.surfaces.closed_surface import write_stl
-from us_sim.volume.surfaces.structure_surface import StructureSurface, structure_surface
+from us_sim.volume.surfaces.label_surface import label_surface, write_stl
 from us_sim.volume.volume import LabelMap, Volume
 
 PICTURE = "segmentation.png"
-_HEADING = ("structure", "volume", "triangles", "area", "parts", "volume kept")
+_HEADING = ("structure", "volume", "triangles")
 
 Progress = Callable[[float, str], None]
 
@@ -53,10 +51,10 @@ def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None
     labels = _labels(asked, volume, progress)
     volume, remarks = labels.on(volume), list(labels.remarks)
     settings = _with_structures(case.settings, labels, remarks)
-    made = []
+    surfaces = {}
     for number, (label, name) in enumerate(sorted(labels.names.items())):
         progress(0.8 + 0.1 * number / len(labels.names), f"surface of {name}")
-        made.append(structure_surface(volume, label))
+        surfaces[name] = label_surface(volume, label)
     with changed_case(asked.case) as folder:
         if not _keeps_labels(asked):
             write_labels(folder / LABELS, volume, labels.colours)
@@ -66,38 +64,33 @@ def segment_as_asked(asked: SegmentRequest, progress: Progress = lambda *_: None
         write_case_settings(folder, settings)
         shutil.rmtree(folder / SURFACES, ignore_errors=True)
         (folder / SURFACES).mkdir()
-        for one in made:
-            write_stl(folder / SURFACES / f"{one.name}.stl", one.surface)
+        for name, surface in surfaces.items():
+            write_stl(folder / SURFACES / f"{name}.stl", *surface)
         draw_segmentation(volume, labels, folder / PICTURE)
     progress(1.0, "")
-    rows = [_HEADING, *(_cells(one) for one in made)]
+    millilitres = 1e6 * abs(float(np.linalg.det(volume.index_to_patient[:3, :3])))
+    rows = [_HEADING] + [
+        (name, f"{labels.voxels[name] * millilitres:.3f} ml", str(len(triangles)))
+        for name, (_, triangles) in surfaces.items()
+    ]
     notes = (f"note: {remark}" for remark in remarks)
     return "\n".join([*aligned(rows), *notes, f"written to {asked.case}"])
 
 
 def _keeps_labels(asked: SegmentRequest) -> bool:
-    return asked.labels is None and asked.seeds is None and asked.vessels is None
+    return asked.labels is None and asked.seeds is None
 
 
 def _labels(asked: SegmentRequest, volume: Volume, progress: Progress) -> LabelMap:
     """The labels that are asked for."""
     if asked.labels is not None:
-        return read_labels(
-            asked.labels,
-            volume,
-            names=asked.given_names(),
-            taken=RESERVED,
-        )
+        return read_labels(asked.labels, volume, names=asked.given_names(), taken=RESERVED)
     if asked.seeds is not None:
         seeds = read_seeds(_seeds_file(asked.seeds))
         return segment(volume, seeds, lambda done, part: progress(0.1 + 0.7 * done, part))
-    if asked.vessels is not None:
-        return find_vessels(volume, lambda done, part: progress(0.1 + 0.7 * done, part))
     names = {label: name for label, name in volume.label_names.items() if label}
     if volume.labels is None or not names:
-        raise VolumeError(
-            f"{asked.case}: has no labels yet: give --labels, --seeds, or --vessels dark"
-        )
+        raise VolumeError(f"{asked.case}: has no labels yet: give --labels or --seeds")
     return LabelMap(volume.labels, names)
 
 
@@ -135,15 +128,3 @@ def _with_structures(settings: CaseSettings, labels: LabelMap, remarks: list[str
         numbers = {f"structures.{name}": label for label, name in labels.names.items()}
         hint = f"; for a file of labels that is --names {numbers.get(error.key, 'LABEL')}=NAME"
         raise CaseError(f"{error.key}: {error.problem}{hint}") from error
-
-
-def _cells(one: StructureSurface) -> tuple[str, ...]:
-    surface = one.surface
-    return (
-        one.name,
-        f"{one.voxels_volume * 1e6:.3f} ml",
-        str(len(surface.triangles)),
-        f"{surface.area * 1e4:.2f} cm²",
-        str(surface.parts),
-        f"{100 * one.volume_kept:.2f} %",
-    )

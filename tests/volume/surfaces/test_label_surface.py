@@ -1,13 +1,21 @@
 """Surfaces of labels: closed, outward, of the labels' own volume; and labels that have none."""
 
+import meshio
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from us_sim.errors import VolumeError
+from us_sim.skin.surface import read_surface
 from us_sim.volume.phantom.phantom import cached_phantom
-from us_sim.volume.surfaces.label_surface import label_surface, spacing_for
+from us_sim.volume.surfaces.label_surface import (
+    enclosed_volume,
+    label_surface,
+    spacing_for,
+    write_stl,
+)
 from us_sim.volume.volume import Volume
 
 
@@ -15,11 +23,6 @@ def labelled(mask, affine=None, label=3):
     labels = np.where(mask, np.uint8(label), np.uint8(1))
     placed = np.diag([1e-3, 1e-3, 1e-3, 1.0]) if affine is None else affine
     return Volume(np.zeros_like(labels), placed, labels=labels, label_names={1: "fat", 3: "vein"})
-
-
-def enclosed(vertices, triangles):
-    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[triangles], 1, 0)
-    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
 
 
 def require_closed(triangles):
@@ -46,9 +49,40 @@ def test_a_ball_keeps_its_volume_and_faces_outwards(radius, steps, mirrored, see
     volume = labelled(mask, affine)
     vertices, triangles = label_surface(volume, 3)
     require_closed(triangles)
-    assert enclosed(vertices, triangles) == pytest.approx(mask.sum() * np.prod(steps), rel=0.01)
+    assert enclosed_volume(vertices, triangles) == pytest.approx(
+        mask.sum() * np.prod(steps), rel=0.01
+    )
     centre = affine[:3, :3] @ np.full(3, 15.3) + affine[:3, 3]
     np.testing.assert_allclose(vertices.mean(axis=0), centre, atol=0.3 * max(steps))
+
+
+@given(
+    mask=arrays(bool, st.tuples(*[st.integers(2, 7)] * 3)),
+    steps=st.tuples(*[st.floats(0.2e-3, 2e-3)] * 3),
+    mirrored=st.booleans(),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_labels_have_a_closed_surface_that_faces_outwards(mask, steps, mirrored):
+    mask.flat[0] = True
+    affine = np.diag([*steps, 1.0])
+    affine[0] *= -1 if mirrored else 1
+    vertices, triangles = label_surface(labelled(mask, affine), 3)
+    require_closed(triangles)
+    assert enclosed_volume(vertices, triangles) > 0.0
+
+
+CORNERS = np.array([[0.01, 0.02, 0.03], [0.05, 0, 0], [0, 0.061, 0], [0, 0, 0.0723]])
+
+
+def test_meshio_and_the_scenes_reader_find_the_same_surface_in_millimetres(tmp_path):
+    path, triangles = tmp_path / "vein.stl", np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    write_stl(path, CORNERS, triangles)
+    there = meshio.read(path)
+    for vertices in (there.points * 1e-3, read_surface(path, 1e-3).vertices):
+        np.testing.assert_allclose(np.sort(vertices, axis=0), np.sort(CORNERS, axis=0), atol=1e-8)
+    found = enclosed_volume(there.points * 1e-3, there.cells_dict["triangle"])
+    assert found == pytest.approx(enclosed_volume(CORNERS, triangles), rel=1e-5)
+    assert b"SPACE=LPS" in path.read_bytes()[:80]
 
 
 @pytest.mark.slow
@@ -62,7 +96,7 @@ def test_structures_of_the_arm_keep_their_volume_within_the_triangles_allowed():
         assert sum(len(faces) for _, faces in made) == pytest.approx(allowed, rel=0.1)
         for label, (vertices, triangles) in zip(labels, made, strict=True):
             voxels = np.count_nonzero(arm.labels == label) * 0.6e-3**3
-            assert enclosed(vertices, triangles) == pytest.approx(voxels, rel=0.03)
+            assert enclosed_volume(vertices, triangles) == pytest.approx(voxels, rel=0.03)
 
 
 def test_a_box_cuts_and_caps():
@@ -71,7 +105,7 @@ def test_a_box_cuts_and_caps():
     box = np.array([[-1.0, 0.0205, -1.0], [1.0, 0.0405, 1.0]])
     vertices, triangles = label_surface(labelled(mask), 3, within=box)
     require_closed(triangles)
-    assert enclosed(vertices, triangles) == pytest.approx(10 * 20 * 10 * 1e-9, rel=0.01)
+    assert enclosed_volume(vertices, triangles) == pytest.approx(10 * 20 * 10 * 1e-9, rel=0.01)
     np.testing.assert_allclose([vertices[:, 1].min(), vertices[:, 1].max()], box[:, 1], atol=2e-4)
 
 

@@ -13,7 +13,6 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import read_yaml
 from us_sim.volume.cases.settings import check_name
-from us_sim.volume.structure_names import Colour
 
 _MOST = 255
 _MILLIMETRES = Quantity("number", -1e5, 1e5)
@@ -50,11 +49,6 @@ class StructureSeeds(Settings):
     )
     close: float = setting(
         _RADIUS, "gaps that a ball of this radius has no room in are filled", default=0
-    )
-    colour: Colour | None = setting(
-        Quantity("number", 0.0, 1.0),
-        "red, green, blue; not given: as the name suggests",
-        default=None,
     )
 
     def check(self) -> None:
@@ -99,8 +93,8 @@ def read_seeds(path: Path) -> SegmentationSettings:
 class SegmentRequest(Settings):
     """Structures of a case, and their surfaces.
 
-    They come from a file of labels, from seeds, or from a search for vessels; without any of these
-    the surfaces of the labels that a case has are made anew.
+    They come from a file of labels or from seeds; without either the surfaces of the labels that a
+    case has are made anew.
     """
 
     error = VolumeError
@@ -117,15 +111,11 @@ class SegmentRequest(Settings):
         description="structures from seeds: this YAML file, or an installed one's name",
         default=None,
     )
-    vessels: str | None = setting(
-        description="propose vessels without seeds", choices=("dark",), default=None
-    )
 
     def check(self) -> None:
-        """Refuse several sources, options of one that is not asked for, and names that are none."""
-        asked = [key for key in ("labels", "seeds", "vessels") if getattr(self, key) is not None]
-        if len(asked) > 1:
-            raise self.refused(asked[1], f"and --{asked[0]} are two sources of labels: keep one")
+        """Refuse two sources, names without a file of labels, and names that are none."""
+        if self.labels is not None and self.seeds is not None:
+            raise self.refused("seeds", "and --labels are two sources of labels: keep one")
         if self.names and self.labels is None:
             raise self.refused("names", "is for --labels only")
         self.given_names()

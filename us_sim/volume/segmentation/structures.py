@@ -1,6 +1,8 @@
-"""Structures of a volume, each found as its seeds say, put together into labels."""
+"""Structures of a volume, each grown from its seeds, put together into labels."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import SimpleITK as sitk
@@ -8,17 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.volume.segmentation.methods import (
-    Index,
-    Progress,
-    array_of,
-    dark_vessels,
-    grow,
-    image_of,
-    in_voxels,
-)
 from us_sim.volume.segmentation.settings import SegmentationSettings, StructureSeeds
 from us_sim.volume.volume import LabelMap, Volume
+
+Progress = Callable[[float, str], None]
 
 
 def segment(
@@ -51,28 +46,13 @@ def segment(
             )
         there[free] = number
     progress(1.0, "")
-    colours = {n: one.colour for n, one in enumerate(settings.structures.values(), 1) if one.colour}
-    return LabelMap(labels, names, colours, tuple(remarks))
-
-
-def find_vessels(volume: Volume, progress: Progress = lambda *_: None) -> LabelMap:
-    """Propose dark vessels, as one structure.
-
-    Raises:
-        VolumeError: there are none.
-    """
-    spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
-    found = dark_vessels(image_of(volume.intensities.astype(np.float32), spacing), progress)
-    labels = array_of(sitk.BinaryFillhole(found)).astype(np.uint8)
-    if not labels.any():
-        raise VolumeError("no dark vessels are found: give --seeds, or --labels")
-    return LabelMap(labels, {1: "vessels"})
+    return LabelMap(labels, names, remarks=tuple(remarks))
 
 
 def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tuple[slice, ...]]:
     """Where a structure is, (i, j, k) in a box of the volume, and that box."""
     spacing = np.linalg.norm(volume.index_to_patient[:3, :3], axis=0)
-    seeds = np.array(_seeds(volume, asked), dtype=int).reshape(-1, 3)
+    seeds = np.array(_seeds(volume, asked))
     first, last = np.zeros(3, dtype=int), np.array(volume.shape)
     if asked.reach is not None:
         away = np.ceil(asked.reach / spacing).astype(int) + 1
@@ -83,16 +63,23 @@ def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tu
     grey = volume.intensities[box].astype(np.float32)
     if asked.smooth:
         grey = ndimage.gaussian_filter(grey, asked.smooth / spacing, truncate=3.0)
-    placed: list[Index] = [(int(i), int(j), int(k)) for i, j, k in seeds]
-    found = grow(image_of(grey, spacing), placed, asked.lower, asked.upper)
+    for number, value in enumerate(grey[tuple(seeds.T)], start=1):
+        if not asked.lower <= value <= asked.upper:
+            raise VolumeError(
+                f"seed {number} has the grey value {value:.0f}, outside {asked.lower:g} to "
+                f"{asked.upper:g}, so nothing grows from it: move it, or widen the range"
+            )
+    found = sitk.ConnectedThreshold(_image(grey, spacing), seeds.tolist(), asked.lower, asked.upper)
     if asked.reach is not None:
         near = np.ones(grey.shape, np.uint8)
         near[tuple(seeds.T)] = 0
         distance = ndimage.distance_transform_edt(near, sampling=spacing)
-        found &= image_of((distance <= asked.reach).astype(np.uint8), spacing)
-    found = sitk.BinaryMorphologicalOpening(found, in_voxels(asked.open, found), sitk.sitkBall)
-    found = sitk.BinaryMorphologicalClosing(found, in_voxels(asked.close, found), sitk.sitkBall)
-    mask = array_of(sitk.BinaryFillhole(found)).astype(bool)
+        found &= _image((distance <= asked.reach).astype(np.uint8), spacing)
+    # The radius of a ball along each axis, in voxels.
+    opening, closing = (np.rint(r / spacing).astype(int) for r in (asked.open, asked.close))
+    found = sitk.BinaryMorphologicalOpening(found, opening.tolist(), sitk.sitkBall)
+    found = sitk.BinaryMorphologicalClosing(found, closing.tolist(), sitk.sitkBall)
+    mask = sitk.GetArrayFromImage(sitk.BinaryFillhole(found)).transpose(2, 1, 0).astype(bool)
     parts, _ = ndimage.label(mask, np.ones((3, 3, 3)))
     mask = np.isin(parts, np.setdiff1d(parts[tuple(seeds.T)], 0))
     if not mask.any():
@@ -100,7 +87,14 @@ def _found(volume: Volume, asked: StructureSeeds) -> tuple[NDArray[np.bool_], tu
     return mask, box
 
 
-def _seeds(volume: Volume, asked: StructureSeeds) -> list[Index]:
+def _image(array: NDArray[np.generic], spacing: NDArray[np.float64]) -> sitk.Image:
+    """Make an image of an array (i, j, k) with that spacing (3,) in m; an image's is in mm."""
+    image = sitk.GetImageFromArray(np.ascontiguousarray(array.transpose(2, 1, 0)))
+    image.SetSpacing((spacing * 1e3).tolist())
+    return image
+
+
+def _seeds(volume: Volume, asked: StructureSeeds) -> list[tuple[int, int, int]]:
     """Indices of the voxels that a structure's seeds lie in.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Surfaces around labelled structures of a volume, by marching cubes.
+"""Surfaces around labelled structures of a volume, by marching cubes, and their STL files.
 
 >>> import numpy as np
 >>> from us_sim.volume.surfaces.label_surface import label_surface
@@ -15,15 +15,17 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from us_sim.errors import VolumeError
-from us_sim.volume.surfaces.closed_surface import ClosedSurface
+from us_sim.volume.partial_file import partial_file
 from us_sim.volume.volume import Volume
 
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _SMOOTHING = 0.7  # grid steps, the least standard deviation that hides the voxels' stairs
 _PADDING = 4  # grid steps
 _LEVELS = (0.5, 0.4)
@@ -74,11 +76,47 @@ def label_surface(
         vertices, triangles = marching_cubes(field, _STAIRS_LEVEL, gradient_direction="ascent")[:2]
         return _placed(volume, vertices.astype(np.float64) - pad + start, triangles)
     wanted = np.count_nonzero(mask) / steps.prod()
-    one, other = (abs(ClosedSurface(*marching_cubes(field, level)[:2]).volume) for level in _LEVELS)
+    one, other = (abs(enclosed_volume(*marching_cubes(field, level)[:2])) for level in _LEVELS)
     level = _LEVELS[0] + (wanted - one) / (other - one) * (_LEVELS[1] - _LEVELS[0])
     level = float(np.clip(level, 0.2, _LEVELS[0]))
     vertices, triangles = marching_cubes(field, level, gradient_direction="ascent")[:2]
     return _placed(volume, vertices.astype(np.float64) * steps - pad + start, triangles)
+
+
+def enclosed_volume(vertices: NDArray[np.float64], triangles: NDArray[np.integer]) -> float:
+    """m³ inside a closed surface, by Gauss's theorem; below zero where triangles face inwards.
+
+    >>> corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
+    >>> enclosed_volume(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    4.5
+    """
+    a, b, c = (vertices - vertices.mean(axis=0))[triangles.T]
+    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
+
+
+def write_stl(path: Path, vertices: NDArray[np.float64], triangles: NDArray[np.integer]) -> None:
+    """Write a surface to a binary file in millimetres; one of that name is replaced.
+
+    Its header says that the axes are left, posterior and superior (``SPACE=LPS``), which 3D Slicer
+    looks for; meshio writes no such header.
+
+    Args:
+        path: of the file.
+        vertices: (V, 3) m.
+        triangles: (T, 3), counter-clockwise seen from outside.
+
+    Raises:
+        VolumeError: the file cannot be written.
+    """
+    facets = np.zeros(len(triangles), _FACET)
+    a, b, c = vertices[triangles.T]
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets["normal"] = normals / np.maximum(lengths, 1e-30)
+    facets["corners"] = 1e3 * vertices[triangles]
+    header = b"us_sim; millimetres; SPACE=LPS".ljust(80)
+    with partial_file(path) as partial:
+        partial.write_bytes(header + np.uint32(len(facets)).tobytes() + facets.tobytes())
 
 
 def spacing_for(
