@@ -311,7 +311,6 @@ def test_wrenches_are_read_by_their_topics_each_of_one_frame(tmp_path):
     [
         ("missing.mcap", None, "missing.mcap"),
         ("a.xml", "#", "PLUS"),
-        ("a.tfm", "#Insight Transform File V1.0\n", "`registration`"),
     ],
 )
 def test_files_that_are_no_path(tmp_path, name, content, words):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,7 +16,6 @@ from us_sim.errors import ScoreError
 from us_sim.geometry.mesh_file import read_with_meshio
 from us_sim.scoring.metrics import Scan, metrics_of
 from us_sim.scoring.motion import Motion
-from us_sim.volume.sequences.itk_transform import read_slicer_transform
 
 NEEDLE = 0.3  # m, TissueDamage.NEEDLE_LENGTH; it points along +z, as its evaluator has by default
 MM, MM2 = 1e3, 1e6
@@ -70,10 +70,22 @@ def lumbar(folder):
     return probe[0], devices, folder / "BodyModel.stl"
 
 
+def slicer_matrix(path):
+    """What 3D Slicer shows of a file of ITK, m: to the parent in RAS; ITK stores the inverse."""
+    stored = sitk.ReadTransform(str(path)).GetInverse()
+    matrix = np.eye(4)
+    matrix[:3, 3] = stored.TransformPoint((0.0, 0.0, 0.0))
+    matrix[:3, :3] = np.transpose([stored.TransformPoint(e) for e in np.eye(3)]) - matrix[:3, 3:]
+    to_ras = np.diag([-1.0, -1.0, 1.0, 1.0])
+    matrix = to_ras @ matrix @ to_ras
+    matrix[:3, 3] /= MM
+    return matrix
+
+
 def in_plane(folder):
     scene = ElementTree.parse(folder / "Scene_InPlane.mrml").iter("Sequence")
     sequences = {node.get("name").removesuffix("-Sequence"): node for node in scene}
-    devices = {"NeedleTipToNeedle": read_slicer_transform(folder / "NeedleTipToNeedle.h5")}
+    devices = {"NeedleTipToNeedle": slicer_matrix(folder / "NeedleTipToNeedle.h5")}
     for name in ("NeedleToReference", "ImageToReference"):
         entries = sequences[name].get("indexValues").strip(";").split(";")
         times = np.array([float(entry.split(":")[1]) for entry in entries])
@@ -84,7 +96,7 @@ def in_plane(folder):
             bundle.extractall(unpacked)
             files = [f"{name}_{n}" if n else name for n in range(len(entries))]
             data = Path(unpacked, f"{name}-Sequence", "Data")
-            devices[name] = np.array([read_slicer_transform(data / f"{n}.h5") for n in files])
+            devices[name] = np.array([slicer_matrix(data / f"{n}.h5") for n in files])
     devices["NeedleTipToNeedle"] = devices["NeedleToReference"] @ devices["NeedleTipToNeedle"]
     return times, devices, folder / "TissueModel.stl"
 

@@ -50,7 +50,6 @@ from us_sim.tracking.calibration.transform_file import (
 from us_sim.tracking.camera.model import write_camera_info
 from us_sim.tracking.camera.rigid_body import printed_board
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
-from us_sim.volume.sequences.sweep import read_sweep
 from us_sim.volume.sequences.transforms import split_transform_name
 
 
@@ -103,15 +102,16 @@ def read_signal(
     """
     of_plus = path.suffix.lower() in SEQUENCE_SUFFIXES
     if of_plus and (images or not read_sequence(path).transforms):
-        sweep = read_sweep(path, tracked=False)
+        sequence = read_sequence(path)
+        which = np.flatnonzero(np.isfinite(sequence.times) & sequence.image_is_valid)
 
         def images_shown() -> Iterator[NDArray[np.uint8]]:
-            for k, image in enumerate(sweep.images()):
+            for k, image in enumerate(sequence.images(which)):
                 yield image
                 if progress is not None:
-                    progress((k + 1) / len(sweep.times), "the line in each image")
+                    progress((k + 1) / len(which), "the line in each image")
 
-        return signal_of_images(sweep.times, images_shown())
+        return signal_of_images(sequence.times[which], images_shown())
     if images:
         raise CalibrationError(f"{path}: is a bag; images are read from recordings of Plus only")
     motion = read_motion(path, name)

@@ -134,7 +134,7 @@ def reconstruct_sweep(
             draw_slices(folder / picture.name, made.volume, made.covered, size)
     sentences = [
         f"{settings.out}: {size} ({100.0 * made.covered.mean():.0f} % covered, {made.filled} of "
-        f"them filled holes) from {made.frames} frames"
+        f"them filled holes) from {len(sweep.numbers)} frames"
     ]
     if left_out := sweep.left_out:
         why = ", ".join(f"{number} with {reason}" for reason, number in left_out.items())

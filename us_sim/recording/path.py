@@ -32,7 +32,6 @@ from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.topic import BagTopic, QosProfile
 from us_sim.recording.writer import BagWriter
-from us_sim.volume.sequences.itk_transform import TRANSFORM_SUFFIXES
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
@@ -183,9 +182,7 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
     try:
         bag = read_bag(path)
     except NoBagError as error:
-        single = Path(path).suffix.lower() in TRANSFORM_SUFFIXES
-        remedy = "a single transform belongs in `registration` or `calibration`; " if single else ""
-        raise BagError(f"{error}; {remedy}{_PATHS}") from None
+        raise BagError(f"{error}; {_PATHS}") from None
     name = whole_name(bag, topic or _only_body(bag, option))
     rows = list(pose_rows(bag, name))
     if topic is None and len(_frames(rows)) > 1:  # a hand and a device took turns

@@ -12,7 +12,7 @@ from us_sim.tracking.calibration.time_offset import (
     find_time_offset,
     line_row,
 )
-from us_sim.volume.sequences.sweep import read_sweep
+from us_sim.volume.sequences.sequence import read_sequence
 
 
 def strokes(times):
@@ -89,7 +89,7 @@ def test_the_water_tanks_lines_are_where_plus_found_them(shared_data):
         (358.067, 241.475, 0.998175, -0.060383),
     ]
     recording = shared_data / "plus-tracker-recordings" / "WaterTankBottomTranslationVideoBuffer"
-    sweep = read_sweep(recording.with_suffix(".igs.mha"), tracked=False)
+    sweep = read_sequence(recording.with_suffix(".igs.mha"))
     middle = 0.5 * (sweep.columns - 1)
     expected = [y + (middle - x) * down / across for x, y, across, down in published]
     found = [line_row(image) for image in sweep.images(range(8))]

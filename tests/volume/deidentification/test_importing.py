@@ -11,7 +11,7 @@ from us_sim.volume.cases.case import read_case
 from us_sim.volume.deidentification.importing import look_at
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.readers import read_volume
-from us_sim.volume.sequences.sweep import read_sweep
+from us_sim.volume.sequences.sequence import read_sequence
 
 VOXELS = np.random.default_rng(5).integers(0, 256, (30, 24, 5), dtype=np.uint8)
 CINE = np.random.default_rng(3).integers(0, 256, (4, 60, 80), dtype=np.uint8)
@@ -55,7 +55,7 @@ def test_a_crop_leaves_every_voxel_where_it_was(volume, tmp_path):
 def test_a_cine_becomes_images_with_their_times(cine, tmp_path):
     out = tmp_path / "cine.igs.mha"
     look_at([cine], out, ImportSettings(crop="10,5,69,54")).write()
-    sweep = read_sweep(out, tracked=False)
+    sweep = read_sequence(out)
     np.testing.assert_allclose(sweep.times, [0.0, 0.04, 0.08, 0.12])
     np.testing.assert_array_equal(np.array(list(sweep.images())), CINE[:, 5:55, 10:70])
 
@@ -131,7 +131,7 @@ def test_a_crop_has_the_scale_of_its_region_and_shows_nothing_outside(shared_fil
         look_at([path], out, ImportSettings(crop=crop)).write()
         assert sitk.ReadImage(str(out)).GetSpacing()[:2] == pytest.approx((scale, scale), rel=1e-4)
     look_at([path], tmp_path / "o.mha", ImportSettings(crop="100,0,450,500")).write()
-    (image,) = read_sweep(tmp_path / "o.mha", tracked=False).images()
+    (image,) = read_sequence(tmp_path / "o.mha").images()
     assert not image[:75].any()
     assert not image[:, :84].any()
     assert image[75:, 84:].any()

@@ -91,21 +91,6 @@ def test_the_poses_are_of_the_middle_of_the_face(tmp_path):
     assert pose.rotation[0, 0] < -0.99  # along the columns
 
 
-def test_the_poses_are_evenly_spread_along_the_way_of_the_middle_of_the_image(tmp_path):
-    sliding, turning = np.linspace(0.0, 0.03, 41), np.linspace(0.0, 0.5, 41)[1:]  # m, rad
-    angles = np.concatenate([np.zeros(41), turning])  # about the face, 0.06 m above the middle
-    places = np.tile(np.eye(4), (81, 1, 1))
-    places[:, 0, 0], places[:, 1, 1], places[:, 2, 2] = -1.0, -np.cos(angles), np.cos(angles)
-    places[:, 1, 2] = places[:, 2, 1] = np.sin(angles)
-    places[:, 1, 3] = np.concatenate([sliding, np.full(40, sliding[-1])])
-    into_image = np.eye(4)[[0, 2, 1, 3]] * [SIDE[0], SIDE[1], 1.0, 1.0]
-    into_image[2, 3] = -0.00475
-    sweep = swept(tmp_path, BOX, places @ into_image)
-    found = scanning_probe(sweep, ImagePart(), np.ones_like(BOX))
-    turned = [abs(each.pose.rotation[1, 2]) > 1e-6 for each in found.poses]
-    assert (len(turned), sum(turned)) == (33, 16)
-
-
 def test_a_part_that_is_named_is_the_probes(tmp_path):
     mask = np.random.default_rng(0).random((ROWS, COLUMNS)) < 0.3  # proves nothing
     sweep = swept(tmp_path, mask)

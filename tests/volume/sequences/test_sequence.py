@@ -1,21 +1,16 @@
-"""Tracked sequences: formats, orientations, broken ones, chains of transforms, ITK's files."""
+"""Tracked sequences: formats, orientations, broken ones, chains of transforms."""
 
 import gzip
-import re
 import zlib
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 
-from us_sim.errors import CalibrationError, VolumeError
-from us_sim.tracking.calibration.transform_file import read_transform
-from us_sim.volume.sequences.itk_transform import read_slicer_transform
+from us_sim.errors import VolumeError
 from us_sim.volume.sequences.sequence import read_sequence
 from us_sim.volume.sequences.sweep import read_sweep, sweep_of
-from us_sim.volume.sequences.transforms import (
-    in_metres,
-)
+from us_sim.volume.sequences.transforms import in_metres
 
 FRAMES, ROWS, COLUMNS = 3, 4, 5
 GREY = np.random.default_rng(5).integers(0, 256, (FRAMES, ROWS, COLUMNS), dtype=np.uint8)
@@ -254,51 +249,3 @@ def test_a_chain_by_way_of_the_tracker_places_images_of_plus_as_its_formula_says
     expected = expected @ calibration @ [410, 300, 0, 1]
     found = sweep.image_to_reference[7] @ [410, 300, 0, 1]
     np.testing.assert_allclose(1e3 * found[:3], expected[:3], atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["NeedleToReference", "ImageToReference"])
-def test_a_file_holds_what_slicer_shows(shared_data, name):
-    folder = shared_data / "perktutor-truth/InPlane"
-    text = (folder / "Scene_InPlane.mrml").read_text()
-    said = re.search(rf'name="{name}".*?matrixTransformToParent="(.*?)"', text, re.DOTALL)
-    shown = np.array(said[1].split(), float).reshape(4, 4)
-    found = read_slicer_transform(folder / f"{name}.h5")
-    scale = 1.0 if name.startswith("Image") else 1e3  # from pixels
-    found[:3, :3] *= 1e3 / scale
-    found[:3, 3] *= 1e3
-    np.testing.assert_allclose(found, shown, atol=1e-5, rtol=1e-5)
-
-
-def transform_file(path, angle=0.3, shift=(10.0, 20.0, 30.0)):
-    """A rotation about z and a shift, as ITK has them."""
-    made = sitk.Euler3DTransform((0, 0, 0), 0, 0, angle, shift)
-    sitk.WriteTransform(made, str(path))
-    return path
-
-
-@pytest.mark.parametrize("ending", ["h5", "tfm"])
-def test_a_scene_takes_a_transform_of_slicer_as_registration(tmp_path, ending):
-    found = read_transform(transform_file(tmp_path / f"NdiToPatient.{ending}"))
-    c, s = np.cos(0.3), np.sin(0.3)
-    lps = -np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ [10, 20, 30]  # of the inverse
-    np.testing.assert_allclose(1e3 * found.position, lps * [-1, -1, 1], atol=1e-9)
-    np.testing.assert_allclose(found.rotation[:2, :2], [[c, s], [-s, c]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("made", "message"),
-    [
-        (sitk.ScaleTransform(3, (2.0, 2.0, 2.0)), "not rigid"),
-        (sitk.BSplineTransform(3), "not linear"),
-        (b"cut", r"a\.tfm: is damaged"),
-        (None, "no such file"),
-    ],
-)
-def test_what_is_no_rigid_transform_is_refused(tmp_path, made, message):
-    path = tmp_path / "a.tfm"
-    if isinstance(made, bytes):
-        path.write_bytes(transform_file(path).read_bytes()[:-90])
-    elif made:
-        sitk.WriteTransform(made, str(path))
-    with pytest.raises(CalibrationError, match=message):
-        read_transform(path)

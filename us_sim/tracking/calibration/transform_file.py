@@ -1,4 +1,4 @@
-"""A rigid transform in a YAML file, with the quality of its calibration, or in a file of 3D Slicer.
+"""A rigid transform in a YAML file, with the quality of its calibration.
 
 `us-sim calibrate` writes it and a scene takes it as `registration:` or `calibration:`. The
 pose is that of the frame `from` in the frame `to`, so it turns points of `from` into points of
@@ -27,13 +27,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from us_sim.errors import CalibrationError, PoseError, VolumeError
+from us_sim.errors import CalibrationError, PoseError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml
-from us_sim.volume.sequences.itk_transform import TRANSFORM_SUFFIXES, read_slicer_transform
 
 
 @dataclass(frozen=True)
@@ -49,22 +48,16 @@ class _Written(Settings):
 def read_transform(path: str | Path) -> Pose:
     """The pose of the file's frame `from` in its frame `to`, m.
 
-    A file of 3D Slicer (.h5, .tfm, .txt) holds the transform to the parent, in RAS.
-
     Raises:
         CalibrationError: the file is missing, is no YAML, lacks the position or orientation, or
-            these are not 3 and 4 finite numbers; or a file of 3D Slicer holds no rigid transform.
+            these are not 3 and 4 finite numbers.
     """
     path = Path(path)
     try:
-        if path.suffix.lower() in TRANSFORM_SUFFIXES:
-            return Pose.from_matrix(read_slicer_transform(path))
         document = _document(path)
         written = {key: document[key] for key in ("position", "orientation") if key in document}
         place = Reader(str(path), error=CalibrationError).read(_Written, written)
         return Pose(np.array(place.position), np.array(place.orientation))
-    except VolumeError as error:
-        raise CalibrationError(str(error)) from error
     except PoseError as error:
         raise CalibrationError(f"{path}: {error}") from error
 

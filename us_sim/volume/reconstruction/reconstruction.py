@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -74,9 +73,7 @@ class Reconstruction:
 
     volume: Volume
     covered: NDArray[np.bool_]  # (i, j, k) hit by a pixel, or filled
-    frames: int
-    hit: int  # voxels
-    filled: int
+    filled: int  # voxels
 
 
 def plan(
@@ -139,18 +136,10 @@ def reconstruct(planned: Plan, progress: Progress | None = None) -> Reconstructi
         insert_pixels(image[planned.used], points, np.ascontiguousarray(to_index), total, count)
     grey, covered = mean_values(total, count)
     del total, count
-    hit = int(np.count_nonzero(covered))
-    if not hit:
+    if not covered.any():
         raise VolumeError(f"{sweep.path}: no pixel of its images lies in the grid")
     tell(_FILLING, "filling holes")
     filled = fill_holes(grey, covered, planned.hole_radius / planned.grid.spacing)
     tell(1.0, "")
     volume = Volume(grey, planned.grid.index_to_reference)
-    return Reconstruction(volume, covered, frames, hit, filled)
-
-
-def correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
-    """Pearson's correlation; nan where one is constant."""
-    first, second = first - first.mean(), second - second.mean()
-    scale = math.sqrt(float(first @ first) * float(second @ second))
-    return float(first @ second) / scale if scale else math.nan
+    return Reconstruction(volume, covered, filled)

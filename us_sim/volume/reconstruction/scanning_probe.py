@@ -26,9 +26,9 @@ from us_sim.settings.registry import PROBES
 from us_sim.volume.reconstruction.settings import ImagePart
 from us_sim.volume.sequences.sweep import Sweep
 
-_COUNTED = 80.0  # percent of the border's points that may not be farther off than is allowed
 _LEAST_POINTS = 16  # of an edge
 _NARROW = math.radians(4.0)  # opening angle below which it is no fan
+_ALIKE = 0.95  # intersection over union of the seen pixels with a shape that fits
 _POINT = 5e-3  # m: beams from a smaller arc are a phased array's, which all leave one place
 
 
@@ -73,8 +73,8 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
     """Find the probe of a sweep, and where its face was.
 
     It is the fan that the part names, or the shape that fits the images, or a linear array as wide
-    as the rectangle that the part names. Where there is none of these, the middle of the pixels
-    that are not black at the images' top is taken for the middle of its face.
+    as the rectangle that the part names. Where there is none of these, the middle of the images'
+    top is taken for the middle of its face.
 
     Args:
         sweep: with poses.
@@ -84,20 +84,11 @@ def scanning_probe(sweep: Sweep, part: ImagePart, used: NDArray[np.bool_]) -> Sc
     Raises:
         VolumeError: the images are damaged.
     """
-    matrices = sweep.image_to_reference
-    steps = np.linalg.norm(matrices[:, :3, :2], axis=1)
-    across, down = np.moveaxis(matrices[:, :3, :2] / steps[:, None, :], -1, 0)
-    pixel = np.median(steps, axis=0)
-    seen = seen_pixels(sweep)
-    shape: Fan | Rectangle | None = None
-    if np.abs((across * down).sum(axis=1)).max() <= 0.05:  # more than a calibration is inexact
-        shape = _named_fan(part, used, pixel) or fitted_part(seen, pixel, used)
-    if shape is not None:
-        return ScanningProbe(_probe(shape), _poses(matrices, shape, pixel))
-    body = None if part.clip is not None else _body(seen & used)
-    box = _rectangle(used if body is None else body, pixel)
-    probe = None if part.clip is None else _probe(box)
-    return ScanningProbe(probe, _poses(matrices, box, pixel))
+    pixel = np.median(np.linalg.norm(sweep.image_to_reference[:, :3, :2], axis=1), axis=0)
+    shape = _named_fan(part, used, pixel) or fitted_part(seen_pixels(sweep), pixel, used)
+    is_known = shape is not None or part.clip is not None
+    shape = shape or _rectangle(used, pixel)
+    return ScanningProbe(_probe(shape) if is_known else None, _poses(sweep, shape, pixel))
 
 
 def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
@@ -106,8 +97,7 @@ def seen_pixels(sweep: Sweep) -> NDArray[np.bool_]:
     Raises:
         VolumeError: the images are damaged.
     """
-    count = len(sweep.numbers)
-    picked = np.unique(np.linspace(0, count - 1, min(count, 32)).round().astype(int))
+    picked = _spread(sweep, 32)
     often = np.zeros((sweep.rows, sweep.columns), dtype=np.int32)
     for image in sweep.images(picked.tolist()):
         often += image > 0
@@ -131,7 +121,7 @@ def fitted_part(
         return None
     z, x = np.indices(body.shape) * pixel[::-1, None, None]
     best: Fan | Rectangle | None = None
-    least = 0.95  # intersection over union of the seen pixels with the shape
+    least = _ALIKE
     for part in (_rectangle(body, pixel), _fan(body, within, pixel)):
         if part is not None:
             inside = part.holds(x, z) & within
@@ -182,23 +172,23 @@ def _fan(
 ) -> Fan | None:
     """The fan on whose edges the border of a part lies, but for where the image cuts it."""
     border = body & ~binary_erosion(body) & binary_erosion(within)
-    lines = _lines(body, border, pixel)
-    if lines is None:
+    rows = np.flatnonzero(body.any(axis=1))
+    first = body[rows].argmax(axis=1)
+    last = body.shape[1] - 1 - body[rows, ::-1].argmax(axis=1)
+    sides = []  # at first: slope and place of a line through each
+    for side, widest in ((first, first.argmin()), (last, last.argmax())):
+        free = np.flatnonzero(border[rows, side] & (np.arange(len(rows)) <= widest))
+        if len(free) < max(_LEAST_POINTS, 0.25 * len(rows)):
+            return None
+        some = free[:: 1 + len(free) // 200]
+        sides.append(theilslopes(side[some] * pixel[0], rows[some] * pixel[1])[:2])
+    (slope, base), (other, further) = sides
+    if math.atan(other) - math.atan(slope) < _NARROW:
         return None
-    apex, *angles = lines
+    z = (base - further) / (other - slope)
+    apex = np.array([slope * z + base, z])
     points = np.argwhere(border)[:, ::-1] * pixel  # (N, 2) m, x and z
-    radius, angle = np.hypot(*(points - apex).T), np.arctan2(*(points - apex).T)
-    everywhere = np.hypot(*(np.argwhere(body)[:, ::-1] * pixel - apex).T)
-    # Beside a corner a fan's top is its side rather than its face.
-    corner = 0.1 * (angles[1] - angles[0])
-    on_arc = (angle > angles[0] + corner) & (angle < angles[1] - corner)
-    half = 0.5 * (everywhere.min() + everywhere.max())
-    near, far = radius[on_arc & (radius < half)], radius[on_arc & (radius > half)]
-    if not len(near) and everywhere.min() > _POINT:
-        return None  # the image cuts off the face
-    # Where there is none of either, beams start in one place, or the image cuts off the bottom.
-    begins = float(np.median(near)) if len(near) else float(everywhere.min())
-    ends = float(np.median(far)) if len(far) else float(everywhere.max())
+    radius = np.hypot(*(np.argwhere(body)[:, ::-1] * pixel - apex).T)
 
     def off(shape: NDArray[np.float64] | list[float]) -> NDArray[np.float64]:
         """m, from points to the nearest of the fan's four edges."""
@@ -210,42 +200,19 @@ def _fan(
 
     fitted = least_squares(
         off,
-        [*apex, *angles, begins, ends],
+        [*apex, math.atan(slope), math.atan(other), radius.min(), radius.max()],
         loss="soft_l1",
         f_scale=float(pixel.max()),
         x_scale=[1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3],
     )
-    x, z, first, last, begins, ends = map(float, fitted.x)
-    if not (0.0 <= begins < ends and last - first > _NARROW):
-        return None
-    if np.percentile(off(fitted.x), _COUNTED) > 0.01 * (ends - begins) + 1.5 * pixel.max():
+    x, z, start, end, begins, ends = map(float, fitted.x)
+    if not (0.0 <= begins < ends and end - start > _NARROW):
         return None
     # From the centres of the outermost pixels to their border, which is half a pixel farther out.
     side = 0.5 * float(pixel.mean())
-    back, middle = side / math.sin(0.5 * (last - first)), 0.5 * (first + last)
+    back, middle = side / math.sin(0.5 * (end - start)), 0.5 * (start + end)
     placed = (x - back * math.sin(middle), z - back * math.cos(middle))
-    return Fan(placed, (max(0.0, begins + back - side), ends + back + side), (first, last))
-
-
-def _lines(
-    body: NDArray[np.bool_], border: NDArray[np.bool_], pixel: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float, float] | None:
-    """A fan's apex (2,) m and the angles of its sides, at first."""
-    rows = np.flatnonzero(body.any(axis=1))
-    first = body[rows].argmax(axis=1)
-    last = body.shape[1] - 1 - body[rows, ::-1].argmax(axis=1)
-    fits = []
-    for side, widest in ((first, first.argmin()), (last, last.argmax())):
-        free = border[rows, side] & (np.arange(len(rows)) <= widest)
-        if free.sum() < max(_LEAST_POINTS, 0.25 * len(rows)):
-            return None
-        some = np.flatnonzero(free)[:: 1 + int(free.sum()) // 200]
-        fits.append(theilslopes(side[some] * pixel[0], rows[some] * pixel[1])[:2])
-    (slope, base), (other, further) = fits
-    if math.atan(other) - math.atan(slope) < _NARROW:
-        return None
-    z = (base - further) / (other - slope)
-    return np.array([slope * z + base, z]), math.atan(slope), math.atan(other)
+    return Fan(placed, (max(0.0, begins + back - side), ends + back + side), (start, end))
 
 
 def _probe(shape: Fan | Rectangle) -> ProbeSettings | None:
@@ -284,16 +251,12 @@ def _middle_beam(
 
 
 def _poses(
-    matrices: NDArray[np.float64], shape: Fan | Rectangle, pixel: NDArray[np.float64]
+    sweep: Sweep, shape: Fan | Rectangle, pixel: NDArray[np.float64]
 ) -> tuple[Placement, ...]:
-    """Of the middle of the probe's face at some frames, as far apart along the sweep as can be."""
-    face, ahead, depth = _middle_beam(shape)
-    middle = np.array([*((face + 0.5 * depth * ahead) / pixel), 0.0, 1.0])
-    seen = (matrices @ middle)[:, :3]
-    moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
-    evenly = np.linspace(0.0, moved[-1], 33)
+    """Of the middle of the probe's face at frames all over a sweep."""
+    face, ahead, _ = _middle_beam(shape)
     poses = []
-    for matrix in matrices[np.unique(np.abs(moved[:, None] - evenly).argmin(axis=0))]:
+    for matrix in sweep.image_to_reference[_spread(sweep, 33)]:
         across, down = (matrix[:3, :2] / np.linalg.norm(matrix[:3, :2], axis=0)).T
         z = ahead[0] * across + ahead[1] * down
         z /= np.linalg.norm(z)
@@ -304,3 +267,9 @@ def _poses(
         i, j, k, w = (round(float(value), 6) for value in turned)
         poses.append(Placement((a, b, c), (i, j, k, w)))
     return tuple(poses)
+
+
+def _spread(sweep: Sweep, most: int) -> NDArray[np.int64]:
+    """Indices of so many frames, evenly over a sweep; of all where there are fewer."""
+    count = len(sweep.numbers)
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -44,7 +43,7 @@ class Sweep:
     # (K, 4, 4) m, from (column, row, 0, 1) of pixel centres to the sweep's reference frame
     image_to_reference: NDArray[np.float64]
     left_out: Mapping[str, int]  # frames without a usable pose, image or time, by reason
-    chain: TransformChain  # of which the poses were made; empty without poses
+    chain: TransformChain  # of which the poses were made
     sequence: TrackedSequence
 
     def images(self, which: Iterable[int] | None = None) -> Iterator[NDArray[np.uint8]]:
@@ -53,18 +52,9 @@ class Sweep:
         return self.sequence.require_images().read(int(number) for number in numbers)
 
 
-def read_sweep(path: str | os.PathLike[str], *, tracked: bool = True) -> Sweep:
-    """The images of a sequence file whose transforms lead from its image to a reference frame.
-
-    Frames whose transform or time stamp is missing, not finite or singular, or whose status is
-    not OK, are left out and counted.
-
-    Args:
-        path: of the file.
-        tracked: False takes images without a pose too; the sweep's poses are then all nan.
-    """
-    sequence = read_sequence(path)
-    return sweep_of(sequence) if tracked else _sweep(sequence, None, TransformChain("", ()))
+def read_sweep(path: str | os.PathLike[str]) -> Sweep:
+    """The images of a sequence file whose transforms lead from its image to a reference frame."""
+    return sweep_of(read_sequence(path))
 
 
 def sweep_of(
@@ -75,6 +65,9 @@ def sweep_of(
     calibration: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Sweep:
     """The images of a sequence, each placed by a chain of transforms.
+
+    Frames whose transform or time stamp is missing, not finite or singular, or whose status is
+    not OK, are left out and counted.
 
     Args:
         sequence: with images.
@@ -104,14 +97,8 @@ def sweep_of(
             f"{', '.join(sorted(known))}: name others, or give the probe's calibration (such as "
             f"ImageToProbe)"
         )
-    return _sweep(sequence, along(known, chain), chain)
-
-
-def _sweep(
-    sequence: TrackedSequence, placed: FrameTransforms | None, chain: TransformChain
-) -> Sweep:
-    sequence.require_images()
-    faults = [""] * len(sequence) if placed is None else list(placed.faults)
+    placed = along(known, chain)
+    faults = list(placed.faults)
     for k in np.flatnonzero(np.isnan(sequence.times)):
         faults[k] = faults[k] or NO_TIME
     for k in np.flatnonzero(~sequence.image_is_valid):
@@ -126,14 +113,13 @@ def _sweep(
             f"{sequence.path}: none of its {sequence.count} frames can be used ({why}); record the "
             f"sweep again with the probe in the tracker's view"
         )
-    matrices = np.full((len(sequence), 4, 4), math.nan) if placed is None else placed.matrices
     return Sweep(
         sequence.path,
         sequence.columns,
         sequence.rows,
         sequence.numbers[used],
         sequence.times[used],
-        matrices[used],
+        placed.matrices[used],
         left_out,
         chain,
         sequence,
@@ -147,8 +133,8 @@ def shifted(sweep: Sweep, offset: float) -> Sweep:
         sweep: with poses.
         offset: s, to add to the images' times to find their poses.
     """
-    centre = np.array([0.5 * (sweep.columns - 1), 0.5 * (sweep.rows - 1), 0.0])
-    placed = poses_at(sweep.times, sweep.image_to_reference, sweep.times + offset, centre)
+    middle = np.array([0.5 * (sweep.columns - 1), 0.5 * (sweep.rows - 1), 0.0])
+    placed = _poses_at(sweep, sweep.times + offset, middle)
     used = np.isfinite(placed).all(axis=(1, 2))
     if not used.any():
         raise VolumeError(
@@ -167,39 +153,28 @@ def shifted(sweep: Sweep, offset: float) -> Sweep:
     )
 
 
-def poses_at(
-    times: NDArray[np.float64],
-    matrices: NDArray[np.float64],
-    wanted: NDArray[np.float64],
-    centre: NDArray[np.float64],
+def _poses_at(
+    sweep: Sweep, wanted: NDArray[np.float64], middle: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(N, 4, 4) transforms between those that were measured; nan where none is near in time.
+    """(N, 4, 4) poses of images between those that were measured; nan where none is near in time.
 
-    A point moves straight from one to the next, and everything turns about it.
-
-    Args:
-        times: (K,) s, of the measured.
-        matrices: (K, 4, 4) m, each a rigid motion of the others.
-        wanted: (N,) s.
-        centre: (3,) the point, in the frame that the matrices take points of.
+    The middle (3,) of the image moves straight from one to the next, and all else turns about it.
     """
     from scipy.spatial.transform import Rotation, Slerp  # which takes a tenth of a second
 
-    times, first = np.unique(times, return_index=True)
-    matrices = matrices[first]
-    after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
-    is_there = times[after] == wanted
+    times, first = np.unique(sweep.times, return_index=True)
+    matrices = sweep.image_to_reference[first]
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    is_within = (times[0] <= wanted) & (wanted <= times[-1])
+    used = is_within & (times[after] - times[after - 1] <= _LONGEST_GAP)
     placed = np.full((len(wanted), 4, 4), np.nan)
-    placed[is_there] = matrices[after[is_there]]
-    gap = times[after] - times[np.maximum(after - 1, 0)]
-    between = ~is_there & (times[0] < wanted) & (wanted < times[-1]) & (gap <= _LONGEST_GAP)
-    if between.any():
+    if used.any():
         base = matrices[0, :3, :3]
         turns = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3] @ np.linalg.inv(base)))
-        turned = turns(wanted[between]).as_matrix() @ base
-        centres = matrices[:, :3, :3] @ centre + matrices[:, :3, 3]
-        moved = np.stack([np.interp(wanted[between], times, each) for each in centres.T], axis=-1)
-        placed[between] = np.eye(4)
-        placed[between, :3, :3] = turned
-        placed[between, :3, 3] = moved - turned @ centre
+        turned = turns(wanted[used]).as_matrix() @ base
+        middles = matrices[:, :3, :3] @ middle + matrices[:, :3, 3]
+        moved = np.stack([np.interp(wanted[used], times, each) for each in middles.T], axis=-1)
+        placed[used] = np.eye(4)
+        placed[used, :3, :3] = turned
+        placed[used, :3, 3] = moved - turned @ middle
     return placed

@@ -15,7 +15,7 @@ from us_sim.volume.deidentification.importing import look_at
 from us_sim.volume.deidentification.settings import ImportSettings
 from us_sim.volume.files.dicom.placed_images import opened_images, placed_images
 from us_sim.volume.files.readers import read_placement, read_volume
-from us_sim.volume.sequences.sweep import read_sweep
+from us_sim.volume.sequences.sequence import read_sequence
 
 MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4"
 
@@ -169,6 +169,6 @@ def test_images_at_one_place_are_a_cine_and_no_volume(tmp_path):
         placed_images(opened_images([path]))
     out = tmp_path / "a.igs.mha"
     look_at([path], out, ImportSettings(keep_whole_image=True)).write()
-    sweep = read_sweep(out, tracked=False)
+    sweep = read_sequence(out)
     np.testing.assert_allclose(sweep.times, 0.04 * np.arange(times))
     assert sitk.ReadImage(str(out)).GetSpacing()[:2] == (0.5, 0.25)
