@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +21,7 @@ from us_sim.command.options import (
     viewed,
     viewer,
 )
-from us_sim.errors import BagError, UsSimError
+from us_sim.errors import UsSimError
 from us_sim.run.forked import begin_fork_server
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
@@ -116,12 +114,6 @@ def _run(args: argparse.Namespace) -> int:
 
 def render_options(render: argparse.ArgumentParser) -> None:
     add_path_option(render, "bag with the probe path; default: the scene's")
-    render.add_argument(
-        "--session",
-        type=Path,
-        metavar="FILE",
-        help="repeat this recording from itself: its scene, parameters and poses",
-    )
     render.add_argument("--out", type=Path, required=True, help="folder to write to")
     render.add_argument(
         "--truth",
@@ -135,37 +127,7 @@ def render_options(render: argparse.ArgumentParser) -> None:
 def _render(args: argparse.Namespace) -> int:
     from us_sim.run.lockstep import render
 
-    if args.session is not None:
-        return _render_session(args)
     return render(_request(args), args.out, truth=args.truth)
-
-
-def _render_session(args: argparse.Namespace) -> int:
-    from us_sim.progress import late_progress
-    from us_sim.recording.reader import read_bag
-    from us_sim.run.lockstep import render
-    from us_sim.run.resimulation import resimulation
-    from us_sim.run.session_diff import diff, table
-
-    parameters = node_parameters(args.param)
-    if any(each is not None for each in (args.scene, args.case, args.path, args.topic)):
-        raise UsSimError(
-            f"--session {args.session}: the scene and the path are those of the recording; leave "
-            f"out the scene, --case, --path and --topic"
-        )
-    with tempfile.TemporaryDirectory(prefix="us_sim_session_") as folder:
-        again, note = resimulation(args.session, Path(folder), args.volume)
-        if note:
-            print(note, file=sys.stderr)
-        for node, values in parameters.items():
-            again.parameters.setdefault(node, {}).update(values)
-        render(again, args.out, truth=args.truth)
-    made = args.out / "session.mcap"
-    try:
-        print(table(diff(read_bag(args.session), read_bag(made), late_progress("comparing"))))
-    except BagError as error:  # it is made, and may have nothing to be compared with
-        print(f"it is not compared: {error}")
-    return 0
 
 
 def view_options(parser: argparse.ArgumentParser) -> None:

@@ -111,7 +111,7 @@ def diff(one: Bag, other: Bag, progress: Progress = lambda *_: None) -> SessionD
     if all(row[2] == "0" for row in rows):
         raise BagError(
             f"{one.path} and {other.path} have no stamp in common, so that nothing can be paired: "
-            f"they are of different runs; `us-sim render --session` keeps the stamps"
+            f"they are of different runs; `us-sim render --path` keeps the stamps"
         )
     return SessionDiff(
         (one.path, other.path), rows, notes, sorted({name for name, _ in both} - {*names})

@@ -12,7 +12,7 @@ from us_sim.nodes.topics import FROZEN, MARKERS
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
-from us_sim.run.resimulation import scene_of
+from us_sim.run.session_scene import scene_of
 from us_sim.run.session_summary import POSE, read_session
 from us_sim.run.session_tables import SECOND, Progress
 from us_sim.scene.building import probe_of, volume_of
