@@ -115,6 +115,7 @@ def test_commands_on_files_do_their_work(python, tmp_path, small_scene):
     matrices[:, 2, 3] = 1e-3 * np.arange(12)
     write_sweep(sweep, grey[:12], matrices)
     points, seeds = tmp_path / "points.csv", tmp_path / "seeds.yaml"
+    markers = ROOT / "config" / "markers" / "board.yaml"
     points.write_text("name,x,y,z\na,0,0,0\nb,9,0,0\nc,0,9,0\nd,0,0,9\n")
     seeds.write_text(SEEDS)
     words = {
@@ -129,7 +130,7 @@ def test_commands_on_files_do_their_work(python, tmp_path, small_scene):
         "segment": ["segment", folder / "case", "--seeds", seeds],
         "cases": ["cases", folder],
         "calibrate": ["calibrate", "landmarks", points, points, "--out", folder / "to.yaml"],
-        "print-marker": ["print-marker", "--out", folder / "marker.png"],
+        "print-marker": ["print-marker", markers, "--out", folder / "marker.png"],
         "reference": ["reference", "--out", folder / "reference.md"],
         "run --dry-run": ["run", small_scene, "--dry-run"],
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -48,7 +47,7 @@ from us_sim.tracking.calibration.transform_file import (
     write_transform,
 )
 from us_sim.tracking.camera.model import write_camera_info
-from us_sim.tracking.camera.rigid_body import printed_board
+from us_sim.tracking.camera.rigid_body import read_rigid_body
 from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
 from us_sim.volume.sequences.transforms import split_transform_name
 
@@ -138,7 +137,7 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
             write exists.
     """
     out = settings.out
-    board = printed_board(settings)
+    board = read_rigid_body(settings.board)
     photos = find_photos(settings.photos)
     if not photos:
         raise CalibrationError("no photo is given; name files, a folder or a pattern")
@@ -161,14 +160,14 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
             progress((k + 1) / len(photos), f"{len(views)} with the board")
     if not views:
         raise CalibrationError(
-            f"none of the {len(photos)} photos shows the board: check --board, --size and "
-            f"--dictionary, and try --legacy with an old ChArUco board"
+            f"none of the {len(photos)} photos shows the board of {settings.board}: check its "
+            f"numbers there, and try legacy: true with an old ChArUco board"
         )
     found = calibrate_camera(views, size[1], size[0])
     far_off = list(compress(names, ~found.used))
     names, views = list(compress(names, found.used)), list(compress(views, found.used))
     notes = {  # further keys, which ROS' readers ignore
-        "method": f"{settings.board} board {settings.size}, Zhang",
+        "method": f"photos of {settings.board.name}, Zhang",
         "residuals": {
             "rms": found.rms,  # pixels
             "photos": dict(zip(names, found.residuals.tolist(), strict=True)),  # RMS, pixels
@@ -195,26 +194,20 @@ def calibrate_photos(settings: CameraSettings, progress: Progress | None = None)
     return f"{said}; {found.note}" if found.note else said
 
 
-def find_photos(patterns: Sequence[str]) -> list[Path]:
-    """The files that are named, lie in named folders or match patterns.
+def find_photos(names: Sequence[str]) -> list[Path]:
+    """The files that are named, or lie in named folders.
 
     Raises:
         CalibrationError: a name stands for no photo.
     """
     photos: dict[Path, None] = {}
-    for text in patterns:
+    for text in names:
         path = Path(os.path.expanduser(text))
-        if path.is_file():
-            photos[path] = None
-            continue
-        if path.is_dir():
-            candidates = list(path.iterdir())
-        else:
-            candidates = [Path(match) for match in glob.glob(str(path), recursive=True)]
-        matches = [file for file in candidates if file.suffix.lower() in _IMAGES]
-        if not matches:
+        inside = sorted(path.iterdir()) if path.is_dir() else []
+        found = [path] if path.is_file() else [p for p in inside if p.suffix.lower() in _IMAGES]
+        if not found:
             raise CalibrationError(f"{text}: there is no such photo, and no folder with any")
-        photos.update(dict.fromkeys(sorted(matches)))
+        photos.update(dict.fromkeys(found))
     return list(photos)
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from us_sim.errors import CalibrationError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
-from us_sim.tracking.settings import BoardSettings
 
 Progress = Callable[[float, str], None]
 """A callback that is told the fraction done, and what is being done."""
@@ -50,12 +49,11 @@ class CalibrationSettings(Settings):
 
 
 @dataclass(frozen=True)
-class CameraSettings(CalibrationSettings, BoardSettings):
+class CameraSettings(CalibrationSettings):
     """Lens and focal length from photos of a board."""
 
-    photos: tuple[str, ...] = setting(
-        description="files, folders or patterns such as 'shots/*.jpg'"
-    )
+    board: Path = setting(description="file of the board, as `us-sim print-marker` prints it")
+    photos: tuple[str, ...] = setting(description="files, or folders of them")
     name: str = setting(description="the camera's name in the file", default="camera")
     out: Path = _out(": camera info", "camera.yaml")
 

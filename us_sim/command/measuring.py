@@ -55,12 +55,8 @@ def _calibrate(name: str, args: argparse.Namespace) -> int:
 
 
 def print_marker_options(parser: argparse.ArgumentParser) -> None:
-    from us_sim.tracking.camera.marker_print import PrintSettings
-
-    parser.add_argument(
-        "body", nargs="?", type=Path, help="file of a rigid body; default: one marker, or a board"
-    )
-    add_setting_options(parser, PrintSettings)
+    parser.add_argument("body", type=Path, help="file of the markers: a rigid body, or a board")
+    parser.add_argument("--paper", default="A4", help="of the sheets: A4, A3 or letter")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help=".pdf, or .png for one sheet"
     )
@@ -68,12 +64,10 @@ def print_marker_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _print_marker(args: argparse.Namespace) -> int:
-    from us_sim.tracking.camera.marker_print import PrintSettings, print_markers
+    from us_sim.tracking.camera.marker_print import print_markers
     from us_sim.tracking.camera.rigid_body import read_rigid_body
 
-    asked = read_settings(args, PrintSettings)
-    body = read_rigid_body(args.body, asked.dictionary) if args.body else asked.body()
-    pages = print_markers(body, args.out, asked.paper)
+    pages = print_markers(read_rigid_body(args.body), args.out, args.paper)
     count = counted(len(pages), "sheet")
-    print(f"{args.out}: {pages[0].foot}; {count} of {asked.paper}, to be printed at 100 %")
+    print(f"{args.out}: {pages[0].foot}; {count} of {args.paper}, to be printed at 100 %")
     return 0

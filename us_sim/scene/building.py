@@ -451,16 +451,18 @@ def camera_body_of(scene: Scene) -> RigidBody:
     """The markers on the probe that the scene's camera looks for.
 
     Raises:
-        TrackingError: their file cannot be used.
+        SceneError: no file is named.
+        TrackingError: the file cannot be used.
     """
-    from us_sim.tracking.camera.rigid_body import RigidBody
+    from us_sim.tracking.camera.rigid_body import read_rigid_body
 
-    settings = source_settings(scene, "camera")
-    if settings.body:
-        from us_sim.tracking.camera.rigid_body import read_rigid_body
-
-        return read_rigid_body(settings.body, settings.dictionary)
-    return RigidBody.single(settings.dictionary, settings.marker, settings.size)
+    body = source_settings(scene, "camera").body
+    if not body:
+        raise SceneError(
+            f"{scene.origin}: tracker.camera.body: is missing; name the file of the markers on the "
+            f"probe, such as config/markers/probe_grip.yaml"
+        )
+    return read_rigid_body(body)
 
 
 @dataclass(frozen=True, eq=False)

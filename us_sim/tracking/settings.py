@@ -4,8 +4,8 @@ A value that is out of range is a TrackingError with its name and the range, as 
 go together.
 
 >>> from us_sim.tracking.settings import CameraSettings, OneEuroSettings
->>> CameraSettings(size="25 mm").size
-0.025
+>>> CameraSettings(view_angle_limit="0.5 rad").view_angle_limit
+0.5
 >>> OneEuroSettings(derivative_cutoff=0)
 Traceback (most recent call last):
 ...
@@ -21,7 +21,6 @@ from us_sim.errors import TrackingError
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 
-BOARDS = ("charuco", "grid")  # the kinds of flat boards
 DICTIONARIES = (
     *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "ARUCO_ORIGINAL",
@@ -34,31 +33,6 @@ MARKER_SIZE = Quantity("length", 1e-3, 0.25)
 
 
 @dataclass(frozen=True)
-class BoardSettings(Settings):
-    """A flat board of markers, as the options of a command describe it."""
-
-    board: str | None = setting(
-        description="its kind", choices=BOARDS, default="charuco", kw_only=True
-    )
-    size: str | None = setting(
-        description="squares or markers across and down: 5x7", default=None, kw_only=True
-    )
-    square: float | None = setting(
-        MARKER_SIZE, "side of a ChArUco board's square", default=None, kw_only=True
-    )
-    marker: float | None = setting(MARKER_SIZE, "side of a marker", default=None, kw_only=True)
-    separation: float | None = setting(
-        MARKER_SIZE, "between the markers of a grid", default=None, kw_only=True
-    )
-    dictionary: str = setting(description="of the markers", default="4X4_50", kw_only=True)
-    legacy: bool = setting(
-        description="the ChArUco board is as OpenCV before 4.6 drew it",
-        default=False,
-        kw_only=True,
-    )
-
-
-@dataclass(frozen=True)
 class CameraSettings(Settings):
     """The settings of the camera source. Each is a key of a scene's ``tracker.camera:``."""
 
@@ -66,14 +40,7 @@ class CameraSettings(Settings):
     error = TrackingError
 
     body: str = setting(
-        description="file of the rigid body of markers; empty for one marker", file=True, default=""
-    )
-    marker: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
-    size: float = setting(MARKER_SIZE, "edge of the one marker's black square", default=0.04)
-    dictionary: str = setting(
-        description="dictionary of the marker, or of a body's file that names none",
-        choices=DICTIONARIES,
-        default="4X4_50",
+        description="file of the rigid body of markers on the probe", file=True, default=""
     )
     minimum_markers: int = setting(
         Quantity("number", 1, 1000), "markers that must be seen for a pose to be taken", default=1
@@ -92,11 +59,6 @@ class CameraSettings(Settings):
         Quantity("image distance", 0.01, 10.0),
         "standard deviation of a corner, the least that the covariance of the pose is made with",
         default=0.1,
-    )
-    latency: float = setting(
-        Quantity("time", -1.0, 1.0),
-        "time from the middle of the exposure to the image's stamp",
-        default=0.0,
     )
 
 

@@ -151,6 +151,12 @@ def test_time_of_two_bags(tmp_path, capsys):
     assert "exists already" in refusal(capsys, "time", moving, fixed, "--out", out)
 
 
+def board_file(tmp_path, dictionary_and_board):
+    file = tmp_path / "board.yaml"
+    file.write_text(f"{{dictionary: {dictionary_and_board}}}")
+    return file
+
+
 @pytest.mark.slow
 def test_camera_from_photos_of_a_board(tmp_path, capsys):
     # Rendered by a pinhole of 700 pixels, 640 × 480, from six sides.
@@ -165,8 +171,9 @@ def test_camera_from_photos_of_a_board(tmp_path, capsys):
     blank = tmp_path / "10.png"
     cv2.imwrite(str(blank), np.full((480, 640), 120, np.uint8))
     out = tmp_path / "out.yaml"
-    options = ("--size", "9x7", "--square", "20 mm", "--marker", "15 mm", "--name", "webcam")
-    assert calibrate("camera", tmp_path, *options, "--out", out) == 0
+    sizes = "columns: 9, rows: 7, square: 20 mm, size: 15 mm"
+    options = (board_file(tmp_path, f"4X4_50, board: {{kind: charuco, {sizes}}}"), tmp_path)
+    assert calibrate("camera", *options, "--name", "webcam", "--out", out) == 0
     said = capsys.readouterr().out
     assert "in 6 photos" in said
     assert "1 without the board: 10.png" in said
@@ -179,16 +186,15 @@ def test_camera_from_photos_of_a_board(tmp_path, capsys):
 
 
 def test_camera_refuses_what_is_no_photo_or_board(tmp_path, capsys):
-    board = ("--size", "5x7", "--square", "40 mm", "--marker", "20 mm", "--dictionary", "6X6_250")
-    out = ("--out", tmp_path / "c.yaml")
-    assert "no such photo" in refusal(capsys, "camera", tmp_path / "*.jpg", *board, *out)
+    sizes = "columns: 5, rows: 7, square: 40 mm, size: 20 mm"
+    board = board_file(tmp_path, f"6X6_250, board: {{kind: charuco, {sizes}}}")
+    photos = ("camera", board, tmp_path, "--out", tmp_path / "c.yaml")
+    assert "no such photo" in refusal(capsys, *photos)
     text = tmp_path / "text.jpg"
     text.write_text("no image")
-    assert "is no image" in refusal(capsys, "camera", text, *board, *out)
+    assert "is no image" in refusal(capsys, *photos)
     text.unlink()
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
-    assert "none of the 1 photos shows" in refusal(capsys, "camera", tmp_path, *board, *out)
+    assert "none of the 1 photos shows" in refusal(capsys, *photos)
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((60, 90), np.uint8))
-    assert "has 90 × 60 pixels" in refusal(capsys, "camera", tmp_path, *board, *out)
-    assert "5x7" in refusal(capsys, "camera", tmp_path, "--size", "5by7", *board[2:], *out)
-    assert "--marker" in refusal(capsys, "camera", tmp_path, *board[:4], *out)
+    assert "has 90 × 60 pixels" in refusal(capsys, *photos)

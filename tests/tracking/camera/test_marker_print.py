@@ -8,6 +8,7 @@ import pytest
 
 from us_sim.command.main import main
 from us_sim.errors import TrackingError
+from us_sim.share import shared_path
 from us_sim.tracking.camera.fiducial_detector import detect_corners
 from us_sim.tracking.camera.marker_print import print_markers, sheets
 from us_sim.tracking.camera.rigid_body import RigidBody
@@ -83,32 +84,17 @@ def test_nothing_is_overwritten_and_what_cannot_be_is_said(tmp_path):
 
 
 def test_the_command_prints(tmp_path, capsys):
+    board = shared_path("config/markers/board.yaml")
     out = tmp_path / "board.png"
-    options = ["--board", "charuco", "--size", "5x7", "--square", "30mm", "--marker", "15mm"]
-    assert main(["print-marker", *options, "--dictionary", "6X6_250", "--out", str(out)]) == 0
-    assert "ChArUco 5x7, squares 30 mm, markers 15 mm, 6X6_250; 1 sheet of A4" in (
+    assert main(["print-marker", str(board), "--out", str(out)]) == 0
+    assert "ChArUco 5x7, squares 30 mm, markers 22 mm, 4X4_50; 1 sheet of A4" in (
         capsys.readouterr().out
     )
     assert out.exists()
-    grip = tmp_path / "grip.yaml"
-    grip.write_text(
-        "{dictionary: 4X4_50, markers: [{id: 1, size: 30 mm}, {id: 2, size: 30 mm, "
-        "position: [0, 40 mm, 0], orientation: [0.6, 0, 0, 0.8]}]}"
-    )
+    grip = shared_path("config/markers/probe_grip.yaml")
     assert main(["print-marker", str(grip), "--out", str(tmp_path / "grip.pdf")]) == 0
-    assert "4X4_50, 1, 2: 30 mm" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        (["--board", "grid"], "--size"),
-        (["--board", "charuco", "--size", "5x7"], "--square"),
-        (["--board", "grid", "--size", "five", "--separation", "5mm"], "5x7"),
-        (["--marker", "40"], "--marker"),
-        (["--id", "99"], "0 to 49"),
-    ],
-)
-def test_bad_options_are_one_sentence(options, word, tmp_path, capsys):
-    assert main(["print-marker", *options, "--out", str(tmp_path / "a.pdf")]) == 1
-    assert word in capsys.readouterr().err
+    assert "4X4_50, 0, 1, 2, 3, 4, 5: 30 mm" in capsys.readouterr().out
+    assert (
+        main(["print-marker", str(board), "--paper", "A5", "--out", str(tmp_path / "a.pdf")]) == 1
+    )
+    assert "letter" in capsys.readouterr().err

@@ -64,9 +64,10 @@ def test_boards_are_read(tmp_path):
     assert len(body.chessboard.corners) == 24
     assert np.allclose(body.chessboard.corners[0], [0.04, 0.04, 0.0])
     path.write_text(
+        "dictionary: 4X4_50\n"
         "board: {kind: grid, columns: 2, rows: 1, size: 30 mm, separation: 6 mm, first: 7}"
     )
-    assert read_rigid_body(path, "4X4_50").ids.tolist() == [7, 8]
+    assert read_rigid_body(path).ids.tolist() == [7, 8]
 
 
 @pytest.mark.parametrize(
@@ -74,12 +75,15 @@ def test_boards_are_read(tmp_path):
     [
         ("{a: [", "YAML"),
         ("dictionary: 4X4_50", "markers"),
-        ("{markers: [], sizes: 3}", "sizes"),
-        ("markers: [{id: 1, size: 30}]", "30 mm"),
-        ("markers: [{id: 1, size: 0.03, position: 3}]", "position"),
-        ("markers: [{id: 1, size: 0.03, orientation: [0, 0, 0, 0]}]", "orientation"),
-        ("markers: [{id: 1, corners: [[0, 0, 0]]}]", "corners"),
-        ("board: {kind: grid, columns: 2}", "board.rows"),
+        ("{dictionary: 4X4_50, markers: [], sizes: 3}", "sizes"),
+        ("markers: [{id: 1, size: 0.03}]", "dictionary"),
+        ("{dictionary: 4X4_50, markers: [{id: 1, size: 30}]}", "30 mm"),
+        ("{dictionary: 4X4_50, markers: [{id: 1, size: 0.03, position: 3}]}", "position"),
+        (
+            "{dictionary: 4X4_50, markers: [{id: 1, size: 0.03, orientation: [0, 0, 0, 0]}]}",
+            "orientation",
+        ),
+        ("{dictionary: 4X4_50, board: {kind: grid, columns: 2}}", "board.rows"),
         ("{dictionary: 9X9, markers: [{id: 1, size: 0.03}]}", "9X9"),
     ],
 )

@@ -83,11 +83,6 @@ def test_a_charuco_board_is_measured_by_its_chessboard():
     assert source.seen == 17
 
 
-def test_the_stamp_is_that_of_the_exposure(image):
-    source = CameraSource(WEBCAM, MARKER, CameraSettings(latency="20 ms"))
-    assert source.measure(image, 1_000_000_000).stamp == 980_000_000
-
-
 def test_a_moving_marker_is_followed_and_found_again(scene):
     source = CameraSource(WEBCAM, MARKER)
     true = [
@@ -125,10 +120,6 @@ def test_images_without_the_marker_say_what_is_there(image):
     refused(np.zeros((480, 640), np.uint8), "black")
     refused(np.full((480, 640), 200, np.uint8), "4X4_50")
     refused(image, "lacks (7)", RigidBody.single("4X4_50", 8, 0.04))
-    source = CameraSource(WEBCAM, RigidBody.single("6X6_250", 7, 0.04))
-    for _ in range(3):
-        assert source.measure(image, 0) is None
-    assert "4X4_1000 (7)" in source.last_problem
 
 
 def test_what_the_marker_cannot_be_measured_by_is_refused(scene, image):

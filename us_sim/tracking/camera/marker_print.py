@@ -16,7 +16,6 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import PdfPages
@@ -26,11 +25,7 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from us_sim.errors import TrackingError
-from us_sim.settings.quantity import Quantity
-from us_sim.settings.setting import setting
-from us_sim.tracking.camera.markers import dictionary
-from us_sim.tracking.camera.rigid_body import RigidBody, printed_board
-from us_sim.tracking.settings import BOARDS, MARKER_SIZE, BoardSettings
+from us_sim.tracking.camera.rigid_body import RigidBody
 
 PAPERS = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height in mm."""
@@ -42,30 +37,6 @@ _FLAT = 1e-5  # m
 _DOTS = 300  # per inch, of a picture
 
 
-@dataclass(frozen=True)
-class PrintSettings(BoardSettings):
-    """Options of ``us-sim print-marker``: the markers and the paper."""
-
-    error = TrackingError
-
-    board: str | None = setting(
-        description="a board in place of one marker", choices=BOARDS, default=None, kw_only=True
-    )
-    marker: float = setting(MARKER_SIZE, "edge of a marker", default=0.04, kw_only=True)
-    id: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
-    paper: str = setting(description="of the sheets", choices=tuple(PAPERS), default="A4")
-
-    def body(self) -> RigidBody:
-        """The marker or the board.
-
-        Raises:
-            TrackingError: it is impossible, or the dictionary has too few markers.
-        """
-        if self.board is None:
-            return RigidBody.single(self.dictionary, self.id, self.marker)
-        return printed_board(self)
-
-
 @dataclass(frozen=True, eq=False)
 class Sheet:
     """The print on one sheet of paper; mm from its upper left corner, x right, y down."""
@@ -73,7 +44,7 @@ class Sheet:
     paper: str
     ids: tuple[int, ...]
     marked: NDArray[np.float64]  # (n, 4, 2), corners of each marker, as the body orders them
-    black: list[NDArray[np.float64]]  # (4, 2) each
+    black: NDArray[np.float64]  # (b, 4, 2), cells
     labels: list[tuple[float, float, str]]  # where, and what is written there
     foot: str
 
@@ -112,13 +83,14 @@ def sheets(body: RigidBody, paper: str = "A4") -> list[Sheet]:
         for k, (corners, dark, size) in enumerate(pieces[first : first + across * down]):
             place = _MARGIN + pitch * [k % across, k // across]
             marked.append(corners + place)
-            black += [each + place for each in dark]
+            black.append(dark + place)
             if len(pieces) > 1:
                 x, y = place.tolist()
                 labels.append((x, y + float(size[1]) + 0.7 * _GAP, str(body.ids[first + k])))
         ids = body.ids[first : first + across * down] if len(pieces) > 1 else body.ids
         there = tuple(ids.tolist())
-        pages.append(Sheet(paper, there, np.concatenate(marked), black, labels, _describe(body)))
+        whole = np.concatenate(marked), np.concatenate(black)
+        pages.append(Sheet(paper, there, *whole, labels, _describe(body)))
     return pages
 
 
@@ -155,58 +127,30 @@ def _is_flat(body: RigidBody) -> bool:
     return bool(np.abs(offsets).max() <= _FLAT and (body.normals @ body.normals[0]).min() >= 0.999)
 
 
-_Piece = tuple[NDArray[np.float64], list[NDArray[np.float64]], NDArray[np.float64]]
-
-
-def _piece(body: RigidBody) -> _Piece:
-    """Corners (M, 4, 2) of a flat body's markers, what is black, and the size (2,), all in mm.
+def _piece(
+    body: RigidBody,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (M, 4, 2) of a flat body's markers, black cells (b, 4, 2), and the size (2,), in mm.
 
     From its upper left corner, x right and y down as one sees it, with the white about it.
     """
-    right = body.corners[0, 1] - body.corners[0, 0]
-    edge = float(np.linalg.norm(right))
-    down = np.cross(right / edge, body.normals[0])
-    corners = 1e3 * body.corners @ np.stack([right / edge, down], axis=1)
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    quiet = 1e3 * edge / (dictionary(body.dictionary).markerSize + 2)  # a cell
-    black: list[NDArray[np.float64]] = []
-    if body.chessboard is not None:
-        board, side = body.chessboard, 1e3 * body.chessboard.square
-        # The markers are in the middles of the white squares, so the others are black.
-        middles = 1e3 * body.centres[:, :2]
-        white = set(map(tuple, np.floor(middles / side).astype(int).tolist()))
-        low = corners[0].mean(axis=0) - middles[0]
-        high = low + side * np.array([board.columns, board.rows])
-        quiet = 0.2 * side
-        black += [
-            low + side * (_UNIT + np.array([column, row]))
-            for row in range(board.rows)
-            for column in range(board.columns)
-            if (column, row) not in white
-        ]
-    for number, quadrilateral in zip(body.ids.tolist(), corners, strict=True):
-        black += _cells(body.dictionary, number, quadrilateral)
+    prints = body.prints
+    marker = prints[-1]
+    right = marker.along / np.linalg.norm(marker.along)
+    axes = 1e3 * np.stack([right, np.cross(right, body.normals[-1])], axis=1)
+    black = []
+    for each in prints:
+        rows, columns = each.cells.shape
+        row, column = np.nonzero(~each.cells)
+        across = (column[:, None] + [0, 1, 1, 0]) / columns
+        down = (row[:, None] + [0, 0, 1, 1]) / rows
+        places = across[..., None] * each.along + down[..., None] * each.down
+        black.append((each.origin + places) @ axes)
+    outlines = np.array([each.corners for each in prints]) @ axes
+    low, high = outlines.min(axis=(0, 1)), outlines.max(axis=(0, 1))
+    quiet = 1e3 * float(np.linalg.norm(marker.along)) / len(marker.cells)  # a cell
     move = quiet - low
-    return corners + move, [each + move for each in black], high - low + 2 * quiet
-
-
-_UNIT = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
-
-
-def _cells(name: str, number: int, corners: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Runs of black cells, row by row, of a marker with corners (4, 2)."""
-    bits = dictionary(name).markerSize + 2
-    code = np.asarray(cv2.aruco.generateImageMarker(dictionary(name), number, bits)) == 0
-    runs = []
-    for row in range(bits):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], code[row].astype(int), [0]])))
-        for start, end in edges.reshape(-1, 2) / bits:
-            s = np.array([start, end, end, start])[:, None]
-            t = np.array([row, row, row + 1, row + 1])[:, None] / bits
-            upper = corners[0] + s * (corners[1] - corners[0])
-            lower = corners[3] + s * (corners[2] - corners[3])
-            runs.append(upper + t * (lower - upper))
-    return runs
+    return body.corners @ axes + move, np.concatenate(black) + move, high - low + 2 * quiet
 
 
 def _describe(body: RigidBody) -> str:
@@ -231,7 +175,7 @@ def _figure(sheet: Sheet) -> Figure:
     axes.set(xlim=(0, width), ylim=(height, 0))
     axes.axis("off")
     # One outline of all, so that no viewer shows seams between neighbours.
-    points = np.concatenate([[*part, part[0]] for part in sheet.black])
+    points = sheet.black[:, [0, 1, 2, 3, 0]].reshape(-1, 2)
     codes = [Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY] * len(sheet.black)
     axes.add_patch(
         PathPatch(Outline(points, codes), facecolor="black", edgecolor="none", snap=False)

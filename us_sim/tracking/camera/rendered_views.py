@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -28,9 +27,8 @@ from numpy.typing import NDArray
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import rotation_exp
 from us_sim.kernels import njit
-from us_sim.tracking.camera.markers import dictionary
 from us_sim.tracking.camera.model import CameraModel
-from us_sim.tracking.camera.rigid_body import Chessboard, RigidBody
+from us_sim.tracking.camera.rigid_body import Print, RigidBody
 
 _LENS = np.array([-0.2, 0.06, 6e-4, -4e-4, 0.0])
 _SMALL = np.array([[600.0, 0.0, 322.3], [0.0, 601.0, 238.1], [0.0, 0.0, 1.0]])  # pixels
@@ -63,22 +61,6 @@ class Conditions:
 
 SHARP = Conditions(defocus=0.0, read_noise=0.0, shot_noise=0.0)
 """An image that is only sampled to pixels and grey levels."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Sheet:
-    """A printed rectangle."""
-
-    origin: NDArray[np.float64]  # (3,) m, its upper left corner, frame of the body
-    along: NDArray[np.float64]  # (3,) m, its upper edge
-    down: NDArray[np.float64]  # (3,) m, its left edge
-    print: NDArray[np.bool_]  # (rows, columns) of equal cells; True is white
-
-    @property
-    def corners(self) -> NDArray[np.float64]:
-        """(4, 3) m."""
-        a, b, c = self.origin, self.along, self.down
-        return np.array([a, a + b, a + b + c, a + c])
 
 
 class RenderedView:
@@ -182,7 +164,7 @@ class RenderedView:
                 image[low[1] : high[1], low[0] : high[0]],
                 self._rays[window],
                 inverse,
-                sheet.print,
+                sheet.cells,
                 np.float32(shade * _BLACK),
                 np.float32(shade * _WHITE),
             )
@@ -229,24 +211,25 @@ def _moved(pose: Pose, motion: NDArray[np.float64]) -> Pose:
     return Pose(pose.position + motion[:3], turned.orientation)
 
 
-def _sheets(body: RigidBody) -> list[_Sheet]:
+_BLANK = np.ones((1, 1), dtype=np.bool_)
+
+
+def _sheets(body: RigidBody) -> list[Print]:
     """White paper first, then the print on it."""
     if body.chessboard is not None:
-        return _chessboard(body.chessboard)
-    cells = dictionary(body.dictionary).markerSize + 2
-    blank = np.ones((1, 1), dtype=np.bool_)
-    papers: list[_Sheet] = []
-    prints: list[_Sheet] = []
-    for number, corners in zip(body.ids.tolist(), body.corners, strict=True):
-        along, down = corners[1] - corners[0], corners[3] - corners[0]
-        code = cv2.aruco.generateImageMarker(dictionary(body.dictionary), number, cells) > 0
-        prints.append(_Sheet(corners[0], along, down, code))
-        a, b = along / cells, down / cells
-        papers.append(_Sheet(corners[0] - a - b, along + 2 * a, down + 2 * b, blank))
-    return [*_joined(papers), *prints]
+        print_ = body.prints[0]
+        a, b = (0.5 * body.chessboard.square * axis for axis in np.eye(3)[:2])
+        paper = Print(-a - b, print_.along + 2 * a, print_.down + 2 * b, _BLANK)
+        return [paper, *body.prints]
+    cells = len(body.prints[0].cells)
+    papers: list[Print] = []
+    for each in body.prints:
+        a, b = each.along / cells, each.down / cells
+        papers.append(Print(each.origin - a - b, each.along + 2 * a, each.down + 2 * b, _BLANK))
+    return [*_joined(papers), *body.prints]
 
 
-def _joined(papers: list[_Sheet]) -> list[_Sheet]:
+def _joined(papers: list[Print]) -> list[Print]:
     """One paper where all markers lie in a plane."""
     first = papers[0]
     points = np.concatenate([paper.corners for paper in papers]) - first.origin
@@ -256,26 +239,7 @@ def _joined(papers: list[_Sheet]) -> list[_Sheet]:
         return papers
     x, y = points @ right, points @ down
     origin = first.origin + x.min() * right + y.min() * down
-    return [_Sheet(origin, np.ptp(x) * right, np.ptp(y) * down, first.print)]
-
-
-def _chessboard(board: Chessboard) -> list[_Sheet]:
-    """A ChArUco board as OpenCV draws it, in cells that its squares and markers are made of."""
-    bits = dictionary(board.dictionary).markerSize + 2
-    # Squares, markers and the margin between them are whole numbers of cells.
-    ratio = Fraction(board.square / board.size * bits).limit_denominator(32)
-    whole = 2 * ratio.denominator
-    side = int(ratio * whole)
-    size = (board.columns * side, board.rows * side)
-    drawn = np.asarray(board.board.generateImage(size, marginSize=0, borderBits=1)) > 127
-    along = np.array([board.columns * board.square, 0.0, 0.0])
-    down = np.array([0.0, board.rows * board.square, 0.0])
-    a, b = (0.5 * board.square * edge / np.linalg.norm(edge) for edge in (along, down))
-    blank = np.ones((1, 1), dtype=np.bool_)
-    return [
-        _Sheet(-a - b, along + 2 * a, down + 2 * b, blank),
-        _Sheet(np.zeros(3), along, down, drawn),
-    ]
+    return [Print(origin, np.ptp(x) * right, np.ptp(y) * down, _BLANK)]
 
 
 def _background(camera: CameraModel, random: np.random.Generator) -> NDArray[np.float32]:

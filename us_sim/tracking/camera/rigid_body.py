@@ -29,9 +29,25 @@ from us_sim.settings.reading import Reader
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
-from us_sim.tracking.settings import MARKER_SIZE, BoardSettings
+from us_sim.tracking.settings import MARKER_SIZE
 
 _FLATNESS = 0.02  # of a marker's edge: how far a corner may be from the plane of the others
+
+
+@dataclass(frozen=True, eq=False)
+class Print:
+    """A printed rectangle of equal cells, in the frame of its body."""
+
+    origin: NDArray[np.float64]  # (3,) m, its upper left corner
+    along: NDArray[np.float64]  # (3,) m, its upper edge
+    down: NDArray[np.float64]  # (3,) m, its left edge
+    cells: NDArray[np.bool_]  # (rows, columns), True is white
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """(4, 3) m."""
+        a, b, c = self.origin, self.along, self.down
+        return np.array([a, a + b, a + b + c, a + c])
 
 
 @dataclass(frozen=True)
@@ -69,6 +85,15 @@ class Chessboard:
     def corners(self) -> NDArray[np.float64]:
         """(K, 3) m: where four squares meet, row by row."""
         return np.asarray(self.board.getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
+
+    def squares(self, centres: NDArray[np.float64]) -> Print:
+        """The squares without their markers, of which the middles (M, 3) m are in white ones."""
+        white = np.zeros((self.rows, self.columns), dtype=np.bool_)
+        column, row = np.floor(centres[:, :2] / self.square).astype(int).T
+        white[row, column] = True
+        along = np.array([self.columns * self.square, 0.0, 0.0])
+        down = np.array([0.0, self.rows * self.square, 0.0])
+        return Print(np.zeros(3), along, down, white)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +192,18 @@ class RigidBody:
         return {int(number): row for row, number in enumerate(self.ids)}
 
     @cached_property
+    def prints(self) -> list[Print]:
+        """What is printed of it on white, each over those before."""
+        printed = [] if self.chessboard is None else [self.chessboard.squares(self.centres)]
+        marker = dictionary(self.dictionary)
+        cells = marker.markerSize + 2
+        for number, corners in zip(self.ids.tolist(), self.corners, strict=True):
+            code = cv2.aruco.generateImageMarker(marker, number, cells) > 0
+            along, down = corners[1] - corners[0], corners[3] - corners[0]
+            printed.append(Print(corners[0], along, down, code))
+        return printed
+
+    @cached_property
     def centres(self) -> NDArray[np.float64]:
         """(M, 3) m: the middle of each marker."""
         return self.corners.mean(axis=1)
@@ -221,36 +258,26 @@ def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
 
 _NUMBER = Quantity("number", 0, 65535)
 _COUNT = Quantity("number", 1, 1000)
-_Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class _Marker(Settings):
-    """A marker of a body: its corners, or its size and where it is."""
+    """A marker of a body: its size and where it is."""
 
     error = TrackingError
 
     id: int = setting(_NUMBER, "number in the dictionary")
-    size: float | None = setting(MARKER_SIZE, "edge of its black square", default=None)
-    position: _Point = setting(PLACE, "of its middle in the body", default=(0.0, 0.0, 0.0))
+    size: float = setting(MARKER_SIZE, "edge of its black square")
+    position: tuple[float, float, float] = setting(
+        PLACE, "of its middle in the body", default=(0.0, 0.0, 0.0)
+    )
     orientation: tuple[float, float, float, float] = setting(
         Quantity("number", -1e6, 1e6), "quaternion x, y, z, w", default=(0.0, 0.0, 0.0, 1.0)
     )
-    corners: tuple[_Point, _Point, _Point, _Point] | None = setting(
-        PLACE, "in the body, in place of size, position and orientation", default=None
-    )
-
-    def check(self) -> None:
-        """A size or corners."""
-        if (self.size is None) == (self.corners is None):
-            raise self.refused("size", "give a size, or corners in place of it")
 
     @property
     def points(self) -> NDArray[np.float64]:
         """(4, 3) m, the corners in the body."""
-        if self.corners is not None:
-            return np.array(self.corners)
-        assert self.size is not None
         try:
             pose = Pose(np.array(self.position), np.array(self.orientation))
         except PoseError as error:
@@ -292,24 +319,6 @@ class CharucoBoard(Settings):
         return RigidBody.charuco(dictionary, **asdict(self))
 
 
-def printed_board(given: BoardSettings) -> RigidBody:
-    """Make the board that the options of a command describe.
-
-    Raises:
-        TrackingError: an option is missing, or the board is impossible.
-    """
-    for name in ("size", "marker", "square" if given.board == "charuco" else "separation"):
-        if getattr(given, name) is None:
-            raise TrackingError(f"--board {given.board} needs --{name}")
-    columns, _, rows = str(given.size).lower().partition("x")
-    if not (columns.isdigit() and rows.isdigit()):
-        raise TrackingError(f"--size {given.size}: write columns and rows, e.g. 5x7")
-    shape, edge = (int(columns), int(rows)), given.marker or 0.0
-    if given.board == "charuco":
-        return RigidBody.charuco(given.dictionary, *shape, given.square or 0.0, edge, given.legacy)
-    return RigidBody.grid(given.dictionary, *shape, edge, given.separation or 0.0)
-
-
 _BOARDS = Choice(
     "board",
     key="kind",
@@ -326,7 +335,7 @@ class _Body(Settings):
 
     error = TrackingError
 
-    dictionary: str | None = setting(description="of the markers", default=None)
+    dictionary: str = setting(description="of the markers")
     markers: tuple[_Marker, ...] = setting(description="one by one", default=())
     board: Chosen | None = setting(description="in place of markers", choice=_BOARDS, default=None)
 
@@ -336,17 +345,13 @@ class _Body(Settings):
             raise self.refused("markers", "give a list of markers, or a board in place of it")
 
 
-def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> RigidBody:
+def read_rigid_body(path: Path | str) -> RigidBody:
     """Read the body that a YAML file describes.
 
-    It has ``dictionary`` and either ``markers`` (each with ``id`` and either ``corners``, 4 × 3 m,
-    or ``size`` with the marker's ``position`` and ``orientation`` in the body), or ``board``
-    (``kind: grid`` with ``columns``, ``rows``, ``size``, ``separation`` and ``first``, or
-    ``kind: charuco`` with ``columns``, ``rows``, ``square``, ``size`` and ``legacy``).
-
-    Args:
-        path: the file.
-        dictionary: of a file that names none.
+    It has ``dictionary`` and either ``markers`` (each with ``id``, ``size`` and the marker's
+    ``position`` and ``orientation`` in the body), or ``board`` (``kind: grid`` with ``columns``,
+    ``rows``, ``size``, ``separation`` and ``first``, or ``kind: charuco`` with ``columns``,
+    ``rows``, ``square``, ``size`` and ``legacy``).
 
     Raises:
         TrackingError: the file, or the body in it, cannot be used.
@@ -360,12 +365,12 @@ def read_rigid_body(path: Path | str, dictionary: str = "ARUCO_ORIGINAL") -> Rig
     if not isinstance(content, Mapping):
         raise TrackingError(f"{path}: it must be a mapping with dictionary and markers or board")
     written = Reader(str(path), error=TrackingError).read(_Body, content)
-    dictionary = written.dictionary or dictionary
     try:
         if written.board is not None:
             board: GridBoard | CharucoBoard = written.board.settings(_BOARDS)
-            return board.body(dictionary)
+            return board.body(written.dictionary)
         corners = np.array([marker.points for marker in written.markers])
-        return RigidBody(dictionary, np.array([marker.id for marker in written.markers]), corners)
+        numbers = np.array([marker.id for marker in written.markers])
+        return RigidBody(written.dictionary, numbers, corners)
     except TrackingError as error:
         raise TrackingError(f"{path}: {error}") from error

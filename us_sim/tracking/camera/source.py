@@ -8,8 +8,9 @@
 >>> image[200:280, 280:360] = cv2.aruco.generateImageMarker(dictionary("4X4_50"), 7, 80)
 >>> source.measure(image, 0).pose.position.round(2) + 0.0
 array([0.  , 0.  , 0.25])
->>> source.measure(np.zeros_like(image), 33_000_000), source.last_problem
-(None, 'no marker of 4X4_50 is in the image, which is black: uncover the lens or add light')
+>>> source.measure(np.zeros_like(image), 33_000_000)
+>>> source.last_problem.partition(": ")[2]
+'uncover the lens or add light'
 """
 
 from __future__ import annotations
@@ -34,58 +35,6 @@ from us_sim.tracking.camera.model import CameraModel
 from us_sim.tracking.camera.rigid_body import RigidBody
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import CameraSettings
-
-
-class StrayMarkers:
-    """Looks for markers that are not the body's, where none of its own is found.
-
-    It tries one dictionary an image, since all would take long.
-    """
-
-    _FAMILIES = (
-        "4X4_1000",
-        "5X5_1000",
-        "6X6_1000",
-        "7X7_1000",
-        "ARUCO_ORIGINAL",
-        "ARUCO_MIP_36h12",
-        "APRILTAG_36h11",
-        "APRILTAG_25h9",
-    )
-
-    def __init__(self, body: RigidBody) -> None:
-        self._body = body
-        own = family(body.dictionary)
-        # The own family first: a marker of another number is the likeliest mistake.
-        self._families = (own, *(name for name in self._FAMILIES if name != own))
-        self._turn = 0
-        self._found = ""
-
-    def look(self, image: NDArray[np.uint8], start: str) -> str:
-        """A sentence that begins with ``start`` and names the markers seen instead."""
-        name = self._families[self._turn % len(self._families)]
-        if self._turn % len(self._families) == 0:
-            self._found = ""
-        self._turn += 1
-        numbers = _numbers_in(image, name)
-        if numbers:
-            listed = ", ".join(str(number) for number in numbers[:5])
-            own = name == self._families[0]
-            markers = counted(len(numbers), "marker")
-            self._found = (
-                f", only {markers} that the body lacks ({listed}): check the body's numbers"
-                if own
-                else f", but {markers} of {name} ({listed}): check camera.dictionary"
-            )
-        return start.replace("no marker", "no marker of the body") + self._found
-
-
-def _numbers_in(image: NDArray[np.uint8], name: str) -> list[int]:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.errorCorrectionRate = 0.0
-    ids = cv2.aruco.ArucoDetector(dictionary(name), parameters).detectMarkers(image)[1]
-    return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
-
 
 REMEMBERED = 0.5
 """s, how long the last pose helps to find the next one and to tell it from its mirror image."""
@@ -114,7 +63,6 @@ class CameraSource:
         self._detector = FiducialDetector(body)
         self._last: tuple[int, Pose] | None = None
         self._ambiguity = PlaneAmbiguity(self.settings.corner_deviation)
-        self._strays = StrayMarkers(body)
 
     def reset(self) -> None:
         """Forget the last pose."""
@@ -126,7 +74,7 @@ class CameraSource:
 
         Args:
             image: (rows, columns) grey.
-            stamp: ns, the image's own; the measurement's is earlier by the settings' latency.
+            stamp: ns, the image's own.
 
         Raises:
             TrackingError: the image is not grey or not of the camera's size.
@@ -143,8 +91,7 @@ class CameraSource:
             return None
         pose, covariance = measured
         self._last = stamp, pose.pose
-        exposed = stamp - round(self.settings.latency * 1e9)
-        return Measurement(exposed, pose.pose, covariance, pose.error)
+        return Measurement(stamp, pose.pose, covariance, pose.error)
 
     def _before(self, stamp: int) -> Pose | None:
         """The last pose, where it is from shortly before."""
@@ -290,10 +237,23 @@ class CameraSource:
                 f"of marker {detection.unclear[0]} an edge is covered, cut off or blurred: it is "
                 f"not used"
             )
-        start = f"no marker of {self.body.dictionary} is in the image"
+        start = f"no marker of the body ({self.body.dictionary}) is in the image"
         if int(image.max()) <= _BLACK:
             return f"{start}, which is black: uncover the lens or add light"
-        return self._strays.look(image, start)
+        others = self._others(image)
+        if not others:
+            return start
+        listed = ", ".join(str(number) for number in others[:5])
+        markers = counted(len(others), "marker")
+        return f"{start}, only {markers} that the body lacks ({listed}): check the body's numbers"
+
+    def _others(self, image: NDArray[np.uint8]) -> list[int]:
+        """Numbers of the markers in the image that are the body's but for their numbers."""
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.errorCorrectionRate = 0.0
+        known = dictionary(family(self.body.dictionary))
+        ids = cv2.aruco.ArucoDetector(known, parameters).detectMarkers(image)[1]
+        return [] if ids is None else np.unique(np.asarray(ids, dtype=np.int64)).tolist()
 
 
 def _copies(numbers: tuple[int, ...]) -> str:
