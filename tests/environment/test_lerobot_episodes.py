@@ -13,7 +13,7 @@ from us_sim.command.main import main
 from us_sim.environment.environment import ScanEnvironment
 from us_sim.environment.lerobot_episodes import frames_a_second, read_episode
 from us_sim.errors import EpisodeError
-from us_sim.recording.lerobot_writer import LeRobotWriter
+from us_sim.recording.lerobot_writer import LeRobotEpisode, write_episodes
 
 STEPS = 5
 DELAY = 2
@@ -101,11 +101,9 @@ def handed(monkeypatch):
 
 
 def test_lerobot_is_handed_features_frames_and_ends(made, tmp_path, handed):
-    with LeRobotWriter(tmp_path / "data", 30, is_video=True) as writer:
-        for name in ("00-short-000000", "00-short-000001"):
-            _, frames, names = episode(made, name)
-            writer.write_episode(frames, names, "find it", name)
-        assert not (tmp_path / "data").exists()
+    given = [(name, *episode(made, name)) for name in ("00-short-000000", "00-short-000001")]
+    episodes = [LeRobotEpisode(frames, names, "find it", name) for name, _, frames, names in given]
+    write_episodes(tmp_path / "data", 30, episodes, is_video=True)
     given = handed.made
     assert (tmp_path / "data").is_dir()
     assert (given.rate, given.ends) == (30, [STEPS, 2 * STEPS, "end"])
@@ -129,21 +127,23 @@ def test_what_fails_leaves_no_folder(tmp_path, handed, monkeypatch):
 
     monkeypatch.setattr(handed, "save_episode", full)
     frame = {"observation.state": np.zeros(2, np.float32)}
-    writer = LeRobotWriter(tmp_path / "data", 30)
-    with pytest.raises(EpisodeError, match="data: cannot be written: no space"), writer:
-        writer.write_episode([frame], {}, "", "a")
+    with pytest.raises(EpisodeError, match="cannot be written: no space"):
+        write_episodes(tmp_path / "data", 30, [LeRobotEpisode([frame], {}, "", "a")])
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_episode_unlike_the_first_and_a_folder_that_is_there_are_refused(tmp_path, handed):
     del handed
     frame = {"observation.state": np.zeros(2, np.float32)}
-    with LeRobotWriter(tmp_path / "data", 30) as writer:
-        writer.write_episode([frame], {"observation.state": ["x", "y"]}, "", "a.mcap")
-        with pytest.raises(EpisodeError, match=r"b: observation\.state is \(\(2,\), \['z', 'y'\]"):
-            writer.write_episode([frame], {"observation.state": ["z", "y"]}, "", "b")
-    with pytest.raises(EpisodeError, match="data exists already: choose another folder"):
-        LeRobotWriter(tmp_path / "data", 30)
+    episodes = [
+        LeRobotEpisode([frame], {"observation.state": names}, "", name)
+        for names, name in ((["x", "y"], "a"), (["z", "y"], "b"))
+    ]
+    with pytest.raises(EpisodeError, match=r"b: observation\.state is .*'z'"):
+        write_episodes(tmp_path / "data", 30, episodes)
+    (tmp_path / "data").mkdir()
+    with pytest.raises(EpisodeError, match="exists already"):
+        write_episodes(tmp_path / "data", 30, episodes)
 
 
 def test_a_missing_lerobot_and_a_rate_that_is_none_are_told_before_work(

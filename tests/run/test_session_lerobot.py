@@ -4,7 +4,9 @@ import re
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 from session_files import EPOCH, PERIOD, TYPES, image, pose, press, wrench
 
 from us_sim.command.main import main
@@ -12,7 +14,7 @@ from us_sim.errors import BagError
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import stamped
 from us_sim.recording.writer import BagWriter
-from us_sim.run.session_lerobot import Episode
+from us_sim.run.session_lerobot import Episode, Track
 
 JOINTS = "sensor_msgs/msg/JointState"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -71,6 +73,16 @@ def test_a_session_gives_what_it_was_made_of_at_a_third_of_its_rate(session):
     assert force == pytest.approx(-1e3 * depth, abs=1e-3)
     corner = [frame["observation.images.ultrasound_image"][0, 0] for frame in frames]
     assert corner == ((moments - EPOCH) // PERIOD).tolist()
+
+
+def test_a_constant_turn_is_met_whatever_the_signs_of_quaternions():
+    turn = Rotation.from_rotvec(np.outer(np.arange(40) / 10, [0.5, 1.0, -2.0])).as_quat()
+    poses = np.hstack([np.zeros((20, 3)), turn[::2] * np.resize([-1, 1, 1], 20)[:, None]])
+    table = pd.DataFrame(poses, index=EPOCH + 2 * PERIOD * np.arange(20))
+    made = Track("/p", table, [], turns=True).values(EPOCH + PERIOD * np.arange(39))[:, 3:]
+    assert np.abs(np.einsum("ij,ij->i", made, turn[:39])) == pytest.approx(1.0, abs=1e-6)
+    assert made[0, 3] >= 0
+    assert (np.einsum("ij,ij->i", made[1:], made[:-1]) >= 0).all()
 
 
 def test_the_rate_is_that_of_the_images_unless_it_is_said(session):

@@ -147,7 +147,7 @@ def _to_lerobot(args: argparse.Namespace) -> int:
     from us_sim.progress import late_progress
     from us_sim.run.session_lerobot import to_lerobot
 
-    for line in to_lerobot(
+    told = to_lerobot(
         args.files,
         args.out,
         args.task,
@@ -157,6 +157,6 @@ def _to_lerobot(args: argparse.Namespace) -> int:
         topics=args.topics,
         action=args.action,
         by_log_time=args.by_log_time,
-    ):
-        print(line)
+    )
+    print("\n".join(told))
     return 0

@@ -27,7 +27,8 @@ from us_sim.recording.lerobot_writer import (
     STATE,
     WRENCH_PARTS,
     Frame,
-    LeRobotWriter,
+    LeRobotEpisode,
+    write_episodes,
 )
 
 _PARTS = {"pose": POSE_PARTS, "goal": POSE_PARTS, "wrench": WRENCH_PARTS, "contact": ("contact",)}
@@ -63,14 +64,15 @@ def write_lerobot(
         _require_whole(folder, len(episodes))
         return
     about = inspect.getdoc(TASKS[task]) if task else "Scan the skin."
-    with (
-        LeRobotWriter(folder, frames_a_second(period), is_video=is_video) as writer,
-        Progress("writing for LeRobot", len(episodes), "episodes") as bar,
-    ):
-        for done, (name, facts) in enumerate(sorted(episodes.items()), 1):
-            frames, names = read_episode(shards / f"{name}.tar", facts)
-            writer.write_episode(frames, names, str(about), f"{name} of {facts['scene']}")
-            bar.update(done)
+    with Progress("writing for LeRobot", len(episodes), "episodes") as bar:
+
+        def each() -> Iterator[LeRobotEpisode]:
+            for done, (name, facts) in enumerate(sorted(episodes.items()), 1):
+                frames, names = read_episode(shards / f"{name}.tar", facts)
+                yield LeRobotEpisode(frames, names, str(about), f"{name} of {facts['scene']}")
+                bar.update(done)
+
+        write_episodes(folder, frames_a_second(period), each(), is_video=is_video)
 
 
 def frames_a_second(period: float) -> int:

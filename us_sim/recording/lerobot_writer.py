@@ -5,19 +5,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import logging
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import EpisodeError
+from us_sim.errors import EpisodeError, UsSimError
 
 Frame = Mapping[str, NDArray[Any]]
 """Arrays by feature; ``observation.images.…`` are of uint8, grey or red, green and blue."""
@@ -30,6 +29,15 @@ _REMEDY = "pip install 'lerobot[dataset]>=0.4'"
 _THREADS = 2  # that compress images
 
 
+class LeRobotEpisode(NamedTuple):
+    """One episode; all of a data set have the same features, of the same shapes and names."""
+
+    frames: Iterable[Frame]  # at least one
+    names: Mapping[str, Sequence[str]]  # of the numbers of each feature that is no image
+    task: str  # in words, for policies that read
+    origin: str  # of the frames, for an error
+
+
 def require_lerobot() -> None:
     """Refuse at once where lerobot is not installed.
 
@@ -40,105 +48,76 @@ def require_lerobot() -> None:
         raise EpisodeError(f"lerobot is not installed: {_REMEDY}")
 
 
-class LeRobotWriter:
-    """A data set in the making, which is in its folder once all of it is written.
-
-    It is a context. The first frame says which features all frames have, and of which shapes.
+def write_episodes(
+    folder: Path, rate: int, episodes: Iterable[LeRobotEpisode], *, is_video: bool = False
+) -> None:
+    """Write a data set; nothing of it stays where that fails.
 
     Args:
         folder: that must not be there.
         rate: frames a second.
+        episodes: what it is to hold.
         is_video: code ``observation.images.…`` as video, which loses speckle.
 
     Raises:
         EpisodeError: lerobot is not installed, the folder is there or cannot be written, or an
             episode is unlike the first.
     """
-
-    def __init__(self, folder: Path, rate: int, *, is_video: bool = False) -> None:
-        require_lerobot()
-        if folder.exists():
-            raise EpisodeError(f"{folder} exists already: choose another folder")
-        self._folder, self._rate, self._is_video = folder, rate, is_video
-        self._partial = folder.with_name(f".{folder.name}.partial")
-        self._first: dict[str, Any] | None = None  # shape and names by feature
-        self._dataset: Any = None
-
-    def __enter__(self) -> LeRobotWriter:
-        shutil.rmtree(self._partial, ignore_errors=True)  # of one that was killed
-        return self
-
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        try:
-            if self._dataset is not None and error is None:
-                with self._telling():
-                    self._dataset.finalize()
-                    shutil.rmtree(self._partial / "images", ignore_errors=True)  # empty folders
-                    self._partial.rename(self._folder)
-        finally:
-            shutil.rmtree(self._partial, ignore_errors=True)
-
-    def write_episode(
-        self, frames: Iterable[Frame], names: Mapping[str, Sequence[str]], task: str, origin: str
-    ) -> None:
-        """Write an episode of at least one frame.
-
-        Args:
-            frames: of the same features as those of the first episode.
-            names: of the numbers of each feature that is no image.
-            task: in words, for policies that read.
-            origin: of the frames, for an error.
-        """
-        for frame in frames:
-            kinds = {name: (v.shape, list(names.get(name, ()))) for name, v in frame.items()}
-            if self._first is None:
-                self._first = kinds
-                self._dataset = self._create(frame, names)
-            for name in sorted(kinds.keys() | self._first.keys()):
-                first, now = (each.get(name, "nothing") for each in (self._first, kinds))
-                if first != now:
-                    raise EpisodeError(
-                        f"{origin}: {name} is {now}, and {first} in the first frame of all: a "
-                        f"LeRobot data set has the same features everywhere; make one of each kind"
+    require_lerobot()
+    if folder.exists():
+        raise EpisodeError(f"{folder} exists already: choose another folder")
+    try:
+        import datasets
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    except ImportError as error:
+        raise EpisodeError(f"lerobot cannot be used: {error}; {_REMEDY}") from error
+    datasets.disable_progress_bars()  # one for each episode
+    logging.getLogger("datasets").setLevel(logging.ERROR)
+    data_set: Any = None
+    first, origin = dict[str, Any](), ""
+    try:
+        for frames, names, task, origin in episodes:
+            for frame in frames:
+                given = {n: _rgb(v) if n.startswith(IMAGES) else v for n, v in frame.items()}
+                features = {n: _feature(n, v, names, is_video) for n, v in given.items()}
+                if data_set is None:
+                    first = features
+                    data_set = LeRobotDataset.create(
+                        f"us_sim/{folder.name}",
+                        rate,
+                        features,
+                        root=folder,
+                        use_videos=is_video,
+                        image_writer_threads=_THREADS,
                     )
-            given = {n: _rgb(v) if n.startswith(IMAGES) else v for n, v in frame.items()}
-            with self._telling():
-                self._dataset.add_frame({**given, "task": task})
-        with self._telling(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of its statistics of booleans
-            self._dataset.save_episode()
+                if unlike := [n for n in {**first, **features} if features.get(n) != first.get(n)]:
+                    raise EpisodeError(
+                        f"{origin}: {unlike[0]} is {features.get(unlike[0])}, and "
+                        f"{first.get(unlike[0])} in the first frame of all: a LeRobot data set has "
+                        f"the same features everywhere; make one of each kind"
+                    )
+                data_set.add_frame({**given, "task": task})
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of its statistics of booleans
+                data_set.save_episode()
+        data_set.finalize()
+        shutil.rmtree(folder / "images", ignore_errors=True)  # empty folders
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, UsSimError) or not isinstance(error, Exception):
+            raise
+        # lerobot's own are of many kinds
+        raise EpisodeError(f"{folder}: {origin} cannot be written: {error}") from error
 
-    def _create(self, frame: Frame, names: Mapping[str, Sequence[str]]) -> Any:
-        try:
-            import datasets
-            from lerobot.datasets.lerobot_dataset import LeRobotDataset
-        except ImportError as error:
-            raise EpisodeError(f"lerobot cannot be used: {error}; {_REMEDY}") from error
-        datasets.disable_progress_bars()  # one for each episode
-        logging.getLogger("datasets").setLevel(logging.ERROR)
-        features: dict[str, dict[str, Any]] = {}
-        for name, value in frame.items():
-            kind, shape, parts = value.dtype.name, value.shape, list(names.get(name, [name]))
-            if name.startswith(IMAGES):
-                kind = "video" if self._is_video else "image"
-                shape, parts = (*shape[:2], 3), ["height", "width", "channels"]
-            features[name] = {"dtype": kind, "shape": shape, "names": parts}
-        with self._telling():
-            return LeRobotDataset.create(
-                f"us_sim/{self._folder.name}",
-                self._rate,
-                features,
-                root=self._partial,
-                use_videos=self._is_video,
-                image_writer_threads=_THREADS,
-            )
 
-    @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:  # lerobot's own are of many kinds
-            raise EpisodeError(f"{self._folder}: cannot be written: {error}") from error
+def _feature(
+    name: str, value: NDArray[Any], names: Mapping[str, Sequence[str]], is_video: bool
+) -> dict[str, Any]:
+    """Describe a feature as lerobot wants it."""
+    kind, parts = value.dtype.name, list(names.get(name, [name]))
+    if name.startswith(IMAGES):
+        kind, parts = "video" if is_video else "image", ["height", "width", "channels"]
+    return {"dtype": kind, "shape": value.shape, "names": parts}
 
 
 def _rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,4 +1,9 @@
-"""Recorded sessions as a LeRobot data set: each is an episode, resampled to one rate."""
+"""Recorded sessions as a LeRobot data set: each is an episode, resampled to one rate.
+
+Numbers are interpolated linearly, orientations on the shortest arc at constant angular velocity
+(slerp; K. Shoemake, Animating rotation with quaternion curves, 1985), and of images the latest is
+shown.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +15,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from us_sim.errors import BagError, TrackingError
 from us_sim.recording.lerobot_writer import (
     IMAGES,
     STATE,
     Frame,
-    LeRobotWriter,
+    LeRobotEpisode,
     require_lerobot,
+    write_episodes,
 )
 from us_sim.recording.path import is_pose, whole_name
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.resampling import Times, latest, linear, slerp
 from us_sim.run.session_tables import (
     SECOND,
     VALUES,
@@ -38,6 +44,8 @@ PIXELS: Mapping[str, Callable[[Any, str], NDArray[np.uint8]]] = {
     "sensor_msgs/msg/CompressedImage": decompress_image,
 }
 """Decoders of images by their types."""
+Times = NDArray[np.int64]
+"""ns, strictly increasing."""
 _HIGHEST_RATE = 1000  # Hz
 _MOST_FRAMES = 10_000_000
 """Of a session; four days at 30 a second. One wrong stamp can make it last for decades."""
@@ -53,7 +61,7 @@ def to_lerobot(
     rate: int | None = None,
     is_video: bool = False,
     **wanted: Any,
-) -> Iterator[str]:
+) -> list[str]:
     """Write sessions as episodes, and say of each topic what became of its messages.
 
     Args:
@@ -68,23 +76,28 @@ def to_lerobot(
 
     Raises:
         BagError: a session cannot be read, or has nothing that is wanted, or at no time all of it.
-        EpisodeError: as for `LeRobotWriter`.
+        EpisodeError: as for `write_episodes`.
     """
     require_lerobot()
     if rate is not None and not 1 <= rate <= _HIGHEST_RATE:
         raise BagError(f"--rate: {rate} is outside 1 to {_HIGHEST_RATE} frames a second")
-    rate = rate or Episode(read_bag(sessions[0]), **wanted).usual_rate
-    frames = 0
-    with LeRobotWriter(folder, rate, is_video=is_video) as writer:
+    hertz = rate or Episode(read_bag(sessions[0]), **wanted).usual_rate
+    told: list[str] = []
+    count = 0
+
+    def episodes() -> Iterator[LeRobotEpisode]:
+        nonlocal count
         for session in sessions:
             episode = Episode(read_bag(session), **wanted)
-            moments = episode.moments(rate)
-            given = episode.frames(moments, progress)
-            writer.write_episode(given, episode.names, task, str(session))
-            progress(1.0, "")
-            frames += len(moments)
-            yield from (f"{session.name}: {sentence}" for sentence in episode.told(moments))
-    yield f"{counted(frames, 'frame')} at {rate} Hz in {folder}"
+            moments = episode.moments(hertz)
+            frames = episode.frames(moments, progress)
+            yield LeRobotEpisode(frames, episode.names, task, str(session))
+            count += len(moments)
+            told.extend(f"{session.name}: {sentence}" for sentence in episode.told(moments))
+
+    write_episodes(folder, hertz, episodes(), is_video=is_video)
+    progress(1.0, "")
+    return [*told, f"{counted(count, 'frame')} at {hertz} Hz in {folder}"]
 
 
 @dataclass
@@ -107,20 +120,37 @@ class Track:
     @property
     def span(self) -> tuple[int, int]:
         """First and last time of which all is known, ns."""
-        there = self.table.notna().to_numpy()
-        first, last = there.argmax(axis=0), there[::-1].argmax(axis=0)
-        return int(self.times[first.max()]), int(self.times[-1 - last.max()])
+        columns = [self.table[name].dropna().index for name in self.table]
+        return max(int(each[0]) for each in columns), min(int(each[-1]) for each in columns)
 
     def values(self, moments: Times) -> NDArray[np.float32]:
-        """(M, N) numbers, interpolated."""
-        between = slerp if self.turns else linear
-        return between(self.times, self.table.to_numpy(), moments).astype(np.float32)
+        """(M, N) numbers, each between the nearest that there are.
+
+        From one moment to the next a quaternion does not change its sign without need; the first
+        has w of 0 or more.
+        """
+        made = np.empty((len(moments), self.table.shape[1]), np.float32)
+        wanted = (moments - moments[0]) * 1e-9  # doubles count no ns since 1970
+        for k, name in enumerate(self.table):
+            known = self.table[name].dropna()
+            made[:, k] = np.interp(wanted, (known.index - moments[0]) * 1e-9, known)
+        if self.turns:
+            turns = Rotation.from_quat(self.table.to_numpy()[:, 3:])
+            found = Slerp((self.times - moments[0]) * 1e-9, turns)(wanted).as_quat()
+            along = np.einsum("ij,ij->i", found[1:], found[:-1]) < 0
+            found[np.cumsum(np.r_[found[0, 3] < 0, along]) % 2 == 1] *= -1
+            made[:, 3:] = found
+        return made
+
+    def latest(self, moments: Times) -> NDArray[np.int64]:
+        """(M,) row of the last message at or before each moment."""
+        return np.searchsorted(self.times, moments, side="right") - 1
 
     def images(self, bag: Bag, moments: Times) -> Iterator[NDArray[np.uint8]]:
         """The latest image of each moment; for one that is damaged the one before."""
         place, pixels = -1, None
         messages = enumerate(bag.messages([self.name]))
-        for wanted in self.table["place"].to_numpy()[latest(self.times, moments)]:
+        for wanted in self.table["place"].to_numpy()[self.latest(moments)]:
             if place < wanted:
                 place, raw = next(each for each in messages if each[0] == wanted)
                 try:
@@ -135,7 +165,7 @@ class Track:
     def told(self, moments: Times) -> str:
         """What became of its messages, in numbers."""
         if self.is_image:
-            shown = latest(self.times, moments)
+            shown = self.latest(moments)
             count = len(np.unique(shown))
             oldest = (moments - self.times[shown]).max() / SECOND
             told = (
@@ -144,10 +174,8 @@ class Track:
                 f"before, which is {oldest:.3f} s old at most"
             )
         else:
-            after = np.clip(np.searchsorted(self.times, moments), 1, len(self.times) - 1)
-            gap = (self.times[after] - self.times[after - 1]).max() / SECOND
             between = "slerp" if self.turns else "linear"
-            messages = counted(len(self.times), "message")
+            messages, gap = counted(len(self.times), "message"), np.diff(self.times).max() / SECOND
             told = f"{between} between {messages}, {gap:.3f} s apart at most"
         damaged = [f"{self.damaged} cannot be decoded"] if self.damaged else []
         return "; ".join([f"{self.name}: {told}", *damaged, *self.notes])
