@@ -11,8 +11,7 @@ import pytest
 from us_sim.command.main import main
 from us_sim.progress import Progress
 from us_sim.recording.writer import BagWriter
-from us_sim.run.processes import ProcessGroup
-from us_sim.run.supervision import say
+from us_sim.run.supervision import SupervisionSettings, Supervisor, say
 
 LONG = "x" * 300  # more than a file's name may have
 
@@ -105,8 +104,7 @@ def test_what_strangers_say_moves_no_cursor_and_fills_no_screen(capsys):
     say(hostile)
     with Progress("running", 1, "s") as bar:
         bar.update(0.5, hostile)
-    group = ProcessGroup()
-    group._show("scorer", hostile)
+    Supervisor(SupervisionSettings())._show("scorer", hostile)
     error = capsys.readouterr().err
     assert not set("\x1b\x07\u202e") & set(error)
     assert len(error) < 6_000

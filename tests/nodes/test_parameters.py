@@ -23,7 +23,7 @@ from us_sim.nodes.settings import (
     parameters_of,
 )
 from us_sim.nodes.tissue_deformer import TissueDeformer
-from us_sim.run.plan import module_of
+from us_sim.run.plan import NodeProcess
 from us_sim.scene.reading import load_scene
 from us_sim.settings.quantity import dial_unit
 from us_sim.settings.setting import Settings, kinds_of, rules_of
@@ -59,7 +59,7 @@ def given_to(node: str, scene: Any, folder: Any) -> dict[str, object]:
 
 
 def made(bench, node: str, scene: Any, folder: Any) -> Any:
-    module = importlib.import_module(module_of(node))
+    module = importlib.import_module(NodeProcess(node).module)
     name = next(n for n in vars(module) if n.lower() == node.replace("_", ""))
     node_class = getattr(module, name)
     if node == "session_control":

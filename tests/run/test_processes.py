@@ -13,7 +13,8 @@ import pytest
 from us_sim.errors import UsSimError
 from us_sim.run.domain import alone_on_domain
 from us_sim.run.plan import NodeProcess
-from us_sim.run.processes import ProcessGroup
+from us_sim.run.processes import RunningNode, end_nodes
+from us_sim.run.shared_memory import remove_abandoned_segments
 
 
 def wait_until(condition):
@@ -37,24 +38,20 @@ def files_of(pid):
 def test_what_killed_nodes_leave_in_shared_memory_is_removed_and_nothing_else(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "24")
     monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")
-    groups = [ProcessGroup(), ProcessGroup()]
+    nodes = [RunningNode(NodeProcess("scorer"), print) for _ in range(3)]
     try:
-        for group in groups:
-            group.start([NodeProcess("image_writer"), NodeProcess("scorer")])
-        nodes = [pid for group in groups for pid in group.pids.values()]
-        wait_until(lambda: all(len(files_of(pid)) >= 3 for pid in nodes))
-        killed, living = nodes[0], nodes[2:]
-        left, used = files_of(killed), [file for pid in living for file in files_of(pid)]
-        os.kill(killed, signal.SIGKILL)
-        wait_until(lambda: not groups[0].is_running("image_writer"))
-        groups[0].stop()
+        wait_until(lambda: all(len(files_of(each.pid)) >= 3 for each in nodes))
+        killed, *living = nodes
+        left, used = files_of(killed.pid), [file for each in living for file in files_of(each.pid)]
+        killed.send_signal(signal.SIGKILL)
+        wait_until(lambda: killed.status is not None)
+        remove_abandoned_segments()
         assert not any(file.exists() for file in left)
         assert left
         assert used
         assert all(file.exists() for file in used)
     finally:
-        for group in groups:
-            group.stop()
+        end_nodes(nodes)
 
 
 def runs(pid):
@@ -76,20 +73,20 @@ def test_what_forks_nodes_has_one_thread_and_no_rclpy():
 STARTS = """
 import time
 from us_sim.run.plan import NodeProcess
-from us_sim.run.processes import ProcessGroup
-group = ProcessGroup()
-group.start([NodeProcess("scorer")])
-print(group.pids["scorer"], flush=True)
-while not group.last_words("scorer"):
-    time.sleep(0.05)
-time.sleep(60)
+from us_sim.run.processes import RunningNode
+if __name__ == "__main__":
+    node = RunningNode(NodeProcess("scorer"), lambda *_: None, is_forked={is_forked})
+    print(node.pid, flush=True)
+    time.sleep(60)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("after", [0.0, 2.0])
-def test_what_was_started_ends_with_a_killed_parent(after):
-    parent = subprocess.Popen([sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True)
+@pytest.mark.parametrize(("is_forked", "after"), [(True, 0.0), (True, 2.0), (False, 2.0)])
+def test_what_was_started_ends_with_a_killed_parent(is_forked, after, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(STARTS.format(is_forked=is_forked))
+    parent = subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())
     time.sleep(after)  # while they import, or as they run
     parent.kill()

@@ -22,7 +22,7 @@ from us_sim.command.options import (
     viewer,
 )
 from us_sim.errors import UsSimError
-from us_sim.run.forked import begin_fork_server
+from us_sim.run.processes import begin_fork_server
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.share import find_bag

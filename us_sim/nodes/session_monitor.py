@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from us_sim.nodes.guarded_node import GuardedNode, Health
 from us_sim.nodes.qos import EVERY
+from us_sim.nodes.settings import RECORDER
 from us_sim.nodes.topics import published_counts
 
 TOLD = 50  # losses that a report tells one by one, the newest
@@ -28,6 +29,7 @@ class SessionMonitor(GuardedNode):
         self.reports: dict[str, dict[str, str]] = {}  # the last of each node
         self.messages: dict[str, str] = {}  # likewise
         self.heard: Counter[tuple[str, int]] = Counter()  # reports by node and process
+        self.recordings: dict[str, int] = {}  # processes by the files that they record
         self._published: dict[tuple[str, int], dict[str, int]] = {}
         self.health = Health(self, "")
         self.health.state = "following"
@@ -43,6 +45,8 @@ class SessionMonitor(GuardedNode):
             self.messages[name] = status.message
             process = name, _number(report.get("pid", ""))
             self.heard[process] += 1
+            if name == RECORDER and "file" in report:
+                self.recordings.setdefault(report["file"], process[1])
             self._published[process] = published_counts(report)
 
     def follow(self, nodes: Collection[str]) -> None:
@@ -67,10 +71,6 @@ class SessionMonitor(GuardedNode):
         return sum(
             counts.get(topic, 0) for (name, _), counts in self._published.items() if name == node
         )
-
-    def rejected(self, node: str, kind: str) -> int:
-        """How often ``node`` says that it had a problem of that kind."""
-        return _number(self.reports.get(node, {}).get(f"rejected {kind}", ""))
 
 
 def _number(text: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import shutil
 import sys
 import time
 from collections import Counter
@@ -70,6 +71,7 @@ class SessionRecorder(GuardedNode):
         self._bag: WriteBehind | None = None  # None once it was stopped
         self._latched: dict[str, tuple[str, bytes, int, int]] = {}  # that came while it was paused
         self.health = Health(self, settings.file)
+        self.health.measure = self._measure
         self._begin()
         offer(self, "stop", self._stop)
         self.create_timer(0.1, self._discover)
@@ -136,11 +138,20 @@ class SessionRecorder(GuardedNode):
         if goes_on and (gap := _gap_before(bag.path, Path(settings.file).stem)):
             self._note(f"it goes on in {bag.path.name}: {gap:.1f} s before that are not recorded")
         self._bag = WriteBehind(bag, settings.max_cache_size)
+        self._file, self._began = Path(bag.path).absolute(), time.monotonic()
         now = self.get_clock().now().nanoseconds
         for name, (media_type, data) in self._attachments.items():
             self._bag.attach(name, media_type, data, now)
         self._tell_state()
         self.get_logger().info(f"recording to {bag.path}")
+
+    def _measure(self) -> dict[str, str]:
+        """Return which file is written, since when, how large it is, and the room that is left."""
+        values = {"file": str(self._file), "seconds": f"{time.monotonic() - self._began:.0f}"}
+        with contextlib.suppress(OSError):  # it was taken away
+            values["bytes"] = str(self._file.stat().st_size)
+            values["room_bytes"] = str(shutil.disk_usage(self._file.parent).free)
+        return values
 
     def _note(self, sentence: str) -> None:
         """Say what is to be known of the file, also in diagnostics."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from us_sim.errors import UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, PlayerSettings, checked_parameters
@@ -22,12 +23,11 @@ from us_sim.run.plan import (
     viewer_process,
 )
 from us_sim.run.preparation import prepare_scene
-from us_sim.run.processes import ProcessGroup, prepare_ros
+from us_sim.run.processes import prepare_ros
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import (
     IMAGER,
     IMAGES,
-    Monitored,
     Outcome,
     SupervisionSettings,
     Supervisor,
@@ -37,6 +37,9 @@ from us_sim.scene.scene import Scene
 from us_sim.settings.viewer import ViewerSettings
 from us_sim.share import full_path
 from us_sim.viewer.access import is_loopback
+
+if TYPE_CHECKING:
+    from us_sim.nodes.session_monitor import SessionMonitor
 
 SETTLE_S = 1.2  # after the path's end: for the last images and each node's last report
 
@@ -60,35 +63,22 @@ def follow(
         UsSimError: a node cannot start, or another simulation runs on this domain.
     """
     with contextlib.nullcontext() if request is None else alone_on_domain():
-        group = ProcessGroup(log)
-        supervisor = simulation = None
-        startup = 0.0
-        # A page loads while the others are looked for and started.
-        early = [each for each in plan.processes if each.node == VIEWER and request is not None]
+        supervisor = Supervisor(settings, log)
         try:
-            group.start(early)
-            # The monitor goes first: it would wait for what a killed node never acknowledges.
-            with contextlib.closing(Monitored(plan.nodes)) as monitor:
-                monitor.refuse_company(set(plan.nodes) - {each.node for each in early})
-                began = time.monotonic()
-                supervisor = Supervisor(plan, group, monitor, settings)
-                update = supervisor.update
-                if request is not None:
-                    simulation = Simulation(request, supervisor, monitor)
-                    update = simulation.update
-                _await_all(update, supervisor)
-                startup = time.monotonic() - began
-                _stay(update, supervisor, monitor)
+            supervisor.start(plan)
+            update = supervisor.update
+            if request is not None:
+                update = Simulation(request, supervisor).update
+            _await_all(update, supervisor)
+            _stay(update, supervisor)
         except KeyboardInterrupt:
-            if supervisor is not None:
-                supervisor.end()
-                lost = supervisor.outcome(startup).sentence()
-                if lost:
-                    say(lost)
+            supervisor.end()
+            if supervisor.plan.processes and (lost := supervisor.outcome().sentence()):
+                say(lost)
             raise
         finally:
-            (group.stop if supervisor is None else supervisor.end)()
-        return supervisor.outcome(startup)
+            supervisor.end()
+        return supervisor.outcome()
 
 
 _LONG_START_S = 15.0  # longer than a start takes that compiles nothing
@@ -109,7 +99,7 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
                 raise UsSimError(failed)
 
 
-def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored) -> None:
+def _stay(update: Callable[[], None], supervisor: Supervisor) -> None:
     began, duration = time.monotonic(), supervisor.plan.duration
     ended: float | None = None
     with Progress("running", duration, "s") as bar:
@@ -117,18 +107,18 @@ def _stay(update: Callable[[], None], supervisor: Supervisor, monitor: Monitored
             update()
             now = time.monotonic()
             ended = ended or now if supervisor.finished else None
-            bar.update(now - began, _status(supervisor.plan, monitor))
+            bar.update(now - began, _status(supervisor.plan, supervisor.monitor.node))
             if duration is not None and now - began > duration:
                 return
             if ended is not None and now - ended > SETTLE_S:
                 return
 
 
-def _status(plan: Plan, monitor: Monitored) -> str:
+def _status(plan: Plan, monitor: SessionMonitor) -> str:
     """Return how far what plays is, which images there are, and where the page is."""
-    player = monitor.node.reports.get(plan.player, {})
-    slicer = monitor.node.reports.get(IMAGER, {})
-    images = monitor.node.count(IMAGER, IMAGES)
+    player = monitor.reports.get(plan.player, {})
+    slicer = monitor.reports.get(IMAGER, {})
+    images = monitor.count(IMAGER, IMAGES)
     told = []
     if plan.poses is not None and "played" in player:
         told.append(f"{player['played']} of {plan.poses} played")
@@ -148,10 +138,10 @@ def _status(plan: Plan, monitor: Monitored) -> str:
     return "; ".join(filter(None, [*told, _page(plan, monitor)]))
 
 
-def _page(plan: Plan, monitor: Monitored) -> str:
+def _page(plan: Plan, monitor: SessionMonitor) -> str:
     """Where a browser finds the page; empty while none is served."""
     viewer = next((each for each in plan.processes if each.node == VIEWER), None)
-    port = monitor.node.reports.get(VIEWER, {}).get("port", "")
+    port = monitor.reports.get(VIEWER, {}).get("port", "")
     if viewer is None or not port:
         return ""
     host = str(viewer.parameters["host"])
@@ -322,7 +312,7 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
         areas = session.lumen_areas(scene, 120, lambda done: bar.update(50 * done))
         summary = session.summary(areas)
         summary |= {"scene": scene.name, "startup_s": round(outcome.startup, 2)}
-        summary |= {"wall_s": round(wall, 2), "lost": outcome.summary()}
+        summary |= {"wall_s": round(wall, 2), "lost": list(outcome.losses)}
         bar.update(50, "drawing the contact sheet")
         contact_sheet(session, scene, areas, out / "contact_sheet.png")
         bar.update(100)

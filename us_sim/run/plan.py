@@ -10,7 +10,6 @@ import json
 import os
 import posixpath
 import secrets
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,11 +30,6 @@ from us_sim.viewer.server import require_free
 Parameters = dict[str, dict[str, str]]  # parameters given by a person: YAML texts by node and name
 
 
-def module_of(node: str) -> str:
-    """The module that runs a node."""
-    return "us_sim.viewer.viewer" if node == "viewer" else f"us_sim.nodes.{node}"
-
-
 @dataclass(frozen=True)
 class NodeProcess:
     """One node and its parameters."""
@@ -44,9 +38,10 @@ class NodeProcess:
     parameters: dict[str, object] = field(default_factory=dict)  # JSON-like values by name
     secrets: dict[str, str] = field(default_factory=dict, repr=False)  # in its environment alone
 
-    def command(self) -> list[str]:
-        """The command line that runs it, in ROS 2 and without."""
-        return [sys.executable, "-P", "-m", module_of(self.node), *self.arguments()]
+    @property
+    def module(self) -> str:
+        """The module that runs it."""
+        return "us_sim.viewer.viewer" if self.node == VIEWER else f"us_sim.nodes.{self.node}"
 
     def arguments(self) -> list[str]:
         """ROS arguments: its enclave, those that all nodes get, and its parameters."""

@@ -7,7 +7,7 @@ import gc
 import importlib
 import signal
 
-from us_sim.run.forked import end_with_parent
+from us_sim.run.processes import end_with_parent
 
 _SHARED = ("scipy.sparse", "us_sim.nodes.messages", "us_sim.nodes.settings")
 """No part of a scene: one that a scene does not name is not imported."""

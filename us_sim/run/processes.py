@@ -1,32 +1,47 @@
-"""Node processes: started, read, told to end, and ended together, the recorder last."""
+"""A node as a process: started, read, and told to end.
+
+On Linux nodes are forked from a process that has imported what they share, so that they start
+soon: multiprocessing's fork server, which never imports rclpy, since its tracing starts threads.
+Where it ends, so do they, and the supervisor starts them again from another.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import importlib
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable
-from pathlib import Path
-from typing import IO
+from collections.abc import Callable, Collection, Mapping
+from multiprocessing.connection import Connection
+from multiprocessing.forkserver import ensure_running
+from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
+from us_sim.nodes import INTERRUPTED, prepare_process, require_rclpy
 
-from us_sim.errors import UsSimError, memory_limit, printable
-from us_sim.nodes import ENDS_WITH_INPUT, INTERRUPTED, require_rclpy
-from us_sim.nodes.settings import RECORDER, VIEWER
-from us_sim.run.forked import ForkedNode
-from us_sim.run.plan import NodeProcess, module_of
-from us_sim.run.shared_memory import remove_abandoned_segments
+if TYPE_CHECKING:
+    from us_sim.run.plan import NodeProcess
 
-LIFELINE, _OTHER_END = os.pipe()
-"""Standard input of what is started from here: it ends with this process, whatever ends that."""
 COMPLAINT = "us_sim: "  # with which a node begins to say why it cannot work
 STOP_S = 1.0  # how long a node may take to end before it is killed
-RECORDER_STOP_S = 10.0  # likewise the recorder, which writes what it still holds
+_UNKNOWN = 255  # the exit status of what was forked by a server that has ended
+_PR_SET_PDEATHSIG = 1
+
+_spawning: Any = multiprocessing.get_context("spawn")
+_forking: Any = _spawning
+if sys.platform == "linux":  # elsewhere forks are not safe
+    _forking = multiprocessing.get_context("forkserver")
+    _forking.set_forkserver_preload([f"{__package__}.preloaded"])
+
+
+def begin_fork_server() -> None:
+    """Have the server import what nodes share while this process does something else."""
+    if _forking is not _spawning:
+        ensure_running()
 
 
 def prepare_ros(*, network: bool) -> None:
@@ -45,162 +60,106 @@ def prepare_ros(*, network: bool) -> None:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
-def child_environment() -> dict[str, str]:
-    """Return the environment of a program that finds this package, and ends with its input."""
-    package = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH", "")]))
-    return os.environ | {"PYTHONPATH": path, ENDS_WITH_INPUT: "1"}
+def end_with_parent(number: signal.Signals) -> None:
+    """Have this process get a signal when the one that started it ends."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+        return
+
+    def end() -> None:
+        multiprocessing.connection.wait([multiprocessing.parent_process().sentinel])
+        os.kill(os.getpid(), number)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 class RunningNode:
     """A node's process, and the thread that reads its output.
 
+    It ends when this process or the fork server ends.
+
     Args:
         node: what it runs.
         show: what is done with each line of a node.
+        is_forked: whether it shares with others what they import.
     """
 
-    def __init__(self, node: NodeProcess, show: Callable[[str, str], None]) -> None:
+    def __init__(
+        self, node: NodeProcess, show: Callable[[str, str], None], *, is_forked: bool = True
+    ) -> None:
         self.node = node
-        environment = child_environment() | node.secrets
-        self.process: subprocess.Popen[str] | ForkedNode
-        # The viewer shares little, and shall be there first; elsewhere forks are not safe.
-        if node.node == VIEWER or sys.platform != "linux":
-            self.process = subprocess.Popen(
-                node.command(),
-                stdin=LIFELINE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-                env=environment,
-                start_new_session=True,  # so that Ctrl-C is for this process alone
-            )
-        else:
-            self.process = ForkedNode(
-                node.node, module_of(node.node), node.arguments(), environment
-            )
         self.complaint = ""  # why it cannot work
         self.last_words = ""
         self.is_noted = False  # that it has ended
-        self._show = show
-        self.reader = threading.Thread(target=self._read, daemon=True)
-        self.reader.start()
+        output, its_output = _forking.Pipe(duplex=False)
+        its_own = (node.node, node.module, node.arguments(), os.environ | node.secrets, its_output)
+        context = _forking if is_forked else _spawning
+        self._process = context.Process(target=_run_node, args=its_own, daemon=True)
+        # A process that is spawned hears Ctrl-C only once it is in a session of its own.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        its_output.close()
+        self.pid: int = self._process.pid
+        self._reader = threading.Thread(target=self._read, args=(output, show), daemon=True)
+        self._reader.start()
 
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            if line.strip():
-                self.last_words = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
-            if line.startswith(COMPLAINT):
-                self.complaint = self.last_words
-            self._show(self.node.node, line)
-
-
-class ProcessGroup:
-    """Processes started together, watched, and ended together: the recorder last.
-
-    Args:
-        log: where their output goes; None shows it on this terminal, above any progress.
-    """
-
-    def __init__(self, log: Path | None = None) -> None:
-        self._running: dict[str, RunningNode] = {}
-        self._log_path = log
-        self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
-
-    def start(self, processes: Iterable[NodeProcess]) -> None:
-        """Start each from this very package; they end with this process, whatever happens to it.
-
-        A node of the same name that has ended is replaced; one that runs as it shall goes on.
-        """
-        remove_abandoned_segments()  # of one that is replaced
-        for process in processes:
-            if not (self.is_running(process.node) and self._running[process.node].node == process):
-                self._running[process.node] = RunningNode(process, self._show)
-
-    def _show(self, node: str, line: str) -> None:
-        if self._log is not None:
-            with contextlib.suppress(OSError):  # a full disk; the recorder says so itself
-                self._log.write(line)
-                self._log.flush()
-        is_for_person = self._log is None or node == VIEWER  # which says where its page is
-        if is_for_person and not line.startswith(COMPLAINT):  # which is said when it has ended
-            tqdm.write(printable(line.rstrip()), file=sys.stderr)
+    def _read(self, output: Connection, show: Callable[[str, str], None]) -> None:
+        with open(os.dup(output.fileno()), errors="replace") as lines:
+            output.close()
+            for line in lines:
+                if line.strip():
+                    self.last_words = line.strip().removeprefix(COMPLAINT).rpartition("]: ")[2]
+                if line.startswith(COMPLAINT):
+                    self.complaint = self.last_words
+                show(self.node.node, line)
 
     @property
-    def pids(self) -> dict[str, int]:
-        """The processes' numbers by node, also of those that have ended."""
-        return {node: running.process.pid for node, running in self._running.items()}
+    def status(self) -> int | None:
+        """The exit status; None while it runs, negative for a signal."""
+        status: int | None = self._process.exitcode
+        return INTERRUPTED if status == _UNKNOWN else status  # it is told to end then
 
-    def is_running(self, node: str) -> bool:
-        """Return whether that node was started and has not ended."""
-        running = self._running.get(node)
-        return running is not None and running.process.poll() is None
+    def wait(self, seconds: float) -> bool:
+        """Wait for its end; return whether it has ended."""
+        self._process.join(seconds)
+        return self.status is not None
 
-    def take_ended(self) -> dict[str, int]:
-        """Return the exit status of each node that has ended; it is told once."""
-        ended = {}
-        for node, running in self._running.items():
-            status = running.process.poll()
-            if status is not None and not running.is_noted:
-                running.is_noted = True
-                running.reader.join(STOP_S)
-                ended[node] = status
-        return ended
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send a signal, unless it has ended."""
+        if self.status is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, number)
 
-    def last_words(self, node: str) -> str:
-        """Return the last line of a node's output, without its logger's prefix."""
-        return self._running[node].last_words
+    def note_end(self) -> None:
+        """Read the rest of its output; its end is known from now on."""
+        self.is_noted = True
+        self._reader.join(STOP_S)
 
-    def check(self) -> None:
-        """Raise UsSimError, in the node's own words, when one has ended with an error."""
-        for node, status in self.take_ended().items():
-            if status:
-                raise self.failure(node, status)
 
-    def failure(self, node: str, status: int) -> UsSimError:
-        """Return why a node cannot work, in its own words where it has said so."""
-        see = f"; see {self._log_path}" if self._log_path else ""
-        limit = f"; {hint}" if (hint := memory_limit()) else ""
-        complaint = self._running[node].complaint
-        return UsSimError(complaint or f"{node} {ending(status)}{see}{limit}")
+def end_nodes(nodes: Collection[RunningNode], limit: float = STOP_S) -> list[str]:
+    """End these nodes; the names of those that had to be killed.
 
-    def end(self, nodes: Collection[str]) -> list[str]:
-        """End these nodes; the names of those that had to be killed.
+    SIGTERM first, SIGKILL at the last. Unlike SIGINT, SIGTERM ends a process without a word while
+    it is still importing.
 
-        SIGTERM first, the recorder after the others, SIGKILL at the last. Unlike SIGINT, SIGTERM
-        ends a process without a word while it is still importing.
-        """
-        killed = []
-        recorder = {RECORDER} & {*nodes}
-        for names, limit in ({*nodes} - recorder, STOP_S), (recorder, RECORDER_STOP_S):
-            ending_now = {n: self._running[n].process for n in names if self.is_running(n)}
-            for process in ending_now.values():
-                process.terminate()
-                process.send_signal(signal.SIGCONT)  # it may be stopped
-            deadline = time.monotonic() + limit
-            for node, process in ending_now.items():
-                try:
-                    process.wait(max(deadline - time.monotonic(), 0.0))
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    with contextlib.suppress(subprocess.TimeoutExpired):
-                        process.wait(STOP_S)
-                    killed.append(node)
-        for node in nodes:
-            self._running[node].is_noted = True
-            self._running[node].reader.join(STOP_S)
-        return killed
-
-    def stop(self) -> list[str]:
-        """End every process, and remove what they leave; the names of those that were killed."""
-        killed = self.end(list(self._running))
-        remove_abandoned_segments()
-        if self._log is not None:
-            with contextlib.suppress(OSError):
-                self._log.close()
-        return killed
+    Args:
+        nodes: that are ended together.
+        limit: s, which they may take.
+    """
+    for each in nodes:
+        each.send_signal(signal.SIGTERM)
+        each.send_signal(signal.SIGCONT)  # it may be stopped
+    deadline = time.monotonic() + limit
+    killed = [each for each in nodes if not each.wait(max(deadline - time.monotonic(), 0.0))]
+    for each in killed:
+        each.send_signal(signal.SIGKILL)
+        each.wait(STOP_S)
+    for each in nodes:
+        each.note_end()
+    return [each.node.node for each in killed]
 
 
 def ending(status: int) -> str:
@@ -215,3 +174,26 @@ def ending(status: int) -> str:
         return f"ended with status {status}"
     name = signal.Signals(-status).name if -status in {*signal.Signals} else f"signal {-status}"
     return f"was ended by {name}"
+
+
+def _run_node(
+    name: str,
+    module: str,
+    arguments: list[str],
+    environment: Mapping[str, str],
+    output: Connection,
+) -> None:
+    """Become the node, in the process that was started."""
+    end_with_parent(signal.SIGTERM)
+    os.setsid()  # so that Ctrl-C is for the process that started it alone
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    for number in 1, 2:
+        os.dup2(output.fileno(), number)
+    output.close()
+    for stream in sys.stdout, sys.stderr:
+        stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.argv = [name, *arguments]
+    prepare_process(name)
+    sys.exit(importlib.import_module(module).main(arguments))

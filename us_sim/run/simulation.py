@@ -13,7 +13,7 @@ from typing import Any
 from us_sim.errors import BagError, SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import PLAYERS, RECORDER, VIEWER, SessionControlSettings
 from us_sim.run.plan import Request, plan_of, require_new
-from us_sim.run.supervision import Monitored, Supervisor, say
+from us_sim.run.supervision import Supervisor, say
 from us_sim.scene.building import path_of
 from us_sim.scene.listing import ListedScene, listed_scene, listed_scenes
 from us_sim.scene.reading import check_files, load_scene
@@ -23,8 +23,8 @@ from us_sim.share import find_bag, full_path, shared_roots
 _BAGS_EVERY_S = 2.0
 _BAGS = (".mcap", ".db3", ".zstd")
 _MOST_BAGS = 500  # the newest
-_RECORDING_EVERY_S = 1.0
 _OF_SCENE = {"scene", "volume"}
+_OF_RECORDER = ("seconds", "bytes", "room_bytes")  # values of its report
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
 """Parameters that go on to the node that plays."""
 
@@ -37,21 +37,19 @@ class Simulation:
     Args:
         request: that the supervisor's plan was made for.
         supervisor: of the nodes.
-        monitor: on whose executor the control node is.
     """
 
-    def __init__(self, request: Request, supervisor: Supervisor, monitor: Monitored) -> None:
+    def __init__(self, request: Request, supervisor: Supervisor) -> None:
         self._request = request
         self._settled: Request | None = None  # the last with which all nodes were ready
-        self._supervisor, self._monitor = supervisor, monitor
+        self._supervisor = supervisor
         self._asked: SessionControlSettings | None = None  # scene that is to be loaded
         self._unlisted = chain([listed_scene(request.scene.origin)], listed_scenes())
         self._listed: dict[str, ListedScene] = {}  # by what loads it
-        self._bags_at = self._recording_at = 0.0
-        self._recording: dict[str, str] = {}  # how far it is
+        self._bags_at = 0.0
         self._bags: dict[str, str] = {}
         self._problem = ""
-        self._control = monitor.control(self, self._shown())
+        self._control = supervisor.monitor.control(self, self._shown())
 
     def update(self) -> None:
         """Update as `Supervisor.update`, and continue pending requests.
@@ -200,16 +198,13 @@ class Simulation:
         if waiting:
             fraction = (count - len(waiting)) / max(count, 1)
             state = f"starting: {count - len(waiting)} of {count} nodes"
-        reports, replay = self._monitor.node.reports, self._control.values
+        reports, replay = self._supervisor.monitor.node.reports, self._control.values
         player: dict[str, str] = {}
         if request.path:
             player = reports.get(self._supervisor.plan.player, {})
         record = full_path(request.record) if request.record else None
         # What a recorder said that has ended is no more so.
         recorder = {} if RECORDER in waiting else reports.get(RECORDER, {})
-        if time.monotonic() - self._recording_at > _RECORDING_EVERY_S:
-            self._recording_at = time.monotonic()
-            self._recording = self._supervisor.recordings.progress(record) if record else {}
         values: dict[str, str] = {
             "scene": request.scene.name,
             "origin": request.scene.origin,
@@ -218,7 +213,9 @@ class Simulation:
             "record": str(record or ""),
             "record_state": recorder.get("state", "starting") if record else "",
             "record_note": recorder.get("note", "") if record else "",
-            **(self._recording if record else {}),
+            **{
+                f"record_{key}": recorder[key] for key in _OF_RECORDER if record and key in recorder
+            },
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",
             "replay_state": player.get("state", "starting") if request.path else "",

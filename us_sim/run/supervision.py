@@ -7,25 +7,23 @@ A `Supervisor` keeps the nodes of a plan running: one that ends, or that says no
 from __future__ import annotations
 
 import contextlib
-import re
-import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from us_sim.errors import BagError, UsSimError, printable
+from us_sim.errors import BagError, UsSimError, memory_limit, printable
 from us_sim.nodes import INTERRUPTED
 from us_sim.nodes.settings import RECORDER, VIEWER
 from us_sim.run.domain import domain, namespace, ros_context
 from us_sim.run.plan import NodeProcess, Plan, goes_on, recorder_of
-from us_sim.run.processes import ProcessGroup, ending
+from us_sim.run.processes import COMPLAINT, RunningNode, end_nodes, ending
+from us_sim.run.shared_memory import remove_abandoned_segments
 from us_sim.settings.quantity import Quantity
 from us_sim.settings.setting import Settings, setting
 from us_sim.settings.spelling import counted
@@ -36,7 +34,7 @@ if TYPE_CHECKING:
     from us_sim.nodes.settings import SessionControlSettings
 
 IMAGES, IMAGER = "ultrasound/image", "slice_interpolator"
-DISCOVERY_S = 0.4  # to discover whether another simulation is on this ROS domain
+RECORDER_STOP_S = 10.0  # a recorder may take to end: it writes what it still holds
 START_S = 900.0  # for the first report: a first run compiles for minutes
 STEP_S = 0.5
 """A longer time between two looks counts as this much: this process was stopped or had no time."""
@@ -66,10 +64,8 @@ class Loss:
     node: str
     what: str  # it did: "was ended by SIGKILL"
     at_s: float  # since the nodes were started
-    last_words: str = ""  # of the node
     back_after_s: float | None = None  # until it reported again
     given_up: str = ""  # why it was not started again
-    time: str = field(default_factory=lambda: datetime.now().astimezone().isoformat())
 
     def __str__(self) -> str:
         """For a person."""
@@ -84,82 +80,19 @@ class Outcome:
     """How a run went."""
 
     startup: float  # s until all nodes were ready
-    losses: Sequence[Loss]
     files: Sequence[Path]  # recorded, in their order
-    made: int  # images, that the node which makes them has reported
-    recorded: int  # of them
-    poses: int | None  # that there were to play
-    awaited: str = ""  # why nothing was played
+    losses: Sequence[str]  # sentences, for a person
 
     def sentence(self) -> str:
-        """Return the losses, for a person; nothing when there are none."""
-        lacks_images = bool(self.files) and self.recorded < self.made
-        if not (self.losses or self.awaited or lacks_images):
+        """Return the losses in one; nothing when there are none."""
+        if not self.losses:
             return ""
-        told = [str(loss) for loss in self.losses[:TOLD]]
+        told = list(self.losses[:TOLD])
         if len(self.losses) > TOLD:
             told.append(f"and {len(self.losses) - TOLD} more times nodes ended or hung")
-        if self.awaited:
-            told.append(f"nothing was played: it waited for {self.awaited}")
-        if lacks_images:
-            told.append(f"{self.recorded} images were recorded of {self.made} that were made")
-        elif self.files and self.losses:
-            of = f" of {self.poses} poses" if self.poses is not None else ""
-            told.append(f"{self.recorded} images were recorded{of}")
         if self.files:
             told.append(f"the recording is in {', '.join(file.name for file in self.files)}")
         return "; ".join(told)
-
-    def summary(self) -> dict[str, Any]:
-        """Return the losses as one JSON-like mapping."""
-        return {
-            "nodes": [asdict(loss) for loss in self.losses],
-            "images_made": self.made,
-            "images_recorded": self.recorded,
-            "files": [file.name for file in self.files],
-        }
-
-
-class Recordings:
-    """Finds the files of each recorder that was started, without those that were there before."""
-
-    def __init__(self) -> None:
-        # By the file asked for: those that were there, and when it was begun (s, monotonic).
-        self._begun: dict[Path, tuple[set[Path], float]] = {}
-
-    def begin(self, recorder: NodeProcess) -> None:
-        """Note that a recorder is about to be started."""
-        file = Path(str(recorder.parameters["file"]))
-        self._begun.setdefault(file, (set(files_of(file)), time.monotonic()))
-
-    def progress(self, file: Path) -> dict[str, str]:
-        """Return age and size of a recording and the room that is left, as in diagnostics."""
-        try:
-            begun = self._begun[file][1]
-            size = sum(each.stat().st_size for each in self._files(file))
-            room = shutil.disk_usage(file.parent).free
-        except (KeyError, OSError):  # not begun, or its folder is gone: the recorder says so
-            return {}
-        return {
-            "record_seconds": f"{time.monotonic() - begun:.0f}",
-            "record_bytes": str(size),
-            "record_room_bytes": str(room),
-        }
-
-    def files(self) -> list[Path]:
-        """Return the files that are there by now, in the order in which they were begun."""
-        return [found for file in self._begun for found in self._files(file)]
-
-    def _files(self, file: Path) -> list[Path]:
-        return [found for found in files_of(file) if found not in self._begun[file][0]]
-
-
-def files_of(recording: Path) -> list[Path]:
-    """Return a recording's file and those in which it goes on: ``a.mcap``, ``a_1.mcap``, …"""
-    pattern = re.compile(rf"{re.escape(recording.stem)}((?:_\d+)*){re.escape(recording.suffix)}")
-    found = {file: pattern.fullmatch(file.name) for file in recording.parent.glob("*")}
-    numbers = {file: [*map(int, match[1].split("_")[1:])] for file, match in found.items() if match}
-    return sorted(numbers, key=numbers.__getitem__)
 
 
 def images_in(files: Sequence[Path], name: str) -> int:
@@ -203,19 +136,6 @@ class Monitored:
         """Take the next message, waiting at most so long."""
         self._executor.spin_once(timeout_sec=seconds)
 
-    def refuse_company(self, names: Collection[str]) -> None:
-        """Raise UsSimError when a node of one of these names is on the domain already."""
-        until = time.monotonic() + DISCOVERY_S
-        while time.monotonic() < until:
-            self.spin()
-        own = self.node.get_namespace()
-        there = {name for name, space in self.node.get_node_names_and_namespaces() if space == own}
-        if taken := sorted(set(names) & there):
-            raise UsSimError(
-                f"{taken[0]} runs already on ROS domain {domain()}: "
-                f"end that simulation, or set ROS_DOMAIN_ID to another number for this one"
-            )
-
     def close(self) -> None:
         """Leave the domain."""
         nodes = self._executor.get_nodes()
@@ -226,35 +146,43 @@ class Monitored:
 
 
 class Supervisor:
-    """Keeps the nodes of a plan running: one that ends or hangs is started again.
+    """Starts the nodes of a plan and keeps them running: one that ends or hangs is started again.
 
     Another plan may take its place while it runs. What is noticed is said, kept in `losses`, and
     published on ``diagnostics``, so that it is in the recording.
 
     Args:
-        plan: what runs.
-        group: of the processes.
-        monitor: hears what they report.
         settings: when a node hangs, and how often it is started again.
+        log: where what nodes say goes; None shows it on this terminal, above any progress.
     """
 
-    def __init__(
-        self, plan: Plan, group: ProcessGroup, monitor: Monitored, settings: SupervisionSettings
-    ) -> None:
-        self.plan = plan
+    monitor: Monitored  # hears what they report
+
+    def __init__(self, settings: SupervisionSettings, log: Path | None = None) -> None:
+        self.plan = Plan([])
         self.losses: list[Loss] = []
-        self.recordings = Recordings()
         self.finished = False  # whether what is played is at its end, or given up
-        self._group, self._monitor, self._settings = group, monitor, settings
+        self._settings, self._log_path = settings, log
+        self._log: IO[str] | None = log.open("w", encoding="utf-8") if log else None
+        self._monitoring = contextlib.ExitStack()  # closes the monitor
+        self._running: dict[str, RunningNode] = {}  # the last process of each node
+        self._started: set[tuple[str, int]] = set()  # nodes and processes
+        self._strangers: set[tuple[str, int]] = set()  # likewise, that others have started
         self._heard: dict[tuple[str, int], tuple[int, float]] = {}  # reports, time of the last
         self._looked, self._watched = time.monotonic(), 0.0  # s
         self._away: dict[str, Loss] = {}  # that are being started again
         self._were_ready: set[str] = set()
-        self._processes: dict[str, NodeProcess] = {}  # that were started, by node
-        self._images = monitor.node.resolve_topic_name(IMAGES)  # also once the node has ended
+        self._restarts: Counter[str] = Counter()
         self._began = time.monotonic()
+        self._startup: float | None = None  # s
         self._changes = 0
-        self._is_disk_full = False
+
+    def start(self, plan: Plan) -> None:
+        """Start the nodes of a plan, and hear them; a page loads while ROS is imported here."""
+        self._start(each for each in plan.processes if each.node == VIEWER)
+        self.monitor = Monitored(plan.nodes)
+        self._monitoring.callback(self.monitor.close)
+        self._images = self.monitor.node.resolve_topic_name(IMAGES)
         self.change(plan)
 
     def change(self, plan: Plan, anew: Collection[str] = ()) -> None:
@@ -265,35 +193,52 @@ class Supervisor:
             anew: nodes that do not go on even so.
         """
         wanted = {process.node: process for process in plan.processes}
-        over = {
-            node
-            for node, process in self._processes.items()
-            if node in anew or not goes_on(process, wanted.get(node))
-        }
-        if over:  # before others of the same names are started
-            self._note_killed(self._group.end(over))
+        over = [
+            process.node
+            for process in self.plan.processes
+            if process.node in anew or not goes_on(process, wanted.get(process.node))
+        ]
+        self._end(over)  # before others of the same names are started
         for node in over:
+            del self._running[node]
             self._away.pop(node, None)
-        self._were_ready -= over
+        self._were_ready -= {*over}
         self.plan, self.finished = plan, False
-        self._restarts: Counter[str] = Counter()
+        self._restarts.clear()
         self._changes += 1
-        self._monitor.node.follow(plan.nodes)
-        new = over | wanted.keys() - self._processes.keys()
-        self._processes = wanted
-        if RECORDER in wanted:
-            self.recordings.begin(wanted[RECORDER])
-        self._group.start(each for each in plan.processes if each.node in new)
+        self.monitor.node.follow(plan.nodes)
+        self._start(each for each in plan.processes if each.node not in self._running)
+
+    def _start(self, processes: Iterable[NodeProcess]) -> None:
+        remove_abandoned_segments()  # of one that is replaced
+        for process in processes:
+            is_forked = process.node != VIEWER  # which shares little, and shall be there first
+            running = RunningNode(process, self._show, is_forked=is_forked)
+            self._running[process.node] = running
+            self._started.add((process.node, running.pid))
+
+    def _end(self, nodes: Collection[str]) -> None:
+        """End these nodes, the recorder after the others."""
+        running = [self._running[node] for node in nodes if node in self._running]
+        end_nodes([each for each in running if each.node.node != RECORDER])
+        if end_nodes([each for each in running if each.node.node == RECORDER], RECORDER_STOP_S):
+            what = "did not end when it was told to and was killed"
+            self._note(RECORDER, what, given_up="its last messages may be missing")
+
+    def _show(self, node: str, line: str) -> None:
+        if self._log is not None:
+            with contextlib.suppress(OSError, ValueError):  # a full disk; or it is closed
+                self._log.write(line)
+                self._log.flush()
+        is_for_person = self._log is None or node == VIEWER  # which says where its page is
+        if is_for_person and not line.startswith(COMPLAINT):  # which is said when it has ended
+            tqdm.write(printable(line.rstrip()), file=sys.stderr)
 
     @property
     def waiting(self) -> list[str]:
         """Nodes that have not reported yet, or not yet again."""
-        heard = self._monitor.node.heard
-        return [
-            node
-            for node, pid in self._group.pids.items()
-            if node in self._processes and (node, pid) not in heard
-        ]
+        heard = self.monitor.node.heard
+        return [node for node, each in self._running.items() if (node, each.pid) not in heard]
 
     def failed(self) -> str:
         """Return why the plan cannot run, where a node is given up before all were ready."""
@@ -307,67 +252,79 @@ class Supervisor:
         Raises:
             UsSimError: a node that was never ready cannot work, in its own words.
         """
-        self._monitor.spin()
-        ended = self._group.take_ended()
-        for _ in range(2 * len(self._processes) if ended else 0):
-            self._monitor.spin(0.0)  # what they said last
-        for node, status in ended.items():
-            self._on_ended(node, status)
+        self.monitor.spin()
+        ended = [each for each in self._running.values() if not each.is_noted]
+        ended = [each for each in ended if each.status is not None]
+        for _ in range(2 * len(self._running) if ended else 0):
+            self.monitor.spin(0.0)  # what they said last
+        for each in ended:
+            each.note_end()
+            self._on_ended(each)
         self._end_silent()
         self._note_ready()
-        self._note_full_disk()
+        self._note_strangers()
 
     def end(self) -> None:
-        """End all nodes; a recorder that had to be killed is lost, as is who is not back."""
+        """End all nodes; a recorder that had to be killed is lost, as is who is not back.
+
+        The monitor goes first: it would wait for what a killed node never acknowledges.
+        """
         for loss in self._away.values():
             loss.given_up = "was not back when the run ended"
-        self._note_killed(self._group.stop())
+        self._away.clear()
+        self._monitoring.close()
+        self._end([*self._running])
+        remove_abandoned_segments()
+        if self._log is not None:
+            with contextlib.suppress(OSError):
+                self._log.close()
 
-    def outcome(self, startup: float) -> Outcome:
+    def outcome(self) -> Outcome:
         """Return how it went, once all has ended."""
-        files = self.recordings.files()
-        recorded = images_in(files, self._images)
+        node, losses = self.monitor.node, [str(loss) for loss in self.losses]
+        recorded_by = node.recordings.items()
+        files = [Path(file) for file, pid in recorded_by if (RECORDER, pid) in self._started]
         # How many images were to be recorded is only known where all that were made were.
         recorder = recorder_of(self.plan.processes)
         all_were = recorder and recorder.at_once and recorder.records(self._images, namespace())
-        is_known = all_were and self._changes == 1
-        made = self._monitor.node.count(IMAGER, IMAGES) if is_known else recorded
-        poses = None if self.plan.loops else self.plan.poses
-        awaited = self._monitor.node.reports.get(self.plan.player, {}).get("awaited", "")
-        return Outcome(startup, self.losses, files, made, recorded, poses, awaited)
+        if files and all_were and self._changes == 1:
+            made, recorded = node.count(IMAGER, IMAGES), images_in(files, self._images)
+            if recorded < made:
+                losses.insert(0, f"{recorded} images were recorded of {made} that were made")
+        if awaited := node.reports.get(self.plan.player, {}).get("awaited", ""):
+            losses.insert(0, f"nothing was played: it waited for {awaited}")
+        return Outcome(self._startup or 0.0, files, losses)
 
-    def _note_killed(self, killed: Collection[str]) -> None:
-        if RECORDER in killed:
-            what = "did not end when it was told to and was killed"
-            self._note(RECORDER, what, given_up="its last messages may be missing")
-
-    def _on_ended(self, node: str, status: int) -> None:
+    def _on_ended(self, running: RunningNode) -> None:
+        node, status = running.node.node, running.status or 0
         plays = self.plan.poses is not None and node == self.plan.player
         if plays and status == 0:  # it has another where it was told to end before
             self.finished = True
-            return
-        if status > 0 and status != INTERRUPTED and node not in self._were_ready:
-            raise self._group.failure(node, status)
-        self._on_lost(node, ending(status), self._group.last_words(node))
+        elif status > 0 and status != INTERRUPTED and node not in self._were_ready:
+            see = f"; see {self._log_path}" if self._log_path else ""
+            limit = f"; {hint}" if (hint := memory_limit()) else ""
+            raise UsSimError(running.complaint or f"{node} {ending(status)}{see}{limit}")
+        else:
+            self._on_lost(node, ending(status), running.last_words)
 
     def _end_silent(self) -> None:
         """End nodes that have not reported for too long, and start them again."""
         now = time.monotonic()
         self._watched += min(now - self._looked, STEP_S)
         self._looked = now
-        for node, pid in [*self._group.pids.items()]:
-            if not self._group.is_running(node):
+        for node, running in [*self._running.items()]:
+            if running.is_noted:
                 continue
-            count = self._monitor.node.heard[node, pid]
-            before, since = self._heard.get((node, pid), (-1, 0.0))
+            count = self.monitor.node.heard[node, running.pid]
+            before, since = self._heard.get((node, running.pid), (-1, 0.0))
             silent = self._watched - since
             if count != before:
-                self._heard[node, pid] = count, self._watched
+                self._heard[node, running.pid] = count, self._watched
             elif silent > (self._settings.silence if count else START_S):
                 if node not in self._were_ready:
                     raise UsSimError(f"{node} did not start in {START_S / 60:g} minutes")
-                said = self._monitor.node.messages.get(node) or self._group.last_words(node)
-                self._group.end([node])
+                said = self.monitor.node.messages.get(node) or running.last_words
+                self._end([node])
                 self._on_lost(node, f"has not reported for {silent:.0f} s", said)
 
     def _on_lost(self, node: str, what: str, said: str) -> None:
@@ -382,39 +339,43 @@ class Supervisor:
             self._away.pop(node, None)
             self.finished |= node == self.plan.player
             return
-        report = self._monitor.node.reports.get(node, {})
-        is_own = report.get("pid") == str(self._group.pids[node])
-        self._group.start([going_on(self._processes[node], report if is_own else {})])
+        report = self.monitor.node.reports.get(node, {})
+        is_own = report.get("pid") == str(self._running[node].pid)
+        first = next(each for each in self.plan.processes if each.node == node)
+        self._start([going_on(first, report if is_own else {})])
         self._away[node] = loss
 
     def _note_ready(self) -> None:
         waiting = self.waiting
-        self._were_ready |= self._processes.keys() - set(waiting)
+        if not waiting and self._startup is None:
+            self._startup = time.monotonic() - self._began
+        self._were_ready |= self._running.keys() - set(waiting)
         for node in [node for node in self._away if node not in waiting]:
             loss = self._away.pop(node)
             loss.back_after_s = round(time.monotonic() - self._began - loss.at_s, 2)
             self._publish()
             say(f"{node} is back after {loss.back_after_s:.1f} s")
 
+    def _note_strangers(self) -> None:
+        """Say once of each node of another simulation that it is here, too."""
+        for each in self.monitor.node.heard.keys() - self._started - self._strangers:
+            self._strangers.add(each)
+            say(
+                f"another {each[0]} is on ROS domain {domain()}: end that simulation, or set "
+                f"ROS_DOMAIN_ID to another number for this one"
+            )
+
     def _note(
         self, node: str, what: str, said: str = "", given_up: str = "", then: str = ""
     ) -> Loss:
-        loss = Loss(node, what, round(time.monotonic() - self._began, 2), said, given_up=given_up)
+        loss = Loss(node, what, round(time.monotonic() - self._began, 2), given_up=given_up)
         self.losses.append(loss)
         last = f", and last said: {said}" if said else ""
         say(f"{node} {what} after {loss.at_s:.1f} s{last}; {given_up or then}".removesuffix("; "))
         return loss
 
     def _publish(self) -> None:
-        self._monitor.node.tell_lost([str(loss) for loss in self.losses])
-
-    def _note_full_disk(self) -> None:
-        """Note once that the recorder could not write."""
-        node = self._monitor.node
-        if node.rejected(RECORDER, "disk") > 0 and not self._is_disk_full:
-            self._is_disk_full = True
-            self._note(RECORDER, f"could not write ({node.messages.get(RECORDER, '')})")
-            self._publish()
+        self.monitor.node.tell_lost([str(loss) for loss in self.losses])
 
 
 def say(sentence: str) -> None:
