@@ -1,4 +1,4 @@
-"""The block of tissue that solvers press and slicers cut, its meshes, and SciPy's linear solver.
+"""The block of tissue that solvers press and slicers cut, and its meshes.
 
 >>> from us_sim.evaluation.block import MESHES, block, graded_planes
 >>> mesh = block(MESHES[0])
@@ -10,15 +10,11 @@
 
 from __future__ import annotations
 
-import inspect
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import cg
 
-from us_sim.errors import SolverError
 from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh, box_mesh, uniform_planes
 
 EXTENT = ((-0.1, 0.1), (-0.05, 0.05), (0.0, 0.1))  # m, along x, y and z
@@ -57,25 +53,3 @@ def graded_planes(
     planes = np.unique(np.concatenate(parts))
     planes[[0, -1]] = low, high
     return planes
-
-
-def conjugate_gradients(
-    matrix: Any, right: NDArray[np.float64], tolerance: float, inverse: Any, limit: int
-) -> NDArray[np.float64]:
-    """(N,) x of the symmetric positive definite system ``matrix @ x = right``, by SciPy.
-
-    Args:
-        matrix: (N, N), or a ``LinearOperator``, as ``inverse``.
-        right: (N,).
-        tolerance: of the residual, relative to ``right``.
-        inverse: the preconditioner, roughly the inverse of the matrix.
-        limit: of iterations.
-
-    Raises:
-        SolverError: it did not converge.
-    """
-    name = "rtol" if "rtol" in inspect.signature(cg).parameters else "tol"  # before SciPy 1.12
-    found, failed = cg(matrix, right, maxiter=limit, M=inverse, **{name: tolerance})
-    if failed:
-        raise SolverError(f"the independent reference did not converge in {limit} steps")
-    return np.asarray(found)

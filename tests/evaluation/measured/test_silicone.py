@@ -15,7 +15,6 @@ from us_sim.evaluation.measured.silicone import (
     read_silicones,
     read_test,
     slipping_force,
-    sticking_force,
 )
 
 
@@ -64,44 +63,11 @@ def test_published_fits_of_yeohs_law_give_the_forces(compressions, silicones):
     assert np.max(np.abs(errors)) < 0.15
 
 
-def test_the_law_falls_less_behind_where_silicones_stiffen(compressions):
-    rows = predict_silicones(compressions / "data", "slip", 8)
-    errors = {row["quantity"].removeprefix("force at "): row["error"] for row in rows}
-    assert max(errors[f"{part} %, slip, neo-Hookean"] for part in (10, 20, 30)) < 8
-    assert errors["66 %, slip, neo-Hookean"] > 30
-    assert errors["66 %, slip, stiffening, s from 60 %"] < 8
-
-
-@pytest.mark.slow
-def test_a_small_compression_of_a_cylinder_that_sticks_is_that_of_other_elements():
-    skfem = pytest.importorskip("skfem")
-    helpers = pytest.importorskip("skfem.helpers")
-    # Half of the cylinder by symmetry, axisymmetric quadratic elements, finer towards the rim.
-    shear, bulk_part = 1.0, 2 * 0.49 / (1 - 2 * 0.49)
-    fine = 1 - (1 - np.linspace(0, 1, 17)) ** 2.5
-    mesh = skfem.MeshQuad.init_tensor(RADIUS * fine, HEIGHT / 2 * fine)
-    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementQuad2()), intorder=6)
-
-    @skfem.BilinearForm
-    def stiffness(u, v, w):
-        radius = w.x[0]
-        one, other = helpers.sym_grad(u), helpers.sym_grad(v)
-        hoop, other_hoop = u[0] / radius, v[0] / radius
-        swelling = (helpers.trace(one) + hoop) * (helpers.trace(other) + other_hoop)
-        shearing = helpers.ddot(one, other) + hoop * other_hoop
-        return (bulk_part * swelling + 2 * shear * shearing) * radius
-
-    matrix = stiffness.assemble(basis)
-    platen = basis.get_dofs(lambda x: np.isclose(x[1], HEIGHT / 2))
-    axis = basis.get_dofs(lambda x: np.isclose(x[0], 0))
-    middle = basis.get_dofs(lambda x: np.isclose(x[1], 0))
-    held = np.unique(np.concatenate([platen.all(), axis.all(["u^1"]), middle.all(["u^2"])]))
-    moved = np.zeros(matrix.shape[0])
-    moved[platen.all(["u^2"])] = -HEIGHT / 2
-    solved = skfem.solve(*skfem.condense(matrix, x=moved, D=held))
-    expected = 2 * np.pi * float(solved @ (matrix @ solved)) / (HEIGHT / 2)  # N at strain 1
-    errors = [sticking_force([1e-3], cells)[0] / 1e-3 / expected - 1 for cells in (6, 12)]
-    assert 0.0 < errors[1] < 0.6 * errors[0] < 0.05
+def test_the_law_holds_until_silicones_stiffen(compressions):
+    rows = list(predict_silicones(compressions / "data"))
+    errors = {row["x"]: row["error"] for row in rows}
+    assert max(errors[part] for part in (10.0, 20.0, 30.0)) < 8
+    assert errors[66.0] > 30
 
 
 def write_test(file, forces):
@@ -112,18 +78,11 @@ def write_test(file, forces):
     file.write_text("A title;\nTime (s),Compression (mm),Load (N)\n" + "\n".join(rows) + "\n")
 
 
-@pytest.mark.parametrize("platens", ["slip", pytest.param("stick", marks=pytest.mark.slow)])
-def test_constants_of_a_made_up_silicone_are_found_and_its_forces_predicted(tmp_path, platens):
+def test_the_modulus_of_a_made_up_silicone_is_found_and_its_forces_predicted(tmp_path):
     for specimen in "AB":
         file = tmp_path / "EF" / f"EF_{specimen}1.csv"
-        write_test(file, 5e3 * slipping_force(COMPRESSIONS, 0.4))
-    rows = {row["quantity"]: row["error"] for row in predict_silicones(tmp_path, platens, 8)}
-    assert rows[f"force at 10 %, {platens}, neo-Hookean"] < (0.2 if platens == "slip" else 2.0)  # %
-    if platens == "slip":
-        for compression in (40, 50, 66):
-            assert rows[f"force at {compression} %, slip, stiffening, s from 60 %"] < 0.2
-        assert rows["force at 66 %, slip, neo-Hookean"] > 30
-        assert "force at 60 %, slip, stiffening, s from 60 %" not in rows  # it is fitted there
+        write_test(file, 5e3 * slipping_force(COMPRESSIONS))
+    assert max(row["error"] for row in predict_silicones(tmp_path)) < 0.2  # %
 
 
 HEAD = "Time (s),Compression (mm),Load (N)\n"
@@ -133,7 +92,7 @@ HEAD = "Time (s),Compression (mm),Load (N)\n"
     ("text", "word"),
     [
         ("Compression test;\n", "no line"),
-        (f"{HEAD}0,0,0\n1,heavy,2\n", ":3:"),
+        (f"{HEAD}0,0,0\n1,heavy,2\n", "heavy"),
         (f"{HEAD}0,0,0\n1,3,2\n", "66 %"),
     ],
 )

@@ -19,9 +19,7 @@ from us_sim.evaluation.measured.vein import plan_vein, report_vein
 from us_sim.evaluation.settings import MeasuredData
 from us_sim.evaluation.subject import Piece, Place, Report, Subject
 
-COLUMNS = (
-    *("case", "quantity", "unit", "measured", "predicted", "error", "floor", "fitted_on", "ms"),
-)
+COLUMNS = ("case", "quantity", "unit", "measured", "predicted", "error", "floor", "fitted_on")
 """Of a row, besides ``study``; what is not known is empty."""
 
 
@@ -68,14 +66,14 @@ def plan_pieces(quick: bool, settings: MeasuredData | None = None) -> dict[str, 
 
 
 def _measure(piece: Piece) -> Iterator[dict[str, Any]]:
-    with threadpool_limits(1):  # as live; threads that wait would count as time of a frame
+    with threadpool_limits(1):  # as live
         for row in piece.measure():
             yield {name: row.get(name) for name in COLUMNS} | dict(row)
 
 
 def report_measured(rows: pd.DataFrame) -> Report:
     """Say what each study found."""
-    rows = rows.astype(dict.fromkeys(("measured", "predicted", "error", "floor", "ms"), float))
+    rows = rows.astype(dict.fromkeys(("measured", "predicted", "error", "floor"), float))
     places: dict[str, Place] = {}
     take_home = []
     for name, found in rows.groupby("study", sort=False):
@@ -93,8 +91,5 @@ MEASURED = Subject(
     "Measured: error against the real world",
     plan_pieces,
     report_measured,
-    hidden=(
-        *("panel", "line", "x", "curve"),
-        *("poisson_ratio", "height", "det_measured", "det_predicted"),
-    ),
+    hidden=("panel", "line", "x", "curve"),
 )

@@ -1,8 +1,6 @@
 """The arm's vein pressed shut at the venous pressures of three postures.
 
-The simulated probe presses on one side, where the published cuff lay all around a leg. So beside
-the pressure under the probe, the one in the tissue beside the vein is measured, which the cuff
-would raise to its own.
+The simulated probe presses on one side, where the published cuff lay all around a leg.
 """
 
 from __future__ import annotations
@@ -47,7 +45,6 @@ required to achieve venous closure from supine to standing positions, J. Vasc. S
 _CLOSED = 0.2
 """Part of the area at rest that counts as closed. Below it the mesh holds the vein open, of whose
 tetrahedra most are lumen in part only: see `us_sim.tissue.elasticity.neo_hookean_material`."""
-_SOFT = 50e3  # Pa; what is stiffer is artery or bone, and not soft tissue
 _DEPTH = 22e-3  # m; deeper, the probe would enter the tissue
 MODULI: Mapping[str, Mapping[str, float]] = {
     "of the scene": {},
@@ -55,26 +52,22 @@ MODULI: Mapping[str, Mapping[str, float]] = {
 }
 """Pa, moduli that take the place of the scene's. Those of volunteers: muscle by shear-wave
 elastography of 127 people (Arda et al., 2011), fat and skin by aspiration in vivo."""
-_BESIDE = (4e-3, 9e-3)  # m from the vein's axis, where the tissue's pressure is taken
-_HALF_LENGTH = 8e-3  # m, along the vein
 
 
 @dataclass(frozen=True, eq=False)
 class Closing:
     """A vein under a probe that is pressed step by step."""
 
-    depth: Array  # (K,) m
     area: Array  # (K,) of the lumen, over that at rest
-    interface: Array  # (K,) mmHg, force over the area that the probe touches
-    beside: Array  # (K,) mmHg, mean pressure of the solid tissue beside the vein
+    pressure: Array  # (K,) mmHg, force over the area that the probe touches
 
-    def at(self, area: float, of: Array) -> float:
-        """A pressure where the area first falls to this; NaN where it does not."""
+    def at(self, area: float) -> float:
+        """Find the pressure where the area first falls to this; NaN where it does not."""
         below = np.flatnonzero(self.area <= area)
         if not len(below):
             return float("nan")
         k = below[0]
-        return float(np.interp(area, self.area[[k, k - 1]], of[[k, k - 1]]))
+        return float(np.interp(area, self.area[[k, k - 1]], self.pressure[[k, k - 1]]))
 
 
 def press(venous: float, count: int, moduli: Mapping[str, float] | None = None) -> Closing:
@@ -96,57 +89,22 @@ def press(venous: float, count: int, moduli: Mapping[str, float] | None = None) 
     scanner.carry(model.mesh.nodes, model.mesh.tetrahedra)
     (label,) = (number for number, name in volume.label_names.items() if name == "vein")
     solver = create_solver("fem_nonlinear", model)
-    beside = _beside(model)
-    depths = np.linspace(0.0, _DEPTH, count + 1)
     rows = []
-    for depth in depths:
+    for depth in np.linspace(0.0, _DEPTH, count + 1):
         pose = Pose(np.array([0.0, 0.0, depth]))
         for _ in range(5):
             made = solver.deform(pose)
         lumen = scanner.labels(pose, made.nodes) == label
         touched = _touched_area(model, made.nodes, made.contact_nodes)
-        interface = np.linalg.norm(made.force) / touched if touched else 0.0
-        pressure = mean_pressure(model, made.nodes)
-        around = np.average(pressure[beside], weights=model.mesh.volumes[beside])
-        rows.append((lumen.sum(), interface, around))
-    area, interface_pa, beside_pa = np.array(rows, np.float64).T
-    return Closing(depths, area / area[0], interface_pa / MMHG, beside_pa / MMHG)
-
-
-def mean_pressure(model: TissueModel, nodes: Array) -> Array:
-    """(M,) Pa, minus a third of the trace of the Cauchy stress of each solid tetrahedron.
-
-    From the energy that `neo_hookean_material` states, without its barrier.
-    """
-    tetrahedra, materials = model.mesh.tetrahedra, model.materials
-    rest, now = ((x[tetrahedra[:, 1:]] - x[tetrahedra[:, :1]]) for x in (model.mesh.nodes, nodes))
-    gradient = np.linalg.solve(rest, now)  # transposed
-    ratio = np.linalg.det(gradient)
-    young, poisson = materials.young_modulus, materials.poisson_ratio
-    shear = young / (2.0 * (1.0 + poisson))
-    bulk = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson)) + shear
-    squared = (gradient**2).sum(axis=(1, 2))
-    return np.asarray(-(shear * squared / (3.0 * ratio) + bulk * (ratio - 1.0) - shear))
-
-
-def _beside(model: TissueModel) -> NDArray[np.bool_]:
-    """(M,) which solid tetrahedra lie beside the vein, under the middle of the probe."""
-    middle = model.mesh.nodes[model.mesh.tetrahedra].mean(axis=1)
-    lumen = model.materials.lumen_fraction
-    near = (lumen > 0.5) & (np.abs(middle[:, 1]) < _HALF_LENGTH)
-    off = np.linalg.norm((middle - middle[near].mean(axis=0))[:, [0, 2]], axis=1)
-    chosen = (lumen == 0.0) & (model.materials.young_modulus < _SOFT)
-    chosen &= (off > _BESIDE[0]) & (off < _BESIDE[1])
-    return np.asarray(chosen & (np.abs(middle[:, 1]) < _HALF_LENGTH))
+        rows.append((lumen.sum(), np.linalg.norm(made.force) / touched if touched else 0.0))
+    area, pressure = np.array(rows, np.float64).T
+    return Closing(area / area[0], pressure / MMHG)
 
 
 def _touched_area(model: TissueModel, nodes: Array, touched: NDArray[np.integer]) -> float:
     """m², a third of the surface's triangles for each corner that is touched."""
-    faces = np.sort(model.mesh.tetrahedra[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]], axis=2)
-    candidate = faces.reshape(-1, 3)
-    candidate = candidate[np.isin(candidate, model.contact_nodes).all(axis=1)]
-    surface, counts = np.unique(candidate, axis=0, return_counts=True)
-    surface = surface[counts == 1]
+    surface = model.mesh.boundary
+    surface = surface[np.isin(surface, model.contact_nodes).all(axis=1)]
     a, b, c = (nodes[surface[:, k]] for k in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return float((areas * np.isin(surface, touched).sum(axis=1)).sum() / 3.0)
@@ -156,24 +114,19 @@ def measure_closing(posture: str, moduli: str, count: int) -> Iterator[dict[str,
     """Press the vein of a posture shut, and compare the pressures with the published ones."""
     closing = press(VENOUS[posture], count, MODULI[moduli])
     low, high = PUBLISHED[posture]
-    middle = 0.5 * (low + high)
-    for where, pressures in (
-        ("under the probe", closing.interface),
-        ("beside the vein", closing.beside),
-    ):
-        pressure = closing.at(_CLOSED, pressures)
-        yield {
-            "case": f"{posture}, moduli {moduli}",
-            "quantity": f"closing pressure, {where}",
-            "unit": "mmHg",
-            "measured": middle,
-            "predicted": pressure,
-            "error": pressure - middle,
-            "floor": 0.5 * (high - low),
-            "panel": f"{where}, moduli {moduli}",
-            "line": posture,
-            "curve": np.stack([pressures, 100 * closing.area], axis=1),
-        }
+    middle, pressure = 0.5 * (low + high), closing.at(_CLOSED)
+    yield {
+        "case": f"{posture}, moduli {moduli}",
+        "quantity": "closing pressure, under the probe",
+        "unit": "mmHg",
+        "measured": middle,
+        "predicted": pressure,
+        "error": pressure - middle,
+        "floor": 0.5 * (high - low),
+        "panel": f"moduli {moduli}",
+        "line": posture,
+        "curve": np.stack([closing.pressure, 100 * closing.area], axis=1),
+    }
 
 
 def plan_vein(folder: Path, quick: bool) -> list[Piece]:
@@ -203,11 +156,11 @@ def report_vein(rows: pd.DataFrame) -> tuple[str, dict[str, Place]]:
         labels={"pressure": "mmHg", "area": "area of the vein, %"},
         limits={"y:closed": 100 * _CLOSED},
     )
-    scene = rows[rows["panel"] == "under the probe, moduli of the scene"]
+    scene = rows[rows["panel"] == "moduli of the scene"]
     said = [f"{row.line} {row.predicted:.0f} ({row.measured:.3g})" for row in scene.itertuples()]
     words = (
         f"A vein closes under the probe at {', '.join(said)} mmHg; in brackets the pressure of a "
         f"cuff that was published."
     )
-    columns = ["case", "quantity", "measured", "predicted", "error"]
+    columns = ["case", "measured", "predicted", "error"]
     return words, {"vein": figure, "vein_table": rows[columns]}
