@@ -19,14 +19,14 @@ def test_the_report_has_what_was_measured_and_says_what_broke(tmp_path, monkeypa
         raise ArithmeticError(f"no closed form, quick {quick}")
 
     def even(quick):
-        return [row_of("surface", "linear", 10.0, 0.02, 2.0, 2.1, "")] if quick else []
+        return [row_of("attenuation", "linear", 10.0, 0.02, 2.0, 2.05, "px")] if quick else []
 
     monkeypatch.setattr(image, "arm_images", lambda: {"arm": {"0°": np.eye(2)}})
-    monkeypatch.setattr(image, "ARTEFACTS", {"anisotropy": broken, "surface": even})
+    monkeypatch.setattr(image, "ARTEFACTS", {"shadow_edge": broken, "attenuation": even})
     assert main(["evaluate", "image", "--quick", "--out", str(tmp_path)]) == 1
     report = (tmp_path / "image.md").read_text(encoding="utf-8")
     assert "ArithmeticError: no closed form, quick True" in report
-    assert "anisotropy" in capsys.readouterr().out
+    assert "shadow_edge" in capsys.readouterr().out
     with (tmp_path / "image.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert list(rows[0])[: len(ASKED)] == ASKED
@@ -35,8 +35,11 @@ def test_the_report_has_what_was_measured_and_says_what_broke(tmp_path, monkeypa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("artefact", [name for name in image.ARTEFACTS if name != "run_time"])
-def test_what_is_asked_of_an_artefact_is_met(artefact):
+def test_what_is_asked_of_an_artefact_is_met(artefact, monkeypatch):
+    monkeypatch.setattr(image, "arm_images", lambda: {"arm": {"0°": np.eye(2)}})
     rows = [{"artefact": artefact, **row} for row in image.ARTEFACTS[artefact](True)]
-    targets = [target for target in image.targets(pd.DataFrame(rows)) if target.met is not None]
+    targets = [
+        target for target in image.report_of(pd.DataFrame(rows)).targets if target.met is not None
+    ]
     assert targets
     assert [target.what for target in targets if not target.met] == []

@@ -1,6 +1,6 @@
 """Sound along the current beams: laws that need no formula, and every sentence about wrong input.
 
-Closed forms of loss, shadow, borders and fibres are in tests/evaluation/image.
+Closed forms of loss and shadow are in tests/evaluation/image, those of borders and fibres here.
 """
 
 import ast
@@ -15,10 +15,11 @@ from us_sim.errors import ProbeError, SceneError
 from us_sim.geometry.pose import Pose
 from us_sim.scene.reading import parse_scene
 from us_sim.slicing.acoustics.settings import Acoustics, TissueAcoustics
-from us_sim.slicing.acoustics.surface_echo import SurfaceNormals
+from us_sim.slicing.acoustics.surface_echo import MIRROR, ROUGHNESS, SurfaceNormals
 from us_sim.slicing.b_mode import BMode, beyond
+from us_sim.slicing.formation.image_formation import GREYS_PER_DECIBEL
 from us_sim.slicing.probe.probe import ConvexProbe, LinearProbe
-from us_sim.slicing.settings import Imaging
+from us_sim.slicing.settings import ECHO_RANGE, Imaging
 from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh
 from us_sim.volume.volume import Volume
 
@@ -101,6 +102,57 @@ def test_a_frequency_below_the_volumes_own_blurs():
     sharp, soft = (BMode(ball(3), PROBE, acoustics=one).image(Pose()) for one in (low, blurred))
     steps = [int(np.abs(np.diff(image.astype(int), axis=0)).max()) for image in (sharp, soft)]
     assert steps[1] < 0.7 * steps[0]
+
+
+def layers(border, grey, names):
+    """What lies above a border (m, along z) has label 1, what lies below has 2."""
+    placed = np.diag([0.5e-3, 0.5e-3, 0.2e-3, 1.0])
+    placed[:3, 3] = (-0.03, -0.02, -0.01)
+    labels = np.ones((120, 80, 220), np.uint8)
+    labels[:, :, placed[2, 3] + 0.2e-3 * np.arange(220) > border] = 2
+    return Volume(np.full(labels.shape, grey, np.uint8), placed, labels, names)
+
+
+def tilted(degrees, axis, y=0.0):
+    """Turn a probe about x, out of its image's plane, or about y, in it."""
+    turn = np.sin(np.radians(degrees) / 2) * np.array(axis)
+    return Pose([0.0, y, 0.0], [*turn, np.cos(np.radians(degrees) / 2)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 20.0])
+def test_a_border_echoes_by_its_angle_as_facets_do(axis, degrees):
+    tissues = {
+        "above": TissueAcoustics(attenuation=0.57, impedance=1.5e6),
+        "below": TissueAcoustics(attenuation=0.57, impedance=1.8e6),
+    }
+    sound = dataclasses.replace(LIVE, tissues=tissues, anisotropy=False)
+    fine = PROBE.with_pixels(512, 512)
+    scanner = BMode(layers(0.0121, 40, {1: "above", 2: "below"}), fine, acoustics=sound)
+    # The border is patchy: the mean of its brightest pixels, over its grain.
+    shown = [scanner.image(tilted(degrees, axis, y)).max(axis=0) for y in 5e-4 * np.arange(16)]
+    facets = np.exp(-(np.tan(np.radians(degrees)) ** 2) / (2 * ROUGHNESS**2))
+    expected = MIRROR + 20.0 * np.log10(0.3 / 3.3 * facets)
+    assert np.mean(shown) / GREYS_PER_DECIBEL - ECHO_RANGE == pytest.approx(expected, abs=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shear", [0.0, 0.15])
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 20.0])
+def test_fibres_are_brightest_across_the_beam(degrees, shear):
+    fibres = {"fibres": (0.0, 1.0, 0.0), "anisotropy": 14.0, "half_angle": 0.3}
+    muscle = TissueAcoustics(attenuation=0.57, impedance=1.645e6, **fibres)
+    sound = dataclasses.replace(LIVE, tissues={"muscle": muscle}, surfaces=False)
+    scanner = BMode(layers(1.0, 150, {1: "muscle"}), PROBE, acoustics=sound)
+    carrier = box_mesh(*(np.linspace(*side, 4) for side in ((-0.02, 0.02),) * 2 + ((0.0, 0.033),)))
+    scanner.carry(carrier.nodes, carrier.tetrahedra)
+    nodes = carrier.nodes.copy()
+    nodes[:, 2] += shear * nodes[:, 1]
+    image = scanner.image(tilted(degrees, (1.0, 0.0, 0.0)), nodes)[30:90, 30:90]
+    square = np.sin(np.radians(degrees) - np.arctan(shear)) ** 2
+    expected = -14.0 * square / (square + np.sin(0.3) ** 2)
+    assert (image.mean() - 150) / GREYS_PER_DECIBEL == pytest.approx(expected, abs=0.1)
 
 
 @pytest.mark.parametrize("flat", [0.35, 0.2])

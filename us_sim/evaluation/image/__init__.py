@@ -1,1 +1,1 @@
-"""Error of sound, strain and flow in an image against closed forms, and its run time."""
+"""Error of sound in an image against closed forms, and its run time."""
