@@ -2,19 +2,21 @@
 
 import pandas as pd
 
-from us_sim.evaluation.viewer.report import SHOWN, report_of
+from us_sim.evaluation.viewer.report import report_of
+
+WHO = ("viewer", "browser")
 
 
 def test_what_is_asked_is_compared_with_the_run_without_a_viewer():
     shown = {"images_a_second_shown": 26.0, "delay_ms_median": 40.0, "delay_ms_p99": 130.0}
-    columns = [*SHOWN, "growth_mb_a_minute_viewer", "growth_mb_a_minute_browser"]
+    columns = ["case", "images_a_second_made", *shown, "start_s", "page_opened_s"]
+    columns += [f"{of}_{who}" for of in ("cores", "growth_mb_a_minute") for who in WHO]
     rows = [
         {"case": "no viewer, path", "images_a_second_made": 60.0},
         {"case": "1 browser, path", "images_a_second_made": 51.0},
         {"case": "1 browser, hand", **shown},
     ]
-    memory = pd.DataFrame(columns=["process", "s", "MB"])
-    table = pd.DataFrame(rows, columns=columns).assign(seconds=8.0, memory=[memory] * 3)
+    table = pd.DataFrame(rows, columns=columns).assign(seconds=8.0)
     seen = {target.what: (target.seen, target.met) for target in report_of(table).targets}
     assert seen["images a second that the simulator loses to a page"] == ("15 %", False)
     assert seen["images a second in a browser, hand"] == ("26", True)
