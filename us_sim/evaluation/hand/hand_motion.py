@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,114 +14,78 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from us_sim.recording.path import ProbePath
-from us_sim.recording.press_and_slide import EPOCH
+from us_sim.geometry.pose import Pose
 
 RATE = 60.0
 """Poses per second."""
+APPROACH = 0.5
+"""s before a motion, in which the probe comes to where it begins."""
 _Array = NDArray[np.float64]
-_Curve = Callable[[_Array], _Array]
+_Point = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Haste:
+class Haste(NamedTuple):
     """How fast a hand is: medians over a motion."""
 
     speed: float  # m/s, of the probe's face
     turning: float  # rad/s
 
 
-HASTES: Mapping[str, Haste] = MappingProxyType(
-    {
-        "careful": Haste(0.020, math.radians(30)),
-        "brisk": Haste(0.060, math.radians(90)),
-        "violent": Haste(0.300, math.radians(360)),
-    }
-)
+HASTES = {
+    "careful": Haste(0.020, math.radians(30)),
+    "brisk": Haste(0.060, math.radians(90)),
+    "violent": Haste(0.300, math.radians(360)),
+}
 """By name, from a sonographer who looks to one who wants to break something."""
 
 
 @dataclass(frozen=True)
-class Room:
-    """The room that a hand takes: by default as much as the scene ``upper_arm`` has.
+class HandMotion:
+    """A kind of motion, which moves or turns the probe, or both.
 
-    Lengths are those of the middle of the probe's face from the origin of ``patient``, whose xy
-    plane is the skin, and angles those of the probe from upright.
+    The middle of the probe's face is between two points of ``patient``, whose xy plane is the skin;
+    angles are those of the probe from upright.
     """
 
-    aside: float = 0.018  # m, to either side along x
-    across: float = 0.012  # m, to either side along y
-    above: float = 0.005  # m, over the skin
-    deepest: float = 0.015  # m, under it
-    tilt: float = math.radians(25)  # rad, to either side, about each of the probe's x and y
-    yaw: float = math.radians(90)  # rad, to either side, about z
-    edge: float = 0.036  # m, where the tissue ends along x
-
-
-@dataclass(frozen=True)
-class HandMotion:
-    """A kind of motion: the fractions of the room that it takes."""
-
     words: str
-    aside: float = 0.0  # of ``aside``, to either side
-    across: float = 0.0  # of ``across``, to either side
-    depth: tuple[float, float] = (0.5, 0.5)  # of ``deepest``, below 0 of ``above``; from and to
-    tilt: float = 0.0  # of ``tilt``
-    yaw: float = 0.0  # of ``yaw``
-    over_the_edge: bool = False  # along x from half of ``edge`` to a quarter beyond it
+    low: _Point  # m
+    high: _Point  # m
+    turn: _Point = (0.0, 0.0, 0.0)  # rad to either side: about z, then the probe's x and y
     steep: float = 1.0  # how much a coordinate prefers the ends of its range; 1: none
 
-    @property
-    def moves(self) -> bool:
-        """Whether the probe's face leaves its place."""
-        return bool(self.aside or self.across or self.over_the_edge or len(set(self.depth)) > 1)
 
-    @property
-    def turns(self) -> bool:
-        """Whether the probe turns."""
-        return bool(self.tilt or self.yaw)
-
-
-KINDS: Mapping[str, HandMotion] = MappingProxyType(
-    {
-        "free": HandMotion(
-            "all six degrees of freedom, in the air and in the tissue",
-            aside=1.0,
-            across=1.0,
-            depth=(-1.0, 1.0),
-            tilt=1.0,
-            yaw=1.0,
-        ),
-        "pressing": HandMotion("down and up in one place", depth=(-1.0, 1.0)),
-        "sliding": HandMotion(
-            "pressed, off an edge of the tissue and back onto it",
-            across=0.2,
-            depth=(0.3, 0.7),
-            over_the_edge=True,
-        ),
-        "tilting": HandMotion("pressed, tilting to all sides", tilt=1.0),
-        "stabbing": HandMotion(
-            "lifted, put elsewhere and stabbed in again",
-            aside=1.0,
-            across=1.0,
-            depth=(-1.0, 1.0),
-            steep=1.8,
-        ),
-    }
-)
-"""By name. A kind that only moves, or only turns, does the other not at all."""
+_TILT = math.radians(25)
+KINDS = {
+    "free": HandMotion(
+        "all six degrees of freedom, in the air and in the tissue",
+        (-0.018, -0.012, -0.005),
+        (0.018, 0.012, 0.015),
+        (math.radians(90), _TILT, _TILT),
+    ),
+    "pressing": HandMotion("down and up in one place", (0.0, 0.0, -0.005), (0.0, 0.0, 0.015)),
+    "sliding": HandMotion(  # the tissue of the scene `upper_arm` ends at 36 mm
+        "pressed, off an edge of the tissue and back onto it",
+        (0.018, -0.0024, 0.0045),
+        (0.045, 0.0024, 0.0105),
+    ),
+    "tilting": HandMotion(
+        "pressed, tilting to all sides",
+        (0.0, 0.0, 0.0075),
+        (0.0, 0.0, 0.0075),
+        (0.0, _TILT, _TILT),
+    ),
+    "stabbing": HandMotion(
+        "lifted, put elsewhere and stabbed in again",
+        (-0.018, -0.012, -0.005),
+        (0.018, 0.012, 0.015),
+        steep=1.8,
+    ),
+}
+"""By name."""
 
 
-def hand_motion(
-    kind: str,
-    haste: str,
-    seed: int,
-    duration: float = 5.0,
-    room: Room | None = None,
-    *,
-    approach: float = 0.0,
-) -> ProbePath:
-    """Make a random motion of a hand.
+def hand_motion(kind: str, haste: str, seed: int, duration: float = 5.0) -> list[Pose]:
+    """Make a random motion of a hand, and its approach from above the skin.
 
     Each coordinate follows a sum of waves of a narrow band of frequencies and random phases, which
     the error function maps to the coordinate's range: it is everywhere in it about equally often,
@@ -132,56 +96,47 @@ def hand_motion(
         kind: one of `KINDS`.
         haste: one of `HASTES`.
         seed: not negative; another number gives another motion.
-        duration: s.
-        room: how far it goes.
-        approach: s before the motion, in which the probe comes from above the skin to where that
-            begins; its speed is none of the motion's.
+        duration: s, without the approach, whose speed is none of the motion's.
 
     Returns:
-        ``RATE * (approach + duration)`` poses on ``/tracker/pose`` in frame ``patient``.
+        ``RATE * (APPROACH + duration)`` poses in frame ``patient``.
     """
-    motion, asked, room = KINDS[kind], HASTES[haste], room or Room()
+    motion, asked = KINDS[kind], HASTES[haste]
+    low, high, angles = np.array([motion.low, motion.high, motion.turn])
     # The same number must not give the kinds' coordinates the same curves.
     random = np.random.default_rng([seed, zlib.crc32(f"{kind} {haste}".encode())])
-    place, turn = _place(motion, room, random), _turn(motion, room, random)
-    coming = round(RATE * approach)
+    moving, turning = _wander(random, motion.steep), _wander(random, motion.steep)
+
+    def place(times: _Array) -> _Array:
+        return np.asarray(low + (high - low) * moving(times))
+
+    def turn(times: _Array) -> Rotation:
+        return Rotation.from_euler("ZXY", angles * (2 * turning(times) - 1))
+
+    def speeds(times: _Array) -> _Array:
+        return np.asarray(RATE * np.linalg.norm(np.diff(place(times), axis=0), axis=1))
+
+    def turnings(times: _Array) -> _Array:
+        turned = turn(times)
+        return np.asarray(RATE * (turned[:-1].inv() * turned[1:]).magnitude())
+
+    coming = round(RATE * APPROACH)
     times = np.arange(round(RATE * duration)) / RATE
-    moving = _tempo(lambda t: _lengths(place(t)), asked.speed, times) if motion.moves else 0.0
-    turning = _tempo(lambda t: _angles(turn(t)), asked.turning, times) if motion.turns else 0.0
     begun = np.concatenate([np.zeros(coming), times])
-    positions, turns = place(moving * begun), turn(turning * begun)
-    present = np.concatenate(
-        [_minimum_jerk(np.arange(coming) / max(coming, 1)), np.ones_like(times)]
-    )
+    positions = place(begun * (_tempo(speeds, asked.speed, times) if np.any(high > low) else 0.0))
+    turns = turn(begun * (_tempo(turnings, asked.turning, times) if angles.any() else 0.0))
+    part = np.arange(coming) / coming
+    # From rest to rest as a hand moves (Flash and Hogan 1985).
+    smooth = part**3 * (10 - 15 * part + 6 * part**2)
+    present = np.concatenate([smooth, np.ones_like(times)])[:, None]
     # On the straight way from 10 mm above the skin, upright.
     hover = np.array([0.0, 0.0, -0.010])
-    positions = hover + present[:, None] * (positions - hover)
-    turns = Rotation.from_rotvec(present[:, None] * turns.as_rotvec())
-    stamps = EPOCH + np.round(np.arange(len(begun)) / RATE * 1e9).astype(np.int64)
-    return ProbePath("/tracker/pose", "patient", stamps, positions, turns.as_quat())
+    positions = hover + present * (positions - hover)
+    orientations = Rotation.from_rotvec(present * turns.as_rotvec()).as_quat()
+    return [Pose(*placed) for placed in zip(positions, orientations, strict=True)]
 
 
-def _place(motion: HandMotion, room: Room, random: np.random.Generator) -> _Curve:
-    """Positions (K, 3) m at times (K,)."""
-    side, across = motion.aside * room.aside, motion.across * room.across
-    low, high = (part * (room.deepest if part > 0 else room.above) for part in motion.depth)
-    # Over the edge it turns back a quarter beyond it.
-    aside = (0.5 * room.edge, 1.25 * room.edge) if motion.over_the_edge else (-side, side)
-    ranges = np.array([aside, (-across, across), (low, high)])
-    curve = _wander(random, motion.steep)
-    return lambda times: ranges[:, 0] + (ranges[:, 1] - ranges[:, 0]) * curve(times)
-
-
-def _turn(
-    motion: HandMotion, room: Room, random: np.random.Generator
-) -> Callable[[_Array], Rotation]:
-    """Rotations at times (K,): the yaw first, then about the axes of the turned probe."""
-    angles = np.array([motion.yaw * room.yaw, motion.tilt * room.tilt, motion.tilt * room.tilt])
-    curve = _wander(random, motion.steep)
-    return lambda times: Rotation.from_euler("ZXY", angles * (2 * curve(times) - 1))
-
-
-def _wander(random: np.random.Generator, steep: float) -> _Curve:
+def _wander(random: np.random.Generator, steep: float) -> Callable[[_Array], _Array]:
     """Three random curves of times (K,), with values (K, 3) from 0 to 1."""
     count = 6
     frequency = random.uniform(0.4, 1.6, (count, 3))  # cycles of the curve's own unit of time
@@ -195,29 +150,13 @@ def _wander(random: np.random.Generator, steep: float) -> _Curve:
     return curve
 
 
-def _tempo(steps: _Curve, asked: float, times: _Array) -> float:
-    """Find how many of its units a curve runs through in a second, so that its steps are as asked.
-
-    ``steps`` are from one of the times (K,) s to the next, of which the median is a speed.
-    """
+def _tempo(speeds: Callable[[_Array], _Array], asked: float, times: _Array) -> float:
+    """Find how many of its units a curve runs through in a second for its median speed."""
 
     def excess(tempo: float) -> float:
-        return float(np.median(steps(tempo * times))) * RATE - asked
+        return float(np.median(speeds(tempo * times))) - asked
 
     high = 1e-4
     while excess(high) < 0.0:
         high *= 2.0
     return float(brentq(excess, 0.5 * high, high))
-
-
-def _lengths(positions: _Array) -> _Array:
-    return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-
-
-def _angles(turns: Rotation) -> _Array:
-    return np.asarray((turns[:-1].inv() * turns[1:]).magnitude())
-
-
-def _minimum_jerk(part: _Array) -> _Array:
-    """(K,) from 0 to 1 as a hand moves from rest to rest (Flash and Hogan 1985)."""
-    return part**3 * (10 - 15 * part + 6 * part**2)

@@ -5,8 +5,8 @@ converges follows the poses in order, and is called again at each until it has c
 further.
 
 >>> from us_sim.evaluation.hand.measure import motions
->>> [str(motion) for motion in motions(quick=True, seed=1)][0]
-'free, brisk'
+>>> motions(quick=True, seed=1)[0]
+Motion(kind='free', haste='brisk', seed=1, duration=2.0)
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from us_sim.evaluation.hand.hand_motion import HASTES, KINDS, RATE, Room, hand_motion
+from us_sim.evaluation.hand.hand_motion import APPROACH, HASTES, KINDS, RATE, hand_motion
 from us_sim.evaluation.tissue_methods import TISSUE_METHODS
 from us_sim.geometry.pose import Pose
 from us_sim.scene.building import tissue_model_of, volume_of
@@ -34,9 +34,7 @@ from us_sim.tissue.solvers.frame_budget import Pace
 from us_sim.tissue.solvers.solver import TissueSolver, create_solver
 
 METHOD = "fem_nonlinear"  # the method whose converged frames are the answer
-APPROACH = 0.5  # s, in which the probe comes to where a motion begins: these frames do not count
-BEGINS = round(APPROACH * RATE)  # the frame after it
-ROOM = Room()
+BEGINS = round(APPROACH * RATE)  # the frame after the approach, whose frames do not count
 CONVERGED = 1e-5  # residual at which a pose is left for the next
 TRUSTED = 1e-3  # residual of the answer above which nothing is compared with it
 AWAY = 1.0  # mm to the converged answer, beyond which tissue is elsewhere
@@ -60,14 +58,10 @@ class Motion:
     seed: int
     duration: float  # s, without the approach
 
-    def __str__(self) -> str:
-        return f"{self.kind}, {self.haste}"
-
     @cached_property
     def poses(self) -> list[Pose]:
         """One pose a frame, those of the approach first."""
-        path = hand_motion(self.kind, self.haste, self.seed, self.duration, ROOM, approach=APPROACH)
-        return path.poses
+        return hand_motion(self.kind, self.haste, self.seed, self.duration)
 
 
 def motions(quick: bool, seed: int) -> list[Motion]:
@@ -92,7 +86,7 @@ class Converged:
 
 def converged(model: TissueModel, poses: Sequence[Pose]) -> Converged:
     """Follow the poses, each to convergence."""
-    solver = create_solver(METHOD, model, **(TISSUE_METHODS[METHOD].patient or {}))
+    solver = create_solver(METHOD, model, **TISSUE_METHODS[METHOD].patient)
     found = [_settled(solver, pose) for pose in poses]
     nodes = np.array([deformation.nodes for deformation in found])
     return Converged(nodes, np.array([deformation.residual for deformation in found]))
@@ -159,7 +153,7 @@ def follow(solver: TissueSolver, motion: Motion, answer: Converged) -> dict[str,
         "live_away_ms": longest_away(live),
         **_percentiles("live_latency_ms", live["latency"], (50, 99, 100)),
         "live_frames_inverted": int((live["inverted"] > 0).sum()),
-        "every": frames.assign(s=(frames["number"] - BEGINS) / RATE),
+        "every": frames,
         "live": live,
     }
 
@@ -229,20 +223,19 @@ def _frame(solver: TissueSolver, motion: Motion, answer: Converged, k: int) -> F
     return Frame(k, 1e3 * error, found.residual, int(inverted.sum()), 1e3 * processor, 1e3 * wall)
 
 
-class Bench:
-    """Measures motions; keeps the last motion's answer, and the solvers."""
+@lru_cache(1)
+def _answer(motion: Motion) -> Converged:
+    return converged(arm(), motion.poses)
 
-    def __init__(self) -> None:
-        self._answers: dict[Motion, Converged] = {}
-        self._solvers: dict[str, TissueSolver] = {}
 
-    def row(self, motion: Motion, method: str) -> list[dict[str, Any]]:
-        """Row of a method."""
-        with threadpool_limits(1):
-            if motion not in self._answers:
-                self._answers = {motion: converged(arm(), motion.poses)}
-            if method not in self._solvers:
-                solver = create_solver(method, arm())
-                solver.warm_up()
-                self._solvers[method] = solver
-            return [follow(self._solvers[method], motion, self._answers[motion])]
+@cache
+def _solver(method: str) -> TissueSolver:
+    solver = create_solver(method, arm())
+    solver.warm_up()
+    return solver
+
+
+def motion_rows(motion: Motion, method: str) -> list[dict[str, Any]]:
+    """Row of a method; the answer of the last motion is kept, and the solvers."""
+    with threadpool_limits(1):
+        return [follow(_solver(method), motion, _answer(motion))]
