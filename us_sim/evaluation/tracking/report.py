@@ -1,4 +1,4 @@
-"""`us-sim evaluate tracking`: bodies of markers in rendered views, small markers, and filters."""
+"""`us-sim evaluate tracking`: bodies of markers in rendered views."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from us_sim.evaluation.tracking.cases import (
     Case,
     cases,
 )
-from us_sim.evaluation.tracking.filters import filter_pieces
 from us_sim.evaluation.tracking.measure import Tracking
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
 
@@ -37,10 +36,7 @@ _ERRORS = {"median_mm": "position, mm", "median_deg": "rotation, degrees"}
 
 def _pieces(quick: bool) -> Mapping[str, Sequence[Piece]]:
     tracking = Tracking()
-    return {
-        "tracking": [_case_piece(tracking, case, quick) for case in cases(quick)],
-        "filters": filter_pieces(quick),
-    }
+    return {"tracking": [_case_piece(tracking, case, quick) for case in cases(quick)]}
 
 
 def _case_piece(tracking: Tracking, case: Case, quick: bool) -> Piece:
@@ -57,7 +53,7 @@ def _case_piece(tracking: Tracking, case: Case, quick: bool) -> Piece:
     return Piece(columns, partial(tracking.row, case, sequences))
 
 
-def _report(table: pd.DataFrame, filters: pd.DataFrame) -> Report:
+def _report(table: pd.DataFrame) -> Report:
     case = ["marker", "image_size", "distance_m", "angle_deg", "condition"]
     shots = pd.concat(
         [row.shots.assign(**{n: row[n] for n in case}) for _, row in table.iterrows()]
@@ -83,17 +79,12 @@ def _report(table: pd.DataFrame, filters: pd.DataFrame) -> Report:
         Target.at_most("single 40 mm marker in plain views: % flipped", 0.5, flips),
     ]
     hidden = near[(near["condition"] == "occlusion") & (near["marker"] == SINGLE)]
-    best = filters[filters["default"]].set_index("filter")
-    kalman, euro = best.loc["kalman"], best.loc["one_euro"]
     take_home = [
         f"A body of six 30 mm markers at 0.4 m before a webcam is {body['mm'].median():.2g} mm and "
         f"{body['degrees'].median():.2g}° off (median), in {ms[SMALL]:.2g} ms of one core.",
         f"A single 40 mm marker flips to its mirror image in {flips:.2g} % of the views; a hand "
         f"over a third of it hides it in {100 * (1 - hidden['detected'].mean()):.0f} %, where a "
         f"body of several is still tracked.",
-        f"The Kalman filter is {kalman['lag_ms']:.1f} ms late and {kalman['error_mm']:.2g} mm off "
-        f"in motion, the 1 € filter {euro['lag_ms']:.0f} ms and {euro['error_mm']:.2g} mm; at rest "
-        f"that one trembles least.",
     ]
     places = {
         "count": f"{len(shots):,}",
@@ -126,8 +117,6 @@ def _report(table: pd.DataFrame, filters: pd.DataFrame) -> Report:
             shots[shots["condition"] == "plain"], ["marker", "image_size", "distance_m"]
         ),
         "conditions": _summed(near, ["marker", "condition"]),
-        "filters": _draw_filters(filters),
-        "filters_table": filters.drop(columns=["rate_hz", "noise_mm", "noise_deg"]),
     }
     return Report(take_home, places, targets)
 
@@ -164,27 +153,6 @@ def _draw_errors(table: pd.DataFrame, parameter: str, title: str) -> Figure:
     return draw_error_over_parameter(_melted(table), parameter, "error", title, **look)
 
 
-def _draw_filters(filters: pd.DataFrame) -> Figure:
-    """Lag in motion against the jitter at rest, and against the error at the very moment."""
-    names = {
-        "jitter_mm": "trembling at rest, mm (root mean square)",
-        "error_mm": "error in motion at the very moment, mm",
-    }
-    kept = ["filter", "lag_ms", "default"]
-    rows = filters.melt(kept, list(names), var_name="of", value_name="error")
-    return draw_error_over_parameter(
-        rows.assign(of=rows["of"].map(names)),
-        "lag_ms",
-        "error",
-        "Filters at 60 poses a second (full: the default settings)",
-        panels="of",
-        lines="filter",
-        filled="default",
-        join=False,
-        labels={"lag_ms": "lag in motion, ms", "error": "mm"},
-    )
-
-
 def _draw_views() -> Figure:
     """A row for each condition and a column for each body, cut from the image around it."""
     cut = 240  # pixels
@@ -207,6 +175,6 @@ TRACKING = Subject(
     "Tracking: error against run time",
     _pieces,
     _report,
-    hidden=("shots", "default"),
-    libraries=("numpy", "numba", "opencv-python-headless", "opencv-python"),
+    hidden=("shots",),
+    libraries=("opencv-python-headless", "opencv-python"),
 )
