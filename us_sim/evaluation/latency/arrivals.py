@@ -26,6 +26,12 @@ HOPS = {
 _HEADER = struct.Struct("<4xiI")  # where a serialized message with a header has its stamp
 
 
+def stamp_of(data: bytes) -> int:
+    """The stamp, ns, of a serialized message with a header."""
+    seconds, nanoseconds = _HEADER.unpack_from(data)
+    return int(1_000_000_000 * seconds + nanoseconds)
+
+
 class Arrivals(Node):  # type: ignore[misc]
     """Subscribes to topics without looking at more of their messages than the stamps."""
 
@@ -49,5 +55,4 @@ class Arrivals(Node):  # type: ignore[misc]
 
     @staticmethod
     def _note(heard: list[tuple[int, int]], data: bytes) -> None:
-        seconds, nanoseconds = _HEADER.unpack_from(data)
-        heard.append((1_000_000_000 * seconds + nanoseconds, time.time_ns()))
+        heard.append((stamp_of(data), time.time_ns()))

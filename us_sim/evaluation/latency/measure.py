@@ -2,7 +2,7 @@
 
 >>> from us_sim.evaluation.latency.measure import cases
 >>> [str(case) for case in cases(quick=True)][:2]
-['fem, 512 x 512, recorder', 'fem_nonlinear, 512 x 512, recorder']
+['fem, 512x512, recorder', 'fem_nonlinear, 512x512, recorder']
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from us_sim.evaluation.processes import UsageOverTime, listening, simulating, started_by
 from us_sim.evaluation.report import percentile
@@ -27,7 +26,6 @@ from us_sim.recording.reader import read_bag
 from us_sim.share import find_bag
 
 HAND = 0.1  # m/s of a hand, by which a delay becomes a distance
-Heard = Sequence[tuple[int, int]]  # stamps and times of arrival, ns
 
 
 @dataclass(frozen=True)
@@ -35,34 +33,24 @@ class Case:
     """One way to run the scene ``upper_arm``."""
 
     solver: str = "fem"
-    image: tuple[int, int] = (512, 512)  # columns and rows
+    image: str = "512x512"  # columns and rows
     recorder: bool = True
-    busy: bool = False  # something else keeps every core busy
-    realtime: bool = True  # the nodes go before ordinary programs, where the system allows that
+    cores_busy: bool = False  # with something else
     seconds: float = 20.0
+    realtime: bool = True  # the nodes go before ordinary programs, where the system allows that
 
     def __str__(self) -> str:
-        columns, rows = self.image
-        parts = [self.solver, f"{columns} x {rows}"]
-        parts += ["recorder"] if self.recorder else []
-        parts += ["cores busy"] if self.busy else []
-        return ", ".join([*parts, "as ordinary programs"] if not self.realtime else parts)
-
-    @property
-    def columns(self) -> dict[str, Any]:
-        """The case in the CSV; its words are for the report."""
-        return {
-            "case": str(self),
-            "solver": self.solver,
-            "image": "x".join(map(str, self.image)),
+        words = {
+            f"{self.solver}, {self.image}": True,
             "recorder": self.recorder,
-            "cores_busy": self.busy,
-            "seconds": self.seconds,
+            "cores busy": self.cores_busy,
+            "as ordinary programs": not self.realtime,
         }
+        return ", ".join(word for word, is_said in words.items() if is_said)
 
 
 DEMO = Case("fem_nonlinear", seconds=130.0)  # the method of the demo
-BUSY = replace(DEMO, busy=True, seconds=20.0)
+BUSY = replace(DEMO, cores_busy=True, seconds=20.0)
 
 
 def cases(quick: bool) -> list[Case]:
@@ -73,26 +61,13 @@ def cases(quick: bool) -> list[Case]:
     return [
         base,
         replace(base, recorder=False),
-        replace(base, image=(256, 256)),
-        replace(base, image=(768, 768)),
+        replace(base, image="256x256"),
+        replace(base, image="768x768"),
         *(replace(base, solver=solver) for solver in ("fem_cg", "msds")),
         DEMO,
         BUSY,
         ordinary,
     ]
-
-
-def write_scene(case: Case, folder: Path) -> Path:
-    """Write ``scene.yaml`` to a folder, and return it."""
-    document = {
-        "name": "latency",
-        "based_on": "upper_arm",
-        "probe": {"image": list(case.image)},
-        "tissue": {"solver": case.solver},
-    }
-    file = folder / "scene.yaml"
-    file.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-    return file
 
 
 def run_case(case: Case) -> list[dict[str, Any]]:
@@ -101,17 +76,20 @@ def run_case(case: Case) -> list[dict[str, Any]]:
     Raises:
         UsSimError: the simulation ends, or no image comes.
     """
+    from us_sim.evaluation.latency.arrivals import stamp_of
     from us_sim.nodes.process import scheduling_of
 
     with tempfile.TemporaryDirectory(prefix="us_sim_latency_") as name:
-        folder = Path(name)
-        session = folder / "session.mcap"
-        words = ["run", str(write_scene(case, folder)), "--param", "path_player.loop=true"]
-        words += ["--path", str(find_bag("press_and_slide.mcap"))]
+        scene, session = Path(name) / "scene.yaml", Path(name) / "session.mcap"
+        image = f"[{case.image.replace('x', ', ')}]"
+        changes = f"probe: {{image: {image}}}\ntissue: {{solver: {case.solver}}}\n"
+        scene.write_text(f"name: latency\nbased_on: upper_arm\n{changes}")
+        words = ["run", str(scene), "--path", str(find_bag("press_and_slide.mcap"))]
+        words += ["--param", "path_player.loop=true"]
         words += ["--record", str(session)] if case.recorder else []
         for node in ("probe_tracker", "tissue_deformer", "skin_deformer", "slice_interpolator"):
             words += ["--param", f"{node}.realtime={str(case.realtime).lower()}"]
-        busy = _busy_cores() if case.busy else contextlib.nullcontext()
+        busy = _busy_cores() if case.cores_busy else contextlib.nullcontext()
         with listening() as arrivals, busy, simulating(*words) as simulation:
             simulation.await_images(arrivals)
             time.sleep(2.0)  # these images do not count
@@ -126,13 +104,16 @@ def run_case(case: Case) -> list[dict[str, Any]]:
             ended_ns = time.time_ns()
             time.sleep(1.5)  # for messages under way to arrive, and to be recorded
             heard = arrivals.heard_between(began_ns, ended_ns)
-        stamps = {stamp for stamp, _ in heard["ultrasound/image"]}
-        recorded = _recorded(session, stamps) if case.recorder else None
+        recorded = None
+        if case.recorder:
+            there = read_bag(session).messages(["/ultrasound/image"])
+            stamps = {stamp for stamp, _ in heard["ultrasound/image"]}
+            recorded = len(stamps & {stamp_of(message.data) for message in there})
     return [{"scheduling": scheduling, **row_of(heard, recorded, usage.columns())}]
 
 
 def row_of(
-    heard: Mapping[str, Heard], recorded: int | None, usage: Mapping[str, float]
+    heard: Mapping[str, Sequence[tuple[int, int]]], recorded: int | None, usage: Mapping[str, float]
 ) -> dict[str, Any]:
     """Row of what was heard by topic, in their order, and of the usage.
 
@@ -141,25 +122,26 @@ def row_of(
         recorded: number of the images that were heard and recorded; None without a recorder.
         usage: columns of `UsageOverTime`.
     """
-    images = heard["ultrasound/image"]
     ages = {
         topic: np.array([1e-6 * (came - stamp) for stamp, came in heard[topic]]) for topic in heard
     }
     age = ages["ultrasound/image"]
-    passed = images[-1][1] - images[0][1] if len(images) > 1 else 0
-    stamps = {stamp for stamp, _ in images}
-    missed = {stamp for stamp, _ in heard["tracker/pose"]} - stamps
-    of_all = {
-        part: [value for name, value in usage.items() if name.startswith(f"{part}_")]
-        for part in ("cores", "memory_mb", "growth_mb_a_minute")
-    }
+    stamps, came = np.array(heard["ultrasound/image"], dtype=np.int64).reshape(-1, 2).T
+    passed = 1e-9 * np.ptp(came) if len(came) else 0.0
+    poses = np.array([stamp for stamp, _ in heard["tracker/pose"]])
+    # Of the poses between the first and the last image.
+    missed = np.setdiff1d(poses, stamps)
+    missed = missed[(missed > stamps.min(initial=2**62)) & (missed < stamps.max(initial=0))]
+
+    def of_all(part: str) -> list[float]:
+        return [value for name, value in usage.items() if name.startswith(part)]
+
     return {
-        "poses": len(heard["tracker/pose"]),
-        "images": len(images),
-        "images_a_second": 1e9 * (len(images) - 1) / passed if passed else np.nan,
-        # Of the poses between the first and the last image.
-        "dropped": sum(min(stamps) <= stamp <= max(stamps) for stamp in missed) if stamps else 0,
-        "not_recorded": np.nan if recorded is None else float(len(images) - recorded),
+        "poses": len(poses),
+        "images": len(stamps),
+        "images_a_second": (len(stamps) - 1) / passed if passed else np.nan,
+        "dropped": len(missed),
+        "not_recorded": np.nan if recorded is None else float(len(stamps) - recorded),
         **{
             f"{topic.replace('/', '_')}_ms_{name}": percentile(ages[topic], percent)
             for topic in ages
@@ -169,24 +151,10 @@ def row_of(
         "image_mm_p50": HAND * percentile(age, 50),
         "image_mm_p99": HAND * percentile(age, 99),
         **{name: value for name, value in usage.items() if name.startswith("cores_")},
-        "cores_all": sum(of_all["cores"]),
-        "memory_mb_all": sum(of_all["memory_mb"]),
-        "growth_mb_a_minute": max(of_all["growth_mb_a_minute"], default=np.nan),
-        "ages": [
-            {"s": 1e-9 * (came - images[0][1]), "ms": 1e-6 * (came - stamp)}
-            for stamp, came in images
-        ],
+        "cores_all": sum(of_all("cores_")),
+        "memory_mb_all": sum(of_all("memory_mb_")),
+        "growth_mb_a_minute": max(of_all("growth_mb_a_minute_"), default=np.nan),
     }
-
-
-def _recorded(file: Path, stamps: set[int]) -> int:
-    """How many images with one of the stamps (ns) the recording has."""
-    there = set()
-    for message in read_bag(file).messages(["/ultrasound/image"]):
-        stamp = message.data[4:12]
-        seconds = int.from_bytes(stamp[:4], "little", signed=True)
-        there.add(1_000_000_000 * seconds + int.from_bytes(stamp[4:], "little"))
-    return len(stamps & there)
 
 
 @contextlib.contextmanager

@@ -48,14 +48,12 @@ def cases(quick: bool) -> list[Case]:
 
 BROWSER = "1 browser"
 """A page in a Chromium without a window, which draws with the processor."""
-DRAG, PERIOD, RATE = 90.0, 2.0, 60.0
-"""CSS pixels and s of the drag that is repeated, and how often the mouse tells where it is, Hz."""
-MOVE = """([x, y, seconds, drag, period, rate]) => new Promise((resolve) => {
+MOVE = """([x, y, seconds]) => new Promise((resolve) => {
     const target = document.elementFromPoint(x, y);
     const began = performance.now();
     const timer = setInterval(() => {
         const passed = (performance.now() - began) / 1000;
-        const down = 0.5 * drag * (1 - Math.cos((2 * Math.PI * passed) / period));
+        const down = 45 * (1 - Math.cos(Math.PI * passed));
         target.dispatchEvent(new PointerEvent("pointermove", {
             pointerId: 1, pointerType: "mouse", isPrimary: true, buttons: 1, bubbles: true,
             clientX: x, clientY: y + down,
@@ -63,9 +61,9 @@ MOVE = """([x, y, seconds, drag, period, rate]) => new Promise((resolve) => {
         if (passed < seconds) return;
         clearInterval(timer);
         resolve();
-    }, 1000 / rate);
+    }, 1000 / 60);
 })"""
-"""Moves of the mouse, made within the page: from outside each would take longer than an image."""
+"""A drag of 90 CSS pixels and back in 2 s, made within the page: from outside it is slow."""
 
 
 @contextlib.contextmanager
@@ -123,7 +121,7 @@ class Page:
         x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.3 * box["height"]
         self.page.mouse.move(x, y)
         self.page.mouse.down()
-        self.page.evaluate(MOVE, [x, y, seconds, DRAG, PERIOD, RATE])
+        self.page.evaluate(MOVE, [x, y, seconds])
         self.page.mouse.up()
 
     def delays(self) -> dict[str, float]:
