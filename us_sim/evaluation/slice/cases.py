@@ -1,8 +1,8 @@
 """Images that `us-sim evaluate slice` cuts of a block of speckle.
 
->>> from us_sim.evaluation.slice.cases import MAIN, dented
->>> MAIN.name, len(MAIN.mesh().nodes), float(dented(np.zeros((1, 3)), 0.012)[0, 2])
-('512 px, 32x16x16 nodes, pressed_12mm, straight', 8192, 0.012)
+>>> from us_sim.evaluation.slice.cases import MAIN, block, dented
+>>> len(block(MAIN.counts).nodes), float(dented(np.zeros((1, 3)), 0.012)[0, 2])
+(8192, 0.012)
 """
 
 from __future__ import annotations
@@ -10,16 +10,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from us_sim.evaluation.block import EXTENT, LARGEST_MESH, MESHES, block
 from us_sim.geometry.pose import Pose
 from us_sim.slicing.probe.plane import SlicePlane
 from us_sim.slicing.probe.probe import LinearProbe
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
 Array = NDArray[np.float64]
@@ -33,27 +34,24 @@ _VOXEL = 0.4e-3  # m
 _WIDTH = 0.022  # m, standard deviation of the dent
 
 
-@dataclass(frozen=True)
-class _View:
+class View(NamedTuple):
     """Where the image lies and how it is turned, seen from where the probe stands."""
 
     words: str
     turned: float = 0.0  # degrees about the probe's axis
     tilted: float = 0.0  # degrees about the image's columns' direction, first
     beside: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, from where the probe stands
-    on_faces: bool = False  # moved onto a layer of the mesh's faces
 
 
 PLANES = {
-    "straight": _View("in the probe's plane"),
-    "oblique": _View("turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)),
-    "corner": _View("turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)),
-    "faces": _View("along a layer of faces", on_faces=True),
+    "straight": View("in the probe's plane"),
+    "oblique": View("turned by 25° and tilted by 30°, from above the skin", 25, 30, (0, 0, -0.01)),
+    "corner": View("turned by 70°, tilted by 40°, out of the block", 70, 40, (0.06, 0.03, 0.01)),
+    "faces": View("along a layer of faces"),
 }
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """Nodes and plane of one image."""
 
     nodes: Array  # (N, 3) m, deformed
@@ -69,33 +67,23 @@ class Case:
     deformation: str
     plane: str
 
-    @property
-    def name(self) -> str:
-        """The case in words, as on the screen."""
-        counts = "x".join(map(str, self.counts))
-        return f"{self.size} px, {counts} nodes, {self.deformation}, {self.plane}"
-
-    def mesh(self) -> TetrahedralMesh:
-        """The block at rest."""
-        return block(self.counts)
-
     def frames(self, count: int) -> list[Frame]:
         """Images of a trembling probe, so that none repeats the one before."""
-        rest = self.mesh().nodes
+        rest = block(self.counts).nodes
         depth, view = DEPTHS[self.deformation], PLANES[self.plane]
         found = []
         for number in range(count):
             nodes = dented(rest, depth * (1.0 - 0.01 * number))
             position = np.array(view.beside)
             position[2] += depth
-            if view.on_faces:
+            if self.plane == "faces":
                 layers = rest[:, 1]
                 position[1] = layers[np.abs(layers).argmin()]
             else:
                 position += 0.2e-3 * number  # m
-            pose = Pose(position, _turn(math.radians(view.turned), math.radians(view.tilted)))
+            turn = Rotation.from_euler("xz", [view.tilted, view.turned], degrees=True)
             probe = LinearProbe(0.06, 0.08, self.size, self.size)
-            found.append(Frame(nodes, probe.plane(pose)))
+            found.append(Frame(nodes, probe.plane(Pose(position, turn.as_quat()))))
         return found
 
 
@@ -103,11 +91,7 @@ MAIN = Case(512, MESHES[-1], "pressed_12mm", "straight")  # the case by which me
 
 
 def cases(quick: bool) -> list[Case]:
-    """All that are cut.
-
-    Every deformation on every plane in the middle size on the finest of the paper's meshes; every
-    mesh with every deformation; every size on every mesh. The quick run leaves most of it out.
-    """
+    """All that are cut, the main one first; the quick run leaves most of them out."""
     if quick:
         return [
             MAIN,
@@ -142,13 +126,13 @@ def dented(nodes: Array, depth: float) -> Array:
 
 
 @cache
-def speckle(seed: int = 1) -> Volume:
+def speckle() -> Volume:
     """The block's volume, and a little around it: speckle with bright layers."""
     axes = [
         low - _BEYOND + _VOXEL * (np.arange(math.ceil((high - low + 2 * _BEYOND) / _VOXEL)) + 0.5)
         for low, high in EXTENT
     ]
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(1)
     echo = generator.standard_normal([len(axis) for axis in axes], dtype=np.float32)
     for axis in range(3):
         echo = ndimage.correlate1d(echo, np.array([0.25, 0.5, 0.25], np.float32), axis)
@@ -159,10 +143,3 @@ def speckle(seed: int = 1) -> Volume:
     placed = np.diag([_VOXEL, _VOXEL, _VOXEL, 1.0])
     placed[:3, 3] = [axis[0] for axis in axes]
     return Volume(np.minimum(grey, 255.0, out=grey).astype(np.uint8), placed)
-
-
-def _turn(about_z: float, about_x: float) -> Array:
-    """The quaternion (x, y, z, w) of a tilt about x, then a turn about z, both in radians."""
-    sx, cx = math.sin(about_x / 2), math.cos(about_x / 2)
-    sz, cz = math.sin(about_z / 2), math.cos(about_z / 2)
-    return np.array([cz * sx, sz * sx, sz * cx, cz * cx])

@@ -4,13 +4,14 @@ That one tries every tetrahedron for every pixel, in float64. What it finds is h
 algebra and SciPy in the tests.
 
 >>> from us_sim.evaluation.slice.measure import SLICING_METHODS
->>> [name for name in SLICING_METHODS if name != "vtk"]
-['scan_conversion', 'per_pixel']
+>>> SLICING_METHODS[0]
+('scan_conversion', 1)
 """
 
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -18,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from us_sim.evaluation.block import block
 from us_sim.evaluation.slice.cases import Case, Frame, speckle
 from us_sim.slicing.cutting.slicer import Slicer, create_slicer
 from us_sim.slicing.probe.plane import SlicePlane
-from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.volume.volume import Volume
 
 Array = NDArray[np.float64]
@@ -32,89 +33,70 @@ OURS = "scan_conversion"
 REFERENCE = "per_pixel"
 WRONG = 0.1  # voxels at rest, beyond which a pixel shows other tissue
 
-SLICING_METHODS = {OURS: (1, 2), REFERENCE: (1,), "vtk": (1, 2)}
-"""Numbers of threads that each method is timed with, in the report's order.
-
-VTK knows nothing of the rigid volume around the tissue: it is compared where tissue is.
-"""
-
-
-def method_names() -> list[str]:
-    """Methods that can be evaluated here."""
-    has_vtk = importlib.util.find_spec("vtkmodules") is not None
-    return [name for name in SLICING_METHODS if name != "vtk" or has_vtk]
-
-
-def slicer_of(method: str, threads: int, volume: Volume, mesh: TetrahedralMesh) -> AnySlicer:
-    """A method that is ready to cut a volume, carried by a mesh."""
-    if method == "vtk":
-        return VtkSlicer(volume, mesh.nodes, mesh.tetrahedra, threads)
-    return create_slicer(method, volume, mesh.nodes, mesh.tetrahedra, threads=threads)
+SLICING_METHODS = ((OURS, 1), (OURS, 2), (REFERENCE, 1))
+"""Methods and their numbers of threads, in the report's order; VTK is the last, where it is."""
 
 
 def case_rows(case: Case, seconds: float) -> list[dict[str, Any]]:
     """A row for every method, timed together for so many seconds."""
-    volume, mesh, frames = speckle(), case.mesh(), case.frames(4)
+    volume, mesh, frames = speckle(), block(case.counts), case.frames(4)
     first = frames[0]
     reference = create_slicer(REFERENCE, volume, mesh.nodes, mesh.tetrahedra)
-    exact = (
-        reference.image(first.nodes, first.plane),
-        reference.rest_coordinates(first.nodes, first.plane),
-    )
-    keys = [(name, threads) for name in method_names() for threads in SLICING_METHODS[name]]
-    slicers = [slicer_of(*key, volume, mesh) for key in keys]
+    exact = reference.image(*first), reference.rest_coordinates(*first)
+    where = volume, mesh.nodes, mesh.tetrahedra
+    slicers: list[tuple[str, int, Slicer | VtkSlicer]] = [
+        (name, threads, create_slicer(name, *where, threads=threads))
+        for name, threads in SLICING_METHODS
+    ]
+    if importlib.util.find_spec("vtkmodules") is not None:
+        slicers.append(("vtk", 1, VtkSlicer(*where)))
     rows: list[dict[str, Any]] = []
-    for (method, threads), slicer in zip(keys, slicers, strict=True):
-        image = slicer.image(first.nodes, first.plane)
-        rest = slicer.rest_coordinates(first.nodes, first.plane)
+    for method, threads, slicer in slicers:
+        image, rest = slicer.image(*first), slicer.rest_coordinates(*first)
         errors = compare(volume, first, exact, image, rest, tissue_only=method == "vtk")
         rows.append({"method": method, "tets": len(mesh.tetrahedra), "threads": threads, **errors})
-    times = timed_together(slicers, frames, seconds)
+    times = timed_together([slicer for *_, slicer in slicers], frames, seconds)
     return [{**row, **columns} for row, columns in zip(rows, times, strict=True)]
 
 
 def timed_together(
-    slicers: Sequence[AnySlicer], frames: Sequence[Frame], seconds: float
+    slicers: Sequence[Slicer | VtkSlicer], frames: Sequence[Frame], seconds: float
 ) -> list[dict[str, float]]:
     """Times of all slicers, by column, in turns on a noisy machine.
 
-    The probe moves on from image to image. A turn has five images of a method that takes less than
-    8 ms, one of another.
-
     Args:
         slicers: to be timed; each has cut an image before, so that nothing is compiled now.
-        frames: that they cut, over and over.
+        frames: that they cut, over and over, five in a turn where one takes less than 8 ms.
         seconds: after which no further turn begins, if each has had three; methods slower than 150
             ms sit those out.
     """
-    found: list[list[tuple[float, float]]] = [[] for _ in slicers]  # ms: wall clock, processor
+    walls: list[list[float]] = [[] for _ in slicers]  # ms
+    owns: list[list[float]] = [[] for _ in slicers]  # ms of the processor
     begin = time.perf_counter()
-    turn = 0
-    while turn < 3 or time.perf_counter() - begin < seconds:
-        for slicer, taken in zip(slicers, found, strict=True):
-            if turn and min(taken)[0] > 150.0 and time.perf_counter() - begin > seconds:
+    for turn in itertools.count():
+        late = time.perf_counter() - begin > seconds
+        if turn >= 3 and late:
+            break
+        for slicer, wall, own in zip(slicers, walls, owns, strict=True):
+            if turn and late and min(wall) > 150.0:
                 continue
             for image in range(5):
                 frame = frames[(turn + image) % len(frames)]
                 before, worked = time.perf_counter(), time.process_time()
-                slicer.image(frame.nodes, frame.plane)
-                wall, own = time.perf_counter() - before, time.process_time() - worked
-                taken.append((1e3 * wall, 1e3 * own))
-                if min(taken)[0] > 8.0:
+                slicer.image(*frame)
+                wall.append(1e3 * (time.perf_counter() - before))
+                own.append(1e3 * (time.process_time() - worked))
+                if min(wall) > 8.0:
                     break
-        turn += 1
-    timings = []
-    for taken in found:
-        walls, owns = np.array(taken).T
-        timings.append(
-            {
-                "ms_median": float(np.median(walls)),
-                "ms_p99": float(np.percentile(walls, 99)),
-                "cpu_ms_median": float(np.median(owns)),
-                "images": len(taken),
-            }
-        )
-    return timings
+    return [
+        {
+            "ms_median": float(np.median(wall)),
+            "ms_p99": float(np.percentile(wall, 99)),
+            "cpu_ms_median": float(np.median(own)),
+            "images": len(wall),
+        }
+        for wall, own in zip(walls, owns, strict=True)
+    ]
 
 
 def compare(
@@ -133,8 +115,8 @@ def compare(
         exact: the reference's image and places.
         image: grey values.
         rest: (rows, columns, 3) m, places at rest; NaN where the method found nothing.
-        tissue_only: the method knows nothing of the rigid volume outside the mesh: what it finds
-            is compared, and what it does not find may be missed where tissue has moved.
+        tissue_only: the method, as VTK, knows nothing of the rigid volume outside the mesh: what it
+            finds is compared, and what it does not find is missed where tissue has moved.
     """
     grey, places = exact
     known, seen = np.isfinite(places[..., 0]), np.isfinite(rest[..., 0])
@@ -169,17 +151,14 @@ class VtkSlicer:
         volume: in frame ``patient``.
         rest_nodes: (N, 3) m.
         tetrahedra: (M, 4) indices into the nodes.
-        threads: more than the one that VTK's wheels use unless told otherwise.
 
     Raises:
         ImportError: VTK is not installed.
     """
 
-    def __init__(
-        self, volume: Volume, rest_nodes: Array, tetrahedra: NDArray[np.int32], threads: int = 1
-    ) -> None:
+    def __init__(self, volume: Volume, rest_nodes: Array, tetrahedra: NDArray[np.int32]) -> None:
         from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-        from vtkmodules.vtkCommonCore import VTK_ID_TYPE, vtkPoints, vtkSMPTools
+        from vtkmodules.vtkCommonCore import VTK_ID_TYPE, vtkPoints
         from vtkmodules.vtkCommonDataModel import (
             VTK_TETRA,
             vtkCellArray,
@@ -189,8 +168,7 @@ class VtkSlicer:
         )
         from vtkmodules.vtkFiltersCore import vtkProbeFilter
 
-        self._workers, self._to_numpy = vtkSMPTools, vtk_to_numpy
-        self._threads = threads
+        self._to_numpy = vtk_to_numpy
         self._to_index = volume.patient_to_index
         self._placed = np.empty(rest_nodes.shape)
         self._points = vtkPoints()
@@ -246,9 +224,6 @@ class VtkSlicer:
         return np.asarray(rest)
 
     def _find(self, nodes: Array, plane: SlicePlane) -> None:
-        # Threads are set for the whole process.
-        self._workers.SetBackend("Sequential" if self._threads == 1 else "STDThread")
-        self._workers.Initialize(self._threads)
         np.add(nodes @ plane.to_pixel[:, :3].T, plane.to_pixel[:, 3], out=self._placed)
         self._points.GetData().Modified()
         self._points.Modified()
@@ -261,6 +236,3 @@ class VtkSlicer:
         """(rows, columns): which pixels of the latest image lie in the mesh."""
         mask = self._finder.GetOutput().GetPointData().GetArray("vtkValidPointMask")
         return np.asarray(self._to_numpy(mask).reshape(plane.rows, plane.columns) > 0)
-
-
-AnySlicer = Slicer | VtkSlicer
