@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,6 @@ from us_sim.tissue.mesh.tetrahedral_mesh import box_mesh, uniform_planes
 from us_sim.volume.volume import Volume
 
 Array = NDArray[np.float64]
-Row: TypeAlias = "dict[str, Any]"
 
 GREY = 170  # of all voxels
 LAYERS = {
@@ -40,7 +39,7 @@ LAYERS = {
 _live = partial(Acoustics, artefacts="live", surfaces=False)
 
 
-def attenuation_rows(quick: bool) -> Iterator[Row]:
+def attenuation_rows(quick: bool) -> Iterator[dict[str, Any]]:
     """Images of layers of one grey, whose levels are the loss alone; the worst depth of each."""
     begins = [begin for begin, *_ in LAYERS.values()]
     volume = _volume_of(
@@ -134,7 +133,7 @@ STATES = {
 """Gradients (3, 3) of the deformation around the bone, and m by which the probe is slid along x."""
 
 
-def shadow_rows(quick: bool) -> Iterator[Row]:
+def shadow_rows(quick: bool) -> Iterator[dict[str, Any]]:
     """A shadow of bone at rest, pressed, and as the probe slides: half of the amplitude is left."""
     (left, right), (top, bottom) = BLOCK
     volume = _volume_of(
