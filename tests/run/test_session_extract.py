@@ -48,15 +48,12 @@ def test_real_poses_are_what_rosbags_decodes(shared_data, tmp_path):
         decoded = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen)]
     poses = [(each.pose.position, each.pose.orientation) for each in decoded]
     numbers = [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for p, q in poses]
-    lines = (tmp_path / "tracker_pose.tum").read_text().splitlines()
-    assert [tuple(map(float, line.split()[1:])) for line in lines] == numbers
     stamps = [(each.header.stamp.sec, each.header.stamp.nanosec) for each in decoded]
-    assert [tuple(map(int, line.split()[0].split("."))) for line in lines] == stamps
     with (tmp_path / "tracker_pose.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert [tuple(float(row[n]) for n in ("x_m", "y_m", "z_m")) for row in rows] == [
-        each[:3] for each in numbers
-    ]
+    assert [tuple(map(int, row["stamp_s"].split("."))) for row in rows] == stamps
+    columns = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    assert [tuple(float(row[name]) for name in columns) for row in rows] == numbers
 
 
 def test_wrenches_are_in_newtons(tmp_path):
@@ -78,7 +75,6 @@ def test_images_are_what_was_recorded_with_their_scale(scaled, tmp_path):
             across, down = (0.0254 / each for each in picture.info["dpi"])
             # PNG has whole pixels a metre.
             assert (across, down) == pytest.approx(SPACING, rel=1e-3)
-            assert "pixel spacing 0.4 mm across, 0.25 mm down" in picture.info["Description"]
     assert cv2.imread(str(files[7]), cv2.IMREAD_UNCHANGED).shape == (48, 64)
     with (tmp_path / "out" / "ultrasound_image.csv").open() as stream:
         rows = list(csv.DictReader(stream))
@@ -118,26 +114,9 @@ def test_all_that_a_recording_lacks_is_named_and_nothing_written(tmp_path, capsy
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("case", "options", "lines", "said"),
-    [
-        ("bag-time-back/stamps_back_by_20_s.mcap", "--poses", 1200, "back 1 time, first by 29.983"),
-        ("bag-quaternions/quaternions.mcap", "--poses", 360, "120 poses are not finite or without"),
-        (
-            "bag-every-type/test_bag_mcap",
-            "--images",
-            0,
-            "/test/sensor_msgs/image: 2 images skipped",
-        ),
-        ("bag-stamps-zero/zed_like.mcap", "--images", 0, "60 of 60 stamps are 0"),
-    ],
-)
-def test_what_is_odd_in_real_bags_is_told(
-    shared_data, tmp_path, capsys, case, options, lines, said
-):
-    extracted(shared_data / "cases" / case, tmp_path, options)
-    assert said in capsys.readouterr().out
-    assert sum(len(file.read_text().splitlines()) for file in tmp_path.glob("*.tum")) == lines
+def test_images_that_cannot_be_decoded_are_told(shared_data, tmp_path, capsys):
+    extracted(shared_data / "cases" / "bag-every-type/test_bag_mcap", tmp_path, "--images")
+    assert "/test/sensor_msgs/image: 2 images skipped" in capsys.readouterr().out
 
 
 def test_nothing_is_overwritten(scaled, tmp_path, capsys):

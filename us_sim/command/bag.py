@@ -9,7 +9,7 @@ from pathlib import Path
 from us_sim.errors import UsSimError
 
 _EXTRACTED = {
-    "poses": "poses of each topic as CSV, and in TUM's format",
+    "poses": "poses of each topic as CSV",
     "wrench": "forces and torques of each topic as CSV",
     "images": "images of each topic as PNG, with their scale",
     "areas": "areas of vessels in the image plane as CSV",

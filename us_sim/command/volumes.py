@@ -111,17 +111,12 @@ def cases_options(cases: argparse.ArgumentParser) -> None:
         help="folder of cases, or a case; default: those in US_SIM_CASES, or in the user's data "
         "folder",
     )
-    cases.add_argument(
-        "--picture", type=Path, metavar="FILE", help="write what the probe sees in each as a PNG"
-    )
     cases.set_defaults(command=_cases)
 
 
 def _cases(args: argparse.Namespace) -> int:
     from us_sim.volume.cases.case import case_roots, cases_in, listed, table
 
-    if args.picture is not None and args.picture.suffix.lower() != ".png":
-        raise UsSimError(f"--picture {args.picture}: must be a file that ends in .png")
     roots = args.folders or [root for root in case_roots() if root.is_dir()]
     folders = [folder for root in roots for folder in cases_in(root)]
     if not folders:
@@ -130,9 +125,4 @@ def _cases(args: argparse.Namespace) -> int:
         return 0
     rows = [listed(folder) for folder in folders]
     print(table(rows))
-    if args.picture is not None:
-        from us_sim.run.contact_sheet import picture_cases
-
-        picture_cases([row.folder for row in rows if not row.problem], args.picture)
-        print(args.picture)
     return 1 if any(row.problem for row in rows) else 0

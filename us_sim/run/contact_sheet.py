@@ -1,9 +1,7 @@
-"""Pictures of cases, and of a session: six moments of the press, and areas of lumens."""
+"""The picture of a session: six moments of the press, and areas of lumens."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,60 +11,17 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from us_sim.errors import BagError, UsSimError
+from us_sim.errors import BagError
 from us_sim.geometry.pose import Pose
-from us_sim.progress import Progress
 from us_sim.run.session_summary import IMAGE, Session
 from us_sim.run.session_tables import SECOND
-from us_sim.scene.building import colour_of, probe_of, scanner_of, volume_of
-from us_sim.scene.reading import load_scene
-from us_sim.scene.scene import CASE_PREFIX, Scene
+from us_sim.scene.building import colour_of, probe_of
+from us_sim.scene.scene import Scene
 from us_sim.scoring.lumen import LumenAreas
 from us_sim.slicing.drawing.label_outlines import label_outlines, onto_border
 from us_sim.slicing.frame import Frame
 from us_sim.slicing.probe.probe import Probe
 from us_sim.volume.structure_names import Colour, anatomical_colour
-
-_COLUMNS = 4
-_INCHES = 3.2  # of a picture's side
-
-
-def picture_cases(folders: Sequence[Path], file: Path) -> None:
-    """Write the picture of the cases in these folders, as PNG.
-
-    Raises:
-        UsSimError: a case cannot be read, or the file cannot be written.
-    """
-    columns = min(_COLUMNS, len(folders))
-    rows = math.ceil(len(folders) / columns)
-    figure = Figure(figsize=(_INCHES * columns, (_INCHES + 0.4) * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    with Progress("drawing", len(folders), "cases") as bar:
-        for number, folder in enumerate(folders):
-            axes = figure.add_subplot(rows, columns, number + 1)
-            _draw_case(axes, load_scene(f"{CASE_PREFIX}{folder}"))
-            axes.set_title(folder.name, fontsize=10)
-            bar.update(number + 1)
-    try:
-        figure.savefig(file, dpi=100)
-    except OSError as error:
-        raise UsSimError(f"--picture {file}: cannot be written: {error.strerror}") from error
-
-
-def _draw_case(axes: Any, scene: Scene) -> None:
-    touching = dataclasses.replace(scene.imaging, contact=False)
-    scene = dataclasses.replace(scene, imaging=touching)
-    volume = volume_of(scene)
-    scanner = scanner_of(scene, volume)
-    _show(axes, scanner.image(Pose()), scanner.probe)
-    if volume.labels is not None:
-        numbers = {name: label for label, name in volume.label_names.items()}
-        colours = {
-            numbers[given.label or name]: colour_of(scene, name)
-            for name, given in scene.structures.items()
-        }
-        _draw_outlines(axes, scanner.frame(Pose()), colours)
-    axes.set_xlabel("mm", fontsize=8)
 
 
 def _show(axes: Any, pixels: Any, probe: Probe) -> None:

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from us_sim.errors import BagError, TrackingError
 from us_sim.recording.decoding import affine_from
-from us_sim.recording.path import is_pose
 from us_sim.recording.reader import Bag
 from us_sim.recording.repair import new_file
 from us_sim.recording.wrench import WRENCH_STAMPED
@@ -64,7 +62,7 @@ def write_parts(
         leave = " and ".join(f"--{part}" for part in lacking)
         raise BagError(f"{bag.path} holds {missing}; leave out {leave}")
     for name in [name for part in ("poses", "wrench") if part in parts for name in needed[part]]:
-        yield from _write_values(bag, name, folder)
+        yield _write_values(bag, name, folder)
     if "images" in parts:
         made = [
             each for name in needed["images"] for each in _write_images(bag, name, folder, progress)
@@ -76,82 +74,45 @@ def write_parts(
         yield _write_areas(bag, folder, progress)
 
 
-def _write_values(bag: Bag, name: str, folder: Path) -> Iterator[Path | str]:
-    """Write poses or wrenches as CSV, and poses in TUM's format.
-
-    TUM's (``timestamp tx ty tz qx qy qz qw``, s and m) has no poses that are not finite or have no
-    orientation.
-    """
+def _write_values(bag: Bag, name: str, folder: Path) -> Path:
+    """Write poses or wrenches as CSV."""
     times, values = read_values(bag, name)
     stamps, logged = times["stamp"].map(_seconds), times["logged"].map(_seconds)
     head = pd.DataFrame({"stamp_s": stamps, "recorded_s": logged, "frame": times["frame"]})
-    file = folder / f"{_file_name(name)}.csv"
-    yield write_table(file, head.join(values.rename(columns=_UNITS)), na_rep="nan")
-    usable = np.ones(len(values), bool)
-    if "qw" in values:
-        usable = is_pose(values.to_numpy())
-        file = file.with_suffix(".tum")
-        kept = head[["stamp_s"]].join(values)[usable]
-        yield write_table(file, kept, sep=" ", header=False)
-        if rejected := int((~usable).sum()):
-            are = counted(rejected, "pose is", "poses are")
-            yield f"{name}: {are} not finite or without an orientation, and not in {file.name}"
-    yield from _say_odd_stamps(name, times["stamp"][usable], file.name)
-
-
-def _say_odd_stamps(name: str, stamps: pd.Series, file: str) -> Iterator[str]:
-    """Sentences on stamps that are 0 or go back."""
-    if missing := int((stamps == 0).sum()):
-        yield f"{name}: {missing} of {counted(len(stamps), 'stamp')} are 0"
-    steps = stamps.reset_index(drop=True).diff()
-    if (steps < 0).any():
-        line = int((steps < 0).idxmax())
-        yield (
-            f"{name}: stamps go back {counted(int((steps < 0).sum()), 'time')}, first by "
-            f"{-steps[line] / SECOND:.3f} s at line {line + 1} of {file}"
-        )
+    table = head.join(values.rename(columns=_UNITS))
+    return write_table(folder / f"{_file_name(name)}.csv", table, na_rep="nan")
 
 
 def _write_images(bag: Bag, name: str, folder: Path, progress: Progress) -> Iterator[Path | str]:
     """Write a topic of images as PNG files, and a CSV with stamp and scale of each.
 
-    The files hold their scale as resolution, and scale, stamp, topic and frame as text. Images
-    without a stamp have the time of their recording.
+    The files hold their scale as resolution. Images without a stamp have the time of their
+    recording.
     """
     stem = folder / _file_name(name)
     spacing = _spacing(bag, name)
     stamps = read_times(bag, [name])[name]
     times = stamps["stamp"].where(stamps["stamp"] != 0, stamps["logged"])
     millimetres = [f"{1e3 * each:.6g}" for each in spacing] or ["", ""]
-    facts, scale = f"topic {name}", dict[str, Any]()
-    if spacing:
-        facts += "; pixel spacing {} mm across, {} mm down".format(*millimetres)
-        scale = {"dpi": tuple(0.0254 / each for each in spacing)}
+    scale: dict[str, Any] = {"dpi": tuple(0.0254 / each for each in spacing)} if spacing else {}
     rows, odd = [], []
     for number, raw in enumerate(bag.messages([name])):
         progress(number / len(times), name)
         try:
-            message = bag.deserialize(raw)
-            pixels = PIXELS[raw.type_name](message, "RGB")
+            pixels = PIXELS[raw.type_name](bag.deserialize(raw), "RGB")
         except (BagError, TrackingError) as error:
             odd.append(str(error))
             continue
-        file, stamp = stem / f"{number:06d}.png", _seconds(times[number])
-        texts = PngInfo()
-        told = f"stamp {stamp} s; frame {message.header.frame_id}; {facts}"
-        texts.add_itxt("Description", told)
-        texts.add_itxt("Software", "us_sim")
+        file = stem / f"{number:06d}.png"
         with new_file(file) as stream:
-            Image.fromarray(pixels).save(stream, "PNG", pnginfo=texts, compress_level=3, **scale)
-        rows.append((file.name, stamp, *millimetres))
+            Image.fromarray(pixels).save(stream, "PNG", compress_level=3, **scale)
+        rows.append((file.name, _seconds(times[number]), *millimetres))
     progress(1.0, "")
     if odd:
         yield f"{name}: {counted(len(odd), 'image')} skipped: {odd[0]}"
     if rows:
         columns = ["image", "stamp_s", "column_spacing_mm", "row_spacing_mm"]
-        file = write_table(stem.with_suffix(".csv"), pd.DataFrame(rows, columns=columns))
-        yield file
-        yield from _say_odd_stamps(name, stamps["stamp"], file.name)
+        yield write_table(stem.with_suffix(".csv"), pd.DataFrame(rows, columns=columns))
         yield stem
 
 
