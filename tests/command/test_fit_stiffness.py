@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrench_files import write_wrenches
+from wrench_files import WrenchRecord, write_wrenches
 
 from us_sim.command.main import main
 from us_sim.recording.path import ProbePath, write_poses
 from us_sim.recording.press_and_slide import press_and_slide
-from us_sim.recording.wrench import WrenchRecord
 from us_sim.recording.writer import BagWriter
 from us_sim.scene.building import materials_of, tissue_model_of, volume_of
 from us_sim.scene.reading import load_scene

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from session_files import EPOCH, HI
-from wrench_files import write_wrenches
+from wrench_files import WrenchRecord, write_wrenches
 
 from us_sim.errors import BagError
 from us_sim.recording.path import POSE_STAMPED, ProbePath, bodies_in, read_path, write_path
 from us_sim.recording.press_and_slide import press_and_slide
 from us_sim.recording.reader import read_bag
 from us_sim.recording.schemas import jazzy_definitions
-from us_sim.recording.wrench import WrenchRecord, read_wrenches
 from us_sim.recording.writer import BagWriter
+from us_sim.run.session_tables import read_wrenches
 
 
 def path_of(positions, orientations=None, **fields):
@@ -268,14 +268,14 @@ def test_another_type_a_silent_topic_and_a_missing_one_are_refused(tmp_path):
     path = press_and_slide(rate=5.0)
     write_path(tmp_path / "path.mcap", path)
     with pytest.raises(BagError, match=POSE_STAMPED):
-        read_wrenches(tmp_path / "path.mcap", path.topic)
+        read_wrenches(read_bag(tmp_path / "path.mcap"), path.topic)
     with pytest.raises(BagError, match="topic probe/wrench"):
-        read_wrenches(tmp_path / "path.mcap")
+        read_wrenches(read_bag(tmp_path / "path.mcap"), "probe/wrench")
     none = WrenchRecord("/probe/wrench", "probe", np.zeros(0, np.int64), np.zeros((0, 6)))
     (tmp_path / "silent").mkdir()
     write_wrenches(tmp_path / "silent" / "silent.mcap", none)
     with pytest.raises(BagError, match="no wrench"):
-        read_wrenches(tmp_path / "silent" / "silent.mcap")
+        read_wrenches(read_bag(tmp_path / "silent" / "silent.mcap"), "probe/wrench")
 
 
 def test_a_topic_of_two_frames_is_refused_and_the_trackers_poses_come_before_the_probes(tmp_path):
@@ -297,13 +297,14 @@ def test_wrenches_are_read_by_their_topics_each_of_one_frame(tmp_path):
         write_wrenches(writer, made)
         for frame, topic in (("flange", "/arm/wrench"), ("probe", "/two"), ("flange", "/two")):
             write_wrenches(writer, wrenches(frame, topic))
-    read = read_wrenches(tmp_path / "w.mcap")
-    assert (read.topic, read.frame_id, len(read)) == ("/probe/wrench", "probe", 20)
-    assert np.array_equal(read.stamps, made.stamps)
-    assert np.array_equal(read.wrenches, made.wrenches)
-    assert read_wrenches(tmp_path / "w.mcap", "arm/wrench").frame_id == "flange"
+    bag = read_bag(tmp_path / "w.mcap")
+    frame, read = read_wrenches(bag, "probe/wrench")
+    assert (frame, len(read)) == ("probe", 20)
+    assert np.array_equal(read["stamp"], made.stamps)
+    assert np.array_equal(read.to_numpy()[:, :6], made.wrenches)
+    assert read_wrenches(bag, "arm/wrench")[0] == "flange"
     with pytest.raises(BagError, match="probe, flange"):
-        read_wrenches(tmp_path / "w.mcap", "two")
+        read_wrenches(bag, "two")
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,7 @@ import pytest
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.recording.path import read_path
-from us_sim.recording.plus_recording import read_tracker_recording
+from us_sim.recording.path import read_path, read_tracker_recording
 
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 MOVED = "0 -1 0 10 1 0 0 20 0 0 1 30 0 0 0 1"

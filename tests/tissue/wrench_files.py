@@ -1,11 +1,25 @@
 """Bags of wrenches."""
 
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.topic import QosProfile
-from us_sim.recording.wrench import WRENCH_STAMPED, WrenchRecord
 from us_sim.recording.writer import BagWriter
+
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+
+
+class WrenchRecord(NamedTuple):
+    """Wrenches of one sensor."""
+
+    topic: str
+    frame_id: str
+    stamps: NDArray[np.int64]  # (K,) ns
+    wrenches: NDArray[np.float64]  # (K, 6) N and N m
 
 
 def write_wrenches(file: str | Path | BagWriter, record: WrenchRecord) -> None:

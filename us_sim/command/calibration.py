@@ -21,8 +21,12 @@ from us_sim.command.calibration_settings import (
 )
 from us_sim.errors import CalibrationError
 from us_sim.geometry.pose import Pose
-from us_sim.recording.path import ProbePath, is_tracker_recording, read_path
-from us_sim.recording.plus_recording import read_tracker_recording
+from us_sim.recording.path import (
+    ProbePath,
+    is_tracker_recording,
+    read_path,
+    read_tracker_recording,
+)
 from us_sim.settings.spelling import counted
 from us_sim.tracking.calibration.camera import (
     INTRINSICS,

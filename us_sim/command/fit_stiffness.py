@@ -84,23 +84,26 @@ def _fit(args: argparse.Namespace) -> int:
 
 
 def _read_press(session: Path, settings: StiffnessSettings) -> Press:
+    from us_sim.recording.lerobot_writer import WRENCH_PARTS
     from us_sim.recording.path import read_path
     from us_sim.recording.reader import read_bag
-    from us_sim.recording.wrench import read_wrenches
+    from us_sim.run.session_tables import read_wrenches
     from us_sim.tissue.stiffness_fit import pair_press
 
-    path = read_path(session, read_bag(session).topic(settings.pose).name)
-    felt = read_wrenches(session, settings.wrench)
+    bag = read_bag(session)
+    path = read_path(session, bag.topic(settings.pose).name)
+    felt_in, felt = read_wrenches(bag, settings.wrench)
     for topic, frame, expected, option in (
         (path.topic, path.frame_id, "patient", "--pose"),
-        (felt.topic, felt.frame_id, "probe", "--wrench"),
+        (settings.wrench, felt_in, "probe", "--wrench"),
     ):
         if frame != expected:
             raise BagError(
                 f"{session}: {topic} is in frame '{frame}': name a topic in frame '{expected}' "
                 f"with {option}"
             )
-    return pair_press(path.stamps, path.poses, felt.stamps, felt.wrenches, settings)
+    wrenches = felt[[*WRENCH_PARTS]].to_numpy()
+    return pair_press(path.stamps, path.poses, felt["stamp"].to_numpy(), wrenches, settings)
 
 
 def _table(found: StiffnessFit) -> str:

@@ -228,29 +228,17 @@ _FIELD = re.compile(r"32FC([1-4])")
 _LARGEST_OFFSET = 1e6  # m, of a pixel, or to the first one
 
 
-def pixels_from(message: Any) -> NDArray[np.uint8]:
-    """The (rows, columns) pixels of a ``mono8`` image.
+def pixels_from(message: Any, encoding: str = "mono8") -> NDArray[np.uint8]:
+    """The pixels of an image: (rows, columns) of ``mono8``, (rows, columns, 3) of ``rgb8``.
 
     Raises:
         VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
     """
-    _require_encoding(message, "mono8", "8UC1")
-    return rows_from(message, 1)
-
-
-def colour_pixels_from(message: Any) -> NDArray[np.uint8]:
-    """The (rows, columns, 3) pixels of an ``rgb8`` image: red, green, blue.
-
-    Raises:
-        VolumeError: another encoding, no pixels, or fewer bytes than the stated size.
-    """
-    _require_encoding(message, "rgb8")
+    if message.encoding not in (encoding, "8UC1" if encoding == "mono8" else encoding):
+        raise VolumeError(f"the image is {message.encoding}; it must be {encoding}")
+    if encoding == "mono8":
+        return rows_from(message, 1)
     return rows_from(message, 3).reshape(int(message.height), int(message.width), 3)
-
-
-def _require_encoding(message: Any, *known: str) -> None:
-    if message.encoding not in known:
-        raise VolumeError(f"the image is {message.encoding}; it must be {known[0]}")
 
 
 def field_from(message: Any) -> NDArray[np.float32]:

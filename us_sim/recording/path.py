@@ -3,6 +3,9 @@
 A body is named ``TOPIC`` where its messages hold one pose, ``TOPIC:NUMBER`` in a PoseArray,
 ``TOPIC:FRAME`` in tf, and ``TOPIC:FRAME:PARENT`` for a frame in another one further up.
 
+Tracker recordings are sequence files of Plus (`.igs.mha`, `.igs.nrrd`), with or without images:
+every sample has a time and named transforms (``ProbeToTracker``), each with a status.
+
 >>> import numpy as np, tempfile
 >>> from us_sim.recording.path import ProbePath, read_path, write_path
 >>> stamps = 1_700_000_000_000_000_000 + np.array([0, 16_666_667])
@@ -16,27 +19,75 @@ array([-0.01 , -0.009])
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from us_sim.errors import BagError
+from us_sim.errors import BagError, TrackingError, VolumeError
 from us_sim.geometry.frame_chain import FrameChain
 from us_sim.geometry.pose import Pose
-from us_sim.recording.probe_path import ProbePath
 from us_sim.recording.reader import Bag, read_bag
 from us_sim.recording.schemas import jazzy_definitions, stamped
 from us_sim.recording.storage import NoBagError
 from us_sim.recording.topic import BagTopic, QosProfile
 from us_sim.recording.writer import BagWriter
-from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES
+from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
+from us_sim.volume.sequences.transforms import (
+    FrameTransforms,
+    TransformChain,
+    along,
+    is_image_frame,
+    shortest_chain,
+    split_transform_name,
+)
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 _POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 _TF = "tf2_msgs/msg/TFMessage"
+_RIGID = 5e-3  # how far from 1 a rotation may scale; real trackers round to 3e-4
+
+
+@dataclass(frozen=True, eq=False)
+class ProbePath:
+    """Poses in the order in which they were recorded; their stamps may go back."""
+
+    topic: str
+    frame_id: str
+    stamps: NDArray[np.int64]  # (K,) ns since the epoch, of the messages' headers
+    positions: NDArray[np.float64]  # (K, 3) m, frame frame_id
+    orientations: NDArray[np.float64]  # (K, 4) x, y, z, w as recorded, not normalised
+    log_times: NDArray[np.int64] = field(  # (K,) ns since the epoch; the stamps by default
+        default_factory=lambda: np.empty(0, np.int64)
+    )
+    rejected: int = 0  # poses of the topic left out: not finite, or without an orientation
+    note: str = ""  # the recording's faults, in a sentence; empty when there are none
+
+    def __post_init__(self) -> None:
+        if not len(self.log_times):
+            object.__setattr__(self, "log_times", self.stamps)
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def pose(self, index: int) -> Pose:
+        """The pose at a place in the path, its quaternion normalised."""
+        return Pose(self.positions[index], self.orientations[index])
+
+    @property
+    def poses(self) -> list[Pose]:
+        """All poses, as `pose` returns them."""
+        return [self.pose(index) for index in range(len(self))]
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last recorded pose."""
+        return float(self.log_times[-1] - self.log_times[0]) / 1e9 if len(self) else 0.0
+
 
 _Found = tuple[str, Any, Any, Any]  # a body's name, header, position, orientation
 
@@ -176,8 +227,6 @@ def read_path(path: str | Path, topic: str | None = None, *, option: str = "topi
         TrackingError: the same of a recording.
     """
     if is_tracker_recording(path):
-        from us_sim.recording.plus_recording import read_tracker_recording
-
         return read_tracker_recording(path).probe_path(topic, option=option)
     try:
         bag = read_bag(path)
@@ -300,3 +349,157 @@ def _usable(bag: Bag, name: str, rows: list[Row]) -> ProbePath:
         rejected=rejected,
         note="; ".join(notes),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerRecording:
+    """Rigid transforms over time; a transform ``AToB`` takes points of A to B."""
+
+    path: Path
+    times: NDArray[np.float64]  # (K,) s, the recorder's clock, as they were recorded
+    transforms: Mapping[str, FrameTransforms]  # by name
+    untimed: int  # samples of the file without a time, none of whose transforms is used
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def left_out(self, name: str) -> dict[str, int]:
+        """How many samples of a transform are not valid, by reason."""
+        return dict(Counter(fault for fault in self.transforms[name].faults if fault))
+
+    def chain(self, name: str, reference: str | None = None) -> TransformChain:
+        """The chain of the fewest transforms from a body to a reference frame.
+
+        Args:
+            name: of a transform (``StylusToTracker``), also one that others make up
+                (``StylusToReference``), or of a body (``Stylus``).
+            reference: a frame (``Reference``); by default that of the body's own transform.
+
+        Raises:
+            TrackingError: the recording has no such transform, or no chain to the reference.
+        """
+        body, end = split_transform_name(name) or (name, None)
+        if reference is None:
+            frames = filter(None, map(split_transform_name, self.transforms))
+            ends = [end] if end else [top for start, top in frames if start == body]
+            reference = ends[0] if len(ends) == 1 else None
+        chain = shortest_chain(self.transforms, body, reference) if reference else None
+        if chain is None:
+            raise TrackingError(
+                f"{self.path}: no transform or several lead from {name} to {reference or 'a frame'}"
+                f"; its transforms are {', '.join(self.transforms)}"
+            )
+        return chain
+
+    def poses(
+        self, name: str, reference: str | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """A body's poses in a reference frame (K, 4, 4) m, and which are valid (K,); nan elsewhere.
+
+        Arguments and errors are those of :meth:`chain`.
+        """
+        found = along(self.transforms, self.chain(name, reference))
+        return found.matrices, found.valid
+
+    def probe_path(
+        self, name: str | None = None, reference: str | None = None, option: str = "topic"
+    ) -> ProbePath:
+        """The valid poses of a body as a path in the reference's frame, by the recorder's clock.
+
+        Arguments are as for :meth:`chain`; without a name it is the recording's only transform, and
+        ``option`` is what names it.
+
+        Raises:
+            TrackingError: see :meth:`chain`; or the name is missing, or no pose is valid.
+        """
+        if name is None:
+            if len(self.transforms) != 1:
+                names = ", ".join(self.transforms)
+                raise TrackingError(
+                    f"{self.path}: has several transforms: name one by {option}, of {names}"
+                )
+            (name,) = self.transforms
+        chain = self.chain(name, reference)
+        matrices, valid = self.poses(name, reference)
+        why = self.why(key for key, _ in chain.steps)
+        if not valid.any():
+            raise TrackingError(
+                f"{self.path}: none of the {len(self)} poses of {name} is valid{why}"
+            )
+        poses = [Pose.from_matrix(matrix) for matrix in matrices[valid]]
+        rejected = self.untimed + int((~valid).sum())
+        count = self.untimed + len(self)
+        return ProbePath(
+            topic=name,
+            frame_id=chain.reference,
+            stamps=np.round(self.times[valid] * 1e9).astype(np.int64),
+            positions=np.array([pose.position for pose in poses]),
+            orientations=np.array([pose.orientation for pose in poses]),
+            rejected=rejected,
+            note=f"{rejected} of the {count} poses of {name} are left out{why}" if rejected else "",
+        )
+
+    def why(self, names: Iterable[str]) -> str:
+        """The samples of these transforms that were left out, in brackets, or an empty text."""
+        said = [
+            f"{count} with {reason}"
+            for name in names
+            for reason, count in self.left_out(name).items()
+        ]
+        if self.untimed:
+            said.append(f"{self.untimed} without a time")
+        return f" ({', '.join(said)})" if said else ""
+
+
+def read_tracker_recording(path: str | Path) -> TrackerRecording:
+    """The transforms of a sequence file of Plus.
+
+    A transform whose status is not OK, or that is not rigid (Plus writes zeros for a tool
+    that it has not seen), is not valid; a sample without a time is left out whole. Both are
+    counted.
+
+    Raises:
+        TrackingError: the file is missing, is no sequence, is cut, or holds no transform or none
+            that is valid.
+    """
+    path = Path(path)
+    try:
+        sequence = read_sequence(path)
+    except VolumeError as error:
+        raise TrackingError(str(error)) from error
+    times = sequence.times
+    timed = np.flatnonzero(np.isfinite(times))
+    transforms = {
+        name: _rigid(series, timed)
+        for name, series in sequence.transforms.items()
+        if not any(map(is_image_frame, split_transform_name(name) or ()))
+    }
+    if not transforms:
+        raise TrackingError(
+            f"{path}: holds no transforms (Seq_Frame0000_ProbeToTrackerTransform); give a tracker "
+            f"recording of Plus"
+        )
+    recording = TrackerRecording(path, times[timed], transforms, len(times) - len(timed))
+    if not any(series.valid.any() for series in transforms.values()):
+        raise TrackingError(
+            f"{path}: none of its {len(times)} samples holds a time and a valid transform"
+            f"{recording.why(transforms)}"
+        )
+    return recording
+
+
+def _rigid(series: FrameTransforms, which: NDArray[np.intp]) -> FrameTransforms:
+    """Some frames' transforms with the rotations nearest to those that trackers round.
+
+    What scales, shears or mirrors is not valid.
+    """
+    matrices = series.matrices[which].copy()
+    faults = [series.faults[k] for k in which]
+    for k in np.flatnonzero([not fault for fault in faults]):
+        left, scales, right = np.linalg.svd(matrices[k, :3, :3])
+        rotation = left @ right
+        if np.abs(scales - 1.0).max() > _RIGID or np.linalg.det(rotation) < 0:
+            faults[k], matrices[k] = "a transform that is not rigid", np.nan
+        else:
+            matrices[k, :3, :3] = rotation
+    return FrameTransforms(matrices, tuple(faults))

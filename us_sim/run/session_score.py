@@ -11,10 +11,9 @@ from us_sim.errors import BagError, ScoreError, UsSimError
 from us_sim.nodes.topics import FROZEN, MARKERS
 from us_sim.recording.path import POSE_STAMPED, ProbePath, is_tracker_recording, read_path
 from us_sim.recording.reader import Bag, read_bag
-from us_sim.recording.wrench import WRENCH_STAMPED, read_wrenches
 from us_sim.run.session_scene import scene_of
 from us_sim.run.session_summary import POSE, read_session
-from us_sim.run.session_tables import SECOND, Progress
+from us_sim.run.session_tables import SECOND, WRENCH_STAMPED, Progress, read_wrenches
 from us_sim.scene.building import probe_of, volume_of
 from us_sim.scoring.lumen import vessels_in
 from us_sim.scoring.metrics import Force, Scan
@@ -94,13 +93,12 @@ def _force(bag: Bag, topic: str | None, begin: int) -> Force:
             several = f"wrenches on {', '.join(names)}: name one with --wrench"
             raise ScoreError(f"{bag.path} holds {several if names else 'no wrench'}")
         topic = names[0]
-    record = read_wrenches(bag.path, topic)
-    newtons = np.linalg.norm(record.wrenches[:, :3], axis=1)
-    later = np.r_[True, record.stamps[1:] > np.maximum.accumulate(record.stamps)[:-1]]
-    usable = np.isfinite(newtons) & later
+    _, wrenches = read_wrenches(bag, topic)
+    stamps, newtons = wrenches["stamp"], np.linalg.norm(wrenches[["fx", "fy", "fz"]], axis=1)
+    usable = np.isfinite(newtons) & (stamps > stamps.cummax().shift(fill_value=-1)).to_numpy()
     if np.count_nonzero(usable) < 2:
-        raise ScoreError(f"{record.topic} holds fewer than two wrenches that can be used")
-    return Force((record.stamps[usable] - begin) / SECOND, newtons[usable])
+        raise ScoreError(f"{topic} holds fewer than two wrenches that can be used")
+    return Force(((stamps[usable] - begin) / SECOND).to_numpy(), newtons[usable])
 
 
 def _truth(bag: Bag, path: ProbePath, progress: Progress) -> dict[str, Any]:

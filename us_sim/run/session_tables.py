@@ -22,9 +22,9 @@ from us_sim.recording.reader import Bag
 from us_sim.recording.repair import new_file
 from us_sim.recording.stamps import stamp_reader
 from us_sim.recording.topic import Fault
-from us_sim.recording.wrench import WRENCH_STAMPED
 
 SECOND = 1_000_000_000  # ns
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 _LARGEST = 2**63 - 1
 _COLUMNS = ("stamp", "logged", "sent", "number", "size", "is_short")
 Progress = Callable[[float, str], None]
@@ -129,6 +129,27 @@ def read_values(bag: Bag, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
             numbers.append(dict(zip(POSE_PARTS, row.pose, strict=True)))
     found = pd.DataFrame(rows, columns=["stamp", "logged", "frame"])
     return found, pd.DataFrame(numbers, index=found.index, dtype=float)
+
+
+def read_wrenches(bag: Bag, name: str) -> tuple[str, pd.DataFrame]:
+    """Read forces and torques, of a simulated probe or a sensor, in one frame.
+
+    Returns:
+        The frame, and ``stamp`` (ns) and the numbers (N and N m) of each message.
+
+    Raises:
+        BagError: there is no such topic, it is of another type, is silent, or its wrenches are of
+            several frames.
+    """
+    topic = bag.topic(name)
+    if topic.type_name != WRENCH_STAMPED:
+        raise BagError(f"{bag.path} holds {topic.name} as {topic.type_name}, not {WRENCH_STAMPED}")
+    found, table = read_values(bag, topic.name)
+    frames = found["frame"].unique()
+    if len(frames) != 1:
+        held = f"wrenches in the frames {', '.join(frames)}" if len(frames) else "no wrench"
+        raise BagError(f"{bag.path} holds {held} on {topic.name}: a sensor has one frame")
+    return str(frames[0]), table.assign(stamp=found["stamp"])
 
 
 def write_table(file: Path, table: pd.DataFrame, **options: Any) -> Path:

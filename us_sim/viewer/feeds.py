@@ -28,7 +28,6 @@ from us_sim.nodes.guarded_node import GuardedNode, Subscriptions
 from us_sim.nodes.qos import LATCHED, STREAM
 from us_sim.recording.decoding import (
     affine_from,
-    colour_pixels_from,
     line_from,
     markers_stamp,
     mesh_from,
@@ -178,7 +177,7 @@ def _flipped(matrix: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
 
 
 def _colour_jpeg(kind: str, message: Image, sequence: int) -> Packet:
-    pixels = cv2.cvtColor(colour_pixels_from(message), cv2.COLOR_RGB2BGR)
+    pixels = cv2.cvtColor(pixels_from(message, "rgb8"), cv2.COLOR_RGB2BGR)
     return _jpeg(message, kind, sequence, pixels)
 
 
