@@ -4,7 +4,6 @@ import math
 
 import pytest
 from bench import pose_at
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -59,24 +58,6 @@ def test_a_quaternion_that_is_not_of_unit_length_is_taken_and_said(bench, tracke
     bench.spin_until(lambda: len(poses) == 2)
     assert poses[1].pose.orientation.w == 1.0
     assert node.health.problems("quaternion") == 1
-
-
-@pytest.mark.parametrize("turns", [(0, 1), (0, 0, 1)])
-@pytest.mark.parametrize(("apart", "contested"), [(0.028, True), (0.001, False)])
-def test_two_that_fight_over_the_pose_are_said(bench, tracker, turns, apart, contested):
-    node, poses, publisher = tracker
-    other = bench.peer.create_publisher(PoseStamped, "tracker/pose", 100)
-    bench.spin_until(other.get_subscription_count)
-    status = bench.collect(DiagnosticStatus, "probe/status", latched=True)
-    for k in range(24):
-        turn = turns[k % len(turns)]
-        pose = pose_at(0.01 + 1e-4 * k, 7 + k, x=apart * turn)
-        (publisher, other)[turn].publish(pose)
-        bench.spin_until(lambda k=k: len(poses) == k + 1)
-    assert bool(node.health.problems("rivals")) is contested
-    if contested:
-        bench.spin_until(lambda: "jump_mm" in {item.key for item in status[-1].values})
-        assert status[-1].level == DiagnosticStatus.WARN
 
 
 def test_a_source_that_starts_again_is_followed(bench, tracker):

@@ -227,7 +227,7 @@ def view():
     return RenderedView(CAMERA, RigidBody.single("6X6_250", 3, 0.04)).render(SEEN, SHARP)
 
 
-MARKER = "{dictionary: 6X6_250, markers: [{id: 3, size: 40 mm}]}"
+SECTION = "{source: camera, camera: {dictionary: 6X6_250, marker: 3, size: 40 mm}}"
 
 
 @pytest.mark.parametrize(
@@ -237,9 +237,8 @@ MARKER = "{dictionary: 6X6_250, markers: [{id: 3, size: 40 mm}]}"
         ("bayer_rggb16", lambda grey: grey.astype(np.uint16) << 8),
     ],
 )
-def test_a_marker_is_measured_in_an_image(bench, tracker, tmp_path, view, encoding, encode):
-    (tmp_path / "marker.yaml").write_text(MARKER)
-    _, poses = tracker("{source: camera, camera: {body: marker.yaml}}")
+def test_a_marker_is_measured_in_an_image(bench, tracker, view, encoding, encode):
+    _, poses = tracker(SECTION)
     infos = bench.publisher(CameraInfo, "camera/camera_info")
     images = bench.publisher(Image, "camera/image_raw")
     infos.publish(camera_info())

@@ -8,7 +8,9 @@ import pytest
 
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
-from us_sim.tracking.measurement import Measurement, TrackingClock, TrackingState
+from us_sim.tracking.filters import create_filter
+from us_sim.tracking.measurement import Measurement, TrackingState
+from us_sim.tracking.probe_tracking import ProbeTracking
 
 
 def test_a_covariance_that_is_symmetric_but_for_rounding_is_taken():
@@ -57,11 +59,11 @@ TABLE = [
 
 
 def test_states_follow_the_table():
-    clock = TrackingClock(coast_for=0.3, lost_after=1.0)
-    for ms, event, expected in TABLE:
+    tracking = ProbeTracking(Pose(), Pose(), create_filter("none"), coast_for=0.3, lost_after=1.0)
+    for number, (ms, event, expected) in enumerate(TABLE):
         now = ms * 1_000_000
         if event == "pose":
-            clock.seen(now)
+            tracking.take(Measurement(number, Pose()), now)
         elif event == "reset":
-            clock.reset()
-        assert clock.state(now) is expected, f"at {ms} ms"
+            tracking.reset()
+        assert tracking.state(now) is expected, f"at {ms} ms"

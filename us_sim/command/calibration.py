@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import compress
 from pathlib import Path
 
@@ -42,7 +42,6 @@ from us_sim.tracking.calibration.pivot import calibrate_pivot, find_dwells
 from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
     find_time_offset,
-    signal_of_images,
     signal_of_positions,
 )
 from us_sim.tracking.calibration.transform_file import (
@@ -52,7 +51,6 @@ from us_sim.tracking.calibration.transform_file import (
 )
 from us_sim.tracking.camera.model import write_camera_info
 from us_sim.tracking.camera.rigid_body import read_rigid_body
-from us_sim.volume.sequences.sequence import SEQUENCE_SUFFIXES, read_sequence
 from us_sim.volume.sequences.transforms import split_transform_name
 
 
@@ -85,38 +83,12 @@ def read_motion(path: Path, name: str | None) -> ProbePath:
     return recording.probe_path(body, reference)
 
 
-def read_signal(
-    path: Path,
-    name: str | None,
-    *,
-    images: bool = False,
-    progress: Callable[[float, str], None] | None = None,
-) -> PositionSignal:
-    """The recorded motion as one number over time.
-
-    Args:
-        path: a bag, or a recording of Plus.
-        name: as in :func:`read_motion`.
-        images: take a Plus recording's images even where it has poses.
-        progress: told the fraction of the images that is done, and what is looked for.
+def read_signal(path: Path, name: str | None) -> PositionSignal:
+    """The recorded motion as one number over time; arguments as in `read_motion`.
 
     Raises:
         UsSimError: it cannot be read, or shows no motion.
     """
-    of_plus = path.suffix.lower() in SEQUENCE_SUFFIXES
-    if of_plus and (images or not read_sequence(path).transforms):
-        sequence = read_sequence(path)
-        which = np.flatnonzero(np.isfinite(sequence.times) & sequence.image_is_valid)
-
-        def images_shown() -> Iterator[NDArray[np.uint8]]:
-            for k, image in enumerate(sequence.images(which)):
-                yield image
-                if progress is not None:
-                    progress((k + 1) / len(which), "the line in each image")
-
-        return signal_of_images(sequence.times[which], images_shown())
-    if images:
-        raise CalibrationError(f"{path}: is a bag; images are read from recordings of Plus only")
     motion = read_motion(path, name)
     return signal_of_positions(seconds_of(motion), motion.positions)
 
@@ -311,16 +283,15 @@ def calibrate_registration(settings: LandmarkSettings, _: Progress | None = None
     )
 
 
-def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -> str:
+def calibrate_clock(settings: ClockSettings, _: Progress | None = None) -> str:
     """Find the offset of a device's stamps; returns a sentence with the result.
 
     Raises:
         UsSimError: the recordings cannot be read or do not determine the offset.
     """
     out = settings.out
-    moving = read_signal(settings.moving, settings.pose, progress=progress)
-    name = settings.fixed_pose or settings.pose
-    fixed = read_signal(settings.fixed, name, images=settings.images, progress=progress)
+    moving = read_signal(settings.moving, settings.pose)
+    fixed = read_signal(settings.fixed, settings.fixed_pose or settings.pose)
     found = find_time_offset(moving, fixed, largest=settings.largest)
     write_calibration(
         out,
@@ -332,7 +303,6 @@ def calibrate_clock(settings: ClockSettings, progress: Progress | None = None) -
                 "correlation": found.correlation,
                 "unexplained": found.residual,  # of the fixed signal's standard deviation
                 "seconds": found.seconds,
-                "left_out": moving.left_out + fixed.left_out,
             },
         },
     )

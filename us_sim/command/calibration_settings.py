@@ -1,7 +1,7 @@
 """The options of `us-sim calibrate`, each a field of settings.
 
 >>> from us_sim.command.calibration_settings import ClockSettings
->>> ClockSettings("tracker.mcap", "video.mcap", largest="300 ms").largest
+>>> ClockSettings("tracker.mcap", "arm.mcap", largest="300 ms").largest
 0.3
 """
 
@@ -92,11 +92,8 @@ class ClockSettings(CalibrationSettings):
     """Offset of a tracker's clock from one motion."""
 
     moving: Path = setting(description="recording whose stamps are to be mended")
-    fixed: Path = setting(description="recording whose stamps are right: poses or images")
+    fixed: Path = setting(description="recording whose stamps are right")
     largest: float = setting(Quantity("time", 0.01, 60.0), "largest offset to believe", default=0.5)
-    images: bool = setting(
-        description="the fixed recording's images, though it has poses", default=False
-    )
     pose: str | None = setting(description=_POSE, default=None)
     fixed_pose: str | None = setting(
         description="the same of the fixed recording, where it differs", default=None

@@ -19,8 +19,44 @@ from dataclasses import dataclass, field
 from us_sim.geometry.pose import Pose
 from us_sim.geometry.se3 import interpolate
 
-_REMEMBERED = 2000  # poses of a link, 10 s of 200 Hz
+_REMEMBERED = 4096  # poses, 4 s of 1 kHz and 20 s of 200 Hz
 _RESTART = 1_000_000_000  # ns that a stamp jumps back by when its source begins again
+
+
+class PoseHistory:
+    """The last poses of a frame, by their stamps.
+
+    Args:
+        longest: ns, between two poses that are interpolated; None for any time.
+    """
+
+    def __init__(self, *, longest: int | None = None) -> None:
+        self._longest = longest
+        self.stamps: deque[int] = deque(maxlen=_REMEMBERED)  # ns, ascending
+        self.poses: deque[Pose] = deque(maxlen=_REMEMBERED)
+
+    def add(self, stamp: int, pose: Pose) -> None:
+        """Take a pose that is newer than all before."""
+        self.stamps.append(stamp)
+        self.poses.append(pose)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.stamps.clear()
+        self.poses.clear()
+
+    def at(self, stamp: int) -> Pose | None:
+        """The pose at a stamp, interpolated; None where it is not known."""
+        k = bisect_left(self.stamps, stamp)
+        if k < len(self.stamps) and self.stamps[k] == stamp:
+            return self.poses[k]
+        if not 0 < k < len(self.stamps):
+            return None
+        before, after = self.stamps[k - 1], self.stamps[k]
+        if self._longest is not None and after - before > self._longest:
+            return None
+        fraction = (stamp - before) / (after - before)
+        return interpolate(self.poses[k - 1], self.poses[k], fraction)
 
 
 @dataclass(eq=False)
@@ -29,21 +65,11 @@ class _Link:
 
     parent: str
     fixed: Pose | None = None
-    stamps: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))  # ns, ascending
-    poses: deque[Pose] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    moving: PoseHistory = field(default_factory=PoseHistory)
 
     def at(self, stamp: int) -> Pose | None:
-        """The pose at a stamp, interpolated; None where it was not known yet."""
-        if self.fixed is not None:
-            return self.fixed
-        k = bisect_left(self.stamps, stamp)
-        if k < len(self.stamps) and self.stamps[k] == stamp:
-            return self.poses[k]
-        if not 0 < k < len(self.stamps):
-            return None
-        before, after = self.stamps[k - 1], self.stamps[k]
-        fraction = (stamp - before) / (after - before)
-        return interpolate(self.poses[k - 1], self.poses[k], fraction)
+        """The pose at a stamp; None where it was not known yet."""
+        return self.moving.at(stamp) if self.fixed is None else self.fixed
 
 
 class FrameChain:
@@ -84,8 +110,7 @@ class FrameChain:
         """Forget what moved."""
         self._newest = None
         for link in self._links.values():
-            link.stamps.clear()
-            link.poses.clear()
+            link.moving.clear()
 
     def fix(self, frame: str, parent: str, pose: Pose) -> None:
         """Put a frame for good at a pose in its parent."""
@@ -101,20 +126,20 @@ class FrameChain:
         link = self._links.get(frame)
         if link is None or link.parent != parent or link.fixed is not None:
             link = self._links[frame] = _Link(parent)
-        if link.stamps and stamp <= link.stamps[-1]:
-            if stamp > link.stamps[-1] - _RESTART:
+        stamps = link.moving.stamps
+        if stamps and stamp <= stamps[-1]:
+            if stamp > stamps[-1] - _RESTART:
                 return None
             self.restart()
-        link.stamps.append(stamp)
-        link.poses.append(pose)
+        link.moving.add(stamp, pose)
         links = self.links()
         return self._composed(links) if links is not None and frame in links else None
 
     def _composed(self, links: list[str]) -> tuple[int, Pose] | None:
-        moving = [self._links[link] for link in links if self._links[link].fixed is None]
-        if not all(link.stamps for link in moving):
+        stamps = [self._links[each].moving.stamps for each in links if not self._links[each].fixed]
+        if not all(stamps):
             return None
-        stamp = min(link.stamps[-1] for link in moving)
+        stamp = min(each[-1] for each in stamps)
         if self._newest is not None and stamp <= self._newest:
             return None
         found = Pose()
@@ -129,9 +154,9 @@ class FrameChain:
     def lag(self) -> tuple[str, float]:
         """The link whose newest stamp is the oldest, and the s by which another one is newer."""
         newest = {
-            link: self._links[link].stamps[-1]
+            link: self._links[link].moving.stamps[-1]
             for link in self.links() or ()
-            if self._links[link].stamps
+            if self._links[link].moving.stamps
         }
         if not newest:
             return "", 0.0

@@ -1,4 +1,4 @@
-"""Faces of tetrahedra, a mesh's boundary, and connected parts of a graph, by NumPy alone."""
+"""Faces of tetrahedra, a mesh's boundary, and connected parts of a graph."""
 
 from __future__ import annotations
 
@@ -44,20 +44,11 @@ def boundary_faces(tetrahedra: NDArray[np.integer]) -> NDArray[np.intp]:
 def connected_parts(count: int, one: ArrayLike, other: ArrayLike) -> NDArray[np.int64]:
     """(``count``,) the part of each vertex, from 0 in the order of their first vertices.
 
-    Each vertex points to one with a lower number, and edges and pointers are followed together
-    until nothing changes (Shiloach and Vishkin, An O(log n) parallel connectivity algorithm, 1982).
-
     Args:
         one, other: (E,) the vertices that each edge joins.
     """
-    ends = np.concatenate([np.asarray(one, np.int64), np.asarray(other, np.int64)])
-    others = np.roll(ends, len(ends) // 2)
-    lowest = np.arange(count)
-    while True:
-        before = lowest.copy()
-        reached = before[others]
-        np.minimum.at(lowest, before[ends], reached)  # the root of a vertex, to its neighbour's
-        np.minimum.at(lowest, ends, reached)
-        lowest = lowest[lowest]
-        if np.array_equal(lowest, before):
-            return np.unique(lowest, return_inverse=True)[1].astype(np.int64)
+    from scipy.sparse import coo_array  # which a tenth of a second is saved where no mesh is
+    from scipy.sparse.csgraph import connected_components
+
+    joined = coo_array((np.ones(np.size(one)), (one, other)), shape=(count, count))
+    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)

@@ -49,15 +49,12 @@ def read_with_meshio(path: Path, refusal: str) -> Any:
             return mesh
     except MeshError:
         raise
-    except FileNotFoundError as error:
-        # Formats of two files: TetGen's `.node` and `.ele`, XDMF with HDF5.
-        other = Path(error.filename or "").name or "another file"
+    except (FileNotFoundError, ModuleNotFoundError) as error:
+        # Of formats of two files: TetGen's `.node` and `.ele`, XDMF with HDF5.
+        missing = Path(getattr(error, "filename", "") or getattr(error, "name", "") or "").name
         raise MeshError(
-            f"it goes with {other}, which is not beside it: copy both into one folder"
-        ) from error
-    except ModuleNotFoundError as error:
-        raise MeshError(
-            f"reading it needs {error.name}; install it with `pip install {error.name}`"
+            f"it needs {missing or 'another file'}, which is not there: copy it beside the file, "
+            f"or install the package of that name"
         ) from error
     except (Exception, SystemExit) as error:
         raise MeshError(refusal) from error

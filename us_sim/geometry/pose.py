@@ -79,7 +79,9 @@ class Pose:
             np.linalg.det(rotation) < 0
         ):
             raise PoseError("the matrix is not rigid: its upper left 3×3 block is not a rotation")
-        return cls(matrix[:3, 3], _quaternion(rotation))
+        from scipy.spatial.transform import Rotation  # which most that hold poses do without
+
+        return cls(matrix[:3, 3], Rotation.from_matrix(rotation).as_quat())
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -144,28 +146,6 @@ def lifted(pose: Pose) -> Pose:
     """The pose of a probe in the same image plane that does not press into z > 0."""
     depth = max(float(pose.position[2]), 0.0) / max(float(pose.rotation[2, 2]), _STEEPEST)
     return Pose(pose.position - depth * pose.rotation[:, 2], pose.orientation)
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion of a rotation matrix, by its largest component (Shepperd 1978)."""
-    trace = np.trace(rotation)
-    squares = np.array([*(2 * np.diag(rotation) - trace), trace]) + 1.0
-    k = int(np.argmax(squares))
-    quaternion = np.empty(4)
-    if k == 3:
-        quaternion[3] = squares[3]
-        quaternion[:3] = [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    else:
-        i, j = (k + 1) % 3, (k + 2) % 3
-        quaternion[k] = squares[k]
-        quaternion[i] = rotation[i, k] + rotation[k, i]
-        quaternion[j] = rotation[j, k] + rotation[k, j]
-        quaternion[3] = rotation[j, i] - rotation[i, j]
-    return quaternion / np.linalg.norm(quaternion)
 
 
 PLACE = Quantity("length", -10.0, 10.0)  # A coordinate of something near the patient

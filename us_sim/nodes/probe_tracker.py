@@ -74,7 +74,6 @@ class ProbeTracker(Device):
         self._state = TrackingState.WAITING
         self._taken_at = 0  # ns, when the last measurement was taken
         self._last: Measurement | None = None  # that was published
-        self._is_contested = False
         self._poses = self.stream(PoseStamped, "probe/pose")
         self._transforms = None
         if TFMessage is not None:
@@ -148,23 +147,7 @@ class ProbeTracker(Device):
             self._transforms.publish(TFMessage(transforms=[transform]))
             self.health.published("tf")
         self._report(probe)
-        self._note_rivals()
         self._check()
-
-    def _note_rivals(self) -> None:
-        jump = self._tracking.jump
-        if bool(jump) != self._is_contested:
-            self._is_contested = bool(jump)
-            self._say_status()
-        if jump:
-            infos = self.get_publishers_info_by_topic(self.resolve_topic_name("tracker/pose"))
-            names = sorted({info.node_name for info in infos})
-            who = f" ({', '.join(names)} publish on tracker/pose)" if len(names) > 1 else ""
-            self.health.problem(
-                "rivals",
-                f"the probe jumps to and fro by {1e3 * jump:.0f} mm, as it does between two "
-                f"sources{who}: let one of them end",
-            )
 
     def _report(self, probe: Measurement) -> None:
         deviation = probe.position_deviation
@@ -194,15 +177,13 @@ class ProbeTracker(Device):
 
     def _say_status(self) -> None:
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if self._is_contested else LEVELS[self._state],
+            level=LEVELS[self._state],
             name="probe",
             message=self._state.value,
             hardware_id=self._source,
         )
         refused = self._tracking.refused
         values = {f"refused {kind}": str(count) for kind, count in refused.items()}
-        if self._is_contested:
-            values["jump_mm"] = f"{1e3 * self._tracking.jump:.1f}"
         if self._last is not None and self._state is not TrackingState.TRACKED:
             values |= {"pose": pose_text(self._last.pose), "stamp": str(self._last.stamp)}
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]

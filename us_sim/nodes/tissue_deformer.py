@@ -44,7 +44,7 @@ from us_sim.tissue.mesh.tetrahedral_mesh import TetrahedralMesh
 from us_sim.tissue.model import Deformation
 from us_sim.tissue.solvers.frame_budget import Pace, shortest
 from us_sim.tissue.solvers.solver import TissueSolver
-from us_sim.tracking.haptic import ContactModel, SecantStiffness, wrench_in_patient
+from us_sim.tracking.haptic import ContactModel, wrench_in_patient
 
 OWN = "tissue_deformer"
 STRUCTURES = "tissue/structures"
@@ -62,7 +62,6 @@ class ContactModelPublisher:
     def __init__(self, node: SceneNode) -> None:
         self._node = node
         self._publisher = node.stream(Float64MultiArray, "tissue/contact_model")
-        self._secant = SecantStiffness()
 
     @property
     def is_wanted(self) -> bool:
@@ -80,10 +79,9 @@ class ContactModelPublisher:
             stiffness = None
         try:
             if stiffness is None:
-                stiffness = self._secant.at(pose, wrench)
+                stiffness = np.zeros((6, 6))
             model = ContactModel(nanoseconds_of(stamp), pose, wrench, stiffness)
         except TrackingError as error:
-            self._secant.forget()
             self._node.health.problem("contact_model", f"{error}; it is not published")
             return
         self._publisher.publish(contact_model_message(model))

@@ -451,18 +451,14 @@ def camera_body_of(scene: Scene) -> RigidBody:
     """The markers on the probe that the scene's camera looks for.
 
     Raises:
-        SceneError: no file is named.
-        TrackingError: the file cannot be used.
+        TrackingError: their file cannot be used.
     """
-    from us_sim.tracking.camera.rigid_body import read_rigid_body
+    from us_sim.tracking.camera.rigid_body import RigidBody, read_rigid_body
 
-    body = source_settings(scene, "camera").body
-    if not body:
-        raise SceneError(
-            f"{scene.origin}: tracker.camera.body: is missing; name the file of the markers on the "
-            f"probe, such as config/markers/probe_grip.yaml"
-        )
-    return read_rigid_body(body)
+    settings = source_settings(scene, "camera")
+    if settings.body:
+        return read_rigid_body(settings.body)
+    return RigidBody.single(settings.dictionary, settings.marker, settings.size)
 
 
 @dataclass(frozen=True, eq=False)

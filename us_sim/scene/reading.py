@@ -27,6 +27,7 @@ from us_sim.scene.building import (
     path_of,
     probe_of,
     require_materials,
+    source_settings,
     tracking_of,
 )
 from us_sim.scene.scene import CASE_PREFIX, Scene, TissueSettings
@@ -209,7 +210,7 @@ def check_files(scene: Scene) -> list[str]:
         for key in ("registration", "calibration")
         if isinstance(getattr(tracker, key), str)
     ]
-    if tracker.source.name == "camera":
+    if tracker.source.name == "camera" and source_settings(scene, "camera").body:
         camera_body_of(scene)
         checked.append("tracker.camera.body")
     if tracker.source.name == "path" and tracker.file:

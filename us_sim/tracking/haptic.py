@@ -7,14 +7,14 @@ the wrench:
 >>> wrench = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])  # N: pressed 10 mm into 200 N/m
 >>> stiffness = np.diag([0.0, 0.0, 200.0, 0.0, 0.0, 0.0])
 >>> wall = ContactModel(0, Pose(position=[0.0, 0.0, 0.01]), wrench, stiffness)
->>> [wall.wrench_at(Pose([0.0, 0.0, depth]))[2].round(6).item() for depth in (0.015, 0.005, -0.005)]
+>>> deeper = [wall.answer(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])) for z in (0.005, -0.005, -0.015)]
+>>> [round(float(wrench[2]), 6) + 0.0 for _, wrench in deeper]
 [-3.0, -1.0, 0.0]
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,14 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from us_sim.geometry import se3
+from us_sim.geometry.frame_chain import PoseHistory
 from us_sim.geometry.pose import Pose, product
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import HapticSettings
 
 _FADING = 0.5  # fraction of the push at the model's pose below which the rest of the energy fades
 _FARTHEST = 0.03  # m: distance after which the push ends at the latest, however soft the tissue is
-_STIFFEST_SECANT = 3e3  # N/m: beyond it the stiffness is an oscillation of the solver, not tissue
-_NEAR = 5e-4  # m along the push: poses nearer than this do not determine the stiffness between them
 
 
 def wrench_in_patient(
@@ -83,19 +82,6 @@ class ContactModel:
         rest = self.stiffness + lacking * np.outer(along, along) - np.outer(slope, shape)
         return direction, force, slope, self.wrench - force * shape, rest
 
-    def displacement(self, pose: Pose) -> NDArray[np.float64]:
-        """(6,) m, rad: of the origin, and the rotation vector, from the model's pose to another."""
-        turn = se3.rotation_between(self.pose.orientation, pose.orientation)
-        return np.concatenate([pose.position - self.pose.position, turn])
-
-    def energy_at(self, pose: Pose) -> float:
-        """J, energy that the tissue returns until the probe is let go, by this model."""
-        return self.answer(self.displacement(pose))[0]
-
-    def wrench_at(self, pose: Pose) -> NDArray[np.float64]:
-        """(6,) N, N m on the probe at another pose, about its origin there, axes of ``patient``."""
-        return self.answer(self.displacement(pose))[1]
-
     def answer(self, displacement: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """The energy (J) and the wrench (6,) N, N m at a displacement (6,) m, rad."""
         energy, wrench = self._slope(displacement)
@@ -134,49 +120,7 @@ def _fade(push: float) -> tuple[float, float]:
     return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / _FADING
 
 
-class SecantStiffness:
-    """The stiffness along the push, by the secant between two poses.
-
-    It is for solvers that know no stiffness of their own. A few poses do not determine the
-    stiffness across the push or against turns: so that is zero.
-    """
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew, as after the contact was lost."""
-        self._spring = 0.0  # N/m
-        self._last: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-
-    def at(self, pose: Pose, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The stiffness (6, 6) at the next pose of the probe.
-
-        Args:
-            pose: in ``patient``.
-            wrench: (6,) N, N m, on the probe, about its origin, axes of ``patient``.
-        """
-        stiffness = np.zeros((6, 6))
-        force = wrench[:3]
-        size = float(np.linalg.norm(force))
-        if size == 0.0:
-            self.forget()
-            return stiffness
-        push = force / size
-        if self._last is None:
-            self._last = pose.position, force
-        else:
-            distance = float((pose.position - self._last[0]) @ push)
-            if abs(distance) >= _NEAR:
-                spring = -float((force - self._last[1]) @ push) / distance
-                spring = min(max(spring, 0.0), _STIFFEST_SECANT)
-                self._spring = 0.5 * (self._spring or spring) + 0.5 * spring
-                self._last = pose.position, force
-        stiffness[:3, :3] = self._spring * np.outer(push, push)
-        return stiffness
-
-
-_REMEMBERED = 4096  # poses of the handle kept for the models that carry their stamps
+_QUEUED = 4096  # poses that wait for the next tick
 _BETWEEN = 20_000_000  # ns: poses nearer in time than this are interpolated between
 _RESTART = 1_000_000_000  # ns: a stamp that jumps back by more is a restarted device, not late
 _LEVER = 0.05  # m: a turn by an angle counts as a displacement of this times the angle
@@ -219,12 +163,11 @@ class HapticRendering:
         self._settings, self._device = settings, device
         self._time_offset = round(1e9 * time_offset)
         self._metric = np.array([1.0, 1.0, 1.0, _LEVER, _LEVER, _LEVER])
-        self._arrived: deque[tuple[int, Pose, int]] = deque(maxlen=_REMEMBERED)
+        self._arrived: deque[tuple[int, Pose, int]] = deque(maxlen=_QUEUED)
         self._arrived_model: deque[tuple[ContactModel, int]] = deque(maxlen=1)
         self._distrusted: deque[str] = deque(maxlen=1)
         self._is_clutched = False
-        self._stamps: list[int] = []
-        self._poses: list[Pose] = []
+        self._handle = PoseHistory(longest=_BETWEEN)
         self._pose_time: int | None = None
         self._model: ContactModel | None = None
         self._model_time = 0
@@ -246,7 +189,7 @@ class HapticRendering:
     @property
     def stamp(self) -> int | None:
         """ns, of the newest pose of the handle."""
-        return self._stamps[-1] if self._stamps else None
+        return self._handle.stamps[-1] if self._handle.stamps else None
 
     def pose(self, stamp: int, pose: Pose, now: int) -> None:
         """Take a pose of the handle in the arm's frame; stamp and time of arrival in ns."""
@@ -274,13 +217,13 @@ class HapticRendering:
         self._motions.append(self._motion)
         if doubt:
             # Only models of poses from here on are believed.
-            self._not_before = self._stamps[-1] if self._stamps else None
+            self._not_before = self.stamp
             return self._doubted(doubt)
         doubt = self._take_model(now)
         if doubt:
             return self._doubted(doubt)
         assert self._model is not None
-        moved = self._device.probe_moved(self._model.pose, self._anchor, self._poses[-1])
+        moved = self._device.probe_moved(self._model.pose, self._anchor, self._handle.poses[-1])
         doubt = self._far(moved)
         if doubt:
             return self._doubted(doubt)
@@ -304,15 +247,14 @@ class HapticRendering:
         self._motion = np.zeros(6)
         while self._arrived:
             stamp, pose, time = self._arrived.popleft()
-            step = stamp - self._stamps[-1] if self._stamps else 1
+            step = 1 if self.stamp is None else stamp - self.stamp
             if step <= -_RESTART:
-                self._stamps.clear()
-                self._poses.clear()
+                self._handle.clear()
                 doubt = "the stamps of the handle's poses have jumped back"
             elif step <= 0:
                 continue  # repeated or late: the handle is where the newest says
-            if self._poses:
-                motion = _motion(self._poses[-1], pose)
+            if self._handle.poses:
+                motion = _motion(self._handle.poses[-1], pose)
                 distance, turn = _lengths(motion)
                 if distance > _JUMP:
                     doubt = f"the handle has jumped by {1e3 * distance:.1f} mm"
@@ -320,11 +262,8 @@ class HapticRendering:
                     doubt = f"the handle has jumped by {math.degrees(turn):.0f}°"
                 else:
                     self._motion = self._motion + motion
-            self._stamps.append(stamp)
-            self._poses.append(pose)
+            self._handle.add(stamp, pose)
             self._pose_time = time
-        if len(self._stamps) > 2 * _REMEMBERED:
-            del self._stamps[:-_REMEMBERED], self._poses[:-_REMEMBERED]
         if doubt:
             return doubt
         if self._pose_time is None:
@@ -348,32 +287,19 @@ class HapticRendering:
         stamp = model.stamp - self._time_offset
         if self._not_before is not None and stamp <= self._not_before:
             return
-        anchor = self._pose_at(stamp)
+        anchor = self._handle.at(stamp)
         if anchor is None:
             return
         before = self._model
         if before is not None and not self.doubt:
             # The wrench felt now fades into the new model's.
-            handle = self._poses[-1]
+            handle = self._handle.poses[-1]
             _, old = before.answer(self._device.probe_moved(before.pose, self._anchor, handle))
             _, new = model.answer(self._device.probe_moved(model.pose, anchor, handle))
             self._left_over = old + self._left(time) - new
             self._since = time
         self._model, self._anchor, self._model_time = model, anchor, time
         self._not_before = stamp
-
-    def _pose_at(self, stamp: int) -> Pose | None:
-        """Where the handle was, or None where that is not known."""
-        place = bisect_left(self._stamps, stamp)
-        if place == len(self._stamps):
-            return None
-        if self._stamps[place] == stamp:
-            return self._poses[place]
-        if place == 0 or self._stamps[place] - self._stamps[place - 1] > _BETWEEN:
-            return None
-        first, second = self._stamps[place - 1], self._stamps[place]
-        fraction = (stamp - first) / (second - first)
-        return se3.interpolate(self._poses[place - 1], self._poses[place], fraction)
 
     def _far(self, moved: NDArray[np.float64]) -> str:
         """A doubt about a model made at a displacement (6,) m, rad, or an empty text."""

@@ -26,28 +26,22 @@ from us_sim.geometry.pose import Pose, product
 from us_sim.tracking.measurement import Measurement
 from us_sim.tracking.settings import SixDofMouseSettings
 
+_LONGEST_GAP = 0.1  # s between two messages over which the velocity is still believed
 _ROUNDING = 1e-3  # how far an axis may be beyond ±1: some drivers divide by a rounded full scale
 
 
 class SixDofMouse:
     """Turns deflections of a cap into poses of the probe in ``patient``.
 
-    While the clutch is held the probe stays where it is; in position mode deflections then count
-    from where the cap was let go, so nothing jumps. At a side of the workspace the probe stops, and
-    comes back as soon as the cap does.
+    A deflection is a velocity. While the clutch is held the probe stays where it is. At a side of
+    the workspace the probe stops, and comes back as soon as the cap does.
     """
 
     def __init__(self, settings: SixDofMouseSettings) -> None:
         self._settings = settings
         self._used = list(settings.axes)
-        rate = settings.mode == "rate"
-        self._full = np.array(
-            [
-                *(settings.speed if rate else settings.reach),
-                *(settings.angular_speed if rate else settings.angular_reach),
-            ]
-        )
-        self._home = Pose(np.array(settings.home), np.array(settings.home_orientation))
+        self._full = np.array([*settings.speed, *settings.angular_speed])
+        self._home = Pose(np.array(settings.home))
         self.last_problem = ""
         self.reset()
 
@@ -55,9 +49,8 @@ class SixDofMouse:
         """Bring the probe home and forget all messages."""
         self.pose = self._home
         self._stamp: int | None = None  # ns, of the last message
-        self._twist = np.zeros(6)  # of the last message, m and rad, a second in rate mode
+        self._twist = np.zeros(6)  # of the last message, m/s and rad/s
         self._held: dict[int, bool] = {}
-        self._let_go()
 
     def axes(self, axes: Sequence[float], buttons: Sequence[int], stamp: int) -> Measurement | None:
         """The probe after a message, or None where it cannot be used: `last_problem` says why.
@@ -79,18 +72,10 @@ class SixDofMouse:
         )
         if home:
             self.pose = self._home
-        if home or clutch:
-            self._let_go()
-        elif self._settings.mode == "rate":
+        elif not clutch:
             # The velocity goes evenly from the last message's to this one's.
             self.pose = self._within(self._moved(self.pose, 0.5 * step * (before + self._twist)))
-        else:
-            self.pose = self._within(self._displaced(self._point, self._twist - self._from))
         return Measurement(stamp, self.pose)
-
-    def _let_go(self) -> None:
-        """Count displacements from here."""
-        self._point, self._from = self.pose, self._twist.copy()
 
     def _deflection(self, axes: Sequence[float]) -> NDArray[np.float64] | None:
         """(6,) deflections of the axes used, counted from the edge of the dead band."""
@@ -121,7 +106,7 @@ class SixDofMouse:
         if self._stamp is None:
             return 0.0
         step = 1e-9 * (stamp - self._stamp)
-        return step if 0.0 < step <= self._settings.longest_gap else 0.0
+        return step if 0.0 < step <= _LONGEST_GAP else 0.0
 
     def _is_held(self, button: int, buttons: Sequence[int]) -> bool:
         if 0 <= button < len(buttons):
@@ -132,14 +117,9 @@ class SixDofMouse:
         """The pose after a motion (6,) m, rad that is uniform in the frame of motion."""
         if self._settings.frame == "probe":
             return pose @ se3.exp(twist)
-        return self._displaced(pose, twist)
-
-    def _displaced(self, pose: Pose, twist: NDArray[np.float64]) -> Pose:
-        """The pose moved by (3,) m and turned about the probe's face by (3,) rad."""
-        turn = se3.rotation_exp(twist[3:])
-        if self._settings.frame == "probe":
-            return pose @ Pose(twist[:3], turn)
-        return Pose(pose.position + twist[:3], product(turn, pose.orientation))
+        # Along the patient's axes, and turned about the probe's face.
+        turn = product(se3.rotation_exp(twist[3:]), pose.orientation)
+        return Pose(pose.position + twist[:3], turn)
 
     def _within(self, pose: Pose) -> Pose:
         """The pose, in the workspace."""

@@ -1,7 +1,8 @@
 """OpenIGTLink: messages as bytes, a client of a tracker's server, and a server of images and poses.
 
 Messages are those of openigtlink.org, versions 1 to 3: big-endian and in millimetres. A message
-whose checksum is wrong is refused; senders that make none write 0.
+whose checksum is wrong is refused; senders that make none write 0. The package pyigtl knows neither
+TDATA, POSITION nor metadata, checks no checksum of what it receives, and takes a process' signals.
 
 >>> from us_sim.tracking.openigtlink import HEADER, header_of, poses_in, transform_message
 >>> matrix = np.eye(4)
@@ -16,12 +17,15 @@ whose checksum is wrong is refused; senders that make none write 0.
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
+import socketserver
 import struct
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,18 +41,15 @@ HEADER = struct.Struct(">H12s20sIIQQ")
 
 NAME_LENGTH = 20  # bytes of a device's name, which is cut to that
 
-POSE_KINDS = ("TRANSFORM", "TDATA", "QTDATA", "POSITION")
+POSE_KINDS = ("TRANSFORM", "TDATA", "POSITION")
 """Types of message in which there are poses."""
 
 _METRES = 1e-3
 _VERSIONS = (1, 2, 3)
 _EXTENSION = struct.Struct(">HHII")  # its size, metadata's header and body, message number
 _METADATA = struct.Struct(">HHI")  # key's length, value's encoding and length
-_ELEMENTS = {
-    kind: np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("numbers", ">f4", count)])
-    for kind, count in (("TDATA", 12), ("QTDATA", 7))
-}
-"""Bodies of messages of several poses: matrices as in a TRANSFORM, positions with quaternions."""
+_ELEMENT = np.dtype([("name", "S20"), ("type", "u1"), ("reserved", "u1"), ("numbers", ">f4", 12)])
+"""A body of a TDATA, with a matrix as in a TRANSFORM."""
 _IMAGE = struct.Struct(">HBBBB3H12f6H")
 _UINT8, _BIG_ENDIAN = 3, 1
 _WORLDS = {"ras": 1, "lps": 2}
@@ -101,17 +102,16 @@ def poses_in(header: Header, body: bytes) -> list[tuple[str, NDArray[np.float64]
         status = metadata.get("TransformStatus", "OK")  # of Plus
         if status.upper() != "OK":
             raise TrackingError(f"the server says that {header.device} is {status}")
-    is_matrix = header.kind in ("TRANSFORM", "TDATA")
-    make = _of_columns if is_matrix else _of_quaternion
-    if header.kind in _ELEMENTS:
-        element = _ELEMENTS[header.kind]
-        if len(content) % element.itemsize:
+    if header.kind == "TDATA":
+        if len(content) % _ELEMENT.itemsize:
             raise _wrong_size(header, len(content))
-        rows = np.frombuffer(content, dtype=element)
-        return [(_text(row["name"]), make(row["numbers"].astype(np.float64))) for row in rows]
+        rows = np.frombuffer(content, dtype=_ELEMENT)
+        return [(_text(row["name"]), _of_columns(row["numbers"])) for row in rows]
+    is_matrix = header.kind == "TRANSFORM"
     if len(content) not in ((48,) if is_matrix else (12, 24, 28)):
         raise _wrong_size(header, len(content))
-    return [(header.device, make(np.frombuffer(content, dtype=">f4").astype(np.float64)))]
+    numbers = np.frombuffer(content, dtype=">f4").astype(np.float64)
+    return [(header.device, _of_columns(numbers) if is_matrix else _of_quaternion(numbers))]
 
 
 def transform_message(
@@ -153,12 +153,6 @@ def image_message(
     return _packed("IMAGE", device, stamp, head + np.ascontiguousarray(pixels).tobytes())
 
 
-def start_tracking_message(interval: float) -> bytes:
-    """Ask for TDATA at most every ``interval`` s."""
-    body = struct.pack(">I32s", max(round(interval * 1e3), 1), b"")
-    return _packed("STT_TDATA", "", 0, body)
-
-
 def _packed(kind: str, device: str, stamp: int, body: bytes) -> bytes:
     seconds, rest = divmod(stamp, 10**9)
     fraction = min((rest * 2**32 + 5 * 10**8) // 10**9, 2**32 - 1)
@@ -182,17 +176,16 @@ def _without_extension(header: Header, body: bytes) -> tuple[bytes, dict[str, st
         end = len(body) - heads - values
         if not _EXTENSION.size <= begin <= end:
             raise _wrong_size(header, len(body))
-        metadata: dict[str, str] = {}
-        if heads:
-            (count,) = struct.unpack_from(">H", body, end)
-            at = end + heads
-            for number in range(count):
-                key, _, value = _METADATA.unpack_from(body, end + 2 + number * _METADATA.size)
-                text = body[at : at + key + value].decode("utf-8", "replace")
-                metadata[text[:key]] = text[key:]
-                at += key + value
+        count = struct.unpack_from(">H", body, end)[0] if heads else 0
+        sizes = [_METADATA.unpack_from(body, end + 2 + 8 * number) for number in range(count)]
     except struct.error as error:
         raise _wrong_size(header, len(body)) from error
+    metadata: dict[str, str] = {}
+    at = end + heads
+    for key, _, value in sizes:
+        text = body[at : at + key + value].decode("utf-8", "replace")
+        metadata[text[:key]] = text[key:]
+        at += key + value
     return body[begin:end], metadata
 
 
@@ -249,9 +242,10 @@ LPS_FROM_RAS = Pose(orientation=np.array([0.0, 0.0, 1.0, 0.0]))
 
 _RETRY_S = 1.0
 _CONNECT_S = 2.0
-_LONGEST_POSES = 1 << 20  # bytes: what claims more is another protocol
-_SKIPPED_AT_ONCE = 1 << 16
+_SILENT_S = 10.0  # after which a server is taken for gone, as where its computer is off
+_LONGEST = 1 << 30  # bytes of a message: what claims more is another protocol
 _SAY_EVERY_S = 1.0
+_ASKED = struct.pack(">I32s", 10, b"")  # TDATA, at most every 10 ms
 
 
 class OpenIGTLinkClient:
@@ -263,7 +257,6 @@ class OpenIGTLinkClient:
         take: called in the client's thread with each measurement, whose stamp is the message's
             (0 where it has none).
         problem: called there with the kind and a sentence when something is not as it should be.
-        connected: called there when the connection stands.
     """
 
     def __init__(
@@ -272,11 +265,10 @@ class OpenIGTLinkClient:
         body: str | None,
         take: Callable[[Measurement], None],
         problem: Callable[[str, str], None],
-        connected: Callable[[], None] = lambda: None,
     ) -> None:
         self._settings = settings
         self._body = body
-        self._take, self._problem, self._say_connected = take, problem, connected
+        self._take, self._problem = take, problem
         #: The server's address, for a person.
         self.place = f"{settings.host}:{settings.port}"
         self._names: dict[str, None] = {}
@@ -318,21 +310,19 @@ class OpenIGTLinkClient:
         settings = self._settings
         with socket.create_connection((settings.host, settings.port), _CONNECT_S) as connection:
             self._socket = connection
-            connection.settimeout(None)
-            _keep_alive(connection)
+            connection.settimeout(_SILENT_S)
             if settings.tracking_data:
-                connection.sendall(start_tracking_message(settings.interval))
+                connection.sendall(_packed("STT_TDATA", "", 0, _ASKED))
             self._names.clear()
             self._heard = time.monotonic()
-            self._say_connected()
+            stream = connection.makefile("rb")
             while not self._closing.is_set():
-                header = header_of(_read(connection, HEADER.size))
-                if header.kind not in POSE_KINDS:
-                    _skip(connection, header.size)
-                    continue
-                if header.size > _LONGEST_POSES:
+                header = header_of(_read(stream, HEADER.size))
+                if header.size > _LONGEST:
                     raise TrackingError(f"a {header.kind} of {header.size} bytes cannot be")
-                self._handle(header, _read(connection, header.size))
+                body = _read(stream, header.size)
+                if header.kind in POSE_KINDS:
+                    self._handle(header, body)
 
     def _handle(self, header: Header, body: bytes) -> None:
         try:
@@ -391,45 +381,31 @@ class OpenIGTLinkClient:
         return LPS_FROM_RAS @ pose if self._settings.world == "ras" else pose
 
 
-def _keep_alive(connection: socket.socket) -> None:
-    """Notice within seconds that the other computer is gone, though nothing is sent to it."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3)):
-        if hasattr(socket, option):
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-
-
-def _read(connection: socket.socket, size: int) -> bytes:
+def _read(stream: BinaryIO, size: int) -> bytes:
     """Read that many bytes.
 
     Raises:
         TrackingError: the server has closed the connection.
     """
-    data = bytearray(size)
-    view = memoryview(data)
-    while view:
-        count = connection.recv_into(view)
-        if not count:
-            raise TrackingError("it has closed the connection")
-        view = view[count:]
-    return bytes(data)
+    data = stream.read(size)
+    if len(data) < size:
+        raise TrackingError("it has closed the connection")
+    return data
 
 
-def _skip(connection: socket.socket, size: int) -> None:
-    while size:
-        size -= len(_read(connection, min(size, _SKIPPED_AT_ONCE)))
+class _Listener(socketserver.ThreadingTCPServer):
+    allow_reuse_address = daemon_threads = True
 
 
 _READ_AT_ONCE = 1 << 16
-_ACCEPT_S = 0.2  # after which it is seen that the server is to close
+_LOOK_S = 0.2  # between two looks for clients that came, sent something, or are gone
 
 
 class OpenIGTLinkServer:
     """Threads that send the newest message of each name to every client.
 
-    A client that is too slow for all messages gets the newest ones; what a client sends is not
-    listened to.
+    A client that is too slow for all messages gets the newest ones; what a client sends is read
+    and dropped.
 
     Args:
         host: name or address to listen at; an empty text for every one this computer has.
@@ -441,18 +417,16 @@ class OpenIGTLinkServer:
 
     def __init__(self, host: str, port: int) -> None:
         try:
-            self._listener = socket.create_server((host, port))
+            self._listener = _Listener((host, port), self._serve)  # type: ignore[arg-type]
         except OSError as error:
             raise TrackingError(
                 f"cannot serve OpenIGTLink at {host or 'every address'}, port {port} "
                 f"({error.strerror or error}): end what uses the port, or choose another"
             ) from error
-        self.port = int(self._listener.getsockname()[1])
+        self.port = int(self._listener.server_address[1])
         self._waiting: dict[socket.socket, dict[str, bytes]] = {}  # of each client, by name
         self._changed = threading.Condition()
-        self._closing = False
-        self._thread = threading.Thread(target=self._accept, name="openigtlink", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._listener.serve_forever, args=(_LOOK_S,), daemon=True).start()
 
     @property
     def clients(self) -> int:
@@ -467,52 +441,32 @@ class OpenIGTLinkServer:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Disconnect all, and wait for the threads to end."""
-        self._closing = True
-        self._thread.join()
-        self._listener.close()
+        """Disconnect all, and wait until they are gone."""
+        self._listener.shutdown()
+        self._listener.server_close()
         with self._changed:
             for connection in self._waiting:
                 _shut(connection)
             self._changed.wait_for(lambda: not self._waiting, _CONNECT_S)
 
-    def _accept(self) -> None:
-        self._listener.settimeout(_ACCEPT_S)
-        while not self._closing:
-            with contextlib.suppress(OSError):  # nobody came, or is gone again already
-                connection, _ = self._listener.accept()
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                with self._changed:
-                    self._waiting[connection] = {}
-                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
-
-    def _serve(self, connection: socket.socket) -> None:
-        """Discard what a client sends, until it is gone."""
-        feeder = threading.Thread(target=self._feed, args=(connection,), daemon=True)
-        feeder.start()
+    def _serve(self, connection: socket.socket, *_: object) -> None:
+        """Send a client what waits for it, until it is gone."""
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        waiting: dict[str, bytes] = {}
+        with self._changed:
+            self._waiting[connection] = waiting
         with contextlib.suppress(OSError):
-            while connection.recv(_READ_AT_ONCE):
-                pass
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: waiting, _LOOK_S)
+                    message = waiting.pop(next(iter(waiting))) if waiting else b""
+                connection.sendall(message)
+                is_readable = bool(select.select([connection], [], [], 0)[0])
+                if is_readable and not connection.recv(_READ_AT_ONCE):
+                    break
         with self._changed:
             del self._waiting[connection]
             self._changed.notify_all()
-        _shut(connection)
-        feeder.join()
-        connection.close()
-
-    def _feed(self, connection: socket.socket) -> None:
-        """Send a client what waits for it, until it is gone."""
-        try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._waiting.get(connection) != {})
-                    if connection not in self._waiting:
-                        return
-                    waiting = self._waiting[connection]
-                    message = waiting.pop(next(iter(waiting)))
-                connection.sendall(message)
-        except OSError:
-            _shut(connection)
 
 
 def _shut(connection: socket.socket) -> None:

@@ -22,24 +22,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter, deque
-
-import numpy as np
-from numpy.typing import NDArray
+from collections import Counter
 
 from us_sim.geometry.pose import Pose, product
 from us_sim.geometry.se3 import adjoint
 from us_sim.tracking.filters import PoseFilter
-from us_sim.tracking.measurement import Measurement, TrackingClock, TrackingState
+from us_sim.tracking.measurement import Measurement, TrackingState
 from us_sim.tracking.outlier_gate import OutlierGate, Verdict
 
 RESTART_NS = 1_000_000_000
 """A stamp that jumps back by more is a restarted source, not a late measurement."""
-
-_LEAST_JUMP = 0.005
-"""m from pose to pose, and back to a quarter of it within `_BACK` poses: no hand does that."""
-_BACK, _WINDOW, _JUMPS = 4, 12, 4
-"""Poses among which a pose comes back; and of so many in a row, how many have to."""
 
 
 class ProbeTracking:
@@ -70,31 +62,32 @@ class ProbeTracking:
         self._to_patient = registration.rotation
         self.filter, self._gate = filter, gate
         self._time_offset = round(1e9 * time_offset)
-        self._clock = TrackingClock(coast_for=coast_for, lost_after=lost_after)
+        self._coasts = round(1e9 * coast_for)
+        self._seen: int | None = None  # ns, when the newest that was believed arrived
         self._longest_gap = round(1e9 * lost_after)
         self._newest: int | None = None  # ns, stamp of the newest measurement in order
         self._believed: int | None = None  # ns, stamp of the newest that was believed
         self.refused: Counter[str] = Counter()
         self.restarts: Counter[str] = Counter()
         self.last_refused = self.last_problem = ""
-        self._places: deque[NDArray[np.float64]] = deque(maxlen=_BACK + 1)
-        self._jumps: deque[float] = deque(maxlen=_WINDOW)
-
-    @property
-    def jump(self) -> float:
-        """How far poses jump to and fro, m, as those of two sources do; 0 where they do not."""
-        jumps = [jump for jump in self._jumps if jump]
-        return float(np.median(jumps)) if len(jumps) >= _JUMPS else 0.0
 
     def reset(self) -> None:
         """Forget all poses, and keep the counts."""
-        self._newest = self._believed = None
-        self._clock.reset()
+        self._newest = self._believed = self._seen = None
         self._start_anew()
 
     def state(self, now_ns: int) -> TrackingState:
-        """Whether the probe is tracked at a time of the clock that `take` is told."""
-        return self._clock.state(now_ns)
+        """Whether the probe is tracked at a time of the clock that `take` is told.
+
+        Where the clock was set back, the last pose's age counts anew.
+        """
+        if self._seen is None:
+            return TrackingState.WAITING
+        self._seen = min(self._seen, now_ns)
+        age = now_ns - self._seen
+        if age < self._coasts:
+            return TrackingState.TRACKED
+        return TrackingState.COASTING if age < self._longest_gap else TrackingState.LOST
 
     def refuse(self, kind: str, sentence: str) -> None:
         """Count a measurement that cannot be used, be it one that never became a pose."""
@@ -115,7 +108,6 @@ class ProbeTracking:
             self.refuse("order", "the pose is not newer than the one before it")
             return None
         probe = self._of_probe(measurement)
-        self._note_jump(probe.pose.position)
         found = self._believed is not None and probe.stamp - self._believed > self._longest_gap
         if found:
             self.filter.reset()
@@ -130,16 +122,8 @@ class ProbeTracking:
         if found:
             self.restarts["gap"] += 1
         self._believed = probe.stamp
-        self._clock.seen(now_ns)
+        self._seen = now_ns
         return self.filter.update(probe)
-
-    def _note_jump(self, place: NDArray[np.float64]) -> None:
-        """Whether the probe has jumped, back to about where it was a few poses ago."""
-        *earlier, last = self._places or [place]
-        step = float(np.linalg.norm(place - last))
-        nearest = min((float(np.linalg.norm(place - each)) for each in earlier), default=step)
-        self._jumps.append(step if step > _LEAST_JUMP and nearest < 0.25 * step else 0.0)
-        self._places.append(place)
 
     def _in_order(self, stamp: int) -> bool:
         """Whether a stamp is newer, or so much older that the source was started again."""

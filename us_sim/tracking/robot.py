@@ -14,7 +14,6 @@ to the tissue by an admittance without mass, a damper: it moves at (wanted - fel
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -83,9 +82,6 @@ class RobotSettings(Settings):
         default=400.0,
     )
     force: float = setting(Quantity("force", 0.1, 200.0), "largest that is sought", default=25.0)
-    delay: float = setting(
-        Quantity("time", 0.0, 1.0), "from a command to the motion, as of an arm", default=0.0
-    )
     timeout: float = setting(
         Quantity("time", 0.01, 60.0),
         "after which a command counts no longer, and the arm stops; likewise a felt force",
@@ -119,7 +115,6 @@ class Robot:
         self.pose = Pose(np.array([0.0, 0.0, -settings.lift]))
         self._velocity = np.zeros(6)  # of the probe in its own frame
         self._time: float | None = None  # of the last motion
-        self._commands: deque[tuple[float, NDArray[np.float64] | float]] = deque()
         self._twist: tuple[float, NDArray[np.float64]] = (-math.inf, np.zeros(6))
         self._wanted = self._felt = (-math.inf, 0.0)
         self.action = "at rest"  # for a person
@@ -130,11 +125,11 @@ class Robot:
         """Ask for a velocity (6,) m/s, rad/s along the axes of the probe, or of ``patient``."""
         if in_patient:
             twist = (twist.reshape(2, 3) @ self.pose.rotation).ravel()
-        self._commands.append((time + self._settings.delay, twist))
+        self._twist = time, twist
 
     def ask_force(self, time: float, force: float) -> None:
         """Ask for a force, N by which the probe presses along its axis."""
-        self._commands.append((time + self._settings.delay, force))
+        self._wanted = time, force
 
     def feel(self, time: float, force: float) -> None:
         """Take the force, N by which the probe presses along its axis."""
@@ -143,12 +138,6 @@ class Robot:
     def move(self, time: float) -> Pose:
         """Move until a time, and return the probe's pose in ``patient``."""
         given = self._settings
-        while self._commands and self._commands[0][0] <= time:
-            due, command = self._commands.popleft()
-            if isinstance(command, float):
-                self._wanted = due, command
-            else:
-                self._twist = due, command
         passed = 0.0 if self._time is None else min(max(time - self._time, 0.0), LONGEST_STEP)
         self._time = time
         wanted = self._wanted_velocity(time)

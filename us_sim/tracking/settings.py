@@ -3,9 +3,9 @@
 A value that is out of range is a TrackingError with its name and the range, as are two that do not
 go together.
 
->>> from us_sim.tracking.settings import CameraSettings, OneEuroSettings
->>> CameraSettings(view_angle_limit="0.5 rad").view_angle_limit
-0.5
+>>> from us_sim.tracking.settings import GateSettings, OneEuroSettings
+>>> GateSettings(jump="5 mm").jump
+0.005
 >>> OneEuroSettings(derivative_cutoff=0)
 Traceback (most recent call last):
 ...
@@ -40,25 +40,15 @@ class CameraSettings(Settings):
     error = TrackingError
 
     body: str = setting(
-        description="file of the rigid body of markers on the probe", file=True, default=""
+        description="file of the rigid body of markers; empty for one marker", file=True, default=""
+    )
+    marker: int = setting(Quantity("number", 0, 65535), "number of the one marker", default=0)
+    size: float = setting(MARKER_SIZE, "edge of the one marker's black square", default=0.04)
+    dictionary: str = setting(
+        description="of the one marker", choices=DICTIONARIES, default="4X4_50"
     )
     minimum_markers: int = setting(
         Quantity("number", 1, 1000), "markers that must be seen for a pose to be taken", default=1
-    )
-    reprojection_limit: float = setting(
-        Quantity("image distance", 0.1, 50.0),
-        "root mean square between the corners seen and those of the pose",
-        default=2.0,
-    )
-    view_angle_limit: float = setting(
-        Quantity("angle", 0.1, 1.5),
-        "angle between a marker's normal and the line of sight, beyond which it is not used",
-        default=math.radians(75.0),
-    )
-    corner_deviation: float = setting(
-        Quantity("image distance", 0.01, 10.0),
-        "standard deviation of a corner, the least that the covariance of the pose is made with",
-        default=0.1,
     )
 
 
@@ -206,7 +196,6 @@ class HapticSettings(Settings):
     )
 
 
-MOUSE_MODES = ("rate", "position")
 MOTION_FRAMES = ("probe", "patient")
 
 _PLACE = Quantity("length", -10.0, 10.0)
@@ -217,19 +206,14 @@ _BUTTON = Quantity("number", -1, 63)
 class SixDofMouseSettings(Settings):
     """The settings of the 6-DOF mouse; each is a key of a scene's ``tracker.six_dof_mouse:``.
 
-    A full deflection is 1. The signs of the defaults turn the axes of REP 103, in which mice
-    report (x forward, y left, z up), about x: so the probe goes down when the cap is pushed down.
+    The deflection is the probe's velocity; a full one is 1. The signs of the defaults turn the axes
+    of REP 103, in which mice report (x forward, y left, z up), about x: so the probe goes down when
+    the cap is pushed down.
     """
 
     section = "six_dof_mouse"
     error = TrackingError
 
-    mode: str = setting(
-        description="rate: the deflection is the probe's velocity; position: its displacement "
-        "from where the clutch was let go",
-        choices=MOUSE_MODES,
-        default="rate",
-    )
     frame: str = setting(
         description="whose axes the probe moves along", choices=MOTION_FRAMES, default="probe"
     )
@@ -240,23 +224,13 @@ class SixDofMouseSettings(Settings):
     )
     speed: tuple[float, float, float] = setting(
         Quantity("speed", -1.0, 1.0),
-        "velocity at full deflection along x, y, z, in rate mode",
+        "velocity at full deflection along x, y, z",
         default=(0.05, -0.05, -0.05),
     )
     angular_speed: tuple[float, float, float] = setting(
         Quantity("angular speed", -10.0, 10.0),
-        "angular velocity at full deflection about x, y, z, in rate mode",
+        "angular velocity at full deflection about x, y, z",
         default=(0.6, -0.6, -0.6),
-    )
-    reach: tuple[float, float, float] = setting(
-        Quantity("length", -1.0, 1.0),
-        "displacement at full deflection along x, y, z, in position mode",
-        default=(0.03, -0.03, -0.03),
-    )
-    angular_reach: tuple[float, float, float] = setting(
-        Quantity("angle", -math.pi, math.pi),
-        "turn at full deflection about x, y, z, in position mode",
-        default=(0.5, -0.5, -0.5),
     )
     dead_band: float = setting(
         Quantity("number", 0.0, 0.9),
@@ -272,31 +246,17 @@ class SixDofMouseSettings(Settings):
     home: tuple[float, float, float] = setting(
         _PLACE, "where the probe begins, in patient", default=(0.0, 0.0, -0.01)
     )
-    home_orientation: tuple[float, float, float, float] = setting(
-        Quantity("number", -1.0, 1.0),
-        "quaternion x, y, z, w of the probe there",
-        default=(0.0, 0.0, 0.0, 1.0),
-    )
     workspace_low: tuple[float, float, float] = setting(
         _PLACE, "least x, y, z of the probe in patient", default=(-0.2, -0.2, -0.1)
     )
     workspace_high: tuple[float, float, float] = setting(
         _PLACE, "largest x, y, z of the probe in patient", default=(0.2, 0.2, 0.1)
     )
-    longest_gap: float = setting(
-        Quantity("time", 1e-3, 10.0),
-        "time between two messages over which the velocity is still believed",
-        default=0.1,
-    )
 
     def check(self) -> None:
-        """Six axes, an orientation, two buttons, and a home in the workspace."""
+        """Six axes, two buttons, and a home in the workspace."""
         if len(set(self.axes)) != len(self.axes):
             raise self.refused("axes", f"{self.axes} must be six different whole numbers, from 0")
-        if math.hypot(*self.home_orientation) < 1e-6:
-            raise self.refused(
-                "home_orientation", "is zero, so it is no orientation: give [0, 0, 0, 1] for none"
-            )
         if self.clutch_button == self.reset_button >= 0:
             raise self.refused(
                 "reset_button",
@@ -341,9 +301,6 @@ class OpenIGTLinkSettings(Settings):
     )
     tracking_data: bool = setting(
         description="ask for TDATA, for servers that send nothing unasked", default=False
-    )
-    interval: float = setting(
-        Quantity("time", 1e-3, 10.0), "time between two TDATA, if asked for", default=0.01
     )
 
     def check(self) -> None:

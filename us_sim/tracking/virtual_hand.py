@@ -27,12 +27,12 @@ from us_sim.errors import MeshError, PoseError
 from us_sim.geometry.pose import Pose, product
 from us_sim.geometry.se3 import rotation_exp
 
-_STEP = 1e-3
-"""m: a way over the surface is walked in steps of this, each along the tangent where it begins."""
 _TURNS, _NEAR = 30, 1e-9
 """How often the foot of a perpendicular is improved at most, and how far (m) it may then be off."""
 _FACING_UP = 0.3
 """Cosine between -z and the normals of a closed surface's upper side, which is more than this."""
+_LEAST_FACING = 0.1
+"""The least of these by which a height is found along z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,22 +113,19 @@ class RestSurface:
         return self._foot(int(near[best]), weights[best])
 
     def above(self, x: float, y: float) -> Foot:
-        """The first point of the surface on the way along +z through x, y (m).
+        """The point of the surface's top at x, y (m), or near it where there is none.
 
-        Where that way misses the surface it is the point closest to x, y on the surface's top.
+        It is the closest to a point on the line along z, which then is put on its tangent plane.
         """
-        a, b, c = (self._corners[:, k, :2] for k in range(3))
-        point = np.array([x, y])
-        areas = np.stack([_area(b, c, point), _area(c, a, point), _area(a, b, point)], axis=1)
-        total = areas.sum(axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            weights = areas / total[:, None]
-        met = np.flatnonzero((weights >= -1e-9).all(axis=1) & (total != 0.0))
-        if not len(met):
-            return self.closest(np.array([x, y, self.lower[2]]))
-        heights = np.einsum("tc,tc->t", weights[met], self._corners[met, :, 2])
-        first = int(np.argmin(heights))
-        return self._foot(int(met[first]), weights[met[first]])
+        height = float(self.lower[2])
+        for _ in range(_TURNS):
+            foot = self.closest(np.array([x, y, height]))
+            aside = np.array([x, y]) - foot.point[:2]
+            if float(np.abs(aside).max()) < _NEAR:
+                break
+            slope = aside @ foot.normal[:2] / max(-float(foot.normal[2]), _LEAST_FACING)
+            height = float(foot.point[2] + slope)
+        return foot
 
     def under(self, position: NDArray[np.float64]) -> tuple[Foot, float]:
         """The foot on whose normal a position (3,) m lies, and how far inwards (m) it is from it.
@@ -147,37 +144,12 @@ class RestSurface:
         foot = self.closest(position)
         return foot, -float((position - foot.point) @ foot.normal)
 
-    def walk(self, foot: Foot, way: NDArray[np.float64]) -> Foot:
-        """Where one comes to along a way (3,) m over the surface, straight on.
-
-        The way's direction is turned with the surface; at an edge one stays.
-        """
-        length = float(np.linalg.norm(way))
-        steps = max(1, int(np.ceil(length / _STEP)))
-        direction = np.asarray(way, dtype=np.float64)
-        for _ in range(steps):
-            tangent = direction - (direction @ foot.normal) * foot.normal
-            size = float(np.linalg.norm(tangent))
-            if size < 1e-12:
-                break
-            direction = tangent / size
-            foot = self.closest(foot.point + (length / steps) * direction)
-        return foot
-
     def _foot(self, triangle: int, weights: NDArray[np.float64]) -> Foot:
         normal = weights @ self._normals[triangle]
         length = float(np.linalg.norm(normal))
         # Where triangles fold onto each other their normals may cancel.
         normal = normal / length if length > 1e-9 else self._flat[triangle]
         return Foot(weights @ self._corners[triangle], normal)
-
-
-def _area(
-    a: NDArray[np.float64], b: NDArray[np.float64], point: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(T,) twice the signed areas of the triangles a, b (T, 2) and a point (2,), m²."""
-    along, to = b - a, point - a
-    return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])
 
 
 def _closest_weights(
@@ -215,10 +187,6 @@ class Approach:
 
     def __init__(self, place: NDArray[np.float64], speed: float, time_constant: float) -> None:
         self._speed, self._time_constant = speed, time_constant
-        self.rest_at(place)
-
-    def rest_at(self, place: NDArray[np.float64]) -> None:
-        """Be somewhere, without movement."""
         self.place = np.array(place, dtype=np.float64)
         self._lead = self.place.copy()
         self.goal: NDArray[np.float64] = self.place.copy()
@@ -290,11 +258,6 @@ class Motion:
         """Whether it is where it goes."""
         metres = max(self._slide.distance(), self._press.distance())
         return metres < _AT_REST and self._turn.distance() < _ALIGNED
-
-    def rest_at(self, stance: Stance) -> None:
-        """Be there, without any movement, as when the probe is taken from somebody else."""
-        for approach, part in zip(self._approaches, _parts(stance), strict=True):
-            approach.rest_at(part)
 
     def aim(self, stance: Stance) -> None:
         """Go there from now on, turning the shorter way."""
@@ -385,11 +348,11 @@ class Stance:
         return Pose(foot.point - self.press * foot.normal, orientation)
 
     def slid(self, surface: RestSurface, along_x: float, along_y: float) -> Stance:
-        """Moved over the skin along the probe's own x and y, m, as it is rotated."""
+        """Moved along the probe's own x and y, m, as it is rotated, to the closest of the skin."""
         foot = surface.closest(self.point)
         turned = product(_upright(foot.normal), rotation_exp(_about(2, self.rotation)))
         way = Pose(np.zeros(3), turned).rotation @ np.array([along_x, along_y, 0.0])
-        return replace(self, point=surface.walk(foot, way).point)
+        return replace(self, point=surface.closest(foot.point + way).point)
 
     def within_reach(self) -> Stance:
         """Pressed and turned no further than a hand may."""

@@ -229,7 +229,7 @@ class ViewerHand:
             self._take_probe()
         elif before.holds and not state.holds:
             assert self._motion is not None
-            self._motion.rest_at(self._motion.stance)
+            self._motion = Motion(self._motion.stance)
             self._node.destroy_publisher(self._publisher)
             self._warning = ""
         rate = 2.0 * MOVING_HZ if state is HandState.MOVING else RESTING_HZ
@@ -304,9 +304,9 @@ class ViewerHand:
         stance = self._motion.stance
         foot = surface.closest(stance.point)
         if float(np.linalg.norm(foot.point - stance.point)) < SAME_PATIENT:
-            self._motion.rest_at(replace(stance, point=foot.point))
+            self._motion = Motion(replace(stance, point=foot.point))
         else:
-            self._motion.rest_at(Stance.home(surface, HOME_PRESS))
+            self._motion = Motion(Stance.home(surface, HOME_PRESS))
 
     def _on_status(self, status: DiagnosticStatus) -> None:
         """Learn where the probe was when poses ended; there it is unless this hand has had it."""

@@ -1,18 +1,15 @@
-"""The offset of two clocks: known shifts, error statistics, Plus' water tank, and refusals."""
+"""The offset of two clocks: known shifts, error statistics, and refusals."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from us_sim.command.calibration import read_signal
 from us_sim.errors import CalibrationError
 from us_sim.tracking.calibration.time_offset import (
     PositionSignal,
     find_time_offset,
-    line_row,
 )
-from us_sim.volume.sequences.sequence import read_sequence
 
 
 def strokes(times):
@@ -62,54 +59,6 @@ def test_what_lies_in_a_gap_is_not_made_up():
     )
     assert found.offset == pytest.approx(0.07, abs=1e-4)
     assert found.correlation > 0.9999
-
-
-@settings(max_examples=15, deadline=None)
-@given(height=st.floats(40.0, 160.0), slope=st.floats(-0.3, 0.3), seed=st.integers(0, 100))
-def test_a_tilted_line_is_found_to_a_part_of_a_row(height, slope, seed):
-    rng = np.random.default_rng(seed)
-    columns, rows = np.arange(301), np.arange(220)[:, None]
-    line = height + slope * (columns - 150)
-    image = 200.0 * np.exp(-0.5 * ((rows - line) / 1.5) ** 2) + rng.uniform(0, 8, (220, 301))
-    image[180:, 40:90] = 230.0  # another echo, below a part of the line
-    assert line_row(image.astype(np.uint8)) == pytest.approx(height, abs=0.15)
-
-
-def test_the_water_tanks_lines_are_where_plus_found_them(shared_data):
-    # The first eight of LineSegmentationResultsBaseline.xml of PlusLibData: a point of the line
-    # and its direction, in pixels.
-    published = [
-        (381.688, 230.524, 0.971201, -0.238262),
-        (419.882, 265.827, 0.968913, -0.247402),
-        (431.941, 314.042, 0.967061, -0.254543),
-        (506.500, 345.490, 0.969446, -0.245305),
-        (382.875, 403.882, 0.986982, -0.160830),
-        (339.188, 399.697, 0.999157, -0.041046),
-        (447.125, 285.936, 0.999988, 0.004842),
-        (358.067, 241.475, 0.998175, -0.060383),
-    ]
-    recording = shared_data / "plus-tracker-recordings" / "WaterTankBottomTranslationVideoBuffer"
-    sweep = read_sequence(recording.with_suffix(".igs.mha"))
-    middle = 0.5 * (sweep.columns - 1)
-    expected = [y + (middle - x) * down / across for x, y, across, down in published]
-    found = [line_row(image) for image in sweep.images(range(8))]
-    np.testing.assert_allclose(found, expected, atol=2.5)
-
-
-@pytest.mark.slow
-def test_the_water_tanks_offset_is_the_one_that_plus_published(shared_data):
-    folder = shared_data / "plus-tracker-recordings"
-    tracker = read_signal(
-        folder / "WaterTankBottomTranslationTrackerBuffer-trimmed.igs.mha", "ProbeToReference"
-    )
-    video = read_signal(folder / "WaterTankBottomTranslationVideoBuffer.igs.mha", None)
-    assert (len(tracker), len(video), video.left_out) == (801, 200, 1)
-    found = find_time_offset(tracker, video)
-    # TemporalCalibrationResultsBaseline.xml of PlusLibData says that the tracker lags by
-    # -0.0648266 s: its stamps are early.
-    assert found.offset == pytest.approx(0.0648266, abs=2e-3)
-    assert 2e-3 < found.deviation < 15e-3
-    assert found.correlation < -0.98
 
 
 TENTHS, NOISE = np.arange(1, 21, 0.1), np.random.default_rng(0).standard_normal(200)

@@ -151,7 +151,7 @@ def test_a_body_that_is_not_as_its_file_says_is_refused():
     image = RenderedView(WEBCAM, grip).render(FACING, ORDINARY)
     wrong = grip.corners.copy()
     wrong[1] += [0.03, 0.0, 0.0]
-    refused(image, "camera.reprojection_limit", RigidBody("4X4_50", grip.ids, wrong))
+    refused(image, "pixels from those of the best pose", RigidBody("4X4_50", grip.ids, wrong))
 
 
 def test_an_image_of_another_camera_is_refused(image):

@@ -21,9 +21,8 @@ from us_sim.evaluation.tracking.cases import CONDITIONS, MARKERS, Case, Marker
 from us_sim.geometry.pose import Pose
 from us_sim.tracking.camera.body_pose import rotation_angle
 from us_sim.tracking.camera.rendered_views import WEBCAMS, RenderedView
-from us_sim.tracking.camera.source import CameraSource
+from us_sim.tracking.camera.source import VIEW_ANGLE_LIMIT, CameraSource
 from us_sim.tracking.measurement import Measurement
-from us_sim.tracking.settings import CameraSettings
 
 
 class Tracking:
@@ -100,7 +99,7 @@ def visible(seen: Marker, pose: Pose) -> int:
     centres = pose.apply(seen.body.centres)
     cosines = -((seen.body.normals @ pose.rotation.T) * centres).sum(axis=1)
     cosines /= np.linalg.norm(centres, axis=1)
-    return int((cosines > np.cos(CameraSettings().view_angle_limit)).sum())
+    return int((cosines > np.cos(VIEW_ANGLE_LIMIT)).sum())
 
 
 def _compared(measured: Measurement | None, seen: Marker, true: Pose) -> dict[str, Any]:

@@ -137,41 +137,37 @@ def calibrate_camera(views: Sequence[BoardView], width: int, height: int) -> Cam
             f"the board is always in the middle of the image ({100 * reach:.0f} % of the way to "
             f"its corners), so the lens cannot be told: take photos with the board near each edge"
         )
-    used = np.ones(len(views), dtype=np.bool_)
-    found = _solve(views, width, height)
+    found = _solve(views, np.ones(len(views), dtype=np.bool_), width, height, reach)
     # A blurred photo or a wrong corner stands out; more than a few are the rule.
     off = found.residuals > max(_FAR_OFF * float(np.median(found.residuals)), _GOOD_RMS)
     if off.any() and off.sum() <= min(_MOST_LEFT_OUT * len(views), len(views) - _FEWEST_VIEWS):
-        used = ~off
-        found = _solve(list(compress(views, used)), width, height)
+        found = _solve(views, ~off, width, height, reach)
     if found.rms > _LARGEST_RMS * _scale(width):
         raise CalibrationError(
             f"no camera fits the photos (RMS {found.rms:.1f} pixels): check the board's kind, size "
             f"and lengths"
         )
-    tilt = _largest_tilt(found.rotations)
-    _check(found.matrix, found.deviations, tilt)
-    camera = CameraModel(width, height, found.matrix, found.lens)
-    fit = (found.rms, found.residuals, used, found.deviations)
-    return CameraCalibration(camera, *fit, tilt, reach)
+    if found.tilt >= _SMALLEST_TILT and found.focal_deviation <= _LARGEST_DEVIATION:
+        return found
+    if found.tilt < _SMALL_TILT:
+        raise CalibrationError(
+            f"the boards are all parallel (to {math.degrees(found.tilt):.1f}°), which leaves the "
+            f"focal length open: take photos tilted to all sides by 30° or more"
+        )
+    raise CalibrationError(
+        f"the photos leave the focal length open by {100 * found.focal_deviation:.0f} % (standard "
+        f"deviation): take more, nearer, and tilted to all sides by 30° or more"
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """OpenCV's solution."""
-
-    rms: float
-    matrix: NDArray[np.float64]  # (3, 3)
-    lens: NDArray[np.float64]  # (5,)
-    rotations: list[NDArray[np.float64]]  # (3, 3) of each view
-    deviations: NDArray[np.float64]  # (9,)
-    residuals: NDArray[np.float64]  # (K,)
-
-
-def _solve(views: Sequence[BoardView], width: int, height: int) -> _Solution:
+def _solve(
+    views: Sequence[BoardView], used: NDArray[np.bool_], width: int, height: int, reach: float
+) -> CameraCalibration:
+    """OpenCV's solution for some of the views."""
     start: Any = None  # no camera to start from, which OpenCV's type hints do not know
+    chosen = list(compress(views, used))
     try:
-        points, pixels = [view.points for view in views], [view.pixels for view in views]
+        points, pixels = [view.points for view in chosen], [view.pixels for view in chosen]
         rms, matrix, lens, turns, _, deviations, _, residuals = cv2.calibrateCameraExtended(
             points, pixels, (width, height), start, start
         )
@@ -179,32 +175,20 @@ def _solve(views: Sequence[BoardView], width: int, height: int) -> _Solution:
         raise CalibrationError(
             "no camera fits the photos: check the board's kind, size and lengths"
         ) from error
-    return _Solution(
-        float(rms),
-        np.array(matrix, np.float64),
-        np.array(lens, np.float64).ravel()[:5],
-        [np.asarray(cv2.Rodrigues(turn)[0], np.float64) for turn in turns],
-        np.array(deviations, np.float64).ravel()[: len(INTRINSICS)],
-        np.array(residuals, np.float64).ravel(),
-    )
-
-
-def _check(matrix: NDArray[np.float64], deviations: NDArray[np.float64], tilt: float) -> None:
     if not np.isfinite(matrix).all() or not np.isfinite(deviations).all():
         raise CalibrationError(
             "the photos do not determine the camera: take 20, tilted to all sides by 30° or more"
         )
-    relative = float((deviations[:2] / np.diag(matrix)[:2]).max())
-    if tilt >= _SMALLEST_TILT and relative <= _LARGEST_DEVIATION:
-        return
-    if tilt < _SMALL_TILT:
-        raise CalibrationError(
-            f"the boards are all parallel (to {math.degrees(tilt):.1f}°), which leaves the focal "
-            f"length open: take photos tilted to all sides by 30° or more"
-        )
-    raise CalibrationError(
-        f"the photos leave the focal length open by {100 * relative:.0f} % (standard deviation): "
-        f"take more, nearer, and tilted to all sides by 30° or more"
+    camera = CameraModel(width, height, np.array(matrix), np.array(lens, np.float64).ravel()[:5])
+    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    return CameraCalibration(
+        camera,
+        float(rms),
+        np.array(residuals, np.float64).ravel(),
+        used,
+        np.array(deviations, np.float64).ravel()[: len(INTRINSICS)],
+        float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max()),
+        reach,
     )
 
 
@@ -217,9 +201,3 @@ def _reach(views: Sequence[BoardView], width: int, height: int) -> float:
     middle = 0.5 * np.array([width - 1, height - 1])
     pixels = np.concatenate([view.pixels for view in views])
     return float(np.linalg.norm(pixels - middle, axis=1).max() / np.linalg.norm(middle))
-
-
-def _largest_tilt(rotations: Sequence[NDArray[np.float64]]) -> float:
-    """rad, the largest angle between the normals of two boards."""
-    normals = np.array([rotation[:, 2] for rotation in rotations])
-    return float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max())

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,21 +27,9 @@ import numpy as np
 import yaml
 
 from us_sim.errors import CalibrationError, PoseError
-from us_sim.geometry.pose import Pose
-from us_sim.settings.quantity import Quantity
+from us_sim.geometry.pose import Placement, Pose
 from us_sim.settings.reading import Reader
-from us_sim.settings.setting import Settings, setting
 from us_sim.settings.text_files import YamlError, load_yaml
-
-
-@dataclass(frozen=True)
-class _Written(Settings):
-    """The keys of a file without which it is no transform."""
-
-    position: tuple[float, float, float] = setting(Quantity("length", -1e3, 1e3), "x, y, z")
-    orientation: tuple[float, float, float, float] = setting(
-        Quantity("number", -1e6, 1e6), "quaternion x, y, z, w, of any length"
-    )
 
 
 def read_transform(path: str | Path) -> Pose:
@@ -54,12 +41,18 @@ def read_transform(path: str | Path) -> Pose:
     """
     path = Path(path)
     try:
-        document = _document(path)
-        written = {key: document[key] for key in ("position", "orientation") if key in document}
-        place = Reader(str(path), error=CalibrationError).read(_Written, written)
-        return Pose(np.array(place.position), np.array(place.orientation))
-    except PoseError as error:
+        document = load_yaml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (PoseError, UnicodeDecodeError, YamlError) as error:
         raise CalibrationError(f"{path}: {error}") from error
+    keys = ("position", "orientation")
+    if not isinstance(document, dict) or not document.keys() >= set(keys):
+        raise CalibrationError(
+            f"{path}: holds no transform; it needs the keys {' and '.join(keys)}"
+        )
+    written = {key: document[key] for key in keys}
+    return Reader(str(path), error=CalibrationError).read(Placement, written).pose
 
 
 def write_transform(
@@ -110,20 +103,6 @@ def write_calibration(path: str | Path, content: Mapping[str, Any]) -> None:
         raise CalibrationError(f"{path}: exists already; choose another name") from None
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        document = load_yaml(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (UnicodeDecodeError, YamlError) as error:
-        raise CalibrationError(f"{path}: {error}") from error
-    if not isinstance(document, dict):
-        raise CalibrationError(
-            f"{path}: holds no transform; it needs the keys position and orientation"
-        )
-    return document
 
 
 def _plain(value: Any) -> Any:

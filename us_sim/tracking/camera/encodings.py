@@ -31,7 +31,6 @@ _ENCODINGS: dict[str, tuple[int, str]] = {
     **{f"bayer_{name}16": (2, f"Bayer{code}2{{}}") for name, code in _BAYER.items()},
 }
 _DEPTHS = (8, 10, 12, 14, 16)  # bits of a sensor
-_NOISE = 8.0  # levels
 
 
 def decode_image(message: Any, colours: str) -> NDArray[np.uint8]:
@@ -58,8 +57,6 @@ def decode_image(message: Any, colours: str) -> NDArray[np.uint8]:
         pixels = np.ascontiguousarray(_rows(message, size))
     except VolumeError as error:
         raise TrackingError(str(error)) from None
-    if encoding == "yuv422":
-        _require_uyvy(pixels)
     if encoding.endswith(("16", "16UC1")):
         pixels = _to_8_bits(pixels.view(">u2" if message.is_bigendian else "<u2"))
     elif size > 1:
@@ -95,22 +92,6 @@ def _to_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     brightest = int(pixels.max())
     depth = next(bits for bits in _DEPTHS if brightest < 1 << bits)
     return (pixels >> (depth - 8)).astype(np.uint8)
-
-
-def _require_uyvy(rows: NDArray[np.uint8]) -> None:
-    """Refuse YUYV, which some drivers call yuv422: its colours would be taken for its grey.
-
-    Raises:
-        TrackingError: what should be the grey alternates as U and V do, or varies far less than
-            what should be the colours.
-    """
-    colours, grey = rows[:, ::2].astype(np.int16), rows[:, 1::2].astype(np.int16)
-    beside, second = (np.abs(grey[:, step:] - grey[:, :-step]).mean() for step in (1, 2))
-    if beside > 1.5 * second + _NOISE or colours.std() > 2.0 * grey.std() + _NOISE:
-        raise TrackingError(
-            "the image is called yuv422, whose bytes are U Y V Y, and they are Y U Y V: let its "
-            "driver call it yuv422_yuy2"
-        )
 
 
 def decompress_image(message: Any, colours: str) -> NDArray[np.uint8]:

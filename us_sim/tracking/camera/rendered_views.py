@@ -44,7 +44,6 @@ _AMBIENT = 0.35  # of the light, which comes from everywhere
 _LIGHT = np.array([0.3, -0.5, -0.8]) / math.sqrt(0.98)  # unit, from the scene towards the lamp
 _SKIN = 150.0  # grey
 _SAMPLES = 8  # a side, of the rays through a pixel that an edge crosses
-_FLAT = 1e-6  # m
 _STEP = 0.5  # pixels that a body moves between the moments of which an exposure is summed
 
 
@@ -226,20 +225,7 @@ def _sheets(body: RigidBody) -> list[Print]:
     for each in body.prints:
         a, b = each.along / cells, each.down / cells
         papers.append(Print(each.origin - a - b, each.along + 2 * a, each.down + 2 * b, _BLANK))
-    return [*_joined(papers), *body.prints]
-
-
-def _joined(papers: list[Print]) -> list[Print]:
-    """One paper where all markers lie in a plane."""
-    first = papers[0]
-    points = np.concatenate([paper.corners for paper in papers]) - first.origin
-    right, down = (edge / np.linalg.norm(edge) for edge in (first.along, first.down))
-    normal = np.cross(right, down)
-    if len(papers) == 1 or np.abs(points @ normal).max() > _FLAT:
-        return papers
-    x, y = points @ right, points @ down
-    origin = first.origin + x.min() * right + y.min() * down
-    return [Print(origin, np.ptp(x) * right, np.ptp(y) * down, _BLANK)]
+    return [*papers, *body.prints]
 
 
 def _background(camera: CameraModel, random: np.random.Generator) -> NDArray[np.float32]:

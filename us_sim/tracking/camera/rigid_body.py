@@ -31,8 +31,6 @@ from us_sim.settings.text_files import YamlError, load_yaml
 from us_sim.tracking.camera.markers import dictionary, marker_count, proper_name, square
 from us_sim.tracking.settings import MARKER_SIZE
 
-_FLATNESS = 0.02  # of a marker's edge: how far a corner may be from the plane of the others
-
 
 @dataclass(frozen=True, eq=False)
 class Print:
@@ -62,7 +60,6 @@ class Chessboard:
     legacy: bool = False  # white upper left square where the rows are even, as before OpenCV 4.6
 
     def __post_init__(self) -> None:
-        _require_counts(self.columns, self.rows, 2)
         if not self.size < self.square:
             raise TrackingError(
                 f"a ChArUco board's markers ({self.size:g} m) must be smaller than its squares "
@@ -104,7 +101,7 @@ class RigidBody:
     as it is printed, and on clockwise as one sees it.
 
     Raises:
-        TrackingError: a marker twice, one that the dictionary lacks, or no flat quadrilateral.
+        TrackingError: a marker twice, or one that the dictionary lacks.
     """
 
     dictionary: str
@@ -116,14 +113,8 @@ class RigidBody:
         ids = np.array(self.ids)
         corners = np.array(self.corners, dtype=np.float64)
         object.__setattr__(self, "dictionary", proper_name(self.dictionary))
-        if ids.ndim != 1 or not len(ids) or corners.shape != (len(ids), 4, 3):
-            raise TrackingError(
-                f"a body needs markers with 4 corners of 3 coordinates each, not "
-                f"{ids.shape} numbers and {corners.shape} coordinates"
-            )
-        for number, quadrilateral in zip(ids.tolist(), corners, strict=True):
+        for number in ids.tolist():
             _require_in_dictionary(self.dictionary, number)
-            _require_marker(number, quadrilateral)
         ids = ids.astype(np.int64)
         numbers, counts = np.unique(ids, return_counts=True)
         if counts.max() > 1:
@@ -138,7 +129,7 @@ class RigidBody:
         """One marker; its middle is the origin, x to its right, y up and z out of the paper.
 
         Raises:
-            TrackingError: there is no such marker, or the size (m) is impossible.
+            TrackingError: there is no such marker.
         """
         return cls(dictionary, np.array([number]), square(size)[None])
 
@@ -158,9 +149,8 @@ class RigidBody:
         paper, as OpenCV has it.
 
         Raises:
-            TrackingError: a count or a size (m) is impossible, or the dictionary is too small.
+            TrackingError: the dictionary is too small.
         """
-        _require_counts(columns, rows, 1)
         marker = size * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         row, column = np.divmod(np.arange(columns * rows), columns)
         places = np.stack([column, row, 0 * row], axis=1) * (size + separation)
@@ -179,7 +169,7 @@ class RigidBody:
         """A ChArUco board of so many squares; its frame is as that of `grid`.
 
         Raises:
-            TrackingError: a count or a size (m) is impossible, or the dictionary is too small.
+            TrackingError: the markers are larger than squares, or the dictionary is too small.
         """
         chessboard = Chessboard(columns, rows, square, size, dictionary, legacy)
         markers = np.asarray(chessboard.board.getObjPoints(), dtype=np.float64).reshape(-1, 4, 3)
@@ -221,43 +211,14 @@ def _normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-def _require_counts(columns: int, rows: int, least: int) -> None:
-    for name, count in (("columns", columns), ("rows", rows)):
-        if not least <= count <= 100:
-            raise TrackingError(f"a board's {name} are {count}: they must be {least} to 100")
-
-
 def _require_in_dictionary(name: str, number: int) -> None:
     count = marker_count(name)
     if not 0 <= number < count:
         raise TrackingError(f"marker {number}: dictionary {name} has only markers 0 to {count - 1}")
 
 
-def _require_marker(number: int, corners: NDArray[np.float64]) -> None:
-    """Refuse corners that are no flat convex quadrilateral of a marker's size."""
-    if not np.isfinite(corners).all():
-        raise TrackingError(f"marker {number}: a corner is not finite")
-    edges = np.roll(corners, -1, axis=0) - corners
-    lengths = np.linalg.norm(edges, axis=1)
-    for length in lengths:
-        try:
-            MARKER_SIZE.parse(float(length))
-        except ValueError as error:
-            raise TrackingError(f"marker {number}: the length of an edge: {error}") from error
-    areas = np.cross(edges, np.roll(edges, -1, axis=0))
-    total = areas.sum(axis=0)
-    if (areas @ total <= 1e-3 * lengths.min() ** 2 * np.linalg.norm(total)).any():
-        raise TrackingError(
-            f"marker {number}: its corners are no convex quadrilateral; give them in order: the "
-            f"upper left one as printed, and on clockwise"
-        )
-    normal = total / np.linalg.norm(total)
-    if np.abs((corners - corners.mean(axis=0)) @ normal).max() > _FLATNESS * lengths.min():
-        raise TrackingError(f"marker {number}: its corners are not in one plane")
-
-
 _NUMBER = Quantity("number", 0, 65535)
-_COUNT = Quantity("number", 1, 1000)
+_COUNT, _SQUARES = Quantity("number", 1, 100), Quantity("number", 2, 100)
 
 
 @dataclass(frozen=True)
@@ -308,8 +269,8 @@ class CharucoBoard(Settings):
 
     error = TrackingError
 
-    columns: int = setting(_COUNT, "squares across")
-    rows: int = setting(_COUNT, "squares down")
+    columns: int = setting(_SQUARES, "squares across")
+    rows: int = setting(_SQUARES, "squares down")
     square: float = setting(MARKER_SIZE, "side of a square")
     size: float = setting(MARKER_SIZE, "edge of a marker")
     legacy: bool = setting(description="as OpenCV before 4.6 drew it", default=False)

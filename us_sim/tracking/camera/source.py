@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from us_sim.errors import TrackingError
 from us_sim.geometry.pose import Pose
 from us_sim.settings.spelling import counted
-from us_sim.tracking.camera.body_pose import BodyPose, PlaneAmbiguity, body_poses
+from us_sim.tracking.camera.body_pose import CORNER_DEVIATION, BodyPose, PlaneAmbiguity, body_poses
 from us_sim.tracking.camera.fiducial_detector import Detection, FiducialDetector
 from us_sim.tracking.camera.markers import dictionary, family
 from us_sim.tracking.camera.model import CameraModel
@@ -39,6 +39,10 @@ from us_sim.tracking.settings import CameraSettings
 REMEMBERED = 0.5
 """s, how long the last pose helps to find the next one and to tell it from its mirror image."""
 
+VIEW_ANGLE_LIMIT = math.radians(75.0)
+"""Angle between a marker's normal and the line of sight, beyond which it is not used."""
+
+_REPROJECTION_LIMIT = 2.0  # pixels, root mean square between the corners seen and the pose's
 _BLACK = 24  # grey, below which all of an image is when it shows nothing
 _MARGIN = 0.35  # of the body's size in the image, around where it is looked for
 _LEAST_MARGIN = 24  # pixels
@@ -62,7 +66,7 @@ class CameraSource:
         """Markers of the body that the last measurement is made from."""
         self._detector = FiducialDetector(body)
         self._last: tuple[int, Pose] | None = None
-        self._ambiguity = PlaneAmbiguity(self.settings.corner_deviation)
+        self._ambiguity = PlaneAmbiguity(CORNER_DEVIATION)
 
     def reset(self) -> None:
         """Forget the last pose."""
@@ -161,14 +165,7 @@ class CameraSource:
                     f"seen, fewer than the {least} of camera.minimum_markers"
                 )
                 return None
-            found = body_poses(
-                self.camera,
-                points,
-                pixels,
-                owners,
-                guess=before,
-                deviation=self.settings.corner_deviation,
-            )
+            found = body_poses(self.camera, points, pixels, owners, guess=before)
             if not found:
                 self.last_problem = (
                     "what is seen of the body does not tell its pose: show more of it, and check "
@@ -193,16 +190,15 @@ class CameraSource:
         """Owners of points that cannot be used in a pose, and why."""
         markers = np.unique(owners)
         angles = self._view_angles(pose.pose, markers)
-        limit = self.settings.view_angle_limit
-        steep = angles > limit
+        steep = angles > VIEW_ANGLE_LIMIT
         if steep.any():
             worst = int(np.argmax(angles))
             return markers[steep], (
                 f"{self._name(markers[worst])} is seen at "
                 f"{math.degrees(angles[worst]):.0f}° from its normal, beyond the "
-                f"{math.degrees(limit):.0f}° of camera.view_angle_limit: it is not used"
+                f"{math.degrees(VIEW_ANGLE_LIMIT):.0f}° up to which its edges tell: it is not used"
             )
-        if pose.error <= self.settings.reprojection_limit:
+        if pose.error <= _REPROJECTION_LIMIT:
             return markers[:0], ""
         squares = (pose.residuals**2).sum(axis=1)
         errors = np.array([math.sqrt(squares[owners == marker].mean()) for marker in markers])
@@ -213,9 +209,8 @@ class CameraSource:
                 f"the others say: it is not used; check its place in the body's file"
             )
         return markers, (
-            f"the corners are {pose.error:.1f} pixels from those of the best pose, more than the "
-            f"{self.settings.reprojection_limit:g} of camera.reprojection_limit: check the "
-            f"marker's size, the body's file and the camera info"
+            f"the corners are {pose.error:.1f} pixels from those of the best pose, where "
+            f"{_REPROJECTION_LIMIT:g} are believed: check the body's file and the camera info"
         )
 
     def _name(self, row: int) -> str:
