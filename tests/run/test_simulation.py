@@ -90,7 +90,6 @@ def test_a_recording_and_a_replay_come_and_go_beside_the_nodes(running, tmp_path
     simulation.update()
     assert control.told[-1][1]["record"] == str(tmp_path.resolve() / "a.mcap")
     assert control.told[-1][1]["record_state"] == "starting"
-    assert control.told[-1][1]["record_note"] == ""
     supervisor.monitor.node.reports["session_recorder"] = {
         "state": "recording",
         "note": "it lies beside another",
@@ -161,6 +160,18 @@ def test_what_turns_out_not_to_work_is_taken_back(running):
     supervisor.why = "tissue_deformer cannot work"
     with pytest.raises(UsSimError, match="tissue_deformer"):
         simulation.update()  # there is nothing more to go back to
+
+
+def test_a_scene_that_is_loaded_says_that_there_are_no_images_meanwhile(running, small_scene):
+    simulation, supervisor, control = running
+    ask(simulation, control, scene=str(small_scene))
+    supervisor.waiting = ["tissue_deformer"]
+    simulation.update()  # which loads it
+    simulation.update()
+    assert "no images" in control.told[-1][0]
+    supervisor.waiting = []
+    simulation.update()
+    assert control.told[-1][0] == "running"
 
 
 def test_a_scene_s_own_recording_is_played_to_its_tracker_and_held_at_its_end():

@@ -19,10 +19,11 @@ from us_sim.run.plan import (
     Plan,
     Request,
     plan_of,
+    prepare_scene,
+    require_free_port,
     require_new,
     viewer_process,
 )
-from us_sim.run.preparation import prepare_scene
 from us_sim.run.processes import prepare_ros
 from us_sim.run.simulation import Simulation
 from us_sim.run.supervision import (
@@ -94,8 +95,7 @@ def _await_all(update: Callable[[], None], supervisor: Supervisor) -> None:
             is_long = time.monotonic() - began > _LONG_START_S
             why = "a first run compiles for minutes: " if is_long else ""  # what is behind is cut
             bar.update(count - len(waiting), why + ", ".join(waiting[:2]) + more)
-            failed = supervisor.failed()
-            if failed:
+            if failed := supervisor.failed():
                 raise UsSimError(failed)
 
 
@@ -135,19 +135,11 @@ def _status(plan: Plan, monitor: SessionMonitor) -> str:
         told.append(f"waiting for {player.get('awaited', 'poses')}")
     elif player.get("state") == "waiting":
         told.append(f"waiting for the simulation on ROS domain {domain()}")
-    return "; ".join(filter(None, [*told, _page(plan, monitor)]))
-
-
-def _page(plan: Plan, monitor: SessionMonitor) -> str:
-    """Where a browser finds the page; empty while none is served."""
-    viewer = next((each for each in plan.processes if each.node == VIEWER), None)
-    port = monitor.reports.get(VIEWER, {}).get("port", "")
-    if viewer is None or not port:
-        return ""
-    host = str(viewer.parameters["host"])
-    if not is_loopback(host):
-        return "open the address with its token, above"
-    return f"open http://{f'[{host}]' if ':' in host else host}:{port}/"
+    if port := monitor.reports.get(VIEWER, {}).get("port"):
+        host = str(next(each for each in plan.processes if each.node == VIEWER).parameters["host"])
+        address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+        told.append(f"open {address if is_loopback(host) else 'the address with its token, above'}")
+    return "; ".join(told)
 
 
 def dry_run(request: Request) -> str:
@@ -156,24 +148,17 @@ def dry_run(request: Request) -> str:
         require_new(full_path(request.record))
     plan_of(request)
     scene, view = request.scene, request.view
-    rows = [
-        ("runs" if part.needed else "left out", part.node, part.reason) for part in scene.parts()
-    ]
-    port = (view and view.port) or "any"
-    for node, reason, without in (
-        (
-            "path_player",
-            request.path and f"plays {request.path}",
-            f"no --path: poses come from `{scene.tracker.source.name}`",
-        ),
-        (RECORDER, request.record and f"records to {request.record}", "no --record"),
-        (VIEWER, view and f"serves a page at {view.host}, port {port}", "no --view"),
-    ):
-        rows.append(("runs", node, reason) if reason else ("left out", node, without))
+    rows = [(part.node, part.needed, part.reason) for part in scene.parts()]
+    path, record = request.path, request.record
+    source = f"no --path: poses come from `{scene.tracker.source.name}`"
+    rows.append(("path_player", path is not None, f"plays {path}" if path else source))
+    rows.append((RECORDER, record is not None, f"records to {record}" if record else "no --record"))
+    page = f"serves a page at {view.host}, port {view.port or 'any'}" if view else "no --view"
+    rows.append((VIEWER, view is not None, page))
     return "\n".join(
         [
             f"scene {scene.name} ({scene.origin}), volume {scene.volume.name}",
-            *(f"{verdict:<9} {node:<19} {reason}" for verdict, node, reason in rows),
+            *(f"{'runs' if runs else 'left out':<9} {node:<19} {why}" for node, runs, why in rows),
             "on demand wrench, tf, markers, annotated image, what is known of images: nothing is "
             "computed for a topic nobody subscribes",
         ]
@@ -200,12 +185,12 @@ def run(request: Request, *, network: bool, supervision: SupervisionSettings) ->
     outcome = _simulate(request, None, supervision)
     for file in outcome.files:
         print(f"recorded to {file}")
-    _require_nothing_lost(outcome)
-    return 0
+    return _require_nothing_lost(outcome)
 
 
 def _simulate(request: Request, log: Path | None, supervision: SupervisionSettings) -> Outcome:
-    plan = plan_of(request).with_free_port()
+    plan = plan_of(request)
+    require_free_port(plan)
     prepare_scene(request.scene, request.path, plan.topic)
     if log is not None:
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -242,8 +227,7 @@ def demo(request: Request, out: Path, *, network: bool, supervision: Supervision
     except UsSimError as error:
         why = filter(None, [outcome.sentence(), str(error)])
         raise UsSimError("; ".join(why)) from error
-    _require_nothing_lost(outcome)
-    return 0
+    return _require_nothing_lost(outcome)
 
 
 def view_running(
@@ -262,8 +246,9 @@ def view_running(
             f"--param {others[0]}: --attach starts the viewer alone; set parameters of what runs "
             f"already with `ros2 param set`, or in the page"
         )
-    _require_nothing_lost(follow(Plan([viewer]).with_free_port(), None, supervision))
-    return 0
+    plan = Plan([viewer])
+    require_free_port(plan)
+    return _require_nothing_lost(follow(plan, None, supervision))
 
 
 def play(
@@ -294,13 +279,13 @@ def play(
         poses = len(read_path(bag, topic or None, option="--topic"))
         process = NodeProcess("path_player", settings | {"topic": topic, "lockstep": lockstep})
     plan = Plan([process], poses, player=process.node, loops=player.loop)
-    _require_nothing_lost(follow(plan, None, SupervisionSettings()))
-    return 0
+    return _require_nothing_lost(follow(plan, None, SupervisionSettings()))
 
 
-def _require_nothing_lost(outcome: Outcome) -> None:
+def _require_nothing_lost(outcome: Outcome) -> int:
     if lost := outcome.sentence():
         raise UsSimError(lost)
+    return 0
 
 
 def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
@@ -326,15 +311,12 @@ def _report(scene: Scene, out: Path, outcome: Outcome, wall: float) -> None:
         f"to the recorder {recorder['p50']:.1f} ms, {recorder['p99']:.1f} ms"
     )
     for vessel in areas.area if areas is not None else ():
-        changes = {
-            moment: "not in the image" if change is None else format(change, form)
-            for moment, form in (("at_full_press", "+.0%"), ("after_release", "+.1%"))
-            for change in [summary["areas"][f"{vessel}_change_{moment}"]]
-        }
-        print(
-            f"{vessel}: {changes['at_full_press']} at full press, "
-            f"{changes['after_release']} after release"
-        )
+        told = []
+        for moment, form in (("at_full_press", "+.0%"), ("after_release", "+.1%")):
+            change = summary["areas"][f"{vessel}_change_{moment}"]
+            shown = "not in the image" if change is None else format(change, form)
+            told.append(f"{shown} {moment.replace('_', ' ')}")
+        print(f"{vessel}: {', '.join(told)}")
     recordings = (file.name for file in outcome.files)
     for name in (*recordings, "contact_sheet.png", "summary.json", "nodes.log"):
         print(out / name)

@@ -15,8 +15,7 @@ from threadpoolctl import threadpool_limits
 from us_sim.errors import UsSimError
 from us_sim.progress import Progress
 from us_sim.run.domain import ros_context
-from us_sim.run.plan import NodeProcess, Plan, Request, plan_of
-from us_sim.run.preparation import prepare_scene
+from us_sim.run.plan import NodeProcess, Plan, Request, plan_of, prepare_scene
 from us_sim.run.processes import prepare_ros
 from us_sim.scene.building import volume_of
 from us_sim.scene.scene import Scene

@@ -10,7 +10,7 @@ import json
 import os
 import posixpath
 import secrets
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ import yaml
 
 from us_sim.errors import SceneError, SettingsError, UsSimError
 from us_sim.nodes.settings import RECORDER, VIEWER, SessionRecorderSettings, checked_parameters
+from us_sim.progress import late_progress
 from us_sim.run.domain import enclave_of, namespace, ros_arguments
-from us_sim.scene.building import path_of
+from us_sim.scene.building import path_of, volume_of
 from us_sim.scene.scene import Scene
 from us_sim.settings.setting import rules_of
 from us_sim.settings.viewer import TOKEN, ViewerSettings
@@ -108,17 +109,12 @@ class Plan:
     def nodes(self) -> list[str]:
         return [process.node for process in self.processes]
 
-    def with_free_port(self) -> Plan:
-        """The same plan, checked before anything is made for it.
 
-        Raises:
-            UsSimError: the page's address or port cannot be listened at.
-        """
-        for process in self.processes:
-            if process.node == VIEWER:
-                parameters = process.parameters
-                require_free(str(parameters["host"]), int(str(parameters["port"])))
-        return self
+def require_free_port(plan: Plan) -> None:
+    """Raise UsSimError where the page's address or port cannot be listened at."""
+    for process in plan.processes:
+        if process.node == VIEWER:
+            require_free(str(process.parameters["host"]), int(str(process.parameters["port"])))
 
 
 def require_new(recording: Path) -> None:
@@ -150,39 +146,58 @@ def plan_of(request: Request) -> Plan:
         UsSimError: a parameter will not do, or the file to be played cannot be.
     """
     request = _with_path_of_tracker(request)
-    scene, parameters = request.scene, dict(request.parameters)
+    scene, given = request.scene, dict(request.parameters)
+    played = "" if request.path is None else str(full_path(request.path))
 
     def taken(node: str) -> dict[str, object]:
-        return checked_parameters(node, scene, parameters.pop(node, {}))
+        return checked_parameters(node, scene, given.pop(node, {}))
 
     processes = []
     if request.view is not None:  # it goes first: a page can load while tissue is built
         processes.append(viewer_process(request.view, taken(VIEWER)))
     recorder = taken(RECORDER) if request.record is not None or request.is_changed else {}
-    player = taken("path_player") if request.path is not None or request.is_changed else {}
-    played = "" if request.path is None else str(full_path(request.path))
+    player = taken("path_player") if played or request.is_changed else {}
     settings: dict[str, object]
-    if request.path is not None and request.everything:
+    if played and request.everything:
         running = ["diagnostics", "session/scenes", "session/bags"]
         running += [f"/{name}" for name in running]  # of a session without namespace
         settings = {"path": played, "exclude": running, **request.playing}
         processes.append(NodeProcess("session_player", settings))
         return Plan(processes, duration=request.duration, player="session_player")
+    common: dict[str, object] = {"scene": scene.origin}
+    if scene.volume.file:
+        common["volume"] = scene.volume.file
     if request.record is not None:
-        settings = {"file": str(full_path(request.record)), **scene_settings(scene)}
-        if request.path is not None:
-            settings["path"] = played
+        settings = {"file": str(full_path(request.record)), **common}
+        settings |= {"path": played} if played else {}
         processes.append(NodeProcess(RECORDER, settings | recorder))
-    is_played = request.by_hand or request.path is not None
-    processes += simulation_nodes(scene, parameters, played=is_played)
+    needed = [part.node for part in scene.parts() if part.needed]
+    for node in needed:
+        is_played = node == "probe_tracker" and (played or request.by_hand)
+        source = {"source": "pose"} if is_played else {}
+        processes.append(NodeProcess(node, common | source | taken(node)))
+    if given:
+        raise UsSimError(
+            f"--param {next(iter(given))}: this scene does not run such a node; it runs "
+            f"{', '.join(needed)}"
+        )
     for process in processes:
         if process.node == RECORDER:
-            process.parameters["parameters"] = parameters_file(processes)
-    awaited = recorder_of(processes)
+            document = {each.node: {"ros__parameters": each.parameters} for each in processes}
+            process.parameters["parameters"] = yaml.safe_dump(document, sort_keys=False)
     if request.path is None:
         return Plan(processes, duration=request.duration)
     path = path_of(scene, request.path, request.topic or str(player.get("topic") or "") or None)
-    settings = player_settings(scene, request.path, awaited, path.topic) | dict(request.playing)
+    topics, space, records = (
+        ["tracker/pose", *scene.ready_topics],
+        namespace(),
+        recorder_of(processes),
+    )
+    recorded = [
+        each for each in topics if records and records.records(posixpath.join(space, each), space)
+    ]
+    settings = {"path": played, "topic": path.topic, "await_topics": topics}
+    settings |= {"await_recorded": recorded or [""], **request.playing}  # [] has no type
     poses = None if settings.get("stay") else len(path)
     settings |= player
     processes.append(NodeProcess("path_player", settings))
@@ -206,39 +221,6 @@ def _with_path_of_tracker(request: Request) -> Request:
     return replace(request, path=Path(tracker.file), playing={"stay": True})
 
 
-def simulation_nodes(
-    scene: Scene, parameters: Parameters | None = None, *, played: bool = False
-) -> list[NodeProcess]:
-    """The nodes that ``scene`` needs.
-
-    Args:
-        scene: what they work on.
-        parameters: extra ones by node, as YAML texts.
-        played: a path is played on ``tracker/pose``, whatever the scene's tracker is.
-
-    Raises:
-        UsSimError: a parameter is for a node that this scene does not run.
-    """
-    given = dict(parameters or {})
-    common = scene_settings(scene)
-    nodes = [
-        NodeProcess(
-            part.node,
-            common
-            | ({"source": "pose"} if played and part.node == "probe_tracker" else {})
-            | checked_parameters(part.node, scene, given.pop(part.node, {})),
-        )
-        for part in scene.parts()
-        if part.needed
-    ]
-    if given:
-        raise UsSimError(
-            f"--param {next(iter(given))}: this scene does not run such a node; it runs "
-            f"{', '.join(process.node for process in nodes)}"
-        )
-    return nodes
-
-
 def viewer_process(view: ViewerSettings, given: dict[str, object] | None = None) -> NodeProcess:
     """The process that shows the simulation in browsers, at an address that it says itself."""
     settings: dict[str, object] = {"host": view.host, "port": view.port}
@@ -253,43 +235,6 @@ def _viewer_token() -> str:
     return os.environ.get(TOKEN) or secrets.token_urlsafe(16)
 
 
-def scene_settings(scene: Scene) -> dict[str, object]:
-    """The parameters that tell a node the scene."""
-    settings: dict[str, object] = {"scene": scene.origin}
-    if scene.volume.file:
-        settings["volume"] = scene.volume.file
-    return settings
-
-
-def parameters_file(processes: Sequence[NodeProcess]) -> str:
-    """The parameters of nodes as ROS reads them with ``--params-file``."""
-    document = {process.node: {"ros__parameters": process.parameters} for process in processes}
-    text: str = yaml.safe_dump(document, sort_keys=False)
-    return text
-
-
-def player_settings(
-    scene: Scene, path: Path, recorder: SessionRecorderSettings | None, topic: str = ""
-) -> dict[str, object]:
-    """Parameters of a ``path_player`` that begins when all of the scene's nodes are ready."""
-    return {
-        "path": str(full_path(path)),
-        "topic": topic,
-        **_awaited(["tracker/pose", *scene.ready_topics], recorder),
-    }
-
-
-def _awaited(topics: Sequence[str], recorder: SessionRecorderSettings | None) -> dict[str, object]:
-    """Parameters that have a player wait for these topics, and for a recorder to record them."""
-    space = namespace()
-    recorded = [
-        topic
-        for topic in topics
-        if recorder and recorder.records(posixpath.join(space, topic), space)
-    ]
-    return {"await_topics": topics, "await_recorded": recorded or [""]}  # [] has no type
-
-
 def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | None:
     """The settings of the recorder among them."""
     for process in processes:
@@ -298,3 +243,34 @@ def recorder_of(processes: Iterable[NodeProcess]) -> SessionRecorderSettings | N
             values: Any = {name: process.parameters[name] for name in known}
             return SessionRecorderSettings(**values)
     return None
+
+
+def prepare_scene(scene: Scene, path: Path | None = None, topic: str | None = None) -> None:
+    """Make a phantom that is not in the cache yet, in view of the person who waits.
+
+    The tissue of a case is made too, and kept in the case. Of a phantom that is there nothing is
+    read, unless a path is played: its nodes do that, and notice damage.
+
+    Args:
+        scene: whose volume is made.
+        path: that will be played.
+        topic: of the body in it.
+
+    Raises:
+        UsSimError: the volume cannot be read, or no image along the path shows any of it.
+    """
+    phantom = scene.volume.phantom
+    if path is None and phantom is not None:
+        from us_sim.volume.phantom.phantom import is_phantom_kept
+
+        if is_phantom_kept(phantom, scene.volume.seed, scene.volume.voxel_size):
+            return
+    volume = volume_of(scene, late_progress(f"making {scene.volume.name}"))
+    if path is not None:
+        from us_sim.scene.placement import check_path_in_volume
+
+        check_path_in_volume(scene, path, volume, topic)
+    if scene.volume.case is not None:
+        from us_sim.scene.case_tissue import keep_tissue
+
+        keep_tissue(scene, volume)

@@ -24,7 +24,7 @@ _BAGS_EVERY_S = 2.0
 _BAGS = (".mcap", ".db3", ".zstd")
 _MOST_BAGS = 500  # the newest
 _OF_SCENE = {"scene", "volume"}
-_OF_RECORDER = ("seconds", "bytes", "room_bytes")  # values of its report
+_OF_RECORDER = ("state", "note", "seconds", "bytes", "room_bytes")  # values of its report
 _OF_PLAYER = {"replay_rate": "rate", "replay_loop": "loop", "replay_paused": "paused"}
 """Parameters that go on to the node that plays."""
 
@@ -194,54 +194,44 @@ class Simulation:
     def _report(self) -> None:
         request, waiting = self._request, self._supervisor.waiting
         count = len(self._supervisor.plan.nodes)
-        state, fraction = "running", 1.0
-        if waiting:
-            fraction = (count - len(waiting)) / max(count, 1)
-            state = f"starting: {count - len(waiting)} of {count} nodes"
+        ready = count - len(waiting)
+        state = f"starting: {ready} of {count} nodes" if waiting else "running"
+        if waiting and self._settled is not None and self._settled.scene is not request.scene:
+            state += ", no images until all are ready"
         reports, replay = self._supervisor.monitor.node.reports, self._control.values
-        player: dict[str, str] = {}
-        if request.path:
-            player = reports.get(self._supervisor.plan.player, {})
-        record = full_path(request.record) if request.record else None
-        # What a recorder said that has ended is no more so.
-        recorder = {} if RECORDER in waiting else reports.get(RECORDER, {})
         values: dict[str, str] = {
             "scene": request.scene.name,
             "origin": request.scene.origin,
             "volume": request.scene.volume.name,
-            "fraction": f"{fraction:.2f}",
-            "record": str(record or ""),
-            "record_state": recorder.get("state", "starting") if record else "",
-            "record_note": recorder.get("note", "") if record else "",
-            **{
-                f"record_{key}": recorder[key] for key in _OF_RECORDER if record and key in recorder
-            },
+            "fraction": f"{ready / max(count, 1):.2f}",
+            "record": str(full_path(request.record)) if request.record else "",
             "replay": str(request.path or ""),
             "replay_as": "recording" if request.everything else "path",
-            "replay_state": player.get("state", "starting") if request.path else "",
             "replay_rate": f"{replay.replay_rate:g}",
             "replay_loop": str(replay.replay_loop).lower(),
             "replay_paused": str(replay.replay_paused).lower(),
-            **{key: player[key] for key in ("position", "duration") if key in player},
         }
+        if request.record:  # what a recorder said that has ended is no more so
+            recorder = {} if RECORDER in waiting else reports.get(RECORDER, {})
+            values["record_state"] = "starting"
+            values |= {f"record_{key}": recorder[key] for key in _OF_RECORDER if key in recorder}
+        if request.path:
+            player = reports.get(self._supervisor.plan.player, {})
+            values["replay_state"] = player.get("state", "starting")
+            values |= {key: player[key] for key in ("position", "duration") if key in player}
         self._control.tell(state, values, self._problem)
 
     def _shown(self) -> SessionControlSettings:
         """The control's parameters as things are."""
         request, scene = self._request, self._request.scene
-        changes: dict[str, Any] = {
-            key: request.playing[name]
-            for key, name in _OF_PLAYER.items()
-            if name in request.playing
-        }
-        return replace(
-            SessionControlSettings(),
+        playing: Any = request.playing
+        return SessionControlSettings(
             scene=scene.origin,
             volume=_volume_of(scene),
             record=str(request.record) if request.record else None,
             replay=str(request.path) if request.path else None,
             replay_as="recording" if request.everything else "path",
-            **changes,
+            **{key: playing[name] for key, name in _OF_PLAYER.items() if name in playing},
         )
 
 
